@@ -461,6 +461,14 @@ class TestUniversalFile:
         with pytest.raises(DataError, match=r"damaged|cut off|no frequency response"):
             read_frequency_response(path, drive="1 N")
 
+    def test_damage_names_its_data_set(self, tmp_path: Path) -> None:
+        sets = [SI, uff_function(X, TIME, 1, 8), uff_function(F, TIME, 1, 13, rsp_node=2)]
+        path = write_uff(tmp_path / "run.uff", *sets)
+        before, last = path.read_bytes().rsplit(b"    58", 1)
+        path.write_bytes(before + b"    58" + last.replace(b".", b"x"))
+        with pytest.raises(DataError, match=r"data set 3 of 3 \(type 58\) .* is damaged: "):
+            read_record(path)
+
 
 class TestTdms:
     def write(self, path: Path, **properties: Any) -> Path:

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response
+from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
 from dahl_ident.synthetic import load_dataset
 
@@ -194,6 +194,19 @@ class TestForms:
 def known_provenance(data: FrequencyResponse) -> dict[str, Any]:
     assert data.provenance is not None
     return dict(data.provenance)
+
+
+def test_units_at_the_end_of_names(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "freq_Hz,drive_mN,receptance_re_m_per_N,receptance_im_m_per_N\n1,200,2e-3,-1e-3\n"
+    )
+    data = read_frequency_response(path)
+    assert (data.quantity, data.response.tolist()) == ("receptance", [2e-3 - 1e-3j])
+    np.testing.assert_allclose(known(data.drive), [0.2])
+    path.write_text("time_s,displacement_um,force_N\n0,1,2\n0.5,2,3\n")
+    record = read_record(path)
+    np.testing.assert_allclose(known(record.displacement), [1e-6, 2e-6])
 
 
 class TestErrors:

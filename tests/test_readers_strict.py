@@ -21,7 +21,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.cli import main
-from dahl_ident.data import inspect, read_frequency_response, read_record, readers
+from dahl_ident.data import inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, ValidationError
 from tests import reader_fuzz
 from tests.reader_fuzz import ENDINGS, NOISE, TIME, F, X
@@ -259,7 +259,7 @@ class TestSize:
         monkeypatch.setattr(di.data.record.Record, "__init__", full)
         code, _, why = told(capsys, "fit", path, "--record")
         assert (code, why.count("\n")) == (1, 1)
-        monkeypatch.setattr(readers, "_parsed", full)
+        monkeypatch.setattr("dahl_ident.data.readers.text_table.read_text_table", full)
         with pytest.raises(DataError, match="takes more memory than there is"):
             read_record(path)
 

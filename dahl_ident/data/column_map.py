@@ -43,6 +43,7 @@ from dahl_ident.units import (
     Motion,
     Quantity,
     Unit,
+    factor_to,
     kind_of,
     parse_quantity,
     parse_unit,
@@ -53,7 +54,7 @@ _SHOWN = 10  # rows that a warning names
 
 
 @dataclass(frozen=True)
-class Column:
+class MappedColumn:
     """The column of a role, by its usual name where there is no other, with its sign and factor.
 
     A `unit` overrides the file's.
@@ -64,12 +65,41 @@ class Column:
     sign: int = 1
     factor: float = 1.0
 
+    @classmethod
+    def of(cls, entry: Any, role: str) -> MappedColumn:
+        """Return what an entry of a column map says, a name or a table."""
+        if role not in FILE_COLUMNS:
+            raise ValidationError(
+                f"unknown entry {role!r}; expected one of "
+                f"{choices((*FILE_COLUMNS, *SETTINGS), role)}"
+            )
+        if isinstance(entry, str):
+            return cls(entry)
+        if not isinstance(entry, Mapping):
+            raise ValidationError(
+                f"{role} is {entry!r}; expected a column's name, or a table with column, unit, "
+                "sign and factor"
+            )
+        unknown = sorted(set(entry) - {"column", "unit", "sign", "factor"})
+        if unknown:
+            raise ValidationError(
+                f"{role}: unknown entry {unknown[0]!r}; expected column, unit, sign or factor"
+            )
+        for key in ("column", "unit"):
+            if not isinstance(entry.get(key, ""), str):
+                raise ValidationError(f"{role}.{key} is {entry[key]!r}; expected text")
+        sign = entry.get("sign", 1)
+        if sign not in (1, -1):
+            raise ValidationError(f"{role}.sign is {sign!r}; expected 1 or -1")
+        factor = positive_number(entry.get("factor", 1.0), f"{role}.factor")
+        return cls(entry.get("column"), entry.get("unit"), int(sign), factor)
+
 
 @dataclass(frozen=True)
 class ColumnMap:
     """Roles and other information that a file does not contain; see `read_frequency_response`."""
 
-    roles: Mapping[str, Column] = field(default_factory=dict)
+    roles: Mapping[str, MappedColumn] = field(default_factory=dict)
     quantity: Quantity | None = None
     controlled: str | Mapping[str, str] | None = None
     sweep: str | None = None
@@ -86,62 +116,26 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
     >>> column_map({"force": {"column": "F", "unit": "kN"}}).roles["force"].unit
     'kN'
     """
-    if value is None or isinstance(value, Mapping):
-        name, entries = "columns", dict(value or {})
-    else:
-        name, entries = str(value), _toml(Path(value))
-    entries |= {key: entry for key, entry in overrides.items() if entry is not None}
+    name, entries = "columns", value or {}
+    if not isinstance(entries, Mapping):
+        name = str(entries)
+        try:
+            entries = tomllib.loads(read_text(name, "the column map"))
+        except tomllib.TOMLDecodeError as exc:
+            raise DataError(f"{name}: not a TOML file: {exc}") from exc
+    entries = {**entries, **{key: entry for key, entry in overrides.items() if entry is not None}}
+    roles: dict[str, MappedColumn] = {}
+    settings: dict[str, Any] = {}
     try:
-        return _read(entries)
+        for key, entry in entries.items():
+            mapped = key in FILE_COLUMNS and isinstance(entry, Mapping) and "column" in entry
+            if key in SETTINGS and not mapped:
+                settings[key] = SETTINGS[key](entry, key)
+            else:
+                roles[key] = MappedColumn.of(entry, key)
     except ValidationError as exc:
         raise DataError(f"{name}: {exc}") from exc
-
-
-def _read(entries: Mapping[str, Any]) -> ColumnMap:
-    roles: dict[str, Column] = {}
-    settings: dict[str, Any] = {}
-    for key, entry in entries.items():
-        column = key in FILE_COLUMNS
-        if key in _SETTINGS and not (column and isinstance(entry, Mapping) and "column" in entry):
-            settings[key] = _SETTINGS[key](entry, key)
-        elif column:
-            roles[key] = _column(entry, key)
-        else:
-            raise ValidationError(
-                f"unknown entry {key!r}; expected one of "
-                f"{choices((*FILE_COLUMNS, *_SETTINGS), key)}"
-            )
     return ColumnMap(roles, **settings)
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path, "the column map"))
-    except tomllib.TOMLDecodeError as exc:
-        raise DataError(f"{path}: not a TOML file: {exc}") from exc
-
-
-def _column(entry: Any, role: str) -> Column:
-    if isinstance(entry, str):
-        return Column(entry)
-    if not isinstance(entry, Mapping):
-        raise ValidationError(
-            f"{role} is {entry!r}; expected a column's name, or a table with column, unit, sign "
-            "and factor"
-        )
-    unknown = set(entry) - {"column", "unit", "sign", "factor"}
-    if unknown:
-        raise ValidationError(
-            f"{role}: unknown entry {sorted(unknown)[0]!r}; expected column, unit, sign or factor"
-        )
-    for key in ("column", "unit"):
-        if not isinstance(entry.get(key, ""), str):
-            raise ValidationError(f"{role}.{key} is {entry[key]!r}; expected text")
-    sign = entry.get("sign", 1)
-    if sign not in (1, -1):
-        raise ValidationError(f"{role}.sign is {sign!r}; expected 1 or -1")
-    factor = positive_number(entry.get("factor", 1.0), f"{role}.factor")
-    return Column(entry.get("column"), entry.get("unit"), int(sign), factor)
 
 
 def _controlled(entry: Any, key: str) -> str | dict[str, str]:
@@ -161,7 +155,7 @@ def _text(entry: Any, key: str) -> str:
     return entry
 
 
-_SETTINGS: dict[str, Callable[[Any, str], Any]] = {
+SETTINGS: dict[str, Callable[[Any, str], Any]] = {
     "quantity": lambda entry, key: one_of(entry, key, QUANTITIES),
     "controlled": _controlled,
     "sweep": _text,
@@ -169,6 +163,7 @@ _SETTINGS: dict[str, Callable[[Any, str], Any]] = {
     "drive_factor": _text,
     "drive_factor_uncertainty": non_negative_number,
 }
+"""Entries of a column map that are not columns, and what checks each."""
 
 
 @dataclass
@@ -194,6 +189,19 @@ class Binding:
                 "or columns={'force': 'column 2 [N]'} and the like"
             )
 
+    def mapped(self, role: str) -> MappedColumn:
+        """Return what the column map says of a role."""
+        return self.map.roles.get(role, MappedColumn())
+
+    def named(self, role: str) -> list[Channel]:
+        """Return the columns that are called what the role is, or said to be it by the format."""
+        declared = self.columns[role]
+        return [
+            c
+            for c in self.source.channels
+            if c.role == role or (c.role is None and c.is_called(declared))
+        ]
+
     def channel(self, role: str) -> Channel | None:
         """Return the channel of a role, or None where the file has none."""
         channel = self._find(role)
@@ -201,19 +209,10 @@ class Binding:
             self.used.add(channel.name)
         return channel
 
-    def named(self, role: str) -> list[Channel]:
-        """Return the columns that are called what the role is, or said to be it by the format."""
-        return [
-            c
-            for c in self.source.channels
-            if c.role == role
-            or (c.role is None and plain(c.short or c.name) in self.columns[role].names)
-        ]
-
     def _find(self, role: str) -> Channel | None:
-        spec = self.map.roles.get(role, Column())
-        if spec.column is not None:
-            return self.source.find(spec.column)
+        column = self.mapped(role).column
+        if column is not None:
+            return self.source.find(column)
         matches, names = self.named(role), self.columns[role].names
         if role not in self.map.roles:  # a column that the map gives another role has no second one
             named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
@@ -254,17 +253,42 @@ class Binding:
 
     def numbers(self, role: str, channel: Channel) -> FloatArray:
         """Return finite numbers with the map's sign and factor, in the file's unit."""
-        spec = self.map.roles.get(role, Column())
-        return scaled(self.source.numbers(channel), spec.sign * spec.factor)
+        mapped = self.mapped(role)
+        return scaled(self.source.numbers(channel), mapped.sign * mapped.factor)
+
+    def si(self, role: str, quantity: str = "dynamic_stiffness", *, least: bool = True) -> Any:
+        """Return a column in SI units, amplitudes zero to peak; None where there is none.
+
+        Where its unit does not say of which kind it is, that of the declaration counts, in a table
+        of `quantity`. Without `least`, numbers below what is allowed are returned too.
+        """
+        channel, declared = self.channel(role), self.columns[role]
+        if channel is None:
+            return None
+        values, unit = self.numbers(role, channel), self.unit(role, channel)
+        if declared.expected and least:
+            self.source.require(values >= declared.least, channel, declared.expected)
+        if declared.kinds:
+            _, factor = self.kind(role, unit)
+        else:
+            si = declared.unit_of(self.motion(), quantity)
+            factor = factor_to(unit, si, f"{self.source.name}: column {channel.name!r}")
+        return scaled(values, factor * unit.to_peak)
 
     def unit(self, role: str, channel: Channel) -> Unit:
         """Return the unit: the map's, the header's, the one in the name, or another column's."""
-        text = self.map.roles.get(role, Column()).unit or channel.unit
-        if text is None and plain(channel.short or channel.name) in self.columns[role].names:
+        declared = self.columns[role]
+        text = self.mapped(role).unit or channel.unit
+        if text is None and channel.is_called(declared):
             text = channel.unit_in_name
-        text = text or self._inherited(self.columns[role])
-        if text is None:
-            example = self.columns[role].example
+        like = (role for role in declared.like if self.has(role))
+        if not text and (other := next(like, None)) is not None:
+            inherited = self.unit(other, self.required(other))
+            text = None if inherited.decibel else inherited.text
+        elif not text and declared.unit == "1":
+            text = "1"
+        if not text:
+            example = declared.example
             raise UnitError(
                 f"{self.source.name}: column {channel.name!r} has no unit; write it in the "
                 f"header, such as '{channel.name} [{example}]', or give "
@@ -275,18 +299,11 @@ class Binding:
         except UnitError as exc:
             raise UnitError(f"{self.source.name}: column {channel.name!r}: {exc}") from exc
 
-    def _inherited(self, column: FileColumn) -> str | None:
-        """Return the unit that a column without one has from the column that it belongs to."""
-        for role in column.like:
-            channel = self.channel(role)
-            if channel is not None:
-                unit = self.unit(role, channel)
-                return None if unit.decibel else unit.text
-        return "1" if column.unit == "1" else None
-
-    def kind(self, role: str, unit: Unit, kinds: tuple[str, ...]) -> tuple[str, float]:
-        """Return which kind a unit is, and its factor; its motion is remembered."""
-        kind, motion, factor = kind_of(unit, kinds, f"{self.source.name}: the {role}")
+    def kind(self, role: str, unit: Unit) -> tuple[str, float]:
+        """Return which kind a role's unit is, and its factor; its motion is remembered."""
+        kind, motion, factor = kind_of(
+            unit, self.columns[role].kinds, f"{self.source.name}: the {role}"
+        )
         if kind in MECHANICAL_KINDS:
             self.motions[role] = motion
         return kind, factor
@@ -312,11 +329,8 @@ class Binding:
         too, and is not refused.
         """
         names = ("drive_factor", "drive_factor_uncertainty")
-        given = [n for n in names if self.source.options.get(n) is not None]
-        if not given:
-            return
-        what = " and ".join(given)
-        if kind in (None, "force"):
+        what = " and ".join(n for n in names if self.source.options.get(n) is not None)
+        if what and kind in (None, "force"):
             channel = self.channel("drive")
             why = "no column holds the drive"
             if channel is not None:
@@ -325,7 +339,7 @@ class Binding:
                 f"{self.source.name}: {what} is given, but {why}; expected a drive in V or A: "
                 "leave the factor out, or name the column with columns={'drive': ...}"
             )
-        if self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
+        if what and self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
             raise DataError(f"{self.source.name}: {what} is given without drive_factor; give both")
 
     def motion(self) -> Motion:
@@ -368,11 +382,6 @@ class Binding:
             more = f" and {marked.size - _SHOWN} more" if marked.size > _SHOWN else ""
             self.doubt(f"{message}: {names}{more}")
 
-    def note_peak(self, role: str, unit: Unit) -> None:
-        """Note the assumption made for an unmarked amplitude; files of this package need none."""
-        if unit.marker is None and not self.source.metadata:
-            self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
-
     def same_length(self, roles: Mapping[str, Channel]) -> None:
         """Refuse columns of different lengths."""
         sizes = {role: channel.size for role, channel in roles.items()}
@@ -393,7 +402,7 @@ def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
     starred = {r: c for r, c in columns.roles.items() if c.column and "*" in c.column}
     if not starred:
         return {None: columns}
-    levels = {role: source.matching(str(spec.column)) for role, spec in starred.items()}
+    levels = {role: source.matching(str(mapped.column)) for role, mapped in starred.items()}
     first = next(iter(levels))
     for role, matches in levels.items():
         if matches.keys() != levels[first].keys():
@@ -402,19 +411,8 @@ def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
                 f"{source.name}: {starred[first].column!r} and {starred[role].column!r} do not "
                 f"match the same levels; only one of them has {listed(odd)}"
             )
-    return {
-        label: replace(
-            columns,
-            roles={
-                **columns.roles,
-                **{r: replace(starred[r], column=levels[r][label].name) for r in starred},
-            },
-        )
-        for label in levels[first]
-    }
-
-
-def per_frequency(values: FloatArray, frequency_hz: FloatArray, kind: str) -> FloatArray:
-    """Return the displacement amplitude of a motion amplitude of any kind."""
-    power = {"displacement": 0, "velocity": 1, "acceleration": 2}[kind]
-    return np.asarray(values / (2.0 * np.pi * frequency_hz) ** power)
+    maps: dict[str | None, ColumnMap] = {}
+    for label in levels[first]:
+        roles = {r: replace(c, column=levels[r][label].name) for r, c in starred.items()}
+        maps[label] = replace(columns, roles={**columns.roles, **roles})
+    return maps

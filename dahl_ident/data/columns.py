@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import (
+    SMALLEST,
     FloatArray,
     finite_array,
     non_negative_array,
@@ -24,7 +25,7 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError, choices
-from dahl_ident.units import Motion, si_unit
+from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, QUANTITIES, Motion, si_unit
 
 Check = Callable[[ArrayLike, str], NDArray[Any]]
 CONTROLLED = ("displacement", "force")
@@ -59,21 +60,6 @@ def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
     return value
 
 
-def column(
-    value: ArrayLike | None, name: str, n: int, check: Check, shape: tuple[int, ...] = ()
-) -> NDArray[Any] | None:
-    """Return a checked read-only ``(n, *shape)`` array, or None for None."""
-    if value is None:
-        return None
-    refuse_masked(value, name)
-    array = check(value, name)
-    if array.shape != (n, *shape):
-        raise ValidationError(
-            f"{name}: expected shape {(n, *shape)}, one entry for each point, got {array.shape}"
-        )
-    return frozen_copy(array)
-
-
 def complex_values(value: ArrayLike, name: str) -> NDArray[np.complex128]:
     """Return finite complex numbers."""
     array = np.asarray(value)
@@ -98,17 +84,7 @@ def degrees_of_freedom(value: ArrayLike, name: str) -> FloatArray:
 def labels(value: ArrayLike, name: str) -> NDArray[Any]:
     """Return finite numbers, or text."""
     array = np.asarray(value)
-    if array.dtype.kind in "OUT":
-        return array.astype(str)
-    return finite_array(array, name)
-
-
-def controlled_words(value: ArrayLike, name: str) -> NDArray[np.str_]:
-    """Return words out of ``CONTROLLED``."""
-    array = np.asarray(value, dtype=np.str_)
-    for word in np.unique(array):
-        one_of(str(word), name, CONTROLLED)
-    return array
+    return array.astype(str) if array.dtype.kind in "OUT" else finite_array(array, name)
 
 
 def run_labels(value: ArrayLike, name: str) -> NDArray[np.str_]:
@@ -117,6 +93,14 @@ def run_labels(value: ArrayLike, name: str) -> NDArray[np.str_]:
     if array.dtype.kind == "U":
         return array
     return np.array([f"{number:.15g}" for number in array.flat], np.str_).reshape(array.shape)
+
+
+def controlled_words(value: ArrayLike, name: str) -> NDArray[np.str_]:
+    """Return words out of ``CONTROLLED``."""
+    array = np.asarray(value, dtype=np.str_)
+    for word in np.unique(array):
+        one_of(str(word), name, CONTROLLED)
+    return array
 
 
 def harmonic_numbers(value: ArrayLike, name: str) -> NDArray[np.int64]:
@@ -162,24 +146,9 @@ def check_covariance(
         )
 
 
-def check_mean_covariance(
-    covariance: FloatArray, cross: FloatArray | None, mean: NDArray[np.bool_]
-) -> None:
-    """Refuse an error of the imaginary part in rows of the mean force, which have none."""
-    imaginary = np.abs(covariance[:, 1, :]).sum(axis=1)
-    if cross is not None:
-        imaginary = imaginary + np.abs(cross[:, 1])
-    bad = mean & (imaginary != 0.0)
-    if bad.any():
-        raise ValidationError(
-            f"covariance[{int(np.argmax(bad))}] gives the imaginary part an error; expected 0, as "
-            "a row with harmonic 0 is a real number"
-        )
-
-
 @dataclass(frozen=True)
 class Column:
-    """A column of a frequency response.
+    """A column of a frequency response or a record in memory.
 
     `check` returns an array of allowed values, or raises an error that names the column; `shape` is
     that of one row's value; where it `repeats`, one value may be given for all rows; without the
@@ -193,9 +162,18 @@ class Column:
 
     def checked(self, value: ArrayLike | None, name: str, n: int) -> NDArray[Any] | None:
         """Return a read-only array of n rows, or None for None."""
-        if self.repeats and value is not None and not np.ndim(value):
-            value = np.full(n, self.check(value, name))
-        return column(value, name, n, self.check, self.shape)
+        if value is None:
+            return None
+        refuse_masked(value, name)
+        array = self.check(value, name)
+        if self.repeats and not array.ndim:
+            array = np.full(n, array)
+        if array.shape != (n, *self.shape):
+            raise ValidationError(
+                f"{name}: expected shape {(n, *self.shape)}, one entry for each point, got "
+                f"{array.shape}"
+            )
+        return frozen_copy(array)
 
 
 COLUMNS = {
@@ -226,19 +204,22 @@ class FileColumn:
     """A column of a file, with its name and others under which it is found without a map.
 
     `unit` is that in which it is saved, such as ``({displacement})*({response})``; where a header
-    has none, the first column of `like` gives it. `least` says what is expected of numbers of which
-    negative ones are refused. `saved` returns its values in a frequency response; `form` is the
-    only form of table that has it: "rectangular", "polar" or "backbone". It is saved under
-    `header`, by default its name with its unit in brackets.
+    has none, the first column of `like` gives it. `kinds` are those that a file's unit may be of,
+    where they are several. `least` is the smallest number that is allowed, and `expected` says so.
+    `saved` returns its values in a frequency response; `form` is the only form of table that has
+    it: "rectangular", "polar" or "backbone". It is saved under `header`, by default its name with
+    its unit in brackets.
     """
 
     names: tuple[str, ...]
     unit: str = ""
-    like: tuple[str, ...] = ()
-    least: str = ""
     saved: Saved | None = None
     form: str = ""
     header: str = ""
+    kinds: tuple[str, ...] = ()
+    like: tuple[str, ...] = ()
+    expected: str = ""
+    least: float = 0.0
 
     def unit_of(self, motion: Motion, quantity: str) -> str:
         """Return the SI unit in tables of a quantity, of translation or rotation."""
@@ -286,62 +267,76 @@ def backbone_std(data: Table, axis: int) -> FloatArray:
 
 
 _A, _F, _R = "{displacement}", "{force}", "{response}"
-_STD, _RECTANGULAR = "a standard deviation >= 0", "rectangular"
+_STD: dict[str, Any] = {"expected": "a standard deviation >= 0"}
+_PEAK: dict[str, Any] = {"expected": "a value > 0", "least": SMALLEST}
+_OF_RESPONSE: dict[str, Any] = {"kinds": QUANTITIES}
 _RESPONSE = (
     FileColumn(
-        ("frequency", "freq", "frequency_hz", "freq_hz"), "Hz",
-        saved=_of("frequency_hz"), header="frequency_hz",
+        ("frequency", "freq", "frequency_hz", "freq_hz"), "Hz", _of("frequency_hz"),
+        header="frequency_hz", kinds=("frequency", "angular_frequency"), least=SMALLEST,
+        expected="a frequency > 0; frequency_hz=(low, high) keeps a range",
     ),
     FileColumn(("level",), saved=_of("level")),
     FileColumn(("run", "test", "file", "day"), saved=_of("run")),
-    FileColumn(("amplitude", "displacement_amplitude"), _A, saved=_of("amplitude")),
     FileColumn(
-        ("drive", "force", "force_amplitude", "drive_amplitude", "torque"), _F, saved=_of("drive")
+        ("amplitude", "displacement_amplitude"), _A, _of("amplitude"), kinds=MOTION_KINDS, **_PEAK
     ),
-    FileColumn(("response", "frf"), _R),
-    FileColumn(("real", "re", "real_part"), _R, (), "", lambda d: d.response.real, _RECTANGULAR),
     FileColumn(
-        ("imag", "im", "imaginary", "imag_part"), _R, ("real",), "",
-        lambda d: d.response.imag, _RECTANGULAR,
+        ("drive", "force", "force_amplitude", "drive_amplitude", "torque"), _F, _of("drive"),
+        kinds=DRIVE_KINDS, **_PEAK,
+    ),
+    FileColumn(("response", "frf"), _R, **_OF_RESPONSE),
+    FileColumn(
+        (
+            "real", "re", "real_part",
+            *(f"{q}_{part}" for q in QUANTITIES for part in ("re", "real")),
+        ),
+        _R, lambda d: d.response.real, "rectangular", **_OF_RESPONSE,
+    ),
+    FileColumn(
+        (
+            "imag", "im", "imaginary", "imag_part",
+            *(f"{q}_{part}" for q in QUANTITIES for part in ("im", "imag")),
+        ),
+        _R, lambda d: d.response.imag, "rectangular", like=("real",), **_OF_RESPONSE,
     ),
     *(
-        FileColumn(
-            (f"covariance_{name}",), f"({_R})^2", (), "", _of("covariance", *part), _RECTANGULAR
-        )
+        FileColumn((f"covariance_{name}",), f"({_R})^2", _of("covariance", *part), "rectangular")
         for name, part in (("real_real", (0, 0)), ("real_imag", (0, 1)), ("imag_imag", (1, 1)))
     ),
     FileColumn(
-        ("damping_ratio", "zeta"), "1", (), "a damping ratio >= 0",
-        lambda d: d.response.imag, "backbone", "damping_ratio",
+        ("damping_ratio", "zeta"), "1", lambda d: d.response.imag, "backbone", "damping_ratio",
+        expected="a damping ratio >= 0",
     ),
     FileColumn(
-        ("frequency_std",), "Hz", ("frequency",), _STD, lambda d: backbone_std(d, 0), "backbone"
+        ("frequency_std",), "Hz", lambda d: backbone_std(d, 0), "backbone", like=("frequency",),
+        **_STD,
     ),
     FileColumn(
-        ("damping_ratio_std", "zeta_std"), "1", (), _STD,
-        lambda d: backbone_std(d, 1), "backbone", "damping_ratio_std",
+        ("damping_ratio_std", "zeta_std"), "1", lambda d: backbone_std(d, 1), "backbone",
+        "damping_ratio_std", **_STD,
     ),
-    FileColumn(("gain", "magnitude", "mag"), _R, saved=lambda d: d.gain, form="polar"),
-    FileColumn(("gain_db", "magnitude_db", "mag_db"), _R),
+    FileColumn(("gain", "magnitude", "mag"), _R, lambda d: d.gain, "polar", **_OF_RESPONSE),
+    FileColumn(("gain_db", "magnitude_db", "mag_db"), _R, **_OF_RESPONSE),
     FileColumn(
-        ("phase", "phase_deg", "phase_rad"), "deg", (), "",
-        lambda d: np.degrees(d.phase), "polar", "phase_deg",
+        ("phase", "phase_deg", "phase_rad"), "deg", lambda d: np.degrees(d.phase), "polar",
+        "phase_deg", ("angle",),
     ),
-    FileColumn(("std",), _R, ("gain", "real", "response"), _STD),
-    FileColumn(("real_std",), _R, ("real", "response"), _STD),
-    FileColumn(("imag_std",), _R, ("real", "response"), _STD),
-    FileColumn(("gain_std",), _R, ("gain",), _STD, _polar(0), "polar"),
+    FileColumn(("std",), _R, like=("gain", "real", "response"), **_STD),
+    FileColumn(("real_std",), _R, like=("real", "response"), **_STD),
+    FileColumn(("imag_std",), _R, like=("real", "response"), **_STD),
+    FileColumn(("gain_std",), _R, _polar(0), "polar", like=("gain",), **_STD),
     FileColumn(
-        ("phase_std", "phase_std_deg", "phase_std_rad"), "rad", (), _STD,
-        _polar(1), "polar", "phase_std_deg",
+        ("phase_std", "phase_std_deg", "phase_std_rad"), "rad", _polar(1), "polar",
+        "phase_std_deg", **_STD,
     ),
     FileColumn(("dof",), saved=_of("dof")),
-    FileColumn(("amplitude_std",), _A, ("amplitude",), _STD, _of("amplitude_std")),
-    FileColumn(("drive_std",), _F, ("drive",), _STD, _of("drive_std")),
+    FileColumn(("amplitude_std",), _A, _of("amplitude_std"), like=("amplitude",), **_STD),
+    FileColumn(("drive_std",), _F, _of("drive_std"), like=("drive",), **_STD),
     *(
         FileColumn(
-            (f"covariance_{level}_{part}",), f"({unit})*({_R})", (), "",
-            _of(f"{level}_covariance", i), _RECTANGULAR,
+            (f"covariance_{level}_{part}",), f"({unit})*({_R})", _of(f"{level}_covariance", i),
+            "rectangular",
         )
         for level, unit in (("amplitude", _A), ("drive", _F))
         for i, part in enumerate(("real", "imag"))
@@ -350,12 +345,12 @@ _RESPONSE = (
     FileColumn(("harmonic",), saved=_of("harmonic")),
 )  # fmt: skip
 _RECORD = (
-    FileColumn(("time", "t", "time_s", "timestamp"), "s"),
-    FileColumn(("displacement", "disp", "position", "x"), "um"),
-    FileColumn(("velocity", "vel", "v"), "mm/s"),
-    FileColumn(("acceleration", "accel", "acc", "a"), "m/s^2"),
-    FileColumn(("force", "f", "torque"), _F),
-    FileColumn(("drive", "voltage", "current"), _F),
+    FileColumn(("time", "t", "time_s", "timestamp"), "s", kinds=("time",)),
+    FileColumn(("displacement", "disp", "position", "x"), "um", kinds=("displacement",)),
+    FileColumn(("velocity", "vel", "v"), "mm/s", kinds=("velocity",)),
+    FileColumn(("acceleration", "accel", "acc", "a"), "m/s^2", kinds=("acceleration",)),
+    FileColumn(("force", "f", "torque"), _F, kinds=("force",)),
+    FileColumn(("drive", "voltage", "current"), _F, kinds=DRIVE_KINDS),
 )
 RESPONSE_COLUMNS = {column.names[0]: column for column in _RESPONSE}
 """Of tables of responses, in the order in which they are saved."""

@@ -27,10 +27,9 @@ from dahl_ident.data.columns import (
     COLUMNS,
     FILE_COLUMNS,
     RESPONSE_COLUMNS,
+    Column,
     backbone_std,
     check_covariance,
-    check_mean_covariance,
-    column,
     frozen_copy,
     frozen_mapping,
     one_of,
@@ -169,7 +168,7 @@ class FrequencyResponse(Tabular):
             ),
             "quality": frozen_mapping(
                 {
-                    name: column(verdict, f"quality {name!r}", n, plain_values)
+                    name: Column(plain_values).checked(verdict, f"quality {name!r}", n)
                     for name, verdict in (quality or {}).items()
                 }
             ),
@@ -177,58 +176,62 @@ class FrequencyResponse(Tabular):
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        self._check_together()
-
-    def _check_together(self) -> None:
-        """Check conditions that involve several fields."""
         if self.amplitude is None and self.drive is None:
             raise ValidationError(
                 "neither amplitude nor drive is given; a response with friction means nothing "
                 "without the amplitude it was measured at"
             )
         for name, one in COLUMNS.items():
-            absent = [need for need in one.needs if getattr(self, need) is None]
-            if absent and getattr(self, name) is not None:
+            absent = [need for need in one.needs if values[need] is None]
+            if absent and values[name] is not None:
                 raise ValidationError(f"{name} is given without {' and '.join(absent)}")
-        if self.quantity == "backbone":
-            self._check_backbone()
-        held = {"dynamic_stiffness": "displacement", "receptance": "force"}.get(self.quantity)
-        alone = (self.harmonic != 1) & (self.controlled != held)
-        if alone.any() and self.quantity != "dynamic_stiffness":  # of which extraction tells
-            row = int(np.argmax(alone))
-            raise ValidationError(
-                f"harmonic[{row}] is {self.harmonic[row]} in a table of {self.quantity}, "
-                f"{self.controlled[row]} controlled; harmonics of the force are rows of dynamic "
-                "stiffness, F_k/X_1, those of the displacement rows of receptance, X_k/F_1, with "
-                "the force controlled"
-            )
-        mean = self.harmonic == 0
-        if (self.response.imag[mean] != 0.0).any():
-            row = int(np.argmax(mean & (self.response.imag != 0.0)))
-            raise ValidationError(
-                f"response[{row}] is {self.response[row]}; expected a real number, as a row with "
-                "harmonic 0 holds a mean over the amplitude of what was controlled"
-            )
+        self._check_rows()
         if self.covariance is not None:
-            check_mean_covariance(self.covariance, self.amplitude_covariance, mean)
             check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
             check_covariance(self.covariance, self.drive_std, self.drive_covariance)
             even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
             object.__setattr__(self, "covariance", frozen_copy(even))
 
-    def _check_backbone(self) -> None:
-        if self.amplitude is None or self.covariance is None:
+    def _check_rows(self) -> None:
+        """Check rows of a backbone, of harmonics and of the mean force."""
+        if self.quantity == "backbone":
+            if self.amplitude is None or self.covariance is None:
+                raise ValidationError(
+                    "a backbone needs amplitudes, and standard deviations of the natural "
+                    "frequencies and of the damping ratios"
+                )
+            wrong = (self.response.imag < 0.0) | (self.controlled == "force")
+            for row in np.flatnonzero(wrong)[:1]:
+                raise ValidationError(
+                    f"row {row} has the damping ratio {self.response.imag[row]:g} and "
+                    f"controlled {self.controlled[row]!r}; expected a ratio >= 0, and "
+                    "'displacement', at whose amplitude the frequency was found"
+                )
+        held = {"dynamic_stiffness": "displacement", "receptance": "force"}.get(self.quantity)
+        wrong = (self.harmonic != 1) & (self.controlled != held)
+        if self.quantity != "dynamic_stiffness":  # of which extraction tells
+            for row in np.flatnonzero(wrong)[:1]:
+                raise ValidationError(
+                    f"harmonic[{row}] is {self.harmonic[row]} in a table of {self.quantity}, "
+                    f"{self.controlled[row]} controlled; harmonics of the force are rows of "
+                    "dynamic stiffness, F_k/X_1, those of the displacement rows of receptance, "
+                    "X_k/F_1, with the force controlled"
+                )
+        mean = self.harmonic == 0
+        for row in np.flatnonzero(mean & (self.response.imag != 0.0))[:1]:
             raise ValidationError(
-                "a backbone needs amplitudes, and standard deviations of the natural frequencies "
-                "and of the damping ratios"
+                f"response[{row}] is {self.response[row]}; expected a real number, as a row with "
+                "harmonic 0 holds a mean over the amplitude of what was controlled"
             )
-        wrong = np.flatnonzero((self.response.imag < 0.0) | (self.controlled == "force"))
-        if wrong.size:
-            raise ValidationError(
-                f"row {wrong[0]} has the damping ratio {self.response.imag[wrong[0]]:g} and "
-                f"controlled {self.controlled[wrong[0]]!r}; expected a ratio >= 0, and "
-                "'displacement', at whose amplitude the frequency was found"
-            )
+        if self.covariance is not None:
+            imaginary = np.abs(self.covariance[:, 1, :]).sum(axis=1)
+            if self.amplitude_covariance is not None:
+                imaginary = imaginary + np.abs(self.amplitude_covariance[:, 1])
+            for row in np.flatnonzero(mean & (imaginary != 0.0))[:1]:
+                raise ValidationError(
+                    f"covariance[{row}] gives the imaginary part an error; expected 0, as a row "
+                    "with harmonic 0 is a real number"
+                )
 
     @classmethod
     def backbone(
@@ -329,9 +332,7 @@ class FrequencyResponse(Tabular):
                 ("gain", extent(self.gain, self.unit)),
                 ("phase", extent(np.degrees(self.phase), "deg")),
             ]
-        lines += [
-            ("controlled", listed(distinct(self.controlled))),
-        ]
+        lines.append(("controlled", listed(distinct(self.controlled))))
         if (self.harmonic != 1).any():
             lines.append(("harmonics", listed(distinct(self.harmonic))))
         if self.covariance is None:
@@ -423,16 +424,13 @@ class FrequencyResponse(Tabular):
             )
         response, derivative = converted(self.response, self.omega, self.quantity, quantity)
         J = jacobian(derivative)
-        covariance = self.covariance
-        cross, of_drive = self.amplitude_covariance, self.drive_covariance
-        return replace(
-            self,
-            response=response,
-            quantity=quantity,
-            covariance=None if covariance is None else J @ covariance @ J.swapaxes(1, 2),
-            amplitude_covariance=None if cross is None else np.einsum("nij,nj->ni", J, cross),
-            drive_covariance=None if of_drive is None else np.einsum("nij,nj->ni", J, of_drive),
-        )
+        changed: dict[str, Any] = {"response": response, "quantity": quantity}
+        if self.covariance is not None:
+            changed["covariance"] = J @ self.covariance @ J.swapaxes(1, 2)
+        for name in ("amplitude_covariance", "drive_covariance"):
+            if getattr(self, name) is not None:
+                changed[name] = np.einsum("nij,nj->ni", J, getattr(self, name))
+        return replace(self, **changed)
 
     def select(
         self,
@@ -561,12 +559,9 @@ class FrequencyResponse(Tabular):
         """
         import pandas as pd
 
-        clashing = sorted(
-            {name for name in self.quality if name in (*FILE_COLUMNS, "frequency_hz")}
-        )
-        if clashing:
+        for name in sorted(self.quality.keys() & {*FILE_COLUMNS, "frequency_hz"}):
             raise ValidationError(
-                f"quality {clashing[0]!r} is also the name of a column of the table; rename it"
+                f"quality {name!r} is also the name of a column of the table; rename it"
             )
         form = "backbone" if self.quantity == "backbone" else "polar" if polar else "rectangular"
         columns: dict[str, Any] = {
@@ -574,13 +569,11 @@ class FrequencyResponse(Tabular):
             for one in RESPONSE_COLUMNS.values()
             if one.saved is not None and one.form in ("", form)
         }
-        columns |= self.quality
-        frame = pd.DataFrame({name: c for name, c in columns.items() if c is not None})
+        columns = {n: c for n, c in (columns | dict(self.quality)).items() if c is not None}
+        frame = pd.DataFrame(columns)
         frame.attrs["dahl_ident"] = {
             "quality": {name: verdict.dtype.kind for name, verdict in self.quality.items()},
-            "text": [
-                str(name) for name, c in columns.items() if c is not None and c.dtype.kind == "U"
-            ],
+            "text": [str(name) for name, c in columns.items() if c.dtype.kind == "U"],
             "drive_factor_uncertainty": self.drive_factor_uncertainty,
             "provenance": plain_data(self.provenance),
         }

@@ -5,6 +5,7 @@ The fields are those that ISO/IEC 17025:2017, 7.8.2 and 7.8.3, asks for.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import math
 import tomllib
@@ -123,33 +124,37 @@ class Metadata:
 
 def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
     """Return metadata from a mapping or a TOML file."""
-    if given is None:
-        return Metadata()
-    if isinstance(given, Mapping):
-        return _checked(given, "")
-    try:
-        read = tomllib.loads(read_text(Path(given)))
-    except tomllib.TOMLDecodeError as exc:
-        raise DataError(f"{given}: is not a TOML file: {exc}") from exc
-    return _checked(read, f"{given}: ")
-
-
-def _checked(entries: Mapping[str, Any], where: str) -> Metadata:
-    _refuse_unknown(entries, (*_TEXTS, *_LISTS), f"{where}metadata")
-    texts = {name: _text(entries[name], f"{where}{name}") for name in _TEXTS if name in entries}
-    return Metadata(
-        texts,
-        _ambient(entries.get("ambient", ()), f"{where}ambient"),
-        _instruments(entries.get("instruments", ()), f"{where}instruments"),
-    )
-
-
-def _refuse_unknown(entries: Mapping[str, Any], known: Sequence[str], name: str) -> None:
-    unknown = sorted(set(entries) - set(known))
-    if unknown:
+    if given is None or isinstance(given, Mapping):
+        entries, where = given or {}, ""
+    else:
+        try:
+            entries, where = tomllib.loads(read_text(Path(given))), f"{given}: "
+        except tomllib.TOMLDecodeError as exc:
+            raise DataError(f"{given}: is not a TOML file: {exc}") from exc
+    texts = _texts(entries, _TEXTS, _LISTS, f"{where}metadata", where)
+    ambient, instruments = entries.get("ambient", ()), entries.get("instruments", ())
+    if isinstance(ambient, Mapping):  # such as {temperature = "22 °C"}
+        name = f"{where}ambient"
+        ambient = [f"{key} {_text(item, f'{name}.{key}')}" for key, item in ambient.items()]
+    elif ambient:
+        ambient = [_text(ambient, f"{where}ambient")]
+    if not isinstance(instruments, (list, tuple)):
         raise ValidationError(
-            f"{name} has the field {unknown[0]!r}; expected any of {choices(known, *unknown)}"
+            f"{where}instruments is {instruments!r}; expected a list, one entry an instrument"
         )
+    described = (_instrument(one, f"{where}instruments[{i}]") for i, one in enumerate(instruments))
+    return Metadata(texts, tuple(ambient), tuple(described))
+
+
+def _texts(
+    entries: Mapping[str, Any], known: Sequence[str], others: Sequence[str], name: str, where: str
+) -> dict[str, str]:
+    """Return the texts that are known, in their order; refuse what is neither they nor others."""
+    unknown = sorted(set(entries) - {*known, *others})
+    if unknown:
+        expected = choices((*known, *others), *unknown)
+        raise ValidationError(f"{name} has the field {unknown[0]!r}; expected any of {expected}")
+    return {key: _text(entries[key], f"{where}{key}") for key in known if key in entries}
 
 
 def _text(value: Any, name: str) -> str:
@@ -158,25 +163,11 @@ def _text(value: Any, name: str) -> str:
     raise ValidationError(f"{name} is {value!r}; expected a text, a number or a date")
 
 
-def _ambient(value: Any, name: str) -> tuple[str, ...]:
-    """Return conditions from a text or a table such as {temperature = "22 °C"}."""
-    if isinstance(value, Mapping):
-        return tuple(f"{key} {_text(item, f'{name}.{key}')}" for key, item in value.items())
-    return (_text(value, name),) if value else ()
-
-
-def _instruments(value: Any, name: str) -> tuple[Instrument, ...]:
-    if not isinstance(value, (list, tuple)):
-        raise ValidationError(f"{name} is {value!r}; expected a list, one entry an instrument")
-    return tuple(_instrument(one, f"{name}[{i}]") for i, one in enumerate(value))
-
-
 def _instrument(one: Any, name: str) -> Instrument:
     """Return an instrument that is given as a text or as a table."""
     if not isinstance(one, Mapping):
         return Instrument(_text(one, name))
-    _refuse_unknown(one, _INSTRUMENT, name)
-    texts = {key: _text(one[key], f"{name}.{key}") for key in _INSTRUMENT if key in one}
+    texts = _texts(one, _INSTRUMENT, (), name, f"{name}.")
     parts = [_WORDS.get(key, "") + text for key, text in texts.items() if key != "channel"]
     parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in texts]
     return Instrument(", ".join(parts), texts.get("channel", ""), _standard(texts, name))
@@ -196,16 +187,14 @@ def _standard(texts: Mapping[str, str], name: str) -> float:
             f"{name} has an uncertainty for the channel {channel}, but no k; expected the coverage "
             "factor of the certificate, k = 2, or k = 1 for a standard uncertainty"
         )
-    try:
+    u = k = math.nan
+    with contextlib.suppress(ValueError, DahlIdentError):
         k = float(texts["k"])
         if channel == "delay":
             u = parse_quantity(text, ("time",), "uncertainty")[0]
-        else:
-            u = float(text.removesuffix("%")) / 100.0 if text.endswith("%") else math.nan
-        stated = 0.0 < u < math.inf and 0.0 < k < math.inf
-    except (ValueError, DahlIdentError):
-        stated = False
-    if not stated:
+        elif text.endswith("%"):
+            u = float(text.removesuffix("%")) / 100.0
+    if not (0.0 < u < math.inf and 0.0 < k < math.inf):
         expected = '"20 us"' if channel == "delay" else 'a share of the reading, "0.5 %"'
         raise ValidationError(
             f"{name} has uncertainty {text!r} and k {texts['k']!r}; expected {expected}, and a "

@@ -162,13 +162,7 @@ def record_doubts(
 
 
 def _stuck(held: FloatArray, other: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
-    """Return where one signal stays at one value while the other continues.
-
-    Dry friction and a coarse converter keep a value as well, but leave it by no more than their
-    usual steps. A converter that sticks jumps afterwards, or before where it gives 0; or it keeps
-    a value within the range of a signal that otherwise hardly ever repeats one, because of its
-    noise. A motion is smooth: it does not stop at once, and it does not rest throughout.
-    """
+    """Return where one signal stays at one value while the other continues."""
     steps = np.abs(np.diff(held))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
     starts = starts - 1  # the value was there before it was repeated
@@ -215,12 +209,7 @@ def _bend(values: FloatArray) -> float:
 
 
 def _unit_changes(values: FloatArray, other: FloatArray) -> NDArray[np.intp]:
-    """Return where values are 1000 times, or a thousandth of, what they were just before.
-
-    All differences change alike if the unit does, first and second; without the factor the signal
-    would go on, and the other signal does. Where a motion begins its noise does not grow with it,
-    and from one level of a test to the next both signals change.
-    """
+    """Return where values are 1000 times, or a thousandth of, what they were just before."""
     if values.size > 2 * _PART:
         parts = [slice(i, i + _PART + 2 * _SWITCH) for i in range(0, values.size, _PART)]
         return np.unique(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import re
@@ -14,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
+from dahl_ident.data.columns import FileColumn
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, UnitError
-from dahl_ident.units import parse_unit
+from dahl_ident.errors import DahlIdentError, DataError, UnitError
+from dahl_ident.units import kind_of, parse_unit
 
 _NUMBER = re.compile(
     r"\s*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan",
@@ -24,6 +26,9 @@ _NUMBER = re.compile(
 )
 _COUNTED = re.compile(r"column ([0-9]{1,4})")
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
+_SYMBOL = "(?:[numkM]?(?:Nm|N|m|rad|V|A|Hz|s)|s2|kg|lbf|(?i:hz|deg|rad|s))"
+# of names of one letter, which are many things, no unit is split off
+_UNIT_AT_END = re.compile(rf"(.*?[^\W_]{{2}})[\s._-]+({_SYMBOL}(?:_per_{_SYMBOL})*)")
 _CODES = (
     999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 999.99, 9999.99,
     32767.0, 32768.0, 2147483647.0, 2147483648.0,  # ends of whole numbers
@@ -43,7 +48,7 @@ _PADDING = (1 << 26, 16)  # bytes, and bytes a letter, that a column of text may
 
 @dataclass(frozen=True)
 class Stored:
-    """An array that is read from its file when it is used.
+    """An array that is read from its file when it is used; `what` names it in messages.
 
     `read` returns a part of it, given by a slice of its only axis.
     """
@@ -51,11 +56,20 @@ class Stored:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     read: Callable[[slice], NDArray[Any]]
+    what: str
 
     @cached_property
     def array(self) -> NDArray[Any]:
         """All of it, read once."""
-        return self.read(slice(None))
+        return self[slice(None)]
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        try:
+            return self.read(rows)
+        except DahlIdentError:
+            raise
+        except Exception as exc:  # libraries raise errors of every kind on damaged files
+            raise DataError(f"{self.what} cannot be read: {exc}") from exc
 
 
 @dataclass(frozen=True)
@@ -89,14 +103,27 @@ class Channel:
 
     def part(self, rows: slice) -> Channel:
         """Return some of the values, and read no others."""
-        if isinstance(self.content, Stored):
-            return replace(self, content=self.content.read(rows))
         return replace(self, content=self.content[rows])
 
     @property
     def unit_in_name(self) -> str | None:
-        """Unit that a name such as ``frequency_hz`` or ``phase_deg`` ends in."""
-        return _SUFFIXES.get(plain(self.short or self.name).rpartition("_")[2])
+        """Unit that a name such as ``frequency_hz``, ``drive_N`` or ``re_m_per_N`` ends in."""
+        match = _UNIT_AT_END.fullmatch(self.short or self.name)
+        if match is None:
+            return None
+        return _SUFFIXES.get(match[2].casefold(), match[2].replace("_per_", "/"))
+
+    def is_called(self, declared: FileColumn) -> bool:
+        """Return whether the name is a column's, perhaps with a unit of its kind behind it."""
+        name = self.short or self.name
+        if plain(name) in declared.names:
+            return True
+        match, unit = _UNIT_AT_END.fullmatch(name), self.unit_in_name
+        if match is None or unit is None or plain(match[1]) not in declared.names:
+            return False
+        with contextlib.suppress(UnitError):
+            return bool(declared.kinds) and bool(kind_of(parse_unit(unit), declared.kinds, name))
+        return False
 
     @property
     def header(self) -> str:
@@ -217,11 +244,7 @@ class Source:
                 f"{self.where(channel, i)}: the cell is {what} ({bad.size} such cells); expected "
                 "a measured number"
             )
-        return values if infinite else self._without_codes(channel, values)
-
-    def _without_codes(self, channel: Channel, values: FloatArray) -> FloatArray:
-        """Refuse numbers that stand for a missing one."""
-        for code, others in missing_marks(values).items():
+        for code, others in ({} if infinite else missing_marks(values)).items():
             bad = np.flatnonzero(values == code)
             raise DataError(
                 f"{self.where(channel, int(bad[0]))}: the cell is {code:g} ({bad.size} such "
@@ -234,7 +257,15 @@ class Source:
         """Return a channel's complex numbers, also those written as text, such as ``5+1i``."""
         values = np.atleast_1d(channel.values)
         if values.dtype.kind == "U":
-            values = np.array([self._complex_cell(channel, i) for i in range(values.size)])
+            cells: list[complex] = []
+            for i, text in enumerate(values.tolist()):
+                try:
+                    cells.append(complex(text.replace(" ", "").replace("i", "j")))
+                except ValueError:
+                    raise DataError(
+                        f"{self.where(channel, i)}: {text[:40]!r} is not a complex number"
+                    ) from None
+            values = np.array(cells)
         if values.dtype.kind != "c":
             raise DataError(
                 f"{self.name}: column {channel.name!r} holds no complex numbers; name the columns "
@@ -242,15 +273,6 @@ class Source:
             )
         self.require(np.abs(values) < LARGEST, channel, "finite numbers")
         return values.astype(np.complex128)
-
-    def _complex_cell(self, channel: Channel, index: int) -> complex:
-        text = str(np.atleast_1d(channel.values)[index])
-        try:
-            return complex(text.replace(" ", "").replace("i", "j"))
-        except ValueError:
-            raise DataError(
-                f"{self.where(channel, index)}: {text[:40]!r} is not a complex number"
-            ) from None
 
     def require(self, good: NDArray[np.bool_], channel: Channel, expected: str) -> None:
         """Raise a DataError that names the first cell that is not `good`."""

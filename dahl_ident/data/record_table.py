@@ -16,7 +16,7 @@ from dahl_ident.data.raw_columns import Channel, Source, missing_marks
 from dahl_ident.data.record import DriveUnit, Record, is_even
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError
-from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, si_unit
+from dahl_ident.units import MOTION_KINDS, si_unit
 
 _STAMP = re.compile(
     r"\s*(?P<stamp>(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)"
@@ -62,7 +62,10 @@ def record_from(
     else:
         bound.refuse_idle_factor(None)
     if "time" not in values:
-        values["time"] = _even_time(bound, size)[complete]
+        rate = bound.map.sample_rate
+        assert rate is not None  # _channels has asked for a time column otherwise
+        bound.notes.append(f"time counted from the sample rate of {rate:g} Hz")
+        values["time"] = (np.arange(size) / rate)[complete]
     force: FloatArray = values["force"] if "force" in values else values["drive"]
     motion = next(values[kind] for kind in MOTION_KINDS if kind in values)
     for places, doubt in record_doubts(values["time"], motion, force):
@@ -85,10 +88,7 @@ def record_size(source: Source, columns: ColumnMap) -> int:
 
 
 def _channels(bound: Binding) -> dict[str, Channel]:
-    """Return the channels of the roles that the record has, exactly one motion among them.
-
-    Of several motions that nobody named the first is taken: friction follows the displacement.
-    """
+    """Return the channels of the roles that the record has, exactly one motion among them."""
     roles = bound.map.roles
     motions = [kind for kind in MOTION_KINDS if kind in roles]
     if not motions:
@@ -132,8 +132,7 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
         return _seconds(bound, channel)
     values = bound.numbers(role, channel)
     unit = bound.unit(role, channel)
-    kinds = DRIVE_KINDS if role == "drive" else (role,)
-    _, factor = bound.kind(role, unit, kinds)
+    _, factor = bound.kind(role, unit)
     if role == "time":
         _require_increasing(bound.source, channel, values)
         values = _without_rounding(bound, values)
@@ -196,7 +195,7 @@ def _without_rounding(bound: Binding, time: FloatArray) -> FloatArray:
 
 
 def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
-    kind, _ = bound.kind("drive", bound.unit("drive", channel), DRIVE_KINDS)
+    kind, _ = bound.kind("drive", bound.unit("drive", channel))
     bound.refuse_idle_factor(kind)
     if kind == "force":
         return {"drive_unit": si_unit("force", bound.motions["drive"])}
@@ -208,13 +207,6 @@ def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
         saved = ("drive_factor", "drive_factor_uncertainty")
         values |= {k: bound.source.metadata[k] for k in saved if k in bound.source.metadata}
     return values
-
-
-def _even_time(bound: Binding, n: int) -> FloatArray:
-    rate = bound.map.sample_rate
-    assert rate is not None  # _channels has asked for a time column otherwise
-    bound.notes.append(f"time counted from the sample rate of {rate:g} Hz")
-    return np.arange(n) / rate
 
 
 def _require_increasing(source: Source, channel: Channel, time: FloatArray) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number
-from dahl_ident.data.column_map import Binding, ColumnMap, by_level, per_frequency
+from dahl_ident.data.column_map import Binding, ColumnMap, by_level
 from dahl_ident.data.columns import CONTROLLED, RECORD_COLUMNS, RESPONSE_COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.plausibility import (
@@ -38,7 +38,6 @@ from dahl_ident.units import (
     MOTION_KINDS,
     QUANTITIES,
     Quantity,
-    factor_to,
     kind_of,
     parse_quantity,
     parse_unit,
@@ -87,7 +86,14 @@ def response_from(
     if source.runs:
         whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
     if source.format == TRACE and not {"gain", "phase"} & columns.roles.keys():
-        _doubt_parts(whole)
+        first, second = map(source.numbers, source.channels[:2])
+        reach = np.abs(second).max()  # above zero, and degrees
+        if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
+            whole.doubt(
+                "the columns of the trace are taken as real and imaginary part, but look like "
+                "magnitude and phase in degrees; if they are, give columns={'gain': {'column': "
+                "'real', 'unit': '...'}, 'phase': {'column': 'imag', 'unit': 'deg'}}"
+            )
     parts = []
     for label, one in by_level(source, columns).items():
         if label is not None:
@@ -107,18 +113,6 @@ def response_from(
     return replace(data, provenance=whole.provenance() | assumed)
 
 
-def _doubt_parts(trace: Binding) -> None:
-    """Warn where real and imaginary part may be magnitude and phase: above zero, and degrees."""
-    first, second = map(trace.source.numbers, trace.source.channels[:2])
-    reach = np.abs(second).max()
-    if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
-        trace.doubt(
-            "the columns of the trace are taken as real and imaginary part, but look like "
-            "magnitude and phase in degrees; if they are, give columns={'gain': {'column': "
-            "'real', 'unit': '...'}, 'phase': {'column': 'imag', 'unit': 'deg'}}"
-        )
-
-
 def _as_gain(channel: Channel) -> Channel:
     """Return an "amplitude" in the unit of a response as what it is, a gain."""
     if plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names and channel.unit:
@@ -131,13 +125,10 @@ def _as_gain(channel: Channel) -> Channel:
 def _with_stated(
     source: Source, columns: ColumnMap, options: ResponseOptions
 ) -> tuple[Source, ResponseOptions]:
-    """Take the level that the file's header states, where neither a column nor the user does.
-
-    Where it states both, the displacement was held, and the drive followed it.
-    """
-    names = {*RESPONSE_COLUMNS["drive"].names, *RESPONSE_COLUMNS["amplitude"].names}
+    """Take the level that the file's header states, where neither a column nor the user does."""
+    levels = [RESPONSE_COLUMNS[role] for role in ("drive", "amplitude")]
     known = {"drive", "amplitude"} & columns.roles.keys() or any(
-        c.role is None and plain(c.short or c.name) in names for c in source.channels
+        c.role is None and any(map(c.is_called, levels)) for c in source.channels
     )
     stated = dict(source.stated)
     if "amplitude" in stated:
@@ -148,8 +139,8 @@ def _with_stated(
     if known or options.drive or options.amplitude or not stated:
         return source, options
     notes = [f"{role} {text}, as the file's header states" for role, text in stated.items()]
-    held = replace(options, drive=stated.get("drive"), amplitude=stated.get("amplitude"))
-    return replace(source, notes=(*source.notes, *notes)), held
+    options = replace(options, drive=stated.get("drive"), amplitude=stated.get("amplitude"))
+    return replace(source, notes=(*source.notes, *notes)), options
 
 
 def _swept(sweep: str, rows: int) -> FloatArray:
@@ -175,6 +166,72 @@ class _Table(Binding):
         self.options = options
         self.level = options.drive if options.level is None else options.level
         self.factor_uncertainty = 0.0
+
+    def response(self) -> FrequencyResponse:
+        options = self.options
+        self._add_stated()
+        self.same_length({r: c for r in RESPONSE_COLUMNS if (c := self.channel(r)) is not None})
+        if options.frequency_hz is not None:  # before anything is judged
+            low, high = options.frequency_hz
+            frequency_hz = self._frequency(least=False)
+            keep = (frequency_hz >= low) & (frequency_hz <= high)
+            if not keep.any():
+                raise ValidationError(f"no frequency lies from {low:g} to {high:g} Hz")
+            self.source = self.source.rows(keep)
+        frequency_hz = self._frequency()
+        amplitude, drive = self._amplitude(frequency_hz), self._drive()
+        if amplitude is None and drive is None:
+            raise ValidationError(
+                "neither an amplitude nor a drive is given; friction answers every amplitude "
+                "differently. Name a column with columns={'amplitude': ...} (inspect proposes a "
+                "column map), or give drive='0.2 N' or amplitude='5 um' for the whole file"
+            )
+        harmonic: Any = 1
+        if (channel := self.channel("harmonic")) is not None:
+            harmonic = self.numbers("harmonic", channel)
+            whole = (harmonic >= 0.0) & (harmonic == np.round(harmonic))
+            self.source.require(whole, channel, "a whole number >= 0")
+        if self.has("damping_ratio"):
+            data = self._backbone(frequency_hz, amplitude)
+            quantity, response = data.quantity, data.response
+            errors = self._errors(quantity, response) | {"covariance": data.covariance}
+        else:
+            quantity, response = self._response(frequency_hz, amplitude, drive)
+            zero = np.flatnonzero((np.abs(response) < SMALLEST) & (harmonic == 1))
+            if zero.size:
+                raise DataError(
+                    f"{self.source.name}, {self.source.row_name(int(zero[0]))}: the response is 0 "
+                    f"({zero.size} such rows); expected a measured value"
+                )
+            errors = self._errors(quantity, response)
+            mean = np.broadcast_to(harmonic == 0, response.shape)  # real, but for rounding
+            rounding = mean & (np.abs(response.imag) <= 1e-9 * np.abs(response.real))
+            response.imag[rounding] = 0.0
+            if errors["covariance"] is not None:
+                errors["covariance"][mean, 1, :] = 0.0
+                errors["covariance"][mean, :, 1] = 0.0
+        saved = self.source.metadata.get("drive_factor_uncertainty")
+        data = FrequencyResponse(
+            frequency_hz,
+            response,
+            amplitude,
+            drive,
+            level=self._labels("level", self.level),
+            run=self._labels("run", options.run),
+            controlled=self._controlled(drive is not None and amplitude is None),
+            harmonic=harmonic,
+            quantity=quantity,
+            motion=self.motion(),
+            drive_factor_uncertainty=self.factor_uncertainty or float(saved or 0.0),
+            quality=self._quality(),
+            **errors,
+        )
+        if quantity != "backbone":
+            check_drive(data, self.doubt_rows)
+            check_phase_size(data, self.doubt_rows)
+            if options.passive:
+                check_energy(self.source.name, data, self.doubt_rows)
+        return data
 
     def _add_stated(self) -> None:
         """Add a column for each of frequency, amplitude and drive that is stated for all rows."""
@@ -209,152 +266,83 @@ class _Table(Binding):
                 unit = f"{si_unit(kind, motion)} pk"
                 self._add(role, np.full(rows, value), unit, role, text)
 
-    def _add(self, role: str, values: FloatArray, unit: str, option: str, said: Any) -> None:
+    def _add(self, role: str, values: FloatArray, unit: str, option: str, text: Any) -> None:
         """Add a column that an option states, unless the table has one."""
-        source, known = self.source, self.channel(role)
+        known = self.channel(role)
         if known is not None:
             raise ValidationError(
-                f"{option}={said!r} is given, and column {known.name!r} holds the {role} too; "
+                f"{option}={text!r} is given, and column {known.name!r} holds the {role} too; "
                 "leave out one of them"
             )
-        channels = (*source.channels, Channel(str(said), values, unit, role))
-        self.source = replace(source, channels=channels)
+        channels = (*self.source.channels, Channel(str(text), values, unit, role))
+        self.source = replace(self.source, channels=channels)
 
-    def response(self) -> FrequencyResponse:
-        options = self.options
-        self._add_stated()
-        self.same_length({r: c for r in RESPONSE_COLUMNS if (c := self.channel(r)) is not None})
-        if options.frequency_hz is not None:
-            self._keep_range(*options.frequency_hz)
-        frequency_hz = self._frequency()
-        amplitude = self._amplitude(frequency_hz)
-        drive = self._drive()
-        if amplitude is None and drive is None:
-            raise ValidationError(
-                "neither an amplitude nor a drive is given; friction answers every amplitude "
-                "differently. Name a column with columns={'amplitude': ...} (inspect proposes a "
-                "column map), or give drive='0.2 N' or amplitude='5 um' for the whole file"
+    def _refuse_waveforms(self) -> None:
+        """Say so where samples in time were given for responses."""
+        called = {
+            role
+            for role in ("time", *MOTION_KINDS, "force")
+            if any(c.is_called(RECORD_COLUMNS[role]) for c in self.source.channels)
+        }
+        if "time" in called and len(called) > 1:
+            channels = listed([c.header for c in self.source.channels], 5)
+            raise WaveformsError(
+                f"{self.source.name}: it holds waveforms ({channels}), and a table of responses at "
+                "some frequencies was expected. If they are sine tests, make such a table with "
+                "extract; any other motion is fitted as a record (on the command line --record)"
             )
-        harmonic = self._whole_numbers("harmonic")
-        if self.has("damping_ratio"):
-            quantity, response, errors = self._backbone(frequency_hz, amplitude)
-        else:
-            quantity, response = self._response(frequency_hz, amplitude, drive)
-            self._refuse_zero(response, harmonic)
-            errors = self._errors(quantity, response)
-            if harmonic is not None:
-                _make_real(response, errors, harmonic == 0)
-        saved = self.source.metadata.get("drive_factor_uncertainty")
-        data = FrequencyResponse(
-            frequency_hz,
-            response,
-            amplitude,
-            drive,
-            level=self._labels("level", self.level),
-            run=self._labels("run", options.run),
-            controlled=self._controlled(drive is not None and amplitude is None),
-            harmonic=1 if harmonic is None else harmonic,
-            quantity=quantity,
-            motion=self.motion(),
-            drive_factor_uncertainty=self.factor_uncertainty or float(saved or 0.0),
-            quality=self._quality(),
-            **errors,
-        )
-        if quantity != "backbone":
-            check_drive(data, self.doubt_rows)
-            check_phase_size(data, self.doubt_rows)
-            if options.passive:
-                check_energy(self.source.name, data, self.doubt_rows)
-        return data
 
     def _backbone(
         self, frequency_hz: FloatArray, amplitude: FloatArray | None
-    ) -> tuple[Quantity, ComplexArray, dict[str, Any]]:
-        """Return damping ratios against amplitude, and their errors."""
+    ) -> FrequencyResponse:
         roles = ("damping_ratio", "frequency_std", "damping_ratio_std")
-        ratio, frequency_std, ratio_std = (self._scaled(role) for role in roles)
+        ratio, frequency_std, ratio_std = (self.si(role) for role in roles)
         if amplitude is None or frequency_std is None or ratio_std is None:
             raise ValidationError(
                 "a table of damping ratios is a backbone; expected the columns amplitude, "
                 "frequency_std and damping_ratio_std in addition to frequency and damping_ratio"
             )
-        data = FrequencyResponse.backbone(
+        return FrequencyResponse.backbone(
             amplitude, frequency_hz, ratio, frequency_std=frequency_std, damping_ratio_std=ratio_std
         )
-        errors = self._errors("backbone", data.response) | {"covariance": data.covariance}
-        return "backbone", data.response, errors
 
-    def _keep_range(self, low: float, high: float) -> None:
-        """Leave out the frequencies that the user does not want, before anything is judged."""
-        frequency_hz = self._hertz(self.numbers("frequency", self.required("frequency")))
-        keep = (frequency_hz >= low) & (frequency_hz <= high)
-        if not keep.any():
-            raise ValidationError(f"no frequency lies from {low:g} to {high:g} Hz")
-        self.source = self.source.rows(keep)
-
-    def _refuse_waveforms(self) -> None:
-        """Say so where samples in time were given for responses."""
-        source = self.source
-        held = {plain(c.short or c.name) for c in source.channels}
-        motion_or_force = {n for r in (*MOTION_KINDS, "force") for n in RECORD_COLUMNS[r].names}
-        if held & set(RECORD_COLUMNS["time"].names) and held & motion_or_force:
-            channels = listed([c.header for c in source.channels], 5)
-            raise WaveformsError(
-                f"{source.name}: it holds waveforms ({channels}), and a table of responses at "
-                "some frequencies was expected. If they are sine tests, make such a table with "
-                "extract; any other motion is fitted as a record (on the command line --record)"
-            )
-
-    def _hertz(self, values: FloatArray) -> FloatArray:
+    def _frequency(self, *, least: bool = True) -> FloatArray:
         channel = self.required("frequency")
-        unit = self.unit("frequency", channel)
-        kind, factor = self.kind("frequency", unit, ("frequency", "angular_frequency"))
-        return values * factor / (2.0 * np.pi if kind == "angular_frequency" else 1.0)
+        values = self.si("frequency", least=least)
+        kind, _ = self.kind("frequency", self.unit("frequency", channel))
+        return np.asarray(values / (2.0 * np.pi if kind == "angular_frequency" else 1.0))
 
-    def _frequency(self) -> FloatArray:
-        channel = self.required("frequency")
-        values = self.numbers("frequency", channel)
-        self.source.require(
-            values >= SMALLEST, channel, "a frequency > 0; frequency_hz=(low, high) keeps a range"
-        )
-        return self._hertz(values)
+    def _peak_kind(self, role: str) -> str:
+        """Return the kind of a column of amplitudes, and note what is assumed of unmarked ones."""
+        channel = self.channel(role)
+        if channel is None:
+            return ""
+        unit = self.unit(role, channel)
+        if unit.marker is None and not self.source.metadata:
+            self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
+        return self.kind(role, unit)[0]
 
     def _amplitude(self, frequency_hz: FloatArray) -> FloatArray | None:
-        kind, values = self._peaks("amplitude", MOTION_KINDS)
-        return None if values is None else per_frequency(values, frequency_hz, kind)
+        values, kind = self.si("amplitude"), self._peak_kind("amplitude")
+        if values is None:
+            return None
+        return np.asarray(values / (2.0 * np.pi * frequency_hz) ** MOTION_KINDS.index(kind))
 
     def _drive(self) -> FloatArray | None:
-        kind, values = self._peaks("drive", DRIVE_KINDS)
-        if not self._gain_per_drive():
-            self.refuse_idle_factor(None if values is None else kind)
+        values, kind = self.si("drive"), self._peak_kind("drive")
+        columns = [(role, self.channel(role)) for role in ("gain", "gain_db", "real", "response")]
+        units = [self.unit(role, channel).text for role, channel in columns if channel is not None]
+        if all(_per_drive(unit) is None for unit in units):
+            self.refuse_idle_factor(kind or None)
         if values is None:
             return None
         factor, self.factor_uncertainty = self.force_per(kind)
-        return values * factor
-
-    def _peaks(self, role: str, kinds: tuple[str, ...]) -> tuple[str, FloatArray | None]:
-        """Return kind and zero-to-peak values of a column."""
-        channel = self.channel(role)
-        if channel is None:
-            return "", None
-        values = self.numbers(role, channel)
-        self.source.require(values >= SMALLEST, channel, "a value > 0")
-        unit = self.unit(role, channel)
-        kind, factor = self.kind(role, unit, kinds)
-        self.note_peak(role, unit)
-        return kind, values * factor * unit.to_peak
-
-    def _gain_per_drive(self) -> bool:
-        """Return whether the response is one for a drive in V or A, such as m/V."""
-        columns = [(role, self.channel(role)) for role in ("gain", "gain_db", "real", "response")]
-        units = (self.unit(role, channel).text for role, channel in columns if channel is not None)
-        return any(_per_drive(unit) is not None for unit in units)
+        return np.asarray(values * factor)
 
     def _response(
         self, frequency_hz: FloatArray, amplitude: FloatArray | None, drive: FloatArray | None
     ) -> tuple[Quantity, ComplexArray]:
-        form = self._form(_FORMS)
-        match form:
+        match self._form(_FORMS):
             case ("response",):
                 quantity, factor, _ = self._factor("response")
                 channel = self.required("response")
@@ -370,13 +358,12 @@ class _Table(Binding):
             case (role, "phase"):
                 quantity, gain = self._part(role)
                 return quantity, gain * np.exp(1j * self._phase())
-        wanted = self.map.quantity
         if amplitude is None or drive is None or not self.has("phase"):
             raise ValidationError(
                 "no response; expected real and imag, gain (or gain_db) and phase, complex "
                 "numbers, or a phase together with amplitude and drive"
             )
-        if wanted is None:
+        if self.map.quantity is None:
             raise ValidationError(
                 "the phase stands without a gain; say which quantity's it is with "
                 "quantity='receptance' or another"
@@ -384,14 +371,14 @@ class _Table(Binding):
         receptance = FrequencyResponse(
             frequency_hz, amplitude / drive, amplitude, quantity="receptance"
         )
-        return wanted, receptance.to(wanted).gain * np.exp(1j * self._phase())
+        gain = receptance.to(self.map.quantity).gain
+        return self.map.quantity, gain * np.exp(1j * self._phase())
 
     def _form(self, forms: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
         """Return the one form whose columns are all there; the map decides between several."""
         mapped = [f for f in forms if self.map.roles.keys() >= {*f}]
         complete = [f for f in mapped or forms if all(self.has(role) for role in f)]
-        named = [f for f in complete if f[0] in self.map.roles]
-        complete = named or complete
+        complete = [f for f in complete if f[0] in self.map.roles] or complete
         if len(complete) > 1:
             raise ValidationError(
                 f"both {' and '.join(complete[0])} and {' and '.join(complete[1])} are there; "
@@ -405,14 +392,14 @@ class _Table(Binding):
         per_drive = _per_drive(unit.text) if self.map.drive_factor is not None else None
         if per_drive is not None:  # such as m/V, made m/N by the factor in N/V
             drive_kind, text, power = per_drive
-            kind, factor = self.kind(role, parse_unit(text), QUANTITIES)
+            kind, factor = self.kind(role, parse_unit(text))
             value, self.factor_uncertainty = self.force_per(drive_kind)
             return cast(Quantity, kind), factor * value**power, unit.decibel
-        kind, factor = self.kind(role, unit, QUANTITIES)
-        wanted = self.map.quantity
-        if wanted is not None and kind != wanted:
+        kind, factor = self.kind(role, unit)
+        if self.map.quantity not in (None, kind):
             raise UnitError(
-                f"{self.source.name}: the {role} in [{unit.text}] is {kind}, not {wanted}"
+                f"{self.source.name}: the {role} in [{unit.text}] is {kind}, not "
+                f"{self.map.quantity}"
             )
         return cast(Quantity, kind), factor, unit.decibel
 
@@ -431,8 +418,7 @@ class _Table(Binding):
     def _phase(self) -> FloatArray:
         channel = self.required("phase")
         values = self.numbers("phase", channel)
-        unit = self.unit("phase", channel)
-        _, factor = self.kind("phase", unit, ("angle",))
+        _, factor = self.kind("phase", self.unit("phase", channel))
         check_phase_unit(values, factor != 1.0, channel.name, self.doubt_rows)
         return values * factor
 
@@ -442,20 +428,20 @@ class _Table(Binding):
         errors: dict[str, Any] = {
             "covariance": None if form is None else self._covariance(form, quantity, response),
             "dof": None if dof is None else self.source.numbers(dof, infinite=True),
-            "amplitude_std": self._scaled("amplitude_std"),
-            "drive_std": self._scaled("drive_std"),
+            "amplitude_std": self.si("amplitude_std"),
+            "drive_std": self.si("drive_std"),
         }
         for level in ("amplitude", "drive"):
             cross = [f"covariance_{level}_{part}" for part in ("real", "imag")]
             if all(self.has(role) for role in cross):
-                both = [self._scaled(role, quantity) for role in cross]
+                both = [self.si(role, quantity) for role in cross]
                 errors[f"{level}_covariance"] = np.stack(both, -1)
         return errors
 
     def _covariance(
         self, form: tuple[str, ...], quantity: Quantity, response: ComplexArray
     ) -> NDArray[np.float64]:
-        columns = [self._scaled(role, quantity) for role in form]
+        columns = [self.si(role, quantity) for role in form]
         ri = np.zeros(response.shape)
         match form:
             case ("std",):
@@ -470,37 +456,6 @@ class _Table(Binding):
             case _:
                 rr, ri, ii = columns
         return np.stack([np.stack([rr, ri], -1), np.stack([ri, ii], -1)], -2)
-
-    def _scaled(self, role: str, quantity: str = "dynamic_stiffness") -> Any:
-        """Return a column in the SI unit that it is declared with, None where there is none."""
-        column = RESPONSE_COLUMNS[role]
-        channel = self.channel(role)
-        if channel is None:
-            return None
-        unit, values = self.unit(role, channel), self.numbers(role, channel)
-        if column.least:
-            self.source.require(values >= 0.0, channel, column.least)
-        si, what = column.unit_of(self.motion(), quantity), f"column {channel.name!r}"
-        return values * factor_to(unit, si, f"{self.source.name}: {what}") * unit.to_peak
-
-    def _whole_numbers(self, role: str) -> FloatArray | None:
-        channel = self.channel(role)
-        if channel is None:
-            return None
-        values = self.numbers(role, channel)
-        good = (values >= 0.0) & (values == np.round(values))
-        self.source.require(good, channel, "a whole number >= 0")
-        return values
-
-    def _refuse_zero(self, response: ComplexArray, harmonic: FloatArray | None) -> None:
-        fundamental = np.ones(response.shape, bool) if harmonic is None else harmonic == 1
-        zero = np.flatnonzero((np.abs(response) < SMALLEST) & fundamental)
-        if zero.size:
-            source = self.source
-            raise DataError(
-                f"{source.name}, {source.row_name(int(zero[0]))}: the response is 0 "
-                f"({zero.size} such rows); expected a measured value"
-            )
 
     def _labels(self, role: str, stated: str | float | None) -> Any:
         """Return the labels in a column, or those stated for the whole table."""
@@ -543,24 +498,14 @@ class _Table(Binding):
 
 def _per_drive(text: str) -> tuple[str, str, int] | None:
     """Return the drive's kind, the unit with N for V or A, and the factor's power in it."""
-    with contextlib.suppress(UnitError):
-        kind_of(parse_unit(text), QUANTITIES, "the gain")
-        return None  # one of the six quantities as it is
+    forms = [("", text, 0)]
     for kind, symbol in (("voltage", "V"), ("current", "A")):
-        for form, power in ((f"({text})*{symbol}/N", -1), (f"({text})*N/{symbol}", 1)):
-            with contextlib.suppress(UnitError):
-                kind_of(parse_unit(form), QUANTITIES, "the gain")
-                return kind, form, power
+        forms += [(kind, f"({text})*{symbol}/N", -1), (kind, f"({text})*N/{symbol}", 1)]
+    for form in forms:
+        with contextlib.suppress(UnitError):
+            kind_of(parse_unit(form[1]), QUANTITIES, "the gain")
+            return form if form[2] else None  # none of one of the six quantities as it is
     return None
-
-
-def _make_real(response: ComplexArray, errors: dict[str, Any], mean: NDArray[np.bool_]) -> None:
-    """Take rounding off the rows of the mean force, which are real: a phase of 180 deg, say."""
-    rounding = mean & (np.abs(response.imag) <= 1e-9 * np.abs(response.real))
-    response.imag[rounding] = 0.0
-    if errors["covariance"] is not None:
-        errors["covariance"][mean, 1, :] = 0.0
-        errors["covariance"][mean, :, 1] = 0.0
 
 
 def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:

@@ -82,13 +82,15 @@ class Rows:
     @classmethod
     def of(cls, data: FrequencyResponse) -> Rows:
         """Return the columns of one table."""
+        return cls._with({name: getattr(data, name) for name in COLUMNS}, data.quantity)
+
+    @classmethod
+    def _with(cls, columns: dict[str, Any], quantity: Quantity) -> Rows:
         return cls(
-            quantity=data.quantity,
-            harmonic=data.harmonic,
-            forced=data.controlled == "force",
-            omega=data.omega,
-            response=data.response,
-            **{name: getattr(data, name) for name in _optional()},
+            quantity=quantity,
+            forced=columns["controlled"] == "force",
+            omega=2.0 * np.pi * columns["frequency_hz"],
+            **{one.name: columns[one.name] for one in fields(cls) if one.name in columns},
         )
 
     @classmethod
@@ -104,24 +106,17 @@ class Rows:
                     f"table {index} has {table.n} rows of {table.quantity}, table 0 has "
                     f"{first.n} rows of {first.quantity}; tables estimated together must agree"
                 )
-        columns: dict[str, Any] = {}
+        columns = {n: _stacked(tables, n) for n in COLUMNS if n not in ("level", "run")}
         for name in ("controlled", "harmonic"):
-            columns[name] = _stacked(tables, name)
-            if columns[name].ndim > 1:
-                different = (columns[name] != columns[name][0]).any(axis=1)
+            values: Any = columns[name]
+            if values.ndim > 1:
+                different = (values != values[0]).any(axis=1)
                 raise DataError(
                     f"table {int(np.argmax(different))} differs from table 0 in {name!r}; "
                     "tables estimated together must agree in it"
                 )
-        frequency = _stacked(tables, "frequency_hz")
-        return cls(
-            quantity=first.quantity,
-            harmonic=columns["harmonic"],
-            forced=columns["controlled"] == "force",
-            omega=2.0 * np.pi * frequency,
-            response=np.array([table.response for table in tables]),
-            **{name: _all_or_none(tables, name) for name in _optional()},
-        )
+        columns["response"] = np.array([table.response for table in tables])
+        return cls._with(columns, first.quantity)
 
     def take(self, tables: NDArray[np.intp] | slice) -> Rows:
         """Return some of the stacked tables; columns that all share stay as they are."""
@@ -144,14 +139,10 @@ class Rows:
         return replace(self, response=responses)
 
 
-def _optional() -> list[str]:
-    """Return the names of the columns that a table may lack."""
-    names = [one.name for one in fields(Rows) if one.name in COLUMNS]
-    return [name for name in names if name not in ("response", "harmonic")]
-
-
-def _all_or_none(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
-    present = [getattr(table, name) is not None for table in tables]
+def _stacked(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
+    """Return the column of all tables, or the one that they share; None where none has it."""
+    columns = [getattr(table, name) for table in tables]
+    present = [column is not None for column in columns]
     if not any(present):
         return None
     if not all(present):
@@ -159,15 +150,8 @@ def _all_or_none(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any]
             f"table {present.index(False)} has no {name}, table {present.index(True)} has; "
             "tables estimated together must agree in what they hold"
         )
-    return _stacked(tables, name)
-
-
-def _stacked(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any]:
-    """Return the column of all tables, or the one that they share."""
-    first = getattr(tables[0], name)
-    columns = [getattr(table, name) for table in tables]
-    if all(column is first for column in columns):
-        return np.asarray(first)
+    if all(column is columns[0] for column in columns):
+        return np.asarray(columns[0])
     stacked = np.array(columns)
     return stacked[0] if (stacked == stacked[0]).all() else stacked
 

@@ -19,17 +19,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dahl_ident.data.column_map import column_map
+from dahl_ident.data.column_map import SETTINGS, column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.levels import labelled
 from dahl_ident.data.raw_columns import Source
-from dahl_ident.data.readers.file import FORMATS, File, open_file
+from dahl_ident.data.readers.file import FORMATS, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
 from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from, record_size
 from dahl_ident.data.response_table import ResponseOptions, response_from
 from dahl_ident.data.storage import plain_data
-from dahl_ident.errors import DataError, DataWarning, ValidationError
+from dahl_ident.errors import DahlIdentError, DataError, DataWarning, ValidationError
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
@@ -135,19 +135,13 @@ def read_frequency_response(
     >>> read_frequency_response(table).amplitude
     array([1.e-05, 2.e-05])
     """
+    entries = {name: value for name, value in locals().items() if name in SETTINGS}
     if level is not None and level_from_name is not None:
         raise ValidationError("level and level_from_name are both given; leave out one of them")
     paths = [path] if isinstance(path, (str, Path)) or _is_frame(path) else [*path]
     if not paths:
         raise DataError("no file to read; expected at least one path")
     refuse_repeated(paths)
-    entries = {
-        "quantity": quantity,
-        "sweep": sweep,
-        "drive_factor": drive_factor,
-        "drive_factor_uncertainty": drive_factor_uncertainty,
-        "controlled": controlled,
-    }
     mapped = column_map(columns, **entries)
     parts = []
     for one in paths:
@@ -239,18 +233,7 @@ def read_record(
     >>> read_record(run, displacement="LVDT").force
     array([2000., 3000.])
     """
-    roles = {
-        "time": time,
-        "displacement": displacement,
-        "velocity": velocity,
-        "acceleration": acceleration,
-        "force": force,
-        "drive": drive,
-        "drive_factor": drive_factor,
-        "drive_factor_uncertainty": drive_factor_uncertainty,
-        "sample_rate": sample_rate,
-    }
-    return next(record_pieces(path, None, columns=columns, sheet=sheet, missing=missing, **roles))
+    return next(record_pieces(samples=None, **locals()))
 
 
 def record_pieces(
@@ -352,13 +335,22 @@ def open_source(
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
         raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is not a workbook")
+    form = FORMATS[file.format]
+    module, _, name = form.reader.partition(".")
+    read = getattr(import_module(f"{__name__}.{module}"), name)  # each imported when first used
     try:
-        source = _parsed(file, sheet)
+        source: Source = read(file, sheet) if name == "read_workbook" else read(file)
+    except DahlIdentError:
+        raise
     except MemoryError as exc:
         raise DataError(
             f"{file.name}: reading takes more memory than there is; expected a smaller table. Cut "
             "the file into parts"
         ) from exc
+    except Exception as exc:  # libraries raise errors of every kind on damaged files
+        if not form.damaged:
+            raise
+        raise DataError(f"{file.name}: {form.damaged} is damaged: {exc}") from exc
     for doubt in source.doubts:
         warnings.warn(f"{file.name}: {doubt}", DataWarning, stacklevel=3)
     return replace(source, options=options or {})
@@ -371,14 +363,6 @@ def _given(**options: Any) -> dict[str, Any]:
         for k, v in options.items()
         if v is not None and (k, v) != ("passive", True)
     }
-
-
-def _parsed(file: File, sheet: str | None) -> Source:
-    """Pass a file to its reader; readers are imported when first used."""
-    module, _, name = FORMATS[file.format].reader.partition(".")
-    read = getattr(import_module(f"{__name__}.{module}"), name)
-    source: Source = read(file, sheet) if name == "read_workbook" else read(file)
-    return source
 
 
 def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:

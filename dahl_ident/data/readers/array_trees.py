@@ -10,9 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
-import tokenize
-import zipfile
-import zlib
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -20,17 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header
-from dahl_ident.data.readers.file import MOST_CHANNELS, File
+from dahl_ident.data.readers.child_process import apart
+from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
 _WIDEST = 64  # columns; a matrix with more both ways is a map or a picture
+_SECONDS, _BYTES_A_SECOND = 5, 10_000_000  # in which MATLAB's files are read
 Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
-_NUMPY_ERRORS = (
-    ValueError, OSError, EOFError, KeyError, TypeError, SyntaxError, MemoryError, OverflowError,
-    RuntimeError, UnicodeDecodeError, zipfile.BadZipFile, zlib.error, NotImplementedError,
-    tokenize.TokenError,
-)  # fmt: skip
 
 
 def tree_source(
@@ -43,9 +38,9 @@ def tree_source(
         if unit is None:
             path, unit = split_header(path)
         file.refuse_above_limit(8 * math.prod(np.shape(value)), path)  # as numbers, once read
-        found = list(_channels(path, value, unit))
-        channels += found
-        if not found:
+        those = list(_channels(path, value, unit))
+        channels += those
+        if not those:
             dtype = getattr(value, "dtype", type(value).__name__)
             notes.append(f"{path} ({np.shape(value)}, {dtype}) is not used")
         if len(channels) + len(notes) > MOST_CHANNELS:
@@ -56,14 +51,8 @@ def tree_source(
     if not channels:
         others = f"; {listed(notes, 3)}" if notes else ""
         raise DataError(f"{file.name}: the file holds no vector or matrix of numbers{others}")
-    return Source(
-        file.name,
-        kind,
-        tuple(channels),
-        file.sha256,
-        row_name=lambda i: f"index {i}",
-        metadata=metadata or {},
-        notes=tuple(notes),
+    return file.source(
+        kind, channels, row_name=lambda i: f"index {i}", metadata=metadata or {}, notes=tuple(notes)
     )
 
 
@@ -74,23 +63,22 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[Channel]:
     if array.dtype.kind not in "fiubcU" or 0 in array.shape:
         return
     shape = tuple(n for n in array.shape if n != 1)
+    upright = len(shape) < 2 or shape[1] <= shape[0]
     if len(shape) < 2:
-        if isinstance(array, Stored):
-            whole = len(array.shape) == 1
-            flat = array if whole else Stored(shape, array.dtype, _column(array, shape, 0, True))
-            yield Channel(path, flat, unit, short=short)
-        else:
-            yield Channel(path, np.squeeze(array), unit, short=short)
+        parts = [""]
     elif len(shape) == 2 and min(shape) <= _WIDEST:
-        upright = shape[1] <= shape[0]
-        for i in range(min(shape)):
-            index = f"[:,{i}]" if upright else f"[{i},:]"
-            read = _column(array, shape, i, upright)
-            if isinstance(array, Stored):
-                content: Any = Stored((max(shape),), array.dtype, read)
-            else:
-                content = read(slice(None))
-            yield Channel(path + index, content, unit, short=short + index)
+        parts = [f"[:,{i}]" if upright else f"[{i},:]" for i in range(min(shape))]
+    else:
+        return
+    for i, index in enumerate(parts):
+        read = _column(array, shape, i, upright)
+        if not isinstance(array, Stored):
+            content: Any = read(slice(None))
+        elif array.shape == shape and len(shape) == 1:
+            content = array
+        else:
+            content = Stored((max(shape),) if shape else (), array.dtype, read, array.what)
+        yield Channel(path + index, content, unit, short=short + index)
 
 
 def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
@@ -100,7 +88,7 @@ def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
         if not isinstance(array, Stored):
             matrix = array.reshape(shape)
         elif rows != slice(None) and upright and array.shape == shape:
-            matrix, rows = array.read(rows), slice(None)
+            matrix, rows = array[rows], slice(None)
         else:
             matrix = array.array.reshape(shape)
         if len(shape) < 2:
@@ -112,60 +100,81 @@ def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
 
 def read_npz(file: File) -> Source:
     """Return the arrays of a ``.npz`` file; objects, which would have to be run, are refused."""
-    try:
-        with np.load(io.BytesIO(file.data), allow_pickle=False) as content:
-            names = content.files[: MOST_CHANNELS + 1]
-            arrays = {name: _numpy_array(content[name]) for name in names}
-    except _NUMPY_ERRORS as exc:
-        raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
-    twice = [name for name in arrays if names.count(name) > 1]
-    if twice:
-        raise DataError(f"{file.name}: two arrays are called {twice[0]!r}; expected one")
-    return tree_source(file, "NumPy .npz", _fields(arrays))
+    with np.load(io.BytesIO(file.data), allow_pickle=False) as content:
+        names = content.files[: MOST_CHANNELS + 1]
+        arrays = {name: content[name] for name in names}
+    repeated = [name for name in arrays if names.count(name) > 1]
+    if repeated:
+        raise DataError(f"{file.name}: two arrays are called {repeated[0]!r}; expected one")
+    leaves = (leaf for name, array in arrays.items() for leaf in _fields(name, array))
+    return tree_source(file, "NumPy .npz", leaves)
 
 
 def read_npy(file: File) -> Source:
     """Return the columns of the matrix, or the fields of the table, in a ``.npy`` file."""
-    try:
-        if file.content is None:
-            array = np.load(file.stream(), mmap_mode="r", allow_pickle=False)
-            left = file.size - getattr(array, "offset", 0) - array.nbytes
-        else:
-            stream = file.stream()
-            array = np.load(stream, allow_pickle=False)
-            left = len(file.content) - stream.tell()
-    except _NUMPY_ERRORS as exc:
-        raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
-    if left:
+    mapped = file.content is None
+    stream = file.stream()
+    array = np.load(stream, mmap_mode="r" if mapped else None, allow_pickle=False)
+    end = getattr(array, "offset", 0) + array.nbytes if mapped else stream.tell()
+    if file.length != end:
         raise DataError(
-            f"{file.name}: the file is damaged: {left} bytes behind its array; were some added?"
+            f"{file.name}: the file is damaged: {file.length - end} bytes behind its array; were "
+            "some added?"
         )
-    leaves = _fields({"data": _numpy_array(array)}, file if file.content is None else None)
-    return tree_source(file, "NumPy .npy", leaves)
+    return tree_source(file, "NumPy .npy", _fields("data", array, file if mapped else None))
 
 
-def _numpy_array(array: Any) -> NDArray[Any]:
-    if not isinstance(array, np.ndarray):
-        raise TypeError("it holds no array")
-    return array
+def _fields(path: str, array: NDArray[Any], mapped: File | None = None) -> Iterator[Leaf]:
+    """Yield an array, or each field of a table; of a mapped file each part is a mapping again."""
+    for field in array.dtype.names or (None,):
+        values = array if field is None else array[field]
+        where = path if field is None else f"{path}.{field}"
+
+        def read(rows: slice, field: str | None = field) -> NDArray[Any]:
+            assert mapped is not None  # others are in memory
+            again = np.load(mapped.stream(), mmap_mode="r", allow_pickle=False)
+            return np.array((again if field is None else again[field])[rows])
+
+        if mapped is None or not values.ndim:
+            yield where, values, None
+        else:
+            yield where, Stored(values.shape, values.dtype, read, f"{mapped.name}: {where}"), None
 
 
-def _fields(arrays: Mapping[str, NDArray[Any]], mapped: File | None = None) -> Iterator[Leaf]:
-    """Walk through arrays, tables of named fields among them."""
-    for path, array in arrays.items():
-        for field in array.dtype.names or (None,):
-            values = array if field is None else array[field]
-            content = (
-                values if mapped is None or not values.ndim else _mapped(mapped, field, values)
-            )
-            yield path if field is None else f"{path}.{field}", content, None
+def read_matlab(file: File) -> Source:
+    """Return the arrays of a MATLAB v4, v5 or v7 file; those of v7.3 are HDF5."""
+    from scipy.io import loadmat
+
+    def load() -> dict[str, Any]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a variable twice, or one that cannot be read
+            content: dict[str, Any] = loadmat(file.stream(), appendmat=False)
+        return content
+
+    seconds = _SECONDS + file.length // _BYTES_A_SECOND
+    content, error = apart(load, seconds=seconds, bytes_at_most=2 * file.limit)
+    if error:
+        raise DataError(f"{file.name}: the file is damaged or no MATLAB file: {error}")
+    names = [name for name in content if not name.startswith("__")]
+    leaves = (leaf for name in names for leaf in _matlab_leaves(file, content[name], name, 0))
+    return tree_source(file, "MATLAB", leaves)
 
 
-def _mapped(file: File, field: str | None, like: NDArray[Any]) -> Stored:
-    """Return a field of a .npy file; each part is a mapping of its own, which ends with it."""
+def _matlab_leaves(file: File, value: Any, path: str, depth: int) -> Iterator[Leaf]:
+    """Walk through an array: its numbers, its cells, or the fields of each struct."""
+    from scipy.io.matlab import MatlabFunction, MatlabOpaque
 
-    def read(rows: slice) -> NDArray[Any]:
-        array = np.load(file.stream(), mmap_mode="r", allow_pickle=False)
-        return np.array((array if field is None else array[field])[rows])
-
-    return Stored(like.shape, like.dtype, read)
+    if depth > DEEPEST:
+        raise DataError(f"{file.name}: {path} is nested deeper than {DEEPEST} levels")
+    if not isinstance(value, np.ndarray):
+        yield path, "sparse matrix", None
+    elif isinstance(value, (MatlabFunction, MatlabOpaque)):
+        yield path, "function or object", None
+    elif value.dtype.names or value.dtype.kind == "O":
+        for i, item in enumerate(value.ravel()):
+            where = path if value.size == 1 else f"{path}[{i}]"
+            parts = {f"{where}.{name}": item[name] for name in value.dtype.names or ()}
+            for inner, part in (parts or {where: item}).items():
+                yield from _matlab_leaves(file, part, inner, depth + 1)
+    else:
+        yield path, value, None

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -35,7 +36,7 @@ def read_json(file: File) -> Source:
     try:
         text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
         file.refuse_above_limit(8 * text.count(","), f"JSON of {text.count(',')} numbers")
-        content = json.loads(text, object_pairs_hook=_without_repeated_names)
+        content = json.loads(text, object_pairs_hook=_object)
     except DataError:  # a ValueError too
         raise
     except (ValueError, RecursionError) as exc:
@@ -43,13 +44,11 @@ def read_json(file: File) -> Source:
     return dictionary_source(content, file.name, "JSON", file.sha256)
 
 
-def _without_repeated_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"one object has the name {twice[:60]!r} twice")
-    return found
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    repeated = next((name for name, n in Counter(name for name, _ in pairs).items() if n > 1), None)
+    if repeated is not None:
+        raise ValueError(f"one object has the name {repeated[:60]!r} twice")
+    return dict(pairs)
 
 
 def dictionary_source(
@@ -65,21 +64,16 @@ def dictionary_source(
     return Source(name, kind, channels, sha256, headerless=headerless)
 
 
-def is_channels(content: Any) -> bool:
-    """Return whether this is a list of SDyPy's channels."""
-    return (
-        isinstance(content, Sequence)
-        and not isinstance(content, str)
-        and len(content) > 0
-        and all(isinstance(c, Mapping) and {"name", "data"} <= c.keys() for c in content)
-    )
-
-
 def _channels(content: Any, name: str, units: Any = None) -> Iterator[Channel]:
     """Yield the columns; `units` are by their names, or in the order of a list of names."""
-    if is_channels(content) and any({"fs", "time"} & c.keys() for c in content):
+    of_names = _is_list_of(Mapping, content) and all("name" in c for c in content)
+    if (
+        of_names
+        and all("data" in c for c in content)
+        and any({"fs", "time"} & {*c} for c in content)
+    ):
         yield from _sdypy(content, name)
-    elif _is_list_of(dict, content) and all(_is_column(c) and "name" in c for c in content):
+    elif of_names and all(any(isinstance(c.get(v), list) for v in _VALUES) for c in content):
         for column in content:
             yield from _columns({str(column["name"]): column}, name, units)
     elif _is_list_of(dict, content):
@@ -102,11 +96,8 @@ def _channels(content: Any, name: str, units: Any = None) -> Iterator[Channel]:
 
 
 def _is_list_of(kind: type, content: Any) -> bool:
-    return isinstance(content, list) and bool(content) and all(isinstance(c, kind) for c in content)
-
-
-def _is_column(content: dict[str, Any]) -> bool:
-    return any(isinstance(content.get(key), list) for key in _VALUES)
+    is_list = isinstance(content, Sequence) and not isinstance(content, str) and len(content) > 0
+    return is_list and all(isinstance(one, kind) for one in content)
 
 
 def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
@@ -135,7 +126,8 @@ def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]
         return
     for key in _TABLES:
         table = content.get(key)
-        if isinstance(table, (list, dict)) and not _is_flat(table):
+        nested = isinstance(table, list) and any(isinstance(v, (list, dict)) for v in table)
+        if nested or isinstance(table, dict):
             yield from _channels(table, name, units)
             return
     yield from _columns(content, name, units)
@@ -157,11 +149,6 @@ def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel
             yield _channel(key, [value[row] for row in index], known.get(plain(key)), name)
         elif isinstance(value, list):
             yield _channel(key, value, known.get(plain(key)), name)
-
-
-def _is_flat(value: Any) -> bool:
-    """Return whether this is one column, and not a table."""
-    return isinstance(value, list) and not any(isinstance(v, (list, dict)) for v in value)
 
 
 def _channel(key: Any, values: Any, unit: Any, name: str) -> Channel:

@@ -15,12 +15,13 @@ import re
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
+from dahl_ident.data.raw_columns import Channel, Source
 from dahl_ident.data.storage import regular
 from dahl_ident.errors import DataError
 
@@ -41,30 +42,39 @@ _UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
 class Format(NamedTuple):
     """A format: its name for messages, extensions that it may have, and module.function to read it.
 
-    A file of another extension may have any format.
+    A file of another extension may have any format. Where a library reads it, any of the library's
+    errors says that what is called `damaged` in messages is so.
     """
 
     name: str
     extensions: str = ""
     reader: str = ""
+    damaged: str = ""
 
 
 FORMATS = {
     "text": Format("a text table", ".csv .tsv .txt .dat .asc .prn", "text_table.read_text_table"),
     "json": Format("JSON", ".json .txt .dat .asc", "dictionaries.read_json"),
-    "excel": Format("an Excel workbook", ".xlsx .xlsm", "spreadsheets.read_workbook"),
+    "excel": Format(
+        "an Excel workbook", ".xlsx .xlsm", "spreadsheets.read_workbook", "the workbook"
+    ),
     "old excel": Format("an Excel 97 workbook"),
-    "ods": Format("an Open Document sheet", ".ods", "spreadsheets.read_workbook"),
+    "ods": Format("an Open Document sheet", ".ods", "spreadsheets.read_workbook", "the workbook"),
     "zip": Format("a ZIP archive"),
-    "npz": Format("NumPy's .npz", ".npz", "array_trees.read_npz"),
-    "npy": Format("NumPy's .npy", ".npy", "array_trees.read_npy"),
-    "parquet": Format("Parquet", ".parquet .pq", "spreadsheets.read_parquet"),
-    "matlab": Format("MATLAB v5 or v7", ".mat", "matlab.read_matlab"),
-    "hdf5": Format("HDF5 or MATLAB v7.3", ".mat .h5 .hdf5", "hdf5.read_hdf5"),
-    "uff": Format("a universal file", ".uff .unv .bunv .txt .dat .asc", "instruments.read_uff"),
-    "tdms": Format("NI TDMS", ".tdms", "instruments.read_tdms"),
+    "npz": Format("NumPy's .npz", ".npz", "array_trees.read_npz", "the file"),
+    "npy": Format("NumPy's .npy", ".npy", "array_trees.read_npy", "the file"),
+    "parquet": Format("Parquet", ".parquet .pq", "spreadsheets.read_parquet", "the file"),
+    "matlab": Format("MATLAB v5 or v7", ".mat", "array_trees.read_matlab", "the file"),
+    "hdf5": Format("HDF5 or MATLAB v7.3", ".mat .h5 .hdf5", "hdf5.read_hdf5", "the file"),
+    "uff": Format(
+        "a universal file",
+        ".uff .unv .bunv .txt .dat .asc",
+        "instruments.read_uff",
+        "the universal file",
+    ),
+    "tdms": Format("NI TDMS", ".tdms", "instruments.read_tdms", "the TDMS file"),
     "lvm": Format("LabVIEW LVM", ".lvm .txt .dat .asc", "lvm.read_lvm"),
-    "sdf": Format("an analyser's SDF", ".sdf .dat", "sdf.read_sdf"),
+    "sdf": Format("an analyser's SDF", ".sdf .dat", "sdf.read_sdf", "the SDF file"),
 }
 _UFF = re.compile(rb"-1[ \t]*[\r\n]\s*\d")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -105,19 +115,15 @@ class File:
     @property
     def head(self) -> bytes:
         """The first bytes."""
-        if self.content is not None:
-            return self.content[:300]
-        assert self.path is not None  # either the bytes or their place is known
-        with self.path.open("rb") as stream:
-            return stream.read(300)
+        with self.opened() as stream:
+            first: bytes = stream.read(300)
+        return first
 
     @cached_property
     def data(self) -> bytes:
         """All bytes, unpacked."""
-        if self.content is not None:
-            return self.content
-        assert self.path is not None  # either the bytes or their place is known
-        return self.path.read_bytes()
+        with self.opened() as stream:
+            return stream.read() if self.content is None else self.content
 
     @property
     def length(self) -> int:
@@ -127,6 +133,11 @@ class File:
     def stream(self) -> Any:
         """Return what a library opens: the file's path, or its bytes."""
         return self.path if self.content is None else io.BytesIO(self.content)
+
+    def opened(self) -> IO[bytes]:
+        """Return the bytes as an open file."""
+        place = self.stream()
+        return place.open("rb") if isinstance(place, Path) else place
 
     @property
     def limit(self) -> int:
@@ -148,6 +159,13 @@ class File:
                 "damaged, or has to be unpacked or cut into parts first"
             )
 
+    def source(self, kind: str, channels: Iterable[Channel], **facts: Any) -> Source:
+        """Return the channels of this file with other facts of a :class:`Source`."""
+        channels = tuple(channels)
+        if not channels:
+            raise DataError(f"{self.name}: the file holds no channels")
+        return Source(self.name, kind, channels, self.sha256, **facts)
+
 
 def open_file(path: str | Path) -> File:
     """Look at a file, ``-`` being standard input."""
@@ -156,36 +174,38 @@ def open_file(path: str | Path) -> File:
             raise DataError("standard input is closed; pipe the file into it, or name the file")
         data = sys.stdin.buffer.read()
         digest = hashlib.sha256(data).hexdigest()
-        return _checked(File(None, "standard input", len(data), digest, "", data), data[:300])
+        return _recognised(File(None, "standard input", len(data), digest, "", data))
     place = regular(path)
     # names of files are bytes, and what is not UTF-8 in them could not be written into a report
     name = str(place).encode(errors="backslashreplace").decode()
     try:
         with place.open("rb") as stream:
-            head = stream.read(300)
-            stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
             size = stream.tell()
-        return _checked(File(place, name, size, digest, ""), head)
+        return _recognised(File(place, name, size, digest, ""))
     except OSError as exc:
         raise DataError(f"{name}: the file cannot be read: {exc.strerror or exc}") from exc
 
 
-def _checked(file: File, head: bytes) -> File:
+def _recognised(file: File) -> File:
     """Return the file with its format, unpacked where it is packed."""
     suffix = file.path.suffix.lower() if file.path else ""
-    content, path = file.content, file.path
+    head = file.head
     for magic, opener, ending in _PACKED:
         if head.startswith(magic):
-            content = _unpacked(file, opener)
-            head = content[:300]
-            if path and suffix == ending:
-                suffix = path.with_suffix("").suffix.lower()
-    plain = File(path, file.name, file.size, file.sha256, "", content)
-    if not head or (head.isspace() and plain.data.isspace()):
+            if file.path and suffix == ending:
+                suffix = file.path.with_suffix("").suffix.lower()
+            try:
+                with opener(io.BytesIO(file.data)) as stream:
+                    content: bytes = stream.read(file.limit + 1)
+            except (OSError, EOFError, ValueError, lzma.LZMAError, zlib.error) as exc:
+                raise DataError(f"{file.name}: the compressed file is damaged: {exc}") from exc
+            file.refuse_above_limit(len(content), "the content")
+            file, head = replace(file, content=content), content[:300]
+    if not head or (head.isspace() and file.data.isspace()):
         raise DataError(f"{file.name}: the file is empty")
-    found = _format(plain, head, suffix)
-    is_format = FORMATS[found]
+    name = _format(file, head, suffix)
+    is_format = FORMATS[name]
     allowed = [one for one in FORMATS.values() if suffix and suffix in one.extensions.split()]
     if allowed and is_format not in allowed:
         raise DataError(
@@ -194,25 +214,15 @@ def _checked(file: File, head: bytes) -> File:
         )
     if not is_format.reader:
         raise DataError(f"{file.name}: {is_format.name} is not read; save it as .xlsx or .csv")
-    return File(path, file.name, file.size, file.sha256, found, content)
-
-
-def _unpacked(file: File, opener: Callable[[Any], Any]) -> bytes:
-    """Return the unpacked bytes, of a file that unpacks to no more than its limit."""
-    try:
-        with opener(io.BytesIO(file.data)) as stream:
-            data: bytes = stream.read(file.limit + 1)
-    except (OSError, EOFError, ValueError, lzma.LZMAError, zlib.error) as exc:
-        raise DataError(f"{file.name}: the compressed file is damaged: {exc}") from exc
-    file.refuse_above_limit(len(data), "the content")
-    return data
+    return replace(file, format=name)
 
 
 def _format(file: File, head: bytes, suffix: str) -> str:
     for magic, found in _MAGIC:
         if head.startswith(magic):
             return _archive(file, suffix) if found == "zip" else found
-    if suffix in (".h5", ".hdf5") and _behind_user_block(file.data):
+    # HDF5 may begin behind a block of the user's own: of 512 bytes, 1024, 2048, ...
+    if suffix in (".h5", ".hdf5") and any(file.data.startswith(_HDF5, 512 << k) for k in range(12)):
         return "hdf5"
     if suffix == ".mat" and b"\0" in head[:4]:
         return "matlab"  # version 4 has no signature
@@ -223,12 +233,6 @@ def _format(file: File, head: bytes, suffix: str) -> str:
     if suffix == ".json" or start in (b'{"', b"[{", b"{\n", b"{\r"):
         return "json"
     return "text"
-
-
-def _behind_user_block(data: bytes) -> bool:
-    """Return whether HDF5 begins behind a block of the user's own: of 512 bytes, 1024, 2048, ..."""
-    starts = (512 << k for k in range(12))
-    return any(data.startswith(_HDF5, start) for start in starts)
 
 
 def _archive(file: File, suffix: str) -> str:

@@ -109,7 +109,8 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
         cells = _without_trailing(row)
         fits = least <= len(cells) <= width and len(row) == len(above[-1])
         numbered = bool(cells) and cells[0].casefold() == _NUMBERED
-        if not cells or not fits or (_holds_number(cells) and not numbered):
+        holds_number = any(CELL["."].fullmatch(c) or CELL[","].fullmatch(c) for c in cells)
+        if not cells or not fits or (holds_number and not numbered):
             break
         lines.insert(0, [*cells, *[""] * (width - len(cells))])
     if not lines:
@@ -160,10 +161,6 @@ def _without_trailing(row: Sequence[str]) -> list[str]:
     return cells
 
 
-def _holds_number(cells: Sequence[str]) -> bool:
-    return any(CELL["."].fullmatch(cell) or CELL[","].fullmatch(cell) for cell in cells)
-
-
 def _bare(cell: str) -> str | None:
     """Return the unit in a cell of a row of units; None for an empty one."""
     text = cell.strip()
@@ -193,7 +190,8 @@ def named_channels(
     channels = []
     for i, values in enumerate(columns):
         label = named.names[i] if named.names else ""
-        if not label and _is_blank(values):
+        blank = np.char.strip(values) == "" if values.dtype.kind == "U" else values != values
+        if not label and np.all(blank):
             continue
         if named.names and i >= named.cells:
             raise DataError(
@@ -203,9 +201,3 @@ def named_channels(
         unit = named.units[i] if named.names else None
         channels.append(Channel(label or f"column {i + 1}", values, unit))
     return tuple(channels)
-
-
-def _is_blank(values: NDArray[Any]) -> bool:
-    if values.dtype.kind == "U":
-        return not np.char.str_len(np.char.strip(values)).any()
-    return values.dtype.kind == "f" and bool(np.isnan(values).all())

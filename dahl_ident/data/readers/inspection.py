@@ -5,45 +5,32 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS
+from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS, FileColumn
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.record import gaps, is_even, sample_rate
 from dahl_ident.data.record_table import is_stamped
 from dahl_ident.data.tabular import as_html, as_text, extent, listed
 from dahl_ident.errors import UnitError
-from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, QUANTITIES, kind_of, parse_unit
+from dahl_ident.units import MOTION_KINDS, kind_of, parse_unit
 
-# Which kinds of unit make a channel a candidate for a role that no name claims.
-_RECORD_UNITS: dict[str, tuple[str, ...]] = {
-    "time": ("time",),
-    **{kind: (kind,) for kind in MOTION_KINDS},
-    "force": ("force",),
-    "drive": ("voltage", "current"),
-}
-_RESPONSE_UNITS: dict[str, tuple[str, ...]] = {
-    "frequency": ("frequency", "angular_frequency"),
-    "amplitude": MOTION_KINDS,
-    "drive": DRIVE_KINDS,
-    "response": (),
-    "real": (),
-    "imag": (),
-    "gain": QUANTITIES,
-    "gain_db": (),
-    "phase": ("angle",),
-    "level": (),
-}
+# The roles that are proposed, those of a response without a unit that claims a channel among them.
+_RECORD_ROLES = tuple(RECORD_COLUMNS)
+_RESPONSE_ROLES = (
+    "frequency", "amplitude", "drive", "response", "real", "imag", "gain", "gain_db", "phase",
+    "level",
+)  # fmt: skip
+_BY_NAME_ONLY = ("response", "real", "imag", "gain_db")  # any of them has the gain's unit
 _INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # s, of single numbers
 _RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # Hz
 _FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
-_NO_UNIT = ("level",)
-_RECORD_NAMES = {role: column.names for role, column in RECORD_COLUMNS.items()}
-_RESPONSE_NAMES = {role: column.names for role, column in RESPONSE_COLUMNS.items()}
-_PROPOSED_NAMES = _RESPONSE_NAMES | {"frequency": (*_RESPONSE_NAMES["frequency"], "f")}
+_FREQUENCY = RESPONSE_COLUMNS["frequency"]
+_PROPOSED = RESPONSE_COLUMNS | {"frequency": replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))}
+_RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("voltage", "current"))}
 
 
 @dataclass(frozen=True)
@@ -120,8 +107,8 @@ def _summary(channel: Channel) -> ChannelSummary:
 
 def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
     """Describe the sampling of the first channel that is time, by its name or its unit."""
-    by_name = [c for c in source.channels if _named(c, "time", _RECORD_NAMES)]
-    by_unit = [c for c in source.channels if _of_kind(c, ("time",))]
+    by_name = [c for c in source.channels if _named(c, "time", _RECORD)]
+    by_unit = [c for c in source.channels if _of_kind(c, "time", _RECORD)]
     for channel in by_name or by_unit:
         if channel.values.dtype.kind not in "fiu" or channel.size < 2:
             continue
@@ -155,8 +142,8 @@ def _gap_lines(found: FloatArray) -> tuple[str, ...]:
     )
 
 
-def _named(channel: Channel, role: str, names: Mapping[str, tuple[str, ...]]) -> bool:
-    return channel.role == role or plain(channel.short or channel.name) in names[role]
+def _named(channel: Channel, role: str, columns: Mapping[str, FileColumn]) -> bool:
+    return channel.role == role or channel.is_called(columns[role])
 
 
 def _proposal(source: Source) -> str:
@@ -165,23 +152,22 @@ def _proposal(source: Source) -> str:
     if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
         groups = {path: channel for path, channel in groups.items() if channel.size > 1}
     response = _is_response(groups.values())
-    names = _PROPOSED_NAMES if response else _RECORD_NAMES
-    units = _RESPONSE_UNITS if response else _RECORD_UNITS
+    columns = _PROPOSED if response else _RECORD
     roles: dict[str, str] = {}
-    for role in units:
+    for role in _RESPONSE_ROLES if response else _RECORD_ROLES:
         free = {p: c for p, c in groups.items() if p not in roles.values()}
-        by_name = (p for p, c in free.items() if _named(c, role, names))
+        by_name = (p for p, c in free.items() if _named(c, role, columns))
         by_unit = (
             p
             for p, c in free.items()
-            if _of_kind(c, units[role]) and not _has_name(c, names, names)
+            if _of_kind(c, role, columns) and not _has_name(c, columns, columns)
         )
         best = next(by_name, None) or min(by_unit, key=_likeness, default=None)
         if best is not None and not (role in MOTION_KINDS and set(MOTION_KINDS) & roles.keys()):
             roles[role] = best
     lines = [line for role, path in roles.items() for line in _entry(role, path, groups[path])]
     others = [path for path in groups if path not in roles.values()]
-    found = [path for path in others if _has_name(groups[path], names.keys() - roles, names)]
+    found = [path for path in others if _has_name(groups[path], columns.keys() - roles, columns)]
     unused = [path for path in others if path not in found]
     for what, paths in (("read by their names", found), ("not used", unused)):
         lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
@@ -220,25 +206,25 @@ def _to_fill_in(found: Collection[str], response: bool, rate: str) -> Iterator[s
         yield f"{rate}, in place of the time; above all lines in brackets"
 
 
-def _has_name(channel: Channel, roles: Iterable[str], names: Mapping[str, tuple[str, ...]]) -> bool:
-    return any(_named(channel, role, names) for role in roles)
+def _has_name(channel: Channel, roles: Iterable[str], columns: Mapping[str, FileColumn]) -> bool:
+    return any(_named(channel, role, columns) for role in roles)
 
 
 def _is_response(channels: Collection[Channel]) -> bool:
     """Return whether channels are a table of response; f is force only with time or motion."""
 
-    def any_is(role: str, names: Mapping[str, tuple[str, ...]]) -> bool:
-        kinds = (_RECORD_UNITS | _RESPONSE_UNITS)[role]
-        return any(_named(c, role, names) or _of_kind(c, kinds) for c in channels)
+    def any_is(role: str, columns: Mapping[str, FileColumn]) -> bool:
+        return any(_named(c, role, columns) or _of_kind(c, role, columns) for c in channels)
 
-    if any_is("frequency", _RESPONSE_NAMES):
+    if any_is("frequency", RESPONSE_COLUMNS):
         return True
-    sampled = any(any_is(role, _RECORD_NAMES) for role in ("time", *MOTION_KINDS))
-    return not sampled and any_is("frequency", _PROPOSED_NAMES)
+    sampled = any(any_is(role, _RECORD) for role in ("time", *MOTION_KINDS))
+    return not sampled and any_is("frequency", _PROPOSED)
 
 
-def _of_kind(channel: Channel, kinds: tuple[str, ...]) -> bool:
-    if channel.unit is None or not kinds:
+def _of_kind(channel: Channel, role: str, columns: Mapping[str, FileColumn]) -> bool:
+    kinds = columns[role].kinds
+    if channel.unit is None or not kinds or role in _BY_NAME_ONLY:
         return False
     try:
         kind_of(parse_unit(channel.unit), kinds, channel.name)
@@ -250,7 +236,7 @@ def _of_kind(channel: Channel, kinds: tuple[str, ...]) -> bool:
 def _entry(role: str, path: str, channel: Channel) -> Iterator[str]:
     yield f"[{role}]"
     yield f"column = {json.dumps(path, ensure_ascii=False)}"
-    if role in _NO_UNIT or (role == "time" and is_stamped(channel)):
+    if role == "level" or (role == "time" and is_stamped(channel)):
         return
     unit = channel.unit or channel.unit_in_name
     if unit is None:

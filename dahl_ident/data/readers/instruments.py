@@ -12,8 +12,7 @@ import re
 import struct
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +43,7 @@ _SYSTEMS = {
     7: ("in", "lbf"),
     8: ("mm", "kgf"),
 }
+_AXES = ("", "X", "Y", "Z", "RX", "RY", "RZ")
 # Universal file 58, specific data type: role in a record, and its unit.
 _DATA_TYPES: dict[int, tuple[str, str]] = {
     8: ("displacement", "motion"),
@@ -60,13 +60,12 @@ def read_uff(file: File) -> Source:
     A negative direction of response or reference turns the sign. Units are the axis labels of
     the data set; without them those of data set 164, which gives factors to SI.
     """
-    pyuff = library("pyuff", "uff")
-    sets = _uff_sets(file, pyuff)
+    sets = _uff_sets(file, library("pyuff", "uff"))
     units = _uff_system(file, next((s for s in sets if s.get("type") == 164), None))
-    wanted = (_TIME_RESPONSE, _FRF)
-    functions = [s for s in sets if s.get("type") == 58 and s.get("func_type") in wanted]
-    if not functions:
-        others = sorted({int(s["func_type"]) for s in sets if s.get("type") == 58})
+    functions = [s for s in sets if s.get("type") == 58]
+    wanted = [s for s in functions if s.get("func_type") in (_TIME_RESPONSE, _FRF)]
+    if not wanted:
+        others = sorted({int(s["func_type"]) for s in functions})
         raise DataError(
             f"{file.name}: no frequency response or time record (data set 58, function type 4 or "
             f"1); the file holds data sets {sorted({int(s.get('type', 0)) for s in sets})}"
@@ -74,33 +73,41 @@ def read_uff(file: File) -> Source:
         )
     channels: list[Channel] = []
     notes: list[str] = []
-    for function in functions:
-        _check_length(file, function)
-        channels += _uff_channels(function, units, notes)
-    texts = [str(function.get(f"id{i}", "")) for function in functions for i in range(1, 6)]
-    source = instrument_source(file, "universal file", merged_axes(channels), notes)
-    return replace(source, stated=stated_levels(texts))
+    for function in wanted:
+        channels += _uff_channels(file, function, units, notes)
+    texts = [str(function.get(f"id{i}", "")) for function in wanted for i in range(1, 6)]
+    return file.source(
+        "universal file",
+        merged_axes(channels),
+        row_name=lambda i: f"sample {i}",
+        notes=tuple(notes),
+        stated=stated_levels(texts),
+    )
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
-    with tempfile.TemporaryDirectory() as folder:
-        # pyuff reads by name only, and standard input has none
+    """Return the data sets of a file, or name the damaged one."""
+    sets: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        # pyuff reads by name only, and prints groups; standard input has no name
         path = Path(folder) / "data.uff"
         # binary data sets count bytes, so that only pure text can be brought to UTF-8
         path.write_bytes(file.data if b"58b" in file.data else _uff_text(utf8(file.lines())))
-        try:
-            with contextlib.redirect_stdout(io.StringIO()):  # pyuff prints groups
-                sets = pyuff.UFF(str(path)).read_sets()
-        except Exception as exc:  # pyuff raises bare Exception
-            raise DataError(f"{file.name}: the universal file is damaged: {exc}") from exc
-    return sets if isinstance(sets, list) else [sets]
+        content = pyuff.UFF(str(path))
+        types = content.get_set_types()
+        for i, kind in enumerate(types):
+            try:
+                sets.append(content.read_sets(i))
+            except Exception as exc:
+                raise DataError(
+                    f"{file.name}: data set {i + 1} of {len(types)} (type {int(kind)}) of the "
+                    f"universal file is damaged: {exc.__context__ or exc}"
+                ) from exc
+    return sets
 
 
 def _uff_text(text: bytes) -> bytes:
-    """Return data sets 58 and 164, as the library expects them; others write them more freely.
-
-    Delimiters may stand anywhere in their line, and exponents may be those of Fortran, 1.0D+00.
-    """
+    """Return data sets 58 and 164, as the library expects them; others write them more freely."""
     kept: list[bytes] = []
     block: list[bytes] | None = None
     for line in [*text.splitlines(), b"-1"]:
@@ -118,80 +125,61 @@ def _uff_text(text: bytes) -> bytes:
     return b"\n".join(kept) + b"\n" if b"    58" in kept else text
 
 
-def _check_length(file: File, function: dict[str, Any]) -> None:
-    found, said = len(function["data"]), int(function["num_pts"])
-    if found != said:
+def _uff_channels(
+    file: File, function: dict[str, Any], units: tuple[str, str] | None, notes: list[str]
+) -> Iterator[Channel]:
+    """Yield the axis and the values of a data set 58, positive in its directions."""
+    direction = {side: int(function[f"{side}_dir"]) for side in ("rsp", "ref")}
+    place = {}  # node and direction, such as 1:+Z or 3:-RX
+    for side, d in direction.items():
+        axis = _AXES[abs(d)] if abs(d) < len(_AXES) else "?"
+        place[side] = f"{function[f'{side}_node']}:{'-' if d < 0 else '+'}{axis}"
+    values, count = np.asarray(function["data"]), int(function["num_pts"])
+    if len(values) != count:
         raise DataError(
-            f"{file.name}: data set 58 ({_dof(function, 'rsp')}) holds {found} values where its "
-            f"header says {said}; the file looks cut off"
+            f"{file.name}: data set 58 ({place['rsp']}) holds {len(values)} values where its "
+            f"header says {count}; the file looks cut off"
         )
 
+    def unit_of(axis: str, side: str) -> str | None:
+        """Return the unit of the axis label, or that of the system of units for its type."""
+        label = str(function.get(f"{axis}_axis_units_lab", "")).strip()
+        if label and label.upper() != "NONE":
+            return label
+        kind = int(function.get(f"{axis}_spec_data_type", 0))
+        if units is None or kind not in _DATA_TYPES:
+            return None
+        length, force = units
+        rotation = abs(direction[side]) > 3
+        motion, load = ("rad", f"{force}*{length}") if rotation else (length, force)
+        return _DATA_TYPES[kind][1].replace("motion", motion).replace("load", load)
 
-def _uff_channels(
-    function: dict[str, Any], units: tuple[str, str] | None, notes: list[str]
-) -> Iterator[Channel]:
-    response, reference = _dof(function, "rsp"), _dof(function, "ref")
-    values = np.asarray(function["data"])
-    axis = np.asarray(function["x"], dtype=float)
+    role, _ = _DATA_TYPES.get(int(function.get("ordinate_spec_data_type", 0)), (None, ""))
+    unit, turned = unit_of("ordinate", "rsp"), direction["rsp"] < 0
+    name, abscissa, step = f"{role or 'channel'} {place['rsp']}", "time", "s"
+    where = place["rsp"]
     if function["func_type"] == _FRF:
-        name = f"FRF {response}/{reference}"
-        sign = _sign(function, "rsp") * _sign(function, "ref")
-        numerator = _uff_unit(function, "ordinate", "rsp", units)
-        denominator = _uff_unit(function, "orddenom", "ref", units)
-        unit = f"({numerator})/({denominator})" if numerator and denominator else numerator
-        yield Channel(f"frequency {response}/{reference}", axis, "Hz", "frequency")
-        role: str | None = "response"
-    else:
-        role, _ = _DATA_TYPES.get(int(function["ordinate_spec_data_type"]), (None, ""))
-        name = f"{role or 'channel'} {response}"
-        sign = _sign(function, "rsp")
-        unit = _uff_unit(function, "ordinate", "rsp", units)
-        yield Channel(f"time {response}", axis, "s", "time")
-    if sign < 0:
+        where = f"{place['rsp']}/{place['ref']}"
+        name, abscissa, step, role = f"FRF {where}", "frequency", "Hz", "response"
+        denominator, turned = unit_of("orddenom", "ref"), turned != (direction["ref"] < 0)
+        unit = f"({unit})/({denominator})" if unit and denominator else unit
+    yield Channel(f"{abscissa} {where}", np.asarray(function["x"], dtype=float), step, abscissa)
+    if turned:
         notes.append(f"{name}: sign turned, as its directions say")
-    yield Channel(name, sign * values, unit, role)
-
-
-def _dof(function: dict[str, Any], side: str) -> str:
-    """Return node and direction, such as ``1:+Z`` or ``3:-RX``."""
-    direction = int(function[f"{side}_dir"])
-    axes = ("", "X", "Y", "Z", "RX", "RY", "RZ")
-    axis = axes[abs(direction)] if abs(direction) < len(axes) else "?"
-    return f"{function[f'{side}_node']}:{'-' if direction < 0 else '+'}{axis}"
-
-
-def _sign(function: dict[str, Any], side: str) -> int:
-    return -1 if int(function[f"{side}_dir"]) < 0 else 1
-
-
-def _uff_unit(
-    function: dict[str, Any], axis: str, side: str, units: tuple[str, str] | None
-) -> str | None:
-    label = str(function.get(f"{axis}_axis_units_lab", "")).strip()
-    if label and label.upper() != "NONE":
-        return label
-    kind = int(function.get(f"{axis}_spec_data_type", 0))
-    if units is None or kind not in _DATA_TYPES:
-        return None
-    rotation = abs(int(function[f"{side}_dir"])) > 3
-    length, force = units
-    motion = "rad" if rotation else length
-    load = f"{force}*{length}" if rotation else force
-    return _DATA_TYPES[kind][1].replace("motion", motion).replace("load", load)
+    yield Channel(name, -values if turned else values, unit, role)
 
 
 def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | None:
     """Return length and force units of data set 164, once its code and factors agree."""
-    if units is None or int(units["units_code"]) not in _SYSTEMS:
-        return None
-    code = int(units["units_code"])
-    system = _SYSTEMS[code]
-    for name, unit in zip(("length", "force"), system, strict=True):
+    system = None if units is None else _SYSTEMS.get(int(units["units_code"]))
+    for name, unit in zip(("length", "force"), system or (), strict=False):
+        assert units is not None  # it has told the system
         stated, expected = float(units[name]), 1.0 / parse_unit(unit).factor
         if not 0.999 < stated / expected < 1.001:
             raise DataError(
-                f"{file.name}: data set 164 contradicts itself: units code {code} means {unit}, "
-                f"a {name} factor of {expected:.6g}, but the file says {stated:.6g}"
+                f"{file.name}: data set 164 contradicts itself: units code "
+                f"{int(units['units_code'])} means {unit}, a {name} factor of {expected:.6g}, but "
+                f"the file says {stated:.6g}"
             )
     return system
 
@@ -237,7 +225,7 @@ def read_tdms(file: File) -> Source:
             "as a file that was appended does; time goes on as if no pause were between them. "
             "Split the file where it holds several runs"
         )
-    return instrument_source(file, "TDMS", channels, doubts=doubts)
+    return file.source("TDMS", channels, row_name=lambda i: f"sample {i}", doubts=tuple(doubts))
 
 
 class _Bounded(io.BufferedReader):
@@ -251,9 +239,7 @@ class _Bounded(io.BufferedReader):
 def _begun_again(file: File) -> list[int]:
     """Return the numbers of later segments that state the sampling of a waveform again."""
     found, number = [], 0
-    with contextlib.ExitStack() as stack:
-        place = file.stream()
-        stream = stack.enter_context(place.open("rb")) if isinstance(place, Path) else place
+    with file.opened() as stream:
         while lead := stream.read(_LEAD_IN.size):
             if len(lead) < _LEAD_IN.size or not lead.startswith(b"TDSm"):
                 raise DataError(
@@ -273,7 +259,7 @@ def _begun_again(file: File) -> list[int]:
 
 @contextlib.contextmanager
 def _damage_named(file: File) -> Iterator[None]:
-    """Turn the library's errors, and the warnings in its log, into errors of this package."""
+    """Turn the warnings in the library's log into errors of this package."""
     log, said = logging.getLogger("nptdms"), logging.handlers.BufferingHandler(1 << 20)
     said.setLevel(logging.WARNING)
     names = [n for n in logging.root.manager.loggerDict if n.startswith("nptdms.")]
@@ -284,10 +270,6 @@ def _damage_named(file: File) -> Iterator[None]:
     log.handlers, log.propagate = [said], False
     try:
         yield
-    except DataError:
-        raise
-    except Exception as exc:  # npTDMS raises errors of many kinds on damaged files
-        raise DataError(f"{file.name}: the TDMS file is damaged: {exc}") from exc
     finally:
         log.handlers, log.propagate = [], True
         for part, handlers in zip(parts, kept, strict=True):
@@ -311,7 +293,9 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
         unit = properties.get("unit_string") or properties.get("NI_UnitDescription")
         count = len(channel)
         file.refuse_above_limit(8 * count, channel.path)
-        values: Any = Stored((count,), np.dtype(channel.dtype), _tdms_read(file, content, channel))
+        read = functools.partial(_tdms_values, file, content, channel)
+        what = f"{file.name}: {channel.path}"
+        values: Any = Stored((count,), np.dtype(channel.dtype), read, what)
         if values.dtype.kind not in "fiubc":
             values = words(map(str, values.array))
         yield labelled_channel(f"{group.name}/", channel.name, values, unit)
@@ -320,22 +304,21 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
             start, begun = float(properties.get("wf_start_offset", 0.0)), _start(channel)
             if begun is not None:  # to a hundredth of a step: clocks of modules differ by less
                 start += step * round(float((begun - first) / np.timedelta64(1, "s")) / step, 2)
-            read = functools.partial(_even_times, start, step, count)
-            times[start, step, count] = Stored((count,), np.dtype(np.float64), read)
+            even = functools.partial(_even_times, start, step, count)
+            times[start, step, count] = Stored((count,), np.dtype(np.float64), even, what)
     for i, time in enumerate(times.values()):
         name = "time" if len(times) == 1 else f"time {i + 1}"
         yield Channel(f"{group.name}/{name}", time, "s", "time", name)
 
 
-def _tdms_read(file: File, content: Any, channel: Any) -> Callable[[slice], NDArray[Any]]:
-    def read(rows: slice) -> NDArray[Any]:
-        with _damage_named(file):
-            found = np.asarray(channel[rows])
-            if content is None or found.size != len(range(*rows.indices(len(channel)))):
-                raise DataError(f"{file.name}: {channel.path} ends before its last sample")
-        return found
-
-    return read
+def _tdms_values(file: File, content: Any, channel: Any, rows: slice) -> NDArray[Any]:
+    """Return some values of a channel, whose file is open as long as `content` lives."""
+    assert content is not None
+    with _damage_named(file):
+        values = np.asarray(channel[rows])
+    if values.size != len(range(*rows.indices(len(channel)))):
+        raise DataError(f"{file.name}: {channel.path} ends before its last sample")
+    return values
 
 
 def _even_times(start: float, step: float, count: int, rows: slice) -> NDArray[Any]:
@@ -358,24 +341,3 @@ def evenly_timed(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel
     for i, time in enumerate(unique):
         name = "time" if len(unique) == 1 else f"time {i + 1}"
         yield Channel(prefix + name, time, "s", "time", name)
-
-
-def instrument_source(
-    file: File,
-    kind: str,
-    channels: list[Channel],
-    notes: Sequence[str] = (),
-    doubts: Sequence[str] = (),
-) -> Source:
-    """Return the channels of an instrument's file."""
-    if not channels:
-        raise DataError(f"{file.name}: the file holds no channels")
-    return Source(
-        file.name,
-        kind,
-        tuple(channels),
-        file.sha256,
-        row_name=lambda i: f"sample {i}",
-        notes=tuple(notes),
-        doubts=tuple(doubts),
-    )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import Channel, Source, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
-from dahl_ident.data.readers.instruments import evenly_timed, instrument_source, labelled_channel
+from dahl_ident.data.readers.instruments import evenly_timed, labelled_channel
 from dahl_ident.errors import DataError
 
 _END = "***End_of_Header***"
@@ -31,8 +31,21 @@ def read_lvm(file: File) -> Source:
     """Return the channels of all segments of a LabVIEW measurement file."""
     text = utf8(file.lines()).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     lines = [(i + 1, line) for i, line in enumerate(text.split("\n"))]
-    head, rest = _up_to_end(file, _without_special(lines), 0)
-    separator = _separator(head)
+    plain, inside = [], False
+    for number, line in lines:
+        mark = line.strip()
+        inside = (inside or mark.startswith(_SPECIAL[0])) and not mark.startswith(_SPECIAL[1])
+        if not inside and not mark.startswith(_SPECIAL[1]):
+            plain.append((number, line))
+    head, rest = _up_to_end(file, plain)
+    separator = next(
+        (
+            _SEPARATORS.get(line[10:].strip().casefold(), line[9])
+            for _, line in head
+            if line.startswith("Separator") and len(line) > 9
+        ),
+        "\t",
+    )
     settings = dict(_entry(line, separator) for _, line in head)
     mark = (settings.get("Decimal_Separator") or ["."])[0]
     columns = (settings.get("X_Columns") or ["One"])[0].strip().casefold()
@@ -51,32 +64,15 @@ def read_lvm(file: File) -> Source:
         for channel in _channels(segment, f"segment {i}/" if len(segments) > 1 else "", columns)
     ]
     doubts = [doubt for segment in segments for doubt in _contradictions(segment)]
-    return instrument_source(file, "LVM", channels, doubts=doubts)
+    return file.source("LVM", channels, row_name=lambda i: f"sample {i}", doubts=tuple(doubts))
 
 
-def _without_special(lines: Lines) -> Lines:
-    kept, inside = [], False
-    for number, line in lines:
-        mark = line.strip()
-        inside = (inside or mark.startswith(_SPECIAL[0])) and not mark.startswith(_SPECIAL[1])
-        if not inside and not mark.startswith(_SPECIAL[1]):
-            kept.append((number, line))
-    return kept
-
-
-def _up_to_end(file: File, lines: Lines, start: int) -> tuple[Lines, Lines]:
-    for i in range(start, len(lines)):
-        if lines[i][1].strip() == _END:
-            return [pair for pair in lines[start:i] if pair[1].strip()], lines[i + 1 :]
+def _up_to_end(file: File, lines: Lines) -> tuple[Lines, Lines]:
+    """Return the lines of a header, and those behind it."""
+    for i, (_, line) in enumerate(lines):
+        if line.strip() == _END:
+            return [pair for pair in lines[:i] if pair[1].strip()], lines[i + 1 :]
     raise DataError(f"{file.name}: the LVM file is damaged: a header without {_END}")
-
-
-def _separator(head: Lines) -> str:
-    for _, line in head:
-        if line.startswith("Separator") and len(line) > 9:
-            word = line[10:].strip().casefold()
-            return _SEPARATORS.get(word, line[9])
-    return "\t"
 
 
 def _entry(line: str, separator: str) -> tuple[str, list[str]]:
@@ -88,7 +84,7 @@ def _segment(
     file: File, lines: Lines, separator: str, mark: str, columns: str, single: bool
 ) -> tuple[dict[str, Any], Lines]:
     """Return header and numbers of a segment, and the lines behind it: none of a single one."""
-    head, rest = _up_to_end(file, lines, 0)
+    head, rest = _up_to_end(file, lines)
     segment: dict[str, Any] = dict(_entry(line, separator) for _, line in head)
     while rest and not rest[0][1].strip():
         rest = rest[1:]
@@ -129,10 +125,7 @@ def _segment(
 
 
 def _check_samples(file: File, segment: dict[str, Any], rows: int, single: bool) -> None:
-    """Refuse a segment with fewer or more samples than its header says.
-
-    Under a single header, which is that of the first samples written, there may be more.
-    """
+    """Refuse a segment with fewer or more samples than its header says."""
     stated = [value.strip() for value in segment.get("Samples", []) if value.strip()]
     unread = [value for value in stated if not re.fullmatch("[0-9]{1,18}", value)]
     if unread:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import Channel, Source
 from dahl_ident.data.readers.file import MOST_CHANNELS, File
-from dahl_ident.data.readers.instruments import instrument_source, merged_axes
-from dahl_ident.errors import DataError
+from dahl_ident.data.readers.instruments import merged_axes
 
 _FILE, _MEASUREMENT, _DATA, _VECTOR, _CHANNEL, _X, _Y = 10, 11, 12, 13, 14, 16, 17  # records
 _FREQUENCY, _TIME = 0, 1  # domains
@@ -27,10 +26,6 @@ _LOGARITHMIC, _COMMON, _OF_RESULT, _OF_VECTOR = 1, 2, 3, 4  # axes; 0 is linear
 _NUMBERS = {1: ">i2", 2: ">i4", 3: ">f4", 4: ">f8"}
 _POWER = 48  # of a channel that is in a result once
 _UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # others than their labels
-
-
-class _DamagedError(Exception):
-    """The records contradict themselves; the message says how."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +59,7 @@ def read_sdf(file: File) -> Source:
     A frequency response is in the engineering units of its channels. Where its coherence is in the
     file too, the standard deviation follows from it.
     """
-    try:
-        return _Sdf(file).source()
-    except (_DamagedError, struct.error, OverflowError, UnicodeDecodeError) as exc:
-        raise DataError(f"{file.name}: the SDF file is damaged: {exc}") from exc
+    return _Sdf(file).source()
 
 
 class _Sdf:
@@ -89,7 +81,7 @@ class _Sdf:
         """Return a record, once its kind and size agree with the file."""
         found, size = struct.unpack_from(">hi", self.data, at) if at >= 0 else (None, 0)
         if found != kind or not 6 <= size <= len(self.data) - at:
-            raise _DamagedError(
+            raise ValueError(
                 f"at byte {at} is not a whole record of type {kind}; is the file cut off?"
             )
         return self.data[at : at + size]
@@ -97,7 +89,7 @@ class _Sdf:
     def records(self, kind: int) -> Iterator[bytes]:
         """Yield all records of a kind."""
         if not 0 <= self.counts[kind] <= MOST_CHANNELS:
-            raise _DamagedError(f"{self.counts[kind]} records of type {kind}")
+            raise ValueError(f"{self.counts[kind]} records of type {kind}")
         at = self.places[kind]
         for _ in range(self.counts[kind]):
             found = self.record(at, kind)
@@ -113,7 +105,7 @@ class _Sdf:
             r.vectors[1] * r.size * np.dtype(_NUMBERS[r.y_number]).itemsize for r in results
         ]
         if sum(expected) != len(numbers):
-            raise _DamagedError(
+            raise ValueError(
                 f"its results take {sum(expected)} bytes, and {len(numbers)} are there (results "
                 "of several scans are not read)"
             )
@@ -142,7 +134,10 @@ class _Sdf:
                 role = "response" if is_response else None
                 found.append(Channel(name, factor * values, unit if is_response else None, role))
         found += self.deviations(results, found, notes)
-        return instrument_source(self.file, "SDF", merged_axes(found), notes, doubts)
+        return self.file.source(
+            "SDF", merged_axes(found), row_name=lambda i: f"sample {i}",
+            notes=tuple(notes), doubts=tuple(doubts),
+        )  # fmt: skip
 
     def result(self, record: bytes) -> _Result:
         """Read the header of a result."""
@@ -158,7 +153,7 @@ class _Sdf:
             points, passes = struct.unpack_from(">i6xh", record, 134)
             values = values if passes == 0 else 2
         if y_number not in _NUMBERS or values != 1 or points < 1 or min(rows, columns) < 1:
-            raise _DamagedError(
+            raise ValueError(
                 f"the result {_text(title)!r} has {points} points of {values} values of type "
                 f"{y_number}; expected some points of one value"
             )
@@ -181,10 +176,10 @@ class _Sdf:
         elif result.spacing in (_COMMON, _OF_RESULT, _OF_VECTOR):
             stored = self.record(self.x_place, _X)[6:]
             if result.x_number not in _NUMBERS:
-                raise _DamagedError(f"an axis of numbers of type {result.x_number}")
+                raise ValueError(f"an axis of numbers of type {result.x_number}")
             dtype = np.dtype(_NUMBERS[result.x_number])
             if len(stored) != result.points * dtype.itemsize:
-                raise _DamagedError(
+                raise ValueError(
                     f"an axis of {result.points} points in {len(stored)} bytes; several axes in "
                     "one file are not read"
                 )
@@ -193,7 +188,7 @@ class _Sdf:
             with np.errstate(over="ignore", invalid="ignore"):
                 values = result.first + result.step * n
         if not np.isfinite(values).all():
-            raise _DamagedError("an axis that is not finite")
+            raise ValueError("an axis that is not finite")
         role = name if name in ("frequency", "time") else None
         return Channel(f"{name} of {result.title}", values, result.x_unit or None, role)
 
@@ -210,7 +205,7 @@ class _Sdf:
                 doubts.append(f"channel {number + 1} was overloaded")
             sensitivity = struct.unpack_from(">f", channel, 138)[0]
             if not 0.0 < abs(sensitivity) < np.inf or abs(power) not in (_POWER, 2 * _POWER):
-                raise _DamagedError(f"channel {number + 1} has the sensitivity {sensitivity:g}")
+                raise ValueError(f"channel {number + 1} has the sensitivity {sensitivity:g}")
             factor *= sensitivity ** (-power / _POWER)
             units[power < 0] = _unit(channel[116:126]) or "V"
         return factor, f"({units[0]})/({units[1]})" if all(units) else units[0] or None
@@ -218,11 +213,7 @@ class _Sdf:
     def deviations(
         self, results: list[_Result], found: list[Channel], notes: list[str]
     ) -> Iterator[Channel]:
-        """Yield the standard deviation that the coherence of averages gives a response.
-
-        Each part of H has the variance abs(H)^2 (1 - c)/(2 n c). (Bendat and Piersol, Random Data,
-        4th ed., Eqn. 9.90)
-        """
+        """Yield the standard deviation that the coherence of averages gives a response."""
         responses = [c for c in found if c.role == "response"]
         kinds = [r.kind for r in results for _ in range(r.vectors[1])]
         coherences = [c for c, kind in zip(found[1::2], kinds, strict=True) if kind == _COHERENCE]

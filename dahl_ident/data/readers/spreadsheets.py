@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,8 +59,7 @@ def _cells(file: File) -> dict[str, list[list[Any]]]:
     calamine = library("python_calamine", "excel")
 
     def read() -> dict[str, list[list[Any]]]:  # pragma: no cover
-        stream = file.stream()
-        with stream.open("rb") if isinstance(stream, Path) else stream as content:
+        with file.opened() as content:
             book = calamine.CalamineWorkbook.from_filelike(content)
             return {name: _rows(book, name) for name in book.sheet_names}
 
@@ -96,11 +94,9 @@ def _table(file: File, sheet: str, cells: list[list[Any]]) -> Source | None:
     named = header(above, run.width)
     filled = [i for i in range(run.start, len(cells)) if any(_text(c) for c in cells[i])]
     columns = [_column([cells[i][k] for i in filled]) for k in range(run.width)]
-    return Source(
-        file.name,
+    return file.source(
         "workbook",
         named_channels(columns, named, where),
-        file.sha256,
         headerless=not named.names,
         row_name=lambda i: f"sheet {sheet!r}, row {filled[i] + 1}",
         stated=stated_levels(";".join(filter(None, row)) for row in above),
@@ -125,15 +121,16 @@ def _column(cells: list[Any]) -> NDArray[Any]:
 
 def read_parquet(file: File) -> Source:
     """Return the columns of a Parquet file, each read when it is used."""
-    library("pyarrow", "parquet")
-    pq = library("pyarrow.parquet")
-    try:
-        table = pq.ParquetFile(file.stream())
-        schema, rows = table.schema_arrow, table.metadata.num_rows
-        metadata = _saved(schema)
-        added = _added_bytes(file, table.metadata)
-    except Exception as exc:  # pyarrow raises errors of many kinds on damaged files
-        raise DataError(f"{file.name}: the file is damaged: {exc}") from exc
+    pa, pq = library("pyarrow", "parquet"), library("pyarrow.parquet")
+    table = pq.ParquetFile(file.stream())
+    schema, rows = table.schema_arrow, table.metadata.num_rows
+    stored = schema.metadata or {}
+    attributes = json.loads(stored.get(b"pandas", b"{}")).get("attributes")
+    if not attributes:  # where older releases of pyarrow and pandas put them
+        attributes = json.loads(stored.get(b"PANDAS_ATTRS", b"{}"))
+    saved = attributes.get("dahl_ident") if isinstance(attributes, dict) else None
+    metadata = {} if saved is None else read_metadata(json.dumps(saved))
+    added = _added_bytes(file, table.metadata)
     if added:
         raise DataError(
             f"{file.name}: the file is damaged: {added} bytes belong to no column; were some added?"
@@ -146,27 +143,25 @@ def read_parquet(file: File) -> Source:
     channels: list[Channel] = []
     notes: list[str] = []
     for field in schema:
-        kind = _arrow_kind(field.type)
-        if kind is None or schema.names.count(field.name) > 1:
+        if pa.types.is_nested(field.type) or schema.names.count(field.name) > 1:
             notes.append(f"{field.name} ({field.type}) is not used")
             continue
         name, unit = split_header(field.name)
-        read = _parquet_column(file, table, field.name)
-        content: Any = Stored((rows,), np.dtype(np.float64), read)
-        channels.append(Channel(name, content if kind == "f" else read(slice(None)), unit))
+        read = functools.partial(_parquet_values, table, field.name)
+        what = f"{file.name}: column {field.name!r}"
+        content: Any = Stored((rows,), np.dtype(np.float64), read, what)
+        number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
+        channels.append(Channel(name, content if number else content.array, unit))
     if not channels:
         raise DataError(f"{file.name}: no column of numbers or text; {listed(notes, 3)}")
-    return Source(file.name, "Parquet", tuple(channels), file.sha256, metadata=metadata,
-                  notes=tuple(notes))  # fmt: skip
+    return file.source("Parquet", channels, metadata=metadata, notes=tuple(notes))
 
 
 def _added_bytes(file: File, metadata: Any) -> int:
-    """Return the bytes between the columns and the footer, where Arrow writes none but indices.
-
-    Its older releases repeat the description of a column behind it, and state where.
-    """
+    """Return the bytes between the columns and the footer, where Arrow writes indices at most."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     parts = [g.column(k) for g in groups for k in range(g.num_columns)]
+    # older releases repeat the description of a column behind it, and state where
     described = any(
         p.has_offset_index or p.file_offset or getattr(p, "bloom_filter_offset", None)
         for p in parts
@@ -179,46 +174,16 @@ def _added_bytes(file: File, metadata: Any) -> int:
     return int(file.length - 8 - metadata.serialized_size - max(ends, default=4))
 
 
-def _saved(schema: Any) -> dict[str, Any]:
-    """Return what an earlier save of this package left in the file."""
-    stored = schema.metadata or {}
-    attributes = json.loads(stored.get(b"pandas", b"{}")).get("attributes")
-    if not attributes:  # where older releases of pyarrow and pandas put them
-        attributes = json.loads(stored.get(b"PANDAS_ATTRS", b"{}"))
-    saved = attributes.get("dahl_ident") if isinstance(attributes, dict) else None
-    return {} if saved is None else read_metadata(json.dumps(saved))
-
-
-def _arrow_kind(kind: Any) -> str | None:
-    """Return f for numbers, U for text and the like, None for what is nested."""
-    pa = library("pyarrow", "parquet")
-    if pa.types.is_floating(kind) or pa.types.is_integer(kind):
-        return "f"
-    return None if pa.types.is_nested(kind) else "U"
-
-
-def _parquet_column(file: File, table: Any, name: str) -> Callable[[slice], NDArray[Any]]:
-    def read(rows: slice) -> NDArray[Any]:
-        try:
-            groups, skipped = _row_groups(table.metadata, rows)
-            column = table.read_row_groups(groups, [name], use_pandas_metadata=False)[name]
-            start, stop, _ = rows.indices(table.metadata.num_rows)
-            series = column.slice(start - skipped, stop - start).to_pandas()
-        except Exception as exc:
-            raise DataError(f"{file.name}: column {name!r} cannot be read: {exc}") from exc
-        return _plain(series)
-
-    return read
-
-
-def _row_groups(metadata: Any, rows: slice) -> tuple[list[int], int]:
-    """Return the parts of a Parquet file that hold some rows, and the rows before them."""
+def _parquet_values(table: Any, name: str, rows: slice) -> NDArray[Any]:
+    """Return some rows of a column, from the groups of rows that hold them."""
+    metadata = table.metadata
     start, stop, _ = rows.indices(metadata.num_rows)
     sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
     edges = np.cumsum([0, *sizes])
     first = int(np.searchsorted(edges, start, side="right")) - 1
-    last = int(np.searchsorted(edges, stop))
-    return list(range(first, last)), int(edges[first])
+    groups = list(range(first, int(np.searchsorted(edges, stop))))
+    column = table.read_row_groups(groups, [name], use_pandas_metadata=False)[name]
+    return _plain(column.slice(start - int(edges[first]), stop - start).to_pandas())
 
 
 def frame_source(

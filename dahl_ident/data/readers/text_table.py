@@ -60,6 +60,10 @@ _TRACE = re.compile(
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
 _SMALL = 1 << 16  # bytes
+_LIKE_DATA = (
+    "the line begins as a comment, yet its cells look like data, {!r}; expected a measured number "
+    "in each. Delete the line, or put a number there"
+)
 _INTEGER = re.compile(r"-?\d{1,18}")
 _FLOAT = re.compile(r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|-?inf")
 _WORD = re.compile(r"(?!(?i:true|false|nan|na|null|none|inf|infinity)$)[A-Za-z][A-Za-z_]*")
@@ -120,19 +124,27 @@ def read_text_table(file: File) -> Source:
     file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
     columns = _parse(body, layout, metadata, name)
     if trace is not None:
-        layout = _of_trace(layout, int(trace[1]), len(columns[0]), name)
-    channels = named_channels(columns, _checked(layout, lines), name)
+        points, count = int(trace[1]), len(columns[0])
+        if count != points:
+            raise DataError(
+                f"{name}: the first line says {points} points, and {count} follow; the file "
+                f"{'looks cut off' if count < points else 'is damaged'}"
+            )
+        layout = replace(layout, header=Header(("real", "imag"), (None, None), 2))
+    named = list(zip(layout.header.names, layout.header.units, strict=True))
+    above = _commented(lines[: layout.line - 1], layout.delimiter)
+    if any(contradict(named, [split_header(cell) for cell in row]) for row in above):
+        layout = replace(layout, header=replace(layout.header, contradicted=True))
+    channels = named_channels(columns, layout.header, name)
     if runs and all(plain(c.name) != "run" for c in channels):
         labels = np.searchsorted(runs, np.arange(len(columns[0])), side="right") + 1
         channels = (*channels, Channel("run", labels.astype(np.str_)))
-    return Source(
-        name,
+    return file.source(
         "text table" if trace is None else TRACE,
         channels,
-        file.sha256,
         headerless=not layout.header.names,
         decimal=layout.mark,
-        row_name=lambda i: f"line {_line_of(body, layout.line, i)}",
+        row_name=lambda i: f"line {layout.line + _places(body)[i]}",
         metadata=metadata,
         notes=tuple(notes),
         runs=tuple(runs),
@@ -143,10 +155,13 @@ def read_text_table(file: File) -> Source:
 def _head(data: bytes, name: str) -> list[tuple[int, str]]:
     """Return offset and text of the first lines."""
     lines: list[tuple[int, str]] = []
-    start = numbers = 0
-    for end in _LINE_END.finditer(data + b"\n" if len(data) < _HEAD_BYTES else data):
+    start = numbers = first = 0
+    for end in _LINE_END.finditer(data if data.endswith((b"\n", b"\r")) else data + b"\n"):
         if end.start() - start > _LONGEST_LINE:
-            break
+            raise DataError(
+                f"{name}: line {len(lines) + 1} has more than {_LONGEST_LINE} bytes; expected a "
+                "table with a line for each sample"
+            )
         lines.append((start, data[start : end.start()].decode("utf-8", "replace")))
         start = end.end()
         if not numbers and lines[-1][1].strip() and _COMMENT.match(lines[-1][1]) is None:
@@ -158,22 +173,7 @@ def _head(data: bytes, name: str) -> list[tuple[int, str]]:
                 f"{name}: the first {_MOST_COMMENTS} lines are comments or blank; expected a table "
                 "of numbers after fewer"
             )
-    else:
-        if len(data) - start > _LONGEST_LINE:
-            raise DataError(_too_long(name, len(lines) + 1))
-        if start < len(data):
-            lines.append((start, data[start:].decode("utf-8", "replace")))
-        return lines
-    if end.start() - start > _LONGEST_LINE:
-        raise DataError(_too_long(name, len(lines) + 1))
     return lines
-
-
-def _too_long(name: str, line: int) -> str:
-    return (
-        f"{name}: line {line} has more than {_LONGEST_LINE} bytes; expected a table with a line "
-        "for each sample"
-    )
 
 
 def _split(line: str, delimiter: str | None) -> list[str]:
@@ -230,8 +230,13 @@ def _in_dialect(
         for (_, text), skip in zip(lines, passed, strict=True)
     ]
     run = best_run(rows, mark)
-    if run is None or (mark[1:] and not _has_thousands(rows[run.start :], mark)):
+    if run is None:
         return None
+    if mark[1:]:  # some cell can only be read with a mark of thousands, as 1,234.5 can
+        group = rf"\s*[-+]?\d{{1,3}}(?:\{mark[1]}\d{{3}})"
+        sure = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*").fullmatch
+        if not any(sure(cell) for row in rows[run.start :] for cell in row or ()):
+            return None
     start, above = run.start, lines[run.start - 1][1] if run.start else ""
     repeated = above.strip() if not passed[run.start - 1] and run.start else ""
     if repeated:  # a header seen before: the numbers began there
@@ -254,35 +259,10 @@ def _in_dialect(
     return (bool(found.names), run.score), layout
 
 
-def _has_thousands(rows: list[list[str] | None], mark: str) -> bool:
-    """Return whether some cell can only be read with a mark of thousands, as 1,234.5 can."""
-    group = rf"\s*[-+]?\d{{1,3}}(?:\{mark[1]}\d{{3}})"
-    sure = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*")
-    return any(sure.fullmatch(cell) for row in rows for cell in row or ())
-
-
 def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list[str]]:
     """Return the cells of the comment lines, without their marks."""
     texts = [text[m.end() :] for _, text in lines if (m := _COMMENT.match(text))]
     return [_split(text, delimiter) for text in texts if METADATA_MARK not in text]
-
-
-def _of_trace(layout: _Layout, points: int, rows: int, name: str) -> _Layout:
-    """Return the layout of an analyser's trace, real and imaginary parts, once it is whole."""
-    if rows != points:
-        raise DataError(
-            f"{name}: the first line says {points} points, and {rows} follow; the file "
-            f"{'looks cut off' if rows < points else 'is damaged'}"
-        )
-    return replace(layout, header=Header(("real", "imag"), (None, None), 2))
-
-
-def _checked(layout: _Layout, lines: list[tuple[int, str]]) -> Header:
-    """Return the header, once the comments above it have been compared with it."""
-    named = list(zip(layout.header.names, layout.header.units, strict=True))
-    above = _commented(lines[: layout.line - 1], layout.delimiter)
-    differs = any(contradict(named, [split_header(cell) for cell in row]) for row in above)
-    return replace(layout.header, contradicted=layout.header.contradicted or differs)
 
 
 def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
@@ -303,9 +283,13 @@ def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
 def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], list[str]]:
     """Return the lines of numbers, all else blanked; rows at which a run begins; and notes."""
     body = data[layout.offset :]
-    first_comment = _first_comment(data, layout)
-    if first_comment is not None:
-        raise DataError(_not_a_comment(name, *first_comment))
+    above = _LINE_END.split(data[: layout.offset])[:-1]
+    for i in range(len(above) - 1, -1, -1):  # directly above are comments, by their first sign
+        text = above[i].decode("utf-8", "replace")
+        if text.strip() and not _COMMENT.match(text):
+            break
+        if _looks_like_data(text, layout):
+            raise DataError(f"{name}, line {i + 1}: {_LIKE_DATA.format(text.strip()[:40])}")
     commented = any(body.find(mark) >= 0 for mark in (b"#", b"%", b"//", b"!"))
     if commented:
         _refuse_odd_comments(body, layout, name)
@@ -321,32 +305,24 @@ def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], li
 
 def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
     """Refuse comments among the numbers that are rows, or another header."""
-    for count, found in enumerate(_COMMENT_LINE.finditer(body)):
-        text = found[0].decode("utf-8", "replace")
-        row, named = _looks_like_data(text, layout), _is_another_header(text, layout)
-        if row or named or count >= _MOST_COMMENTS:
-            line = layout.line + len(_LINE_END.findall(body, 0, found.start()))
-            raise DataError(
-                _not_a_comment(name, line, text)
-                if row
-                else f"{name}, line {line}: {text.strip()[:60]!r} names the columns again, with "
-                "other units, marks or order; expected one header. Split the file there"
-                if named
-                else f"{name}, line {line}: more than {_MOST_COMMENTS} comments stand among the "
-                "numbers; expected fewer. Delete them"
-            )
-
-
-def _first_comment(data: bytes, layout: _Layout) -> tuple[int, str] | None:
-    """Return a line directly above the numbers that is a comment by its first sign alone."""
-    above = _LINE_END.split(data[: layout.offset])[:-1]
-    for i in range(len(above) - 1, -1, -1):
-        text = above[i].decode("utf-8", "replace")
-        if text.strip() and not _COMMENT.match(text):
-            return None
+    for count, comment in enumerate(_COMMENT_LINE.finditer(body)):
+        text = comment[0].decode("utf-8", "replace")
+        why = ""
         if _looks_like_data(text, layout):
-            return i + 1, text
-    return None
+            why = _LIKE_DATA.format(text.strip()[:40])
+        elif _is_another_header(text, layout):
+            why = (
+                f"{text.strip()[:60]!r} names the columns again, with other units, marks or order; "
+                "expected one header. Split the file there"
+            )
+        elif count >= _MOST_COMMENTS:
+            why = (
+                f"more than {_MOST_COMMENTS} comments stand among the numbers; expected fewer. "
+                "Delete them"
+            )
+        if why:
+            line = layout.line + len(_LINE_END.findall(body, 0, comment.start()))
+            raise DataError(f"{name}, line {line}: {why}")
 
 
 def _looks_like_data(text: str, layout: _Layout) -> bool:
@@ -371,14 +347,6 @@ def _is_another_header(text: str, layout: _Layout) -> bool:
     )
 
 
-def _not_a_comment(name: str, line: int, text: str) -> str:
-    return (
-        f"{name}, line {line}: the line begins as a comment, yet its cells look like data, "
-        f"{text.strip()[:40]!r}; expected a measured number in each. Delete the line, or put a "
-        "number there"
-    )
-
-
 def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
     """Blank the lines of words or nothing below the table: "End of data", "Mean,0.1,0.2", ",,"."""
     footers: list[str] = []
@@ -386,21 +354,18 @@ def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
     for _ in range(_FOOTER_LINES):
         start = max(body.rfind(b"\n", 0, end), body.rfind(b"\r", 0, end)) + 1
         text = body[start:end].decode("utf-8", "replace")
-        if not start or not _is_footer(text, layout):
+        cells = _split(text, layout.delimiter)
+        if any(cell.strip() for cell in cells):  # else a spreadsheet's empty rows, of delimiters
+            numbers = any(CELL[layout.mark].fullmatch(cell) for cell in cells)
+            summary = cells[0].strip(" \"':.").casefold() in _SUMMARIES
+            words_first = _FOOTER.match(text) and cells[0].strip() not in _MISSING
+            if not words_first or (numbers and not summary):
+                break
+        if not start:
             break
         footers.insert(0, text)
         end = len(body[:start].rstrip())
     return (body[:end] + b"\n" if footers else body), footers
-
-
-def _is_footer(text: str, layout: _Layout) -> bool:
-    cells = _split(text, layout.delimiter)
-    if not any(cell.strip() for cell in cells):
-        return True  # a spreadsheet's empty rows, of delimiters alone
-    if not _FOOTER.match(text) or cells[0].strip() in _MISSING:
-        return False
-    numbers = [cell for cell in cells if CELL[layout.mark].fullmatch(cell)]
-    return not numbers or cells[0].strip(" \"':.").casefold() in _SUMMARIES
 
 
 def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list[int]]:
@@ -439,17 +404,14 @@ def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
         )
     if not ends[-1] or len(before) < _MANY_LINES:
         return
-    found, usual = _decimals(last, layout), {_decimals(line, layout) for line in before[1:]}
-    if len(usual) == 1 and found < min(usual):
+    numbers = [_split(line, layout.delimiter)[-1].strip() for line in [last, *before[1:]]]
+    decimals, *others = [len(number.partition(layout.mark)[2]) for number in numbers]
+    usual = set(others)
+    if len(usual) == 1 and decimals < min(usual):
         raise DataError(
-            f"{name}: the last number, {cells[-1]!r}, has {found} decimals and no line end, where "
-            f"all above have {min(usual)}; the file looks cut off"
+            f"{name}: the last number, {cells[-1]!r}, has {decimals} decimals and no line end, "
+            f"where all above have {min(usual)}; the file looks cut off"
         )
-
-
-def _decimals(line: str, layout: _Layout) -> int:
-    """Return how much of the line's last number stands behind its decimal mark."""
-    return len(_split(line, layout.delimiter)[-1].strip().partition(layout.mark)[2])
 
 
 def _counts(line: bytes) -> bool:
@@ -457,11 +419,13 @@ def _counts(line: bytes) -> bool:
     return bool(line.strip()) and not _COMMENT_LINE.match(line)
 
 
-def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] | None:
-    """Return the columns of a small table of plain numbers and words, None for any other.
+def _places(body: bytes) -> list[int]:
+    """Return the line of each row below the first, past blank lines and comments."""
+    return [i for i, text in enumerate(_LINE_END.split(body)) if _counts(text)]
 
-    The import of pandas takes longer than all else that such a table needs.
-    """
+
+def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] | None:
+    """Return the columns of a small table of plain numbers and words, None for any other."""
     if len(body) > _SMALL or layout.mark != "." or b'"' in body or not body.isascii():
         return None
     rows = [line.decode().split(layout.delimiter) for line in _LINE_END.split(body) if line.strip()]
@@ -523,7 +487,13 @@ def _parse(
             except pd.errors.DtypeWarning:
                 frame = read(in_parts=False)
     except pd.errors.ParserError as exc:
-        raise DataError(f"{name}: {_where_ragged(str(exc), layout)}") from exc
+        ragged = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(exc))
+        if ragged is None:
+            raise DataError(f"{name}: the table cannot be read: {str(exc).strip()}") from exc
+        raise DataError(
+            f"{name}: line {int(ragged[2]) + layout.line - 1} has {ragged[3]} fields; expected "
+            f"{ragged[1]} as in the lines above"
+        ) from exc
     except (ValueError, OverflowError) as exc:
         raise DataError(f"{name}: the table cannot be read: {exc}") from exc
     if metadata:  # written by this package
@@ -531,22 +501,8 @@ def _parse(
     return [_plain(frame[key].to_numpy()) for key in keys]
 
 
-def _where_ragged(message: str, layout: _Layout) -> str:
-    found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", message)
-    if found is None:
-        return f"the table cannot be read: {message.strip()}"
-    line = int(found[2]) + layout.line - 1
-    return f"line {line} has {found[3]} fields; expected {found[1]} as in the lines above"
-
-
 def _plain(values: NDArray[Any]) -> NDArray[Any]:
     """Return numbers or truth values as they are, anything else as text, empty cells as ''."""
     if values.dtype.kind in "fiub":
         return values
     return words("" if v is None or v != v else str(v) for v in values)
-
-
-def _line_of(body: bytes, first: int, row: int) -> int:
-    """Return the line number of a row, past blank lines and comments."""
-    kept = [i for i, text in enumerate(_LINE_END.split(body)) if _counts(text)]
-    return first + kept[row]
