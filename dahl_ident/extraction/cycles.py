@@ -60,7 +60,10 @@ def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
     """Cut a record of unknown frequencies into runs of consecutive cycles, in order of time."""
     runs = _crossing_runs(time, motion, 0)
     runs.sort(key=lambda edges: float(edges[0]))
-    return [_without_noise(_measured(time, motion, edges)) for edges in _joined(runs)]
+    cycles = [_measured(time, motion, edges) for edges in _joined(runs)]
+    return [  # noise alone may have made some of them: theirs is infinite
+        replace(c, noise=np.where(c.noise > _NOISIEST_CROSSING, np.inf, c.noise)) for c in cycles
+    ]
 
 
 def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
@@ -102,12 +105,6 @@ def _joined(runs: list[FloatArray]) -> list[FloatArray]:
     return joined
 
 
-def _without_noise(cycles: Cycles) -> Cycles:
-    """Return the cycles with infinite noise for those that noise alone may have made."""
-    by_noise = cycles.noise > _NOISIEST_CROSSING
-    return replace(cycles, noise=np.where(by_noise, np.inf, cycles.noise))
-
-
 def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[FloatArray]:
     """Return the rising crossings, split where the motion is quiet, and those found there."""
     if time.size < _FEWEST_SAMPLES or depth > _DEEPEST:
@@ -140,9 +137,11 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
         if rising.size < 2:
             continue
         found.append(_crossings(time, moved, beyond[rising], beyond[rising + 1]))
-        start, stop = _with_a_cycle_more(beyond[rising])
+        # a cycle before and after, the motion may have been on its way to or from these
+        at = beyond[rising]
+        start = max(int(2 * at[0] - at[1]), 0)
         found += _crossing_runs(time[done:start], motion[done:start], depth + 1)
-        done = stop
+        done = int(2 * at[-1] - at[-2])
     if done:
         found += _crossing_runs(time[done:], motion[done:], depth + 1)
     return found
@@ -160,23 +159,10 @@ def scattered(samples: FloatArray, count: int) -> FloatArray:
     return np.asarray(samples[np.sort((places * samples.size).astype(np.intp))])
 
 
-def _with_a_cycle_more(rising: NDArray[np.intp]) -> tuple[int, int]:
-    """Return the samples a cycle before the first and after the last of rising crossings.
-
-    In them the motion may have been on its way to or from the first and last.
-    """
-    start = rising[0] - (rising[1] - rising[0])
-    stop = rising[-1] + (rising[-1] - rising[-2])
-    return max(int(start), 0), int(stop)
-
-
 def _lobe_spacing(
     beyond: NDArray[np.intp], above: NDArray[np.bool_], pairs: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """Return, for pairs of samples beyond the threshold, how far lobes near each are apart.
-
-    In samples from the start of one lobe to that of the next, before or after the pair's own.
-    """
+    """Return, for pairs of samples beyond the threshold, how far lobes near each are apart."""
     turns = np.flatnonzero(above[1:] != above[:-1]) + 1
     lobe = np.searchsorted(turns, pairs, side="right")
     starts = beyond[np.concatenate([[0], turns])]
@@ -189,10 +175,7 @@ def _lobe_spacing(
 def _crossings(
     time: FloatArray, moved: FloatArray, before: NDArray[np.intp], after: NDArray[np.intp]
 ) -> FloatArray:
-    """Return where zero is crossed between samples before and after.
-
-    Noise may cross it several times: the middle of the first and the last crossing.
-    """
+    """Return where zero is crossed between samples before and after."""
     upward = np.flatnonzero((moved[:-1] < 0.0) & (moved[1:] >= 0.0))
     first = upward[np.searchsorted(upward, before)]
     last = upward[np.searchsorted(upward, after) - 1]
@@ -255,11 +238,7 @@ def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:
 def _log_frequency(
     start: FloatArray, stop: FloatArray, phase: FloatArray, turns: int
 ) -> FloatArray:
-    """Return the mean frequency from the middle of each cycle to that of the next.
-
-    The phases give the fraction of a turn; the whole turns are those that the cycles make,
-    and as many as fit into what is missing between them.
-    """
+    """Return the mean frequency from the middle of each cycle to that of the next."""
     middle, period = 0.5 * (start + stop), stop - start
     missing = (start[1:] - stop[:-1]) / (0.5 * (period[1:] + period[:-1]))
     fraction = np.diff(phase) / (2.0 * np.pi)

@@ -10,43 +10,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, positive_number, whole_number
+from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.columns import one_of
-from dahl_ident.errors import ExtractionError, ValidationError
-from dahl_ident.extraction.block_means import Samples
+from dahl_ident.errors import ExtractionError
 from dahl_ident.extraction.cycles import Cycles
 from dahl_ident.extraction.joined_points import joined
-from dahl_ident.extraction.plateaus import MODES, Mode
 from dahl_ident.extraction.point import Point, Settings, measure
 from dahl_ident.extraction.segments import record_cycles, record_spans, segment_of
-from dahl_ident.extraction.sine_fit import FEWEST_CYCLES, HARMONICS
+from dahl_ident.extraction.sine_fit import Samples
 from dahl_ident.extraction.sine_test import ROUTE, SWEEP_ROUTE, is_sweep, not_a_sine_test
 
 _WELL_COVERED = 0.8  # of the moving time: points that cover more of it are none by chance
 
 
 def record_response(
-    pieces: Iterable[Record],
-    *,
-    frequency: float | None = None,
-    mode: Mode = "auto",
-    num_periods: int | None = None,
-    settling_periods: int | None = None,
-    harmonics: Sequence[int] | None = None,
-    controlled: str = "displacement",
-    level: ArrayLike | None = None,
-    run: str | None = None,
-    min_share: float = 0.6,
+    pieces: Iterable[Record], settings: Settings, level: ArrayLike | None, run: str | None
 ) -> FrequencyResponse:
-    """Return the points of a record in pieces, with rows of all harmonics where none are named.
+    """Return the points of a record in pieces, with a row for each harmonic.
 
-    A level that goes on from one piece to the next is one point. The other arguments are those of
-    :func:`dahl_ident.extraction.extract`.
+    A level that goes on from one piece to the next is one point.
     """
-    settings = _settings(num_periods, settling_periods, harmonics, controlled, min_share)
-    one_of(mode, "mode", MODES)
-    known = None if frequency is None else positive_number(frequency, "frequency")
     points: list[Point] = []
     refused: list[str] = []
     doubts: dict[str, None] = {}
@@ -54,7 +37,7 @@ def record_response(
         doubts |= dict.fromkeys((record.provenance or {}).get("warnings", ()))
         settings = replace(settings, motion_channel=record.motion_channel)
         try:
-            further, unusable = _points(record, known, mode, settings)
+            further, unusable = _points(record, settings)
         except ExtractionError as exc:
             further, unusable = [], [str(exc)]
         points = joined(points, further)
@@ -65,48 +48,16 @@ def record_response(
         raise ExtractionError(f"{file}{_summary(refused)}")
     if refused:
         warnings.warn(f"{file}left out: {_summary(refused)}", stacklevel=3)
-    options = {
-        "frequency": known,
-        "mode": mode,
-        "num_periods": num_periods,
-        "settling_periods": settling_periods,
-        "harmonics": list(settings.harmonics),
-        "min_share": settings.min_share,
-        "refused": refused,
-    }
+    names = ("frequency", "mode", "num_periods", "settling_periods", "harmonics", "min_share")
+    options = {name: getattr(settings, name) for name in names}
+    options |= {"harmonics": list(settings.harmonics), "refused": refused}
     provenance |= {"extraction": options} | ({"warnings": list(doubts)} if doubts else {})
     return _table(points, record, settings, {"level": level, "run": run}, provenance)
 
 
-def _settings(
-    num_periods: int | None,
-    settling_periods: int | None,
-    harmonics: Sequence[int] | None,
-    controlled: str,
-    min_share: float,
-) -> Settings:
-    if num_periods is not None:
-        num_periods = whole_number(num_periods, "num_periods", FEWEST_CYCLES)
-    if settling_periods is not None:
-        settling_periods = whole_number(settling_periods, "settling_periods", 0)
-    if harmonics is None:
-        harmonics = (1,) if controlled == "force" else range(HARMONICS + 1)
-    orders = tuple(whole_number(k, "harmonics", 0) for k in harmonics)
-    if not orders or max(orders) > HARMONICS or len(set(orders)) < len(orders):
-        raise ValidationError(
-            f"harmonics is {list(harmonics)!r}; expected different numbers from 0 to {HARMONICS}"
-        )
-    if controlled not in ("displacement", "force"):
-        raise ValidationError(f"controlled is {controlled!r}; expected 'displacement' or 'force'")
-    if not 0.0 <= min_share < 1.0:
-        raise ValidationError(f"min_share is {min_share!r}; expected a share from 0 to below 1")
-    return Settings(orders, num_periods, settling_periods, min_share, "displacement", controlled)
-
-
-def _points(
-    record: Record, frequency: float | None, mode: Mode, settings: Settings
-) -> tuple[list[Point], list[str]]:
+def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]:
     """Return the points, and why other segments give none; at least one does."""
+    frequency, mode = settings.frequency, settings.mode
     time = record.time if record.time[0] == 0.0 else record.time - record.time[0]
     samples = Samples(time, record.motion_samples, record.force_samples)
     runs = record_cycles(time, samples.motion, frequency)
@@ -166,34 +117,32 @@ def _table(
     """Return one row for each harmonic of each point."""
     rows = [len(point.harmonic) for point in points]
 
-    def per_point(values: Sequence[float]) -> FloatArray:
-        return np.repeat(np.asarray(values), rows)
+    def per_row(name: str) -> Any:
+        """Return a field or a verdict of the points, one for each row."""
+        values = [getattr(p, name) if hasattr(p, name) else p.quality[name] for p in points]
+        each = [
+            np.asarray(v) if np.ndim(v) else np.full(n, v)
+            for v, n in zip(values, rows, strict=True)
+        ]
+        return np.concatenate(each)
 
-    def per_row(arrays: Sequence[FloatArray]) -> FloatArray:
-        return np.concatenate(arrays)
-
-    quality = {
-        name: np.concatenate(
-            [np.broadcast_to(p.quality[name], n) for p, n in zip(points, rows, strict=True)]
-        )
-        for name in points[0].quality
-    }
+    joint = per_row("joint")
     return FrequencyResponse(
-        per_point([p.frequency_hz for p in points]),
-        np.concatenate([p.response for p in points]),
-        amplitude=per_point([p.amplitude for p in points]),
-        drive=per_point([p.drive for p in points]),
-        covariance=per_row([p.covariance for p in points]),
-        dof=per_row([p.dof for p in points]),
-        amplitude_std=per_point([p.amplitude_std for p in points]),
-        amplitude_covariance=per_row([p.amplitude_covariance for p in points]),
+        per_row("frequency_hz"),
+        per_row("response"),
+        amplitude=per_row("amplitude"),
+        drive=per_row("drive"),
+        covariance=joint[:, 1:, 1:],
+        dof=per_row("dof"),
+        amplitude_std=np.sqrt(joint[:, 0, 0]),
+        amplitude_covariance=joint[:, 0, 1:],
         **labels,
         controlled=settings.controlled,
-        harmonic=[k for p in points for k in p.harmonic],
+        harmonic=per_row("harmonic"),
         motion=record.motion,
         drive_factor_uncertainty=0.0
         if record.force is not None
         else record.drive_factor_uncertainty,
-        quality=quality,
+        quality={name: per_row(name) for name in points[0].quality},
         provenance=provenance,
     )

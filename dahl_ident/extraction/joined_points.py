@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import TINY, FloatArray
+from dahl_ident.arrays import TINY
 from dahl_ident.extraction.plateaus import AMPLITUDE_TOLERANCE, FREQUENCY_TOLERANCE
 from dahl_ident.extraction.point import Point
 
@@ -31,24 +31,18 @@ _MEANS = (
 
 def joined(points: list[Point], further: list[Point]) -> list[Point]:
     """Return the points of one piece and of the next, a level across the cut as one point."""
-    if points and further and _one_level(points[-1], further[0]):
-        return [*points[:-1], _both(points[-1], further[0]), *further[1:]]
-    return [*points, *further]
-
-
-def _one_level(a: Point, b: Point) -> bool:
+    if not points or not further:
+        return [*points, *further]
+    a, b = points[-1], further[0]
     apart = (b.quality["start_time"] - a.quality["end_time"]) * a.frequency_hz
-    return bool(
+    one_level = (
         not (a.sweep or b.sweep)
         and a.harmonic == b.harmonic
         and apart < _APART + b.quality["settling_periods"]
         and abs(np.log(b.amplitude / a.amplitude)) < AMPLITUDE_TOLERANCE
         and abs(np.log(b.frequency_hz / a.frequency_hz)) < FREQUENCY_TOLERANCE
     )
-
-
-def _used(point: Point) -> int:
-    return int(point.quality["num_periods"] - point.quality["settling_periods"])
+    return [*points[:-1], _both(a, b), *further[1:]] if one_level else [*points, *further]
 
 
 def _both(a: Point, b: Point) -> Point:
@@ -59,15 +53,18 @@ def _both(a: Point, b: Point) -> Point:
         return replace(
             b, quality={**b.quality, "num_periods": periods, "settling_periods": left_out}
         )
-    weights = np.array([_used(a), _used(b)], dtype=np.float64)
-    weights /= weights.sum()
+    used = [p.quality["num_periods"] - p.quality["settling_periods"] for p in (a, b)]
+    weights = np.array(used, dtype=np.float64) / sum(used)
 
     def mean(of_a: Any, of_b: Any) -> Any:
         return weights[0] * of_a + weights[1] * of_b
 
     repeating = mean(a.repeating, b.repeating)
     own = [w**2 * (p.joint - p.repeating) for w, p in zip(weights, (a, b), strict=True)]
-    joint = own[0] + own[1] + repeating
+    # the degrees of freedom of a sum of variances, as Welch and Satterthwaite have them
+    traces = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in own]
+    spread = sum((s / sum(traces)) ** 2 / p.dof for s, p in zip(traces, (a, b), strict=True))
+    verdicts = zip(a.quality["verdict"], b.quality["verdict"], strict=True)
     quality = {
         **a.quality,
         **{name: mean(a.quality[name], b.quality[name]) for name in _MEANS},
@@ -76,9 +73,7 @@ def _both(a: Point, b: Point) -> Point:
         "num_periods": periods,
         "settling_periods": a.quality["settling_periods"] + b.quality["settling_periods"],
         "end_time": b.quality["end_time"],
-        "verdict": [
-            _verdict(*both) for both in zip(a.quality["verdict"], b.quality["verdict"], strict=True)
-        ],
+        "verdict": [_verdict(*both) for both in verdicts],
     }
     return replace(
         a,
@@ -86,19 +81,11 @@ def _both(a: Point, b: Point) -> Point:
         amplitude=mean(a.amplitude, b.amplitude),
         drive=mean(a.drive, b.drive),
         response=mean(a.response, b.response),
-        joint=joint,
+        joint=own[0] + own[1] + repeating,
         repeating=repeating,
-        dof=_dof(own, [a.dof, b.dof]),
+        dof=np.asarray(1.0 / spread),
         quality=quality,
     )
-
-
-def _dof(own: list[FloatArray], dof: list[FloatArray]) -> FloatArray:
-    """Return the degrees of freedom of a sum of variances, as Welch and Satterthwaite have it."""
-    shares = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in own]
-    total = shares[0] + shares[1]
-    spread = sum((s / total) ** 2 / d for s, d in zip(shares, dof, strict=True))
-    return np.asarray(1.0 / spread)
 
 
 def _verdict(first: str, second: str) -> str:

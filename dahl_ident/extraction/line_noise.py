@@ -75,7 +75,10 @@ def line_noise(
         else:
             weights, sides = (np.abs(lines) <= _MEAN_LINES).astype(np.float64), 2
         weights = weights / (weights @ free)
-        weighted = np.sqrt(weights / _left_by_drift(frequency * cycles, cycles)) * (sums @ half.T)
+        # a straight line, which the fit removes, holds 6/(pi p)^2 of the sine with p periods in the
+        # record and nothing of the cosine; its part in the harmonics, about 1/P^2, is theirs
+        drift = 3.0 / (np.pi * frequency * cycles) ** 2 / (1.0 - 1.0 / cycles**2)
+        weighted = np.sqrt(weights / (1.0 - drift)) * (sums @ half.T)
         noise.append(LineNoise(weighted, 2.0 / sides / float(weights**2 @ free)))
     return noise
 
@@ -83,10 +86,7 @@ def line_noise(
 def _line_content(
     fit: SineFit, harmonics: Sequence[int], cycles: int, side: int, residual: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``sum r exp(-j (k + m/P) theta)`` and the window's own ``sum exp(-j q theta/P)``.
-
-    The first has shape (harmonics, 2, 2 side), the second is for q = 0 ... 2 side.
-    """
+    """Return ``sum r exp(-j (k + m/P) theta)`` and the window's own ``sum exp(-j q theta/P)``."""
     theta, residual, counts = _block_sums(fit.segment.theta, residual)
     products = np.zeros((2, len(harmonics), 2, 2, side))
     window = np.zeros(2 * side + 1, dtype=np.complex128)
@@ -109,10 +109,7 @@ def _line_content(
 def _block_sums(
     theta: FloatArray, residual: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return phases, sums of the residual and numbers of samples, about 128 blocks a cycle.
-
-    White noise keeps its power on every line; of noise that is slow 1 % is lost on the ninth.
-    """
+    """Return phases, sums of the residual and numbers of samples, about 128 blocks a cycle."""
     block = np.floor((theta - theta[0]) * (_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
     starts = np.flatnonzero(np.diff(block, prepend=-1.0))
     if 2 * starts.size > theta.size:
@@ -131,11 +128,7 @@ def powers(rotor: ComplexArray, highest: int) -> ComplexArray:
 
 
 def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Return the matrix that gives each line the variance of a sample, and how free each is.
-
-    On an even grid the lines are orthogonal, and the share that is free is 1 for each. Gaps mix
-    them with one another and with the harmonic between them, which the fit has removed.
-    """
+    """Return the matrix that gives each line the variance of a sample, and how free each is."""
     apart = lines[:, None] - lines
     gram = np.where(apart >= 0, window[np.abs(apart)], window[np.abs(apart)].conj())
     onto = np.where(lines >= 0, window[np.abs(lines)], window[np.abs(lines)].conj())
@@ -144,12 +137,3 @@ def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, 
     kept = vectors[:, values > _INDEPENDENT * values[-1]]
     half = (kept / np.sqrt(values[-kept.shape[1] :])) @ kept.conj().T
     return half, np.sum(np.abs(kept) ** 2, axis=1)
-
-
-def _left_by_drift(periods: FloatArray, cycles: int) -> FloatArray:
-    """Return the share of a line's power that fitting a drift leaves.
-
-    A straight line holds 6/(pi p)^2 of the sine with p periods in the record and nothing of
-    the cosine; its part in the harmonics, about 1/P^2, is theirs already.
-    """
-    return 1.0 - 3.0 / (np.pi * periods) ** 2 / (1.0 - 1.0 / cycles**2)

@@ -1,14 +1,23 @@
-"""Quality of a segment of samples: sensor steps, clipping, share of the sine.
+"""Quality of a segment of samples: sensor steps, clipping, share of the sine, asymmetry.
 
 The describing function assumes a displacement that is one sine, seen by a sensor that is finer
 than the amplitude and wide enough for it. Each of these is measured here, for each segment.
+
+A loop that is alike in both directions has odd harmonics alone. Even ones appear where friction,
+clearance or a spring differ between the directions, and where the displacement has even harmonics
+itself: a linear element turns X_k/X_1 into k^2 X_k/X_1 of the force at most (a mass), and a
+symmetric but nonlinear one spreads X_2 over all even orders, each about as large as X_2/X_1. The
+mean (k = 0) is not judged, because a load cell's zero and a weight shift it as well. Without
+asymmetry abs(F_k)^2 over its variance follows F(2, dof_k) for each order. Above the limit of
+F(2 m, smallest dof) the mean of m orders lies less often than one of that distribution would.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import fdtri
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.extraction.cycles import scattered
 from dahl_ident.extraction.sine_fit import HARMONICS, Segment, SineFit
 
@@ -22,6 +31,9 @@ _SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value
 _CORNER = 3  # samples within which a clipped waveform is ...
 _AWAY = 1e-4  # ... this much of its span away from the rail
+EVEN = (2, 4, 6, 8)  # the lowest harmonics, which are the largest
+BY_CHANCE = 1e-4  # of symmetric points, how many seem asymmetric at most
+_LEAST = 1e-3  # of the fundamental: smaller even harmonics do not matter
 _FITTED = 5  # offset, drift, a sine and its frequency
 
 
@@ -113,11 +125,29 @@ def distortion(fit: SineFit, channel: int, integrations: int = 0) -> float:
     """
     orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
     noise = float(fit.residual_variance[channel])
-    power = np.array(
-        [
-            abs(fit.phasors(k)[channel]) ** 2 - noise * fit.phasor_variance(k)
-            for k in orders.tolist()
-        ]
-    )
+    sizes = np.array([abs(fit.phasors(k)[channel]) for k in orders.tolist()])
+    power = sizes**2 - noise * np.array([fit.phasor_variance(k) for k in orders.tolist()])
     power /= orders.astype(np.float64) ** (2 * integrations)
-    return float(np.sqrt(max(power[1:].sum(), 0.0)) / abs(fit.phasors(1)[channel]))
+    return float(np.sqrt(max(power[1:].sum(), 0.0)) / sizes[0])
+
+
+def asymmetry(
+    orders: FloatArray,
+    force: ComplexArray,
+    variance: FloatArray,
+    dof: FloatArray,
+    displacement: FloatArray,
+) -> float:
+    """Return the force's even harmonics over its fundamental, 0 where they are not significant.
+
+    `force` and `displacement` are phasors of even orders over those of the fundamental, with E
+    abs(error)^2 of the former as `variance` and its degrees of freedom.
+    """
+    if orders.size == 0:
+        return 0.0
+    distorted = float(np.sqrt(np.sum(displacement**2)))
+    explained = np.maximum(orders**2 * displacement + distorted, _LEAST)
+    excess = np.maximum(np.abs(force) - explained, 0.0) ** 2 / np.maximum(variance, TINY)
+    if np.mean(excess) <= fdtri(2 * orders.size, float(np.min(dof)), 1.0 - BY_CHANCE):
+        return 0.0
+    return float(np.sqrt(np.maximum(np.sum(np.abs(force) ** 2 - variance), 0.0)))

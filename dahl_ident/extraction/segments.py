@@ -54,7 +54,7 @@ def record_spans(
     mode: Mode,
     window: int | None,
 ) -> list[Span]:
-    """Return the spans of a record, or say that it has none.
+    """Return the spans of a record in order of time, each with where its neighbours end and begin.
 
     In noise that drowns the crossings, periods of the strongest line are tried as well.
     """
@@ -68,21 +68,22 @@ def record_spans(
             spans = max(spans, find_spans(periods, mode, fewest, window), key=_covered)
         moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
         if spans and (fewest == _PLATEAU_CYCLES or _covered(spans) > _NO_CHANCE * moving):
-            return _with_room(spans)
+            ordered = sorted(spans, key=lambda s: s.start)
+            ends = [-np.inf, *(s.stop for s in ordered[:-1])]
+            begins = [*(s.start for s in ordered[1:]), np.inf]
+            return [
+                replace(span, earliest=end, latest=begin)
+                for span, end, begin in zip(ordered, ends, begins, strict=True)
+            ]
     if frequency is not None and mode != "sweep" and len(runs):
         return [Span(float(time[0]), float(time[-1]), frequency)]
-    raise ExtractionError(_no_spans(time, motion, runs, frequency))
-
-
-def _with_room(spans: Sequence[Span]) -> list[Span]:
-    """Return the spans in order of time, each with where its neighbours end and begin."""
-    ordered = sorted(spans, key=lambda s: s.start)
-    ends = [-np.inf, *(s.stop for s in ordered[:-1])]
-    begins = [*(s.start for s in ordered[1:]), np.inf]
-    return [
-        replace(span, earliest=end, latest=begin)
-        for span, end, begin in zip(ordered, ends, begins, strict=True)
-    ]
+    cycles = sum(len(run) for run in runs)
+    read = "" if frequency is None else f" of {frequency:.6g} Hz"
+    raise ExtractionError(
+        f"no segment of constant amplitude and frequency in {time[-1] - time[0]:.6g} s: "
+        f"{cycles} cycles{read}, motion from {motion.min():.4g} to {motion.max():.4g}; expected "
+        f"at least {FEWEST_CYCLES} similar cycles: record longer, give frequency=, or mode='sweep'"
+    )
 
 
 def _covered(spans: Sequence[Span]) -> float:
@@ -94,18 +95,6 @@ def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
     spectrum = np.abs(np.fft.rfft(motion - motion.mean()))
     line = int(np.argmax(spectrum[1:])) + 1
     return line / float((time[-1] - time[0]) * time.size / (time.size - 1))
-
-
-def _no_spans(
-    time: FloatArray, motion: FloatArray, runs: Sequence[Cycles], frequency: float | None
-) -> str:
-    cycles = sum(len(run) for run in runs)
-    read = "" if frequency is None else f" of {frequency:.6g} Hz"
-    return (
-        f"no segment of constant amplitude and frequency in {time[-1] - time[0]:.6g} s: "
-        f"{cycles} cycles{read}, motion from {motion.min():.4g} to {motion.max():.4g}; expected "
-        f"at least {FEWEST_CYCLES} similar cycles: record longer, give frequency=, or mode='sweep'"
-    )
 
 
 def segment_of(
@@ -138,11 +127,7 @@ def segment_of(
 
 
 def _refuse_drift(segment: Segment) -> None:
-    """Refuse a given frequency at which the motion's phase drifts from cycle to cycle.
-
-    The phasors of the cycles turn evenly then: their spectrum has its peak next to zero. A phase
-    that settles turns them as well, but less and less.
-    """
+    """Refuse a given frequency at which the motion's phase drifts from cycle to cycle."""
     few = thinned(segment)
     cuts = np.searchsorted(few.time, cycle_edges(segment))
     counts = np.diff(cuts)

@@ -103,10 +103,7 @@ def _median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _strongest_line(motion: FloatArray) -> tuple[float, int]:
-    """Return the share of the power near the strongest line, and its periods in what is seen.
-
-    The middle of the record is seen; a drift from its start to its end is the first line.
-    """
+    """Return the share of the power near the strongest line, and its periods in what is seen."""
     start = max(0, (motion.size - _SPECTRUM_OF) // 2)
     part = motion[start : start + _SPECTRUM_OF]
     power = np.abs(np.fft.rfft(part - part.mean())[1:]) ** 2

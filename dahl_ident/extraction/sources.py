@@ -23,6 +23,7 @@ from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.extraction.from_record import record_response
 from dahl_ident.extraction.plateaus import Mode
+from dahl_ident.extraction.point import Settings
 
 PathLike = str | Path
 Columns = Mapping[str, Any] | str | Path
@@ -162,15 +163,9 @@ def extract(
     >>> f"{N:.2f}", f"{exact:.2f}", str(data.quality["verdict"][0])
     ('19.74+9.72j', '19.74+9.72j', 'good')
     """
-    how = {
-        "frequency": frequency,
-        "mode": mode,
-        "num_periods": num_periods,
-        "settling_periods": settling_periods,
-        "harmonics": harmonics,
-        "controlled": controlled,
-        "min_share": min_share,
-    }
+    how = locals().copy()
+    for name in ("records", "columns", "level", "jobs"):
+        del how[name]
     reading = {} if columns is None else {"columns": columns}
     named = _named(records)
     if isinstance(records, Mapping):
@@ -196,15 +191,16 @@ def extract_all(
 
     Several tasks without runs get their names as runs, or as levels.
     """
+    settings = Settings.of(**how)
     refuse_repeated([task.source for task in tasks])
     jobs = min(whole_number(jobs, "jobs", 1), len(tasks))
     if jobs == 1:
-        parts = [_extracted(task, how) for task in tasks]
+        parts = [_extracted(task, settings) for task in tasks]
     else:
         # a forked copy of a process with threads may hang: the workers start afresh
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             parts = []
-            for part, messages in pool.map(_extracted_apart, tasks, repeat(how)):
+            for part, messages in pool.map(_extracted_apart, tasks, repeat(settings)):
                 parts.append(part)
                 for message in messages:
                     warnings.warn(message, stacklevel=3)
@@ -213,20 +209,20 @@ def extract_all(
     return data if how.get("harmonics") is not None else _without_needless_rows(data)
 
 
-def _extracted_apart(task: Task, how: Mapping[str, Any]) -> tuple[FrequencyResponse, list[str]]:
+def _extracted_apart(task: Task, settings: Settings) -> tuple[FrequencyResponse, list[str]]:
     """Return the points of a task and its warnings, which another process cannot show."""
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
-        data = _extracted(task, how)
-    return data, [str(warning.message) for warning in said]
+        data = _extracted(task, settings)
+    return data, [str(warning.message) for warning in shown]
 
 
-def _extracted(task: Task, how: Mapping[str, Any]) -> FrequencyResponse:
+def _extracted(task: Task, settings: Settings) -> FrequencyResponse:
     if isinstance(task.source, Record):
         records: Iterable[Record] = [task.source]
     else:
         records = record_pieces(task.source, _PIECE, **task.reading)
-    return record_response(records, level=task.level, run=task.run, **how)
+    return record_response(records, settings, task.level, task.run)
 
 
 def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
@@ -243,13 +239,12 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
                     "for each name"
                 )
             named.append((str(name), found[0]))
-    elif isinstance(records, str | Path):
-        found = _files(records)
-        if found == [str(records)]:
-            return [(None, records)]
-        named = list(zip(_labels(found), found, strict=True))
     else:
-        found = [file for source in records for file in _files(source)]
+        alone = isinstance(records, str | Path)
+        sources = [records] if isinstance(records, str | Path) else records
+        found = [file for source in sources for file in _files(source)]
+        if alone and found == [str(records)]:
+            return [(None, found[0])]
         named = list(zip(_labels(found), found, strict=True))
     if not named:
         raise ValidationError("records is empty; expected at least one record or file")

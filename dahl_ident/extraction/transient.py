@@ -90,7 +90,8 @@ def estimate_transient(
     """
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
     few = thinned(replace(fit.segment, channels=drifting[None]))
-    basis = columns(few.theta, few.tau, _orders(few))
+    # the harmonics that a departure is distinguished from
+    basis = columns(few.theta, few.tau, min(HARMONICS, resolvable_orders(few)))
     steady = np.delete(basis, 1, axis=0)
     steady = np.linalg.solve(np.linalg.cholesky(steady @ steady.T), steady)  # orthonormal
     path = _path(few.theta + displacement_phase)
@@ -100,7 +101,8 @@ def estimate_transient(
     unsteady = few.channels[0] - steady.T @ (steady @ few.channels[0])
     seen = slow.tones @ unsteady
     rates = _RATES
-    centre = np.log(_friction_rate(response))
+    friction_rates, phases = _friction_phases()
+    centre = np.log(np.interp(np.angle(response), phases, friction_rates))
     for _ in range(_REFINEMENTS):
         decays = np.exp(-0.25 * rates[:, None] * (path - start))
         decays -= decays @ steady.T @ steady
@@ -113,11 +115,6 @@ def estimate_transient(
         departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
         rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
     return Transient(float(departure), float(std), float(rate), displacement_phase, start)
-
-
-def _orders(segment: Segment) -> int:
-    """Return how many harmonics a departure is distinguished from."""
-    return min(HARMONICS, resolvable_orders(segment))
 
 
 def _path(theta: FloatArray) -> FloatArray:
@@ -141,25 +138,16 @@ class _SlowLines:
         return cls(p, powers(np.exp(-1j / cycles * angle), p.size)[1:])
 
     def variance(self, lines: ComplexArray, departure: float, decay: FloatArray) -> float:
-        """Return the variance of white noise that moves D_0 as much as the slow noise does.
-
-        `lines` are those of noise and departure together. They are taken as c/f; the decay sees
-        c times its own mean of 1/f.
-        """
+        """Return the variance of white noise that moves D_0 as much as the slow noise does."""
         decaying = self.tones @ decay
         power = np.abs(decaying) ** 2
         level = float(np.mean(self.p * np.abs(lines - departure * decaying) ** 2)) / decay.size
         return max(level * float(np.sum(power / self.p) / np.sum(power)), TINY)
 
 
-def _friction_rate(response: complex) -> float:
-    """Return 4 beta of the Dahl friction that has the phase of the response."""
-    rates, phases = _friction_phases()
-    return float(np.interp(np.angle(response), phases, rates))
-
-
 @cache
 def _friction_phases() -> tuple[FloatArray, FloatArray]:
+    """Return rates 4 beta of Dahl friction, and the phases of its response."""
     beta = np.geomspace(_RATES[0] / 4.0, 1e3, 600)
     phase = Dahl(f_max=1.0, sigma=1.0).phase(beta)
     return 4.0 * beta, phase
