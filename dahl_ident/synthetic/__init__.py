@@ -7,12 +7,11 @@ estimates by describing functions are tested independently. Ready-made data sets
 the package: see :func:`load_dataset`.
 """
 
-from dahl_ident.synthetic.acquisition import Acquisition, Channel
+from dahl_ident.synthetic.acquisition import Acquisition, Channel, Table
 from dahl_ident.synthetic.excitation import AmplitudeRamp, FrequencySweep, SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
 from dahl_ident.synthetic.lab import simulate
 from dahl_ident.synthetic.shipped import load_dataset
-from dahl_ident.synthetic.table_errors import Table
 
 __all__ = [
     "Acquisition",

@@ -1,4 +1,4 @@
-"""Sensors and recorder, which turn the true motion into stored numbers.
+"""Sensors and recorder, which turn the true motion into stored numbers, and errors of tables.
 
 A channel stores, at its nominal sampling times t,
 
@@ -10,6 +10,7 @@ channels, since one clock samples both; noise is not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,8 +21,11 @@ from dahl_ident.arrays import (
     finite_number,
     non_negative_number,
     positive_number,
+    whole_number,
 )
+from dahl_ident.data.columns import one_of
 from dahl_ident.errors import ValidationError
+from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.synthetic.mechanism import Signal
 from dahl_ident.synthetic.randomness import Draws
 
@@ -119,10 +123,7 @@ class Channel:
         return y if self.limit is None else np.clip(y, -self.limit, self.limit)
 
     def _filtered(self, signal: Signal, start: float, stop: float, step: float) -> Signal:
-        """Return the signal after the anti-alias filter, which is in steady state at `start`.
-
-        The filter is exact for a signal that is linear between 16 points per sample.
-        """
+        """Return the signal after the anti-alias filter, which is in steady state at `start`."""
         from scipy.interpolate import CubicSpline
         from scipy.signal import lfilter
 
@@ -223,3 +224,60 @@ class Acquisition:
         kept = draws.uniform("dropped samples", time.size) >= self.dropped_fraction
         kept[[0, -1]] = True
         return time[kept], x[kept], F[kept]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Request for a table of response with given errors.
+
+    Parameters
+    ----------
+    displacement_std, force_std : float, default 0
+        Relative standard deviation of the real and of the imaginary part of each phasor; of
+        the fundamental's size for higher harmonics.
+    harmonics : sequence of int, default (1,)
+        Harmonics that get a row: of the force where displacement is controlled, of the
+        displacement, up to 9, where the force is.
+    outlier_fraction : float, default 0
+        Share of the rows, chosen at random, with a gross error.
+    outlier_size : float, default 0.5
+        That error relative to the response, in a random direction of the complex plane.
+    steady : {"exact", "describing function"}, default "exact"
+        Where force is controlled: the motion of the plant, or what the paper's describing function
+        makes of it, which no plant does.
+
+    Raises
+    ------
+    ValidationError
+        If a value is not as said here.
+
+    Examples
+    --------
+    >>> Table(force_std=0.01).harmonics
+    (1,)
+    """
+
+    displacement_std: float = 0.0
+    force_std: float = 0.0
+    harmonics: Sequence[int] = (1,)
+    outlier_fraction: float = 0.0
+    outlier_size: float = 0.5
+    steady: Steady = "exact"
+
+    def __post_init__(self) -> None:
+        for name in ("displacement_std", "force_std", "outlier_fraction", "outlier_size"):
+            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        one_of(self.steady, "steady", STEADY)
+        if self.outlier_fraction > 1.0:
+            raise ValidationError(
+                f"outlier_fraction is {self.outlier_fraction!r}; expected a share from 0 to 1"
+            )
+        harmonics = tuple(whole_number(k, "harmonics", 1) for k in self.harmonics)
+        if not harmonics:
+            raise ValidationError("harmonics is empty; expected at least the fundamental, (1,)")
+        object.__setattr__(self, "harmonics", harmonics)
+
+    def outlier_rows(self, rows: int, draws: Draws) -> list[int]:
+        """Return the rows that get a gross error, rising."""
+        count = round(self.outlier_fraction * rows)
+        return sorted(draws.permutation("outlier rows", rows)[:count])

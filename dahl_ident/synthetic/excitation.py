@@ -72,10 +72,8 @@ class SteppedSine:
         one_of(self.order, "order", get_args(Order))
         whole_number(self.settling_periods, "settling_periods", 0)
         whole_number(self.num_periods, "num_periods", 1)
-        object.__setattr__(
-            self, "ramp_periods", non_negative_number(self.ramp_periods, "ramp_periods")
-        )
-        object.__setattr__(self, "rest", non_negative_number(self.rest, "rest"))
+        for name in ("ramp_periods", "rest"):
+            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
 
     def grid(self, seed: int) -> list[tuple[float, float]]:
         """Return level and frequency of every step in the order of the run."""
@@ -140,11 +138,10 @@ class FrequencySweep:
     ramp_periods: float = 2.0
 
     def __post_init__(self) -> None:
+        several = isinstance(self.level, Sequence)
         if isinstance(self.level, Sequence):
             object.__setattr__(self, "level", _numbers(self.level, "level"))
-            _check_passage(self, "start_hz", "stop_hz", "duration")
-        else:
-            _check_passage(self, "level", "start_hz", "stop_hz", "duration")
+        _check_passage(self, *["level"][several:], "start_hz", "stop_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
         """Return a ramp and the sweep, for each level."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import textwrap
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,14 +20,13 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
-from dahl_ident.synthetic.acquisition import Acquisition, Channel
+from dahl_ident.synthetic.acquisition import Acquisition, Channel, Table
 from dahl_ident.synthetic.excitation import (
     AmplitudeRamp,
     Excitation,
     FrequencySweep,
     SteppedSine,
 )
-from dahl_ident.synthetic.table_errors import Table
 from dahl_ident.units import Motion
 
 _T = TypeVar("_T")
@@ -84,8 +83,27 @@ class Experiment:
         object.__setattr__(self, "plant", as_model(self.plant))
         self.plant.known_values()
         one_of(self.motion, "motion", ("translation", "rotation"))
-        if self.table is not None:
-            self._check_table(self.table)
+        table, excitation = self.table, self.excitation
+        if table is None:
+            return
+        if not isinstance(excitation, SteppedSine):
+            raise ValidationError(
+                f"a table was requested of a {type(excitation).__name__}; only a SteppedSine "
+                "has one response for each step: leave table out to record waveforms"
+            )
+        orders = table.harmonics
+        highest = 9 if table.steady == "exact" else 1  # the describing function has no more
+        if excitation.controlled == "force" and (1 not in orders or max(orders) > highest):
+            raise ValidationError(
+                f"harmonics is {orders} where force is controlled; expected 1 among them, and none "
+                f"above {highest}"
+            )
+        faults = self.acquisition.faults_of_records()
+        if faults:
+            raise ValidationError(
+                f"{', '.join(faults)} cannot appear in a table; leave table out to record "
+                "waveforms, or give the errors of the table in Table"
+            )
 
     @property
     def truth(self) -> dict[str, float]:
@@ -152,10 +170,7 @@ class Experiment:
         DataError
             If the text is not JSON, or not an experiment.
         """
-        try:
-            return cls.from_dict(json.loads(text))
-        except json.JSONDecodeError as exc:
-            raise DataError(f"the experiment is not JSON: {exc}") from exc
+        return cls.from_dict(_parsed(json.loads, text, "JSON"))
 
     def to_toml(self) -> str:
         """Return the description as TOML."""
@@ -170,10 +185,7 @@ class Experiment:
         DataError
             If the text is not TOML, or not an experiment.
         """
-        try:
-            return cls.from_dict(tomllib.loads(text))
-        except tomllib.TOMLDecodeError as exc:
-            raise DataError(f"the experiment is not TOML: {exc}") from exc
+        return cls.from_dict(_parsed(tomllib.loads, text, "TOML"))
 
     @classmethod
     def read(cls, path: str | Path) -> Experiment:
@@ -205,25 +217,12 @@ class Experiment:
     def __hash__(self) -> int:
         return hash(self.to_json())
 
-    def _check_table(self, table: Table) -> None:
-        if not isinstance(self.excitation, SteppedSine):
-            raise ValidationError(
-                f"a table was requested of a {type(self.excitation).__name__}; only a SteppedSine "
-                "has one response for each step: leave table out to record waveforms"
-            )
-        orders = table.harmonics
-        highest = 9 if table.steady == "exact" else 1  # the describing function has no more
-        if self.excitation.controlled == "force" and (1 not in orders or max(orders) > highest):
-            raise ValidationError(
-                f"harmonics is {orders} where force is controlled; expected 1 among them, and none "
-                f"above {highest}"
-            )
-        faults = self.acquisition.faults_of_records()
-        if faults:
-            raise ValidationError(
-                f"{', '.join(faults)} cannot appear in a table; leave table out to record "
-                "waveforms, or give the errors of the table in Table"
-            )
+
+def _parsed(loads: Callable[[str], Any], text: str, form: str) -> Any:
+    try:
+        return loads(text)
+    except ValueError as exc:
+        raise DataError(f"the experiment is not {form}: {exc}") from exc
 
 
 def _built(cls: type[_T], given: Mapping[str, Any], where: str) -> _T:

@@ -8,23 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.steady_state import response
+from dahl_ident.synthetic.acquisition import Table
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
 from dahl_ident.synthetic.mechanism import Mechanism, Progress, Signal
 from dahl_ident.synthetic.randomness import Draws
-from dahl_ident.synthetic.table_errors import Phasors, Table, receptance_table, stiffness_table
-from dahl_ident.synthetic.waveform import Waveform
 
 GENERATOR = "dahl_ident.synthetic 3"
 """Raised whenever the same experiment and seed would give other values."""
-
-IntArray = NDArray[np.int64]
-Steps = tuple[FloatArray, FloatArray]
-"""Level and frequency, Hz, of every step."""
 
 
 def simulate(
@@ -84,90 +79,97 @@ def simulate(
         "truth": experiment.truth,
         "experiment": experiment.to_dict(),
     }
-    excitation = experiment.excitation
+    excitation, acquisition = experiment.excitation, experiment.acquisition
     if experiment.table is not None and isinstance(excitation, SteppedSine):
-        level, frequency_hz = np.array(excitation.grid(seed)).T
-        data = _table(experiment, (level, frequency_hz), experiment.table, draws)
-        outliers = experiment.table.outlier_rows(data.n, draws)
+        grid = np.array(excitation.grid(seed))
+        data, outliers = _table(experiment, experiment.table, grid, draws)
         return replace(
             data, motion=experiment.motion, provenance=provenance | {"outlier_rows": outliers}
         )
     waveform = excitation.waveform(seed)
-    windows = [list(window) for window in waveform.windows]
-    return _record(experiment, waveform, draws, provenance | {"windows": windows}, progress)
-
-
-def _record(
-    experiment: Experiment,
-    waveform: Waveform,
-    draws: Draws,
-    provenance: dict[str, Any],
-    progress: Progress | None,
-) -> Record:
+    provenance["windows"] = [list(window) for window in waveform.windows]
     mechanism = Mechanism.of(experiment.plant)
     displacement: Signal = waveform.value
     force: Signal = waveform.value
-    if experiment.excitation.controlled == "force":
+    if excitation.controlled == "force":
         displacement = mechanism.displacement_under(waveform, progress)
     else:
         force = mechanism.force_under(waveform, progress)
-    acquisition = experiment.acquisition
     times = acquisition.sampling_times(waveform.duration, waveform.highest_frequency_hz)
     time, x, F = acquisition.record(displacement, force, times, draws)
     return Record(time, displacement=x, force=F, motion=experiment.motion, provenance=provenance)
 
 
-def _table(experiment: Experiment, steps: Steps, table: Table, draws: Draws) -> FrequencyResponse:
-    """Return the table of a stepped sine: the true phasors, as measured by the sensors."""
-    if experiment.excitation.controlled == "force":
-        phasors = _forced_phasors(experiment, *steps, np.array(table.harmonics))
-        return receptance_table(phasors, table, draws)
-    phasors = _held_phasors(experiment, *steps, np.array(table.harmonics))
-    return stiffness_table(phasors, table, draws)
-
-
-def _held_phasors(
-    experiment: Experiment, level: FloatArray, frequency_hz: FloatArray, harmonics: IntArray
-) -> Phasors:
-    """Return a row for every step and harmonic, with controlled displacement."""
-    step, k = (g.ravel() for g in np.meshgrid(np.arange(level.size), harmonics, indexing="ij"))
-    A, f = level[step], frequency_hz[step]
-    omega = 2.0 * np.pi * f
-    force = np.zeros(step.size, dtype=np.complex128)
-    for harmonic in harmonics.tolist():
-        rows = k == harmonic
-        stiffness = experiment.plant.dynamic_stiffness(A[rows], omega[rows], harmonic=harmonic)
-        force[rows] = stiffness * A[rows]
-    fundamental = np.abs(experiment.plant.dynamic_stiffness(A, omega)) * A
-    sensors = experiment.acquisition
-    return Phasors(
-        f, A, k, step,
-        displacement=A * sensors.displacement.response(omega),
-        force=force * sensors.force.response(k * omega),
-        displacement_size=A * np.abs(sensors.displacement.response(omega)),
-        force_size=fundamental * np.abs(sensors.force.response(omega)),
+def _table(
+    experiment: Experiment, table: Table, grid: FloatArray, draws: Draws
+) -> tuple[FrequencyResponse, list[int]]:
+    """Return the table of a stepped sine, a row for every step and harmonic, and its outliers."""
+    # With relative errors e of the phasors the table holds A (1 + e_A) over H (1 + e_H), A of what
+    # answers and H of what was held. The covariance is of the true response: one that followed
+    # each row's error would bias every fit.
+    level, frequency_hz = grid.T
+    steps, harmonics = np.arange(level.size), np.array(table.harmonics)
+    step, k = (g.ravel() for g in np.meshgrid(steps, harmonics, indexing="ij"))
+    omega = 2.0 * np.pi * frequency_hz[step]
+    forced = experiment.excitation.controlled == "force"
+    sensors = (experiment.acquisition.displacement, experiment.acquisition.force)
+    of_held, of_answer = sensors[::-1] if forced else sensors
+    errors = {"displacement": table.displacement_std, "force": table.force_std}
+    (held_name, held_std), (name, std) = sorted(errors.items(), reverse=forced)
+    if forced:
+        steady = response(experiment.plant, frequency_hz, level, steady=table.steady)
+        if not steady.found.all():
+            raise ModelError(steady.message)
+        every = np.asarray(steady.harmonics)
+        answer, fundamental = every[step, k], every[step, 1]
+    else:
+        plant, A = experiment.plant, level[step]
+        fundamental, answer = plant.dynamic_stiffness(A, omega) * A, np.zeros(k.size, complex)
+        for harmonic in harmonics.tolist():
+            rows = k == harmonic
+            stiffness = plant.dynamic_stiffness(A[rows], omega[rows], harmonic=harmonic)
+            answer[rows] = stiffness * A[rows]
+    held = level[step] * of_held.response(omega)
+    answer = answer * of_answer.response(k * omega)
+    size = np.abs(fundamental * of_answer.response(omega))
+    true = _referred(answer, held, k)
+    one_a_step = draws.complex_normal(f"{held_name} phasor", steps.size)[step]
+    noisy_held = held * (1.0 + held_std * one_a_step)
+    turned = np.exp(1j * np.angle(answer)) * draws.complex_normal(f"{name} phasor", answer.size)
+    noisy = answer + std * size * turned
+    measured = _referred(noisy, noisy_held, k)
+    outliers = table.outlier_rows(k.size, draws)
+    angle = 2.0 * np.pi * draws.uniform("outlier direction", k.size)[outliers]
+    measured[outliers] *= 1.0 + table.outlier_size * np.exp(1j * angle)
+    amplitude, drive, shared, of_amplitude = np.abs(noisy_held), None, -true, np.abs(held)
+    if forced:
+        drive, of_amplitude = amplitude, size
+        amplitude = np.abs(noisy)[np.flatnonzero(k == 1)[step]]
+        shared = np.where(k == 1, true, 0.0)
+    known: dict[str, Any] = {}
+    if table.displacement_std > 0.0 or table.force_std > 0.0:
+        # the response changes with the size of what was held, and with its phase
+        with_held = held_std**2 * (_outer(true) + _outer(1j * k * true))
+        shared = table.displacement_std**2 * of_amplitude * shared
+        known = {
+            "covariance": with_held + (std * size / np.abs(held))[:, None, None] ** 2 * np.eye(2),
+            "dof": np.inf,
+            "amplitude_std": table.displacement_std * of_amplitude,
+            "amplitude_covariance": np.column_stack([shared.real, shared.imag]),
+        }
+    data = FrequencyResponse(
+        frequency_hz[step], measured, amplitude, drive, level=level[step], harmonic=k,
+        controlled=held_name, quantity="receptance" if forced else "dynamic_stiffness", **known,
     )  # fmt: skip
+    return data, outliers
 
 
-def _forced_phasors(
-    experiment: Experiment, drive: FloatArray, frequency_hz: FloatArray, harmonics: IntArray
-) -> Phasors:
-    """Return a row for every step and harmonic, with controlled force."""
-    assert experiment.table is not None
-    how = experiment.table.steady
-    steady = response(experiment.plant, frequency_hz, drive, steady=how)
-    if not steady.found.all():
-        raise ModelError(steady.message)
-    step, k = (g.ravel() for g in np.meshgrid(np.arange(drive.size), harmonics, indexing="ij"))
-    f, omega = frequency_hz[step], 2.0 * np.pi * frequency_hz[step]
-    sensors = experiment.acquisition
-    X = np.asarray(steady.harmonics)[step]
-    force = drive[step] * sensors.force.response(omega)
-    motion = sensors.displacement.response
-    return Phasors(
-        f, drive[step], k, step,
-        displacement=X[np.arange(step.size), k] * motion(k * omega),
-        force=force,
-        displacement_size=np.abs(X[:, 1] * motion(omega)),
-        force_size=np.abs(force),
-    )  # fmt: skip
+def _referred(answer: ComplexArray, held: ComplexArray, k: NDArray[np.int64]) -> ComplexArray:
+    """Return a harmonic over the size of what was held, turned by k times its phase."""
+    return np.asarray(answer / np.abs(held) * np.exp(-1j * k * np.angle(held)))
+
+
+def _outer(v: ComplexArray) -> FloatArray:
+    """Return the (n, 2, 2) products of a complex vector's parts with each other."""
+    parts = np.column_stack([v.real, v.imag])
+    return np.asarray(parts[:, :, None] * parts[:, None, :])

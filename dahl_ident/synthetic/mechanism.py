@@ -136,10 +136,7 @@ class SpringMotion:
         return x
 
     def _on_stroke(self, i: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return displacements where the force has some values after a turn, and the laws' forces.
-
-        Both rise with the path since the turn, so that halving finds it.
-        """
+        """Return displacements, and the laws' forces, where the force has some values."""
         heading, start = self._heading[i], self._at_turn[i]
         low, high = np.zeros(u.shape), np.abs(u - self._u[i]) / self._stiffness
         forces = np.zeros((len(self._laws), u.size))

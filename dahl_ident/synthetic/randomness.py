@@ -11,22 +11,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtri
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 
 
 class Draws:
-    """The random streams of one seed, each identified by its purpose.
-
-    Parameters
-    ----------
-    seed : int
-        Whole number >= 0.
-
-    Examples
-    --------
-    >>> Draws(1).uniform("hum", 2).round(6).tolist() == Draws(1).uniform("hum", 2).round(6).tolist()
-    True
-    """
+    """The random streams of one seed, a whole number >= 0, each identified by its purpose."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
@@ -40,6 +29,11 @@ class Draws:
     def normal(self, purpose: str, n: int) -> FloatArray:
         """Return `n` standard normal numbers."""
         return np.asarray(ndtri(self.uniform(purpose, n)))
+
+    def complex_normal(self, purpose: str, n: int) -> ComplexArray:
+        """Return `n` complex numbers of standard normal parts."""
+        parts = (self.normal(f"{purpose}, {part}", n) for part in ("real", "imaginary"))
+        return np.asarray(next(parts) + 1j * next(parts))
 
     def flicker(self, purpose: str, n: int) -> FloatArray:
         """Return `n` numbers of 1/f noise: power falling as 1/f, mean 0, expected variance 1."""
