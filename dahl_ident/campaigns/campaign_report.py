@@ -63,7 +63,7 @@ def campaign_document(
     verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
     sections = []
     if evaluated is not None:
-        verdict += [_sentence(p) for p in evaluated.parameters.values()]
+        verdict += [f"{'; '.join(str(p).splitlines())}." for p in evaluated.parameters.values()]
         sections = [Section(f"Population: {p.name}", tuple(_blocks(p))) for p in
                     evaluated.parameters.values()]  # fmt: skip
     else:
@@ -77,42 +77,24 @@ def campaign_document(
     return Document(title, status, tuple(verdict), tuple(sections), facts=facts)
 
 
-def _sentence(p: PopulationParameter) -> str:
-    mean, u = p.mean
-    relative = p.logarithmic
-    scatter = [
-        f"{100.0 * s[0]:.2g} %" if relative else f"{s[0]:.3g} {p.unit}"
-        for s in (p.between_devices, p.between_runs)
-    ]
-    text = f"{p.name}: mean {mean:.4g} {p.unit} (u = {u:.2g}), scatter between devices {scatter[0]}"
-    if p.between_runs[0]:
-        text += f", between runs {scatter[1]}"
-    if p.outlying:
-        text += f"; outside the population and not in these numbers: {', '.join(p.outlying)}"
-    if p.out_of_control:
-        fits = "1 fit" if len(p.out_of_control) == 1 else f"{len(p.out_of_control)} fits"
-        text += f"; {fits} outside the control limits"
-    return text + "."
-
-
 def _blocks(p: PopulationParameter) -> Iterator[Block]:
     label = f"{p.name} [{p.unit}]" if p.unit else p.name
     measured = f"ln {p.name}" if p.logarithmic else label
-    rows = [(words(key)[0], number(v), number(u, 2)) for key, (v, u) in p.coefficients.items()]
-    spread = [
-        (words("scatter between devices")[0], *(number(x, 3) for x in p.between_devices)),
-        *(
-            [(words("scatter between runs")[0], *(number(x, 3) for x in p.between_runs))]
-            if p.between_runs[0]
-            else []
-        ),
-    ]
+    scatters = {"devices": p.between_devices, "runs": p.between_runs}
     yield Table(
         f"{measured} at the mean of the covariates, and its change per unit of each",
         ("coefficient", "value", "standard uncertainty"),
-        tuple(rows),
+        tuple((words(k)[0], number(v), number(u, 2)) for k, (v, u) in p.coefficients.items()),
     )
-    yield Table(f"Scatter of {measured}", ("source", "median", "2.3 %", "97.7 %"), tuple(spread))
+    yield Table(
+        f"Scatter of {measured}",
+        ("source", "median", "2.3 %", "97.7 %"),
+        tuple(
+            (words(f"scatter between {where}")[0], *(number(x, 3) for x in scatter))
+            for where, scatter in scatters.items()
+            if scatter[0] or where == "devices"
+        ),
+    )
 
     def devices() -> object:
         from dahl_ident.plots import plot_devices

@@ -35,7 +35,7 @@ import re
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -239,36 +239,42 @@ def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]
         raise ValidationError("[files] has no pattern; give one, such as 'data/{device}.csv'")
     paths = _matches(folder, pattern)
     table = _covariates(folder, files.get("covariates"))
-    groups: dict[tuple[str, str], list[tuple[str, Path, dict[str, float | str]]]] = {}
-    seen: dict[tuple[str, str], Path] = {}
+    runs: dict[tuple[str, str], Task] = {}
     for path, fields in paths:
         device = fields.pop("device")
         run = fields.pop("run", path.stem)
-        if (device, run) in seen:
+        if (device, run) in runs:
             raise ValidationError(
-                f"{seen[device, run]} and {path} are both device {device!r}, run {run!r}; "
+                f"{runs[device, run].files[0]} and {path} are both device {device!r}, run {run!r}; "
                 "add what distinguishes them to the pattern, as {run}"
             )
-        seen[device, run] = path
-        values: dict[str, float | str] = {key: _value(text) for key, text in fields.items()}
-        row = _looked_up(table, device, run)
-        if both := values.keys() & row.keys():
+        row = {} if table is None else table.get((device, run), table.get((device, None)))
+        if row is None:
+            raise ValidationError(
+                f"the table of covariates has no row for device {device!r}, run {run!r}; add one"
+            )
+        if both := fields.keys() & row.keys():
             raise ValidationError(
                 f"{', '.join(sorted(both))} stands in the pattern and in the table of "
                 "covariates; leave it out of one"
             )
-        values |= row
-        groups.setdefault((device, run if per == "run" else ""), []).append((run, path, values))
-    return tuple(
-        Task(
-            device,
-            run,
-            tuple(path for _, path, _ in members),
-            tuple(label for label, _, _ in members),
-            _shared(members),
-        )
-        for (device, run), members in sorted(groups.items())
-    )
+        values = {key: _value(text) for key, text in fields.items()} | row
+        runs[device, run] = Task(device, run, (path,), (run,), values)
+    if per == "run":
+        return tuple(task for _, task in sorted(runs.items()))
+    of_devices = groupby(sorted(runs.values(), key=lambda t: t.device), key=lambda t: t.device)
+    return tuple(_joined(device, list(tasks)) for device, tasks in of_devices)
+
+
+def _joined(device: str, runs: list[Task]) -> Task:
+    """Return one fit of several runs, with the covariates that all of them share."""
+    shared = {
+        name: value
+        for name, value in runs[0].covariates.items()
+        if all(task.covariates.get(name) == value for task in runs)
+    }
+    files = tuple(path for task in runs for path in task.files)
+    return Task(device, "", files, tuple(task.run for task in runs), shared)
 
 
 def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
@@ -338,29 +344,6 @@ def _covariates(
             raise DataError(f"{path}: line {number} repeats the {both}")
         rows[key] = {c: _value(row[c]) for c in header if c not in keys}
     return rows
-
-
-def _looked_up(
-    table: Mapping[tuple[str, str | None], dict[str, float | str]] | None,
-    device: str,
-    run: str,
-) -> dict[str, float | str]:
-    if table is None:
-        return {}
-    for key in ((device, run), (device, None)):
-        if key in table:
-            return table[key]
-    raise ValidationError(
-        f"the table of covariates has no row for device {device!r}, run {run!r}; add one"
-    )
-
-
-def _shared(
-    members: list[tuple[str, Path, dict[str, float | str]]],
-) -> dict[str, float | str]:
-    """Return the covariates of a fit: of several files, those that all of them share."""
-    first = members[0][2]
-    return {k: v for k, v in first.items() if all(m[2].get(k) == v for m in members)}
 
 
 def _value(text: str) -> float | str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import (
@@ -32,21 +31,16 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.version import __version__
 
 _Tag = TypeVar("_Tag")
-PATIENCE = 120.0
-"""Seconds for which a place may not answer."""
-_WAITING = 2
-"""Jobs submitted for each worker: one in progress, one waiting."""
-_LOOK = 1.0
-"""Seconds between looks at a place from which no row came."""
-_ANSWER = 5.0
-"""Seconds in which a scheduler answers."""
+PATIENCE = 120.0  # seconds for which a place may not answer
+_WAITING = 2  # jobs submitted for each worker: one in progress, one waiting
+_LOOK = 1.0  # seconds between looks at a place from which no row came
+_ANSWER = 5.0  # seconds in which a scheduler answers
 _TIMES_MEDIAN, _LEAST = 10.0, 60.0
 _LEAST_MEMORY = 2.0
 """GB that a fit may always have where no limit was given; what is loaded takes some tenths."""
 _FIRST, _KNOWN = 600.0, 3
 """Limit of time, s, until this number of fits says how long a fit takes."""
-_RECENT = 1001
-"""Fits whose median is taken."""
+_RECENT = 1001  # fits whose median is taken
 
 
 class LostError(DataError):
@@ -91,12 +85,13 @@ class Limits:
             self._took.append(row["seconds"])
 
 
-class Place(ABC):
-    """Where jobs are done, `workers` at a time."""
+class Place:
+    """An executor that somebody else made and ends; of its state only rows are known."""
 
-    workers: int
-    connections: int = 1
-    """How often it was connected to; what was under way on an earlier connection is lost."""
+    connections = 1  # how often it was connected to; what was under way on an earlier one is lost
+
+    def __init__(self, workers: int, executor: Executor) -> None:
+        self.workers, self._executor = workers, executor
 
     def __enter__(self) -> Place:
         return self
@@ -104,66 +99,49 @@ class Place(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @abstractmethod
     def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
         """Begin a job."""
-
-    def answers(self) -> bool:
-        """Return whether the place is known to work; asked when no row came for a while."""
-        return True
-
-    def patience(self, given: float, seconds: float) -> float:
-        """Return for how long it may not answer while jobs of so many seconds are under way."""
-        return given
-
-    def close(self) -> None:
-        """Give back what the place holds; nothing in general."""
-        return
-
-
-class Local(Place):
-    """Processes of this machine."""
-
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
-        self._threads = ThreadPoolExecutor(workers)
-
-    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
-        """Begin a job in a thread that waits for its process."""
-        share = memory or max(worker.machine_memory() / self.workers, _LEAST_MEMORY)
-        return self._threads.submit(worker.do_within, job, seconds, share)
-
-    def close(self) -> None:
-        """End processes, but for one that the next campaign may use."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        worker.end_busy()
-        self._threads.shutdown(wait=True)
-        worker.end_idle(keep=1)
-
-
-class Given(Place):
-    """An executor that somebody else made and ends; of its state only rows are known."""
-
-    def __init__(self, executor: Executor, workers: int) -> None:
-        self.workers, self._executor = workers, executor
-
-    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
-        """Begin a job on the executor."""
         try:
             return self._executor.submit(worker.do_within, job, seconds, memory)
         except RuntimeError as exc:  # among them BrokenExecutor
-            raise LostError(f"the executor takes no jobs any more: {exc}") from exc
+            raise LostError(f"{self} takes no jobs any more: {exc}") from exc
 
     def answers(self) -> bool:
-        """Return that nothing is known."""
+        """Return whether the place is known to work; asked when no row came for a while."""
         return False
+
+    def patience(self, patience: float, seconds: float) -> float:
+        """Return for how long it may not answer while jobs of so many seconds are under way."""
+        return patience + seconds
+
+    def close(self) -> None:
+        """Give back what the place holds."""
 
     def __str__(self) -> str:
         return "the executor"
 
-    def patience(self, given: float, seconds: float) -> float:
-        """Return the time in which it must have ended one of its jobs."""
-        return given + seconds
+
+class Local(Place):
+    """Processes of this machine, each behind a thread that waits for it."""
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(workers, ThreadPoolExecutor(workers))
+
+    def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
+        """Begin a job with its share of the memory."""
+        share = memory or max(worker.machine_memory() / self.workers, _LEAST_MEMORY)
+        return super().submit(job, seconds, share)
+
+    def answers(self) -> bool:
+        """Return that it works."""
+        return True
+
+    def close(self) -> None:
+        """End processes, but for one that the next campaign may use."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+        worker.end_busy()
+        self._executor.shutdown(wait=True)
+        worker.end_idle(keep=1)
 
 
 class Scheduler(Place):
@@ -175,7 +153,8 @@ class Scheduler(Place):
             self._client = self._connected()
         except (OSError, ValueError, TypeError, RuntimeError) as exc:  # TypeError: no certificate
             raise ValidationError(f"scheduler {address}: no scheduler answers: {exc}") from exc
-        self.workers = workers or sum(self._client.ncores().values()) or 1
+        count = workers or sum(self._client.ncores().values()) or 1
+        super().__init__(count, self._client.get_executor(pure=False))
         self._refuse_other_versions()
 
     def _connected(self) -> Any:
@@ -200,11 +179,8 @@ class Scheduler(Place):
             )
 
     def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
-        """Begin a job on a worker."""
-        future: Future[Row] = self._client.get_executor(pure=False).submit(
-            worker.do_within, job, seconds, memory
-        )
-        return future
+        """Begin a job on a worker; what a broken connection says is not the end of the place."""
+        return self._executor.submit(worker.do_within, job, seconds, memory)
 
     def answers(self) -> bool:
         """Return whether the scheduler has workers; connect again where the connection is lost."""
@@ -212,12 +188,16 @@ class Scheduler(Place):
             if self._client.status != "running":
                 client = self._connected()
                 self.close()
-                self._client = client
+                self._client, self._executor = client, client.get_executor(pure=False)
                 self.connections += 1
             cores = self._client.sync(self._client.scheduler.ncores, callback_timeout=_ANSWER)
         except Exception:  # whatever a library says about a connection that is broken
             return False
         return bool(cores)
+
+    def patience(self, patience: float, seconds: float) -> float:
+        """Return the time given, because a scheduler answers while jobs are under way."""
+        return patience
 
     def close(self) -> None:
         """End the connection."""

@@ -34,23 +34,19 @@ if TYPE_CHECKING:
 
 USABLE = ("trusted", "approximate")
 """Statuses whose numbers and uncertainties can be used."""
-_NODES = 31
-"""Of the grid in tau and in omega; twice as many change no interval by 1 %."""
-_GONE = 14.0
-"""Drop of the log-likelihood, a factor of a million, at which the grid ends."""
-_MOST = 20.0
-"""Largest tau that REML tries, in standard deviations of the data."""
-_FALSE_ALARMS = 0.01
-"""Probability that any device is called outlying although none is."""
+_NODES = 31  # of the grid in tau and in omega; twice as many change no interval by 1 %
+_GONE = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
+_MOST = 20.0  # largest tau that REML tries, in standard deviations of the data
+_FALSE_ALARMS = 0.01  # probability that any device is called outlying although none is
+# Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations
 EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
-"""Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations."""
+# Mean difference of two normal numbers, in standard deviations (1.128)
 _MOVING_RANGE = 2.0 / np.sqrt(np.pi)
-"""Mean difference of two normal numbers, in standard deviations (1.128)."""
 
 
 @dataclass(frozen=True)
-class _Sums:
-    """The data of one parameter, with devices numbered."""
+class _Fits:
+    """The fits of one parameter, with devices numbered."""
 
     y: FloatArray
     u2: FloatArray
@@ -58,40 +54,38 @@ class _Sums:
     device: NDArray[np.intp]
     devices: int
 
-    @property
-    def repeated(self) -> bool:
-        """Whether some device has several fits."""
-        return len(self.y) > self.devices
+    @classmethod
+    def of(cls, y: FloatArray, u2: FloatArray, X: FloatArray, device: NDArray[Any]) -> _Fits:
+        labels, numbers = np.unique(device, return_inverse=True)
+        return cls(y, u2, X, numbers, labels.size)
 
-    def of(self, kept: NDArray[np.bool_]) -> _Sums:
-        """Return the same of some fits."""
-        labels, device = np.unique(self.device[kept], return_inverse=True)
-        return _Sums(self.y[kept], self.u2[kept], self.X[kept], device, labels.size)
+    def only(self, kept: NDArray[np.bool_]) -> _Fits:
+        return _Fits.of(self.y[kept], self.u2[kept], self.X[kept], self.device[kept])
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Return the sums of values, (n,) or (n, c), of each device's fits."""
+        each = [np.bincount(self.device, v, self.devices) for v in np.atleast_2d(values.T)]
+        return np.asarray(each[0] if values.ndim == 1 else np.stack(each, axis=-1))
 
     def at(self, tau: float, omega: float) -> _Solution:
         """Return the generalised least squares solution at given scatters."""
         w = 1.0 / (omega**2 + self.u2)
-        total = self.of_devices(w)
+        total = self.sums(w)
         shrink = tau**2 / (1.0 + tau**2 * total)
         columns = np.column_stack([self.X, self.y])
-        sums = self.of_devices(w[:, None] * columns)
+        sums = self.sums(w[:, None] * columns)
         G = columns.T @ (w[:, None] * columns) - sums.T @ (shrink[:, None] * sums)
         C = np.asarray(np.linalg.inv(G[:-1, :-1]), dtype=np.float64)
         b = C @ G[:-1, -1]
         log_det = -np.log(w).sum() + np.log1p(tau**2 * total).sum()
         squares = G[-1, -1] - G[:-1, -1] @ b
         log_likelihood = -0.5 * (log_det - np.linalg.slogdet(C)[1] + squares)
-        away = self.of_devices(w * (self.y - self.X @ b)) / total
+        away = self.sums(w * (self.y - self.X @ b)) / total
         return _Solution(tau, b, C, float(log_likelihood), away, 1.0 / total)
-
-    def of_devices(self, values: FloatArray) -> FloatArray:
-        """Return the sums of values of each device's fits."""
-        sums = [np.bincount(self.device, v, self.devices) for v in np.atleast_2d(values.T)]
-        return np.asarray(np.squeeze(np.stack(sums, axis=-1)), dtype=np.float64)
 
 
 class _Solution(NamedTuple):
-    """Coefficients b with their covariance C, and the mean residual of each device."""
+    """Coefficients b with covariance C, mean residuals of devices and their variance by fits."""
 
     tau: float
     b: FloatArray
@@ -99,18 +93,13 @@ class _Solution(NamedTuple):
     log_likelihood: float
     away: FloatArray
     variance: FloatArray
-    """Of the mean residuals, scatter between devices not included."""
 
     def shrunken(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return estimates of the devices, of mean covariates x, and their variances."""
         pull = self.tau**2 / (self.tau**2 + self.variance)
-        rest = (1.0 - pull)[:, None] * x
-        variance = pull * self.variance + np.einsum("ij,jk,ik->i", rest, self.C, rest)
+        left = (1.0 - pull)[:, None] * x
+        variance = pull * self.variance + np.einsum("ij,jk,ik->i", left, self.C, left)
         return x @ self.b + pull * self.away, variance
-
-    def distances(self) -> FloatArray:
-        """Return each device's distance from the population in its standard deviations."""
-        return np.asarray(self.away / np.sqrt(self.tau**2 + self.variance))
 
 
 @dataclass(frozen=True)
@@ -185,7 +174,11 @@ class PopulationParameter:
             if high > 0.0:
                 limits = interval(low, high, unit)
                 lines.append(f"scatter of {what} between {where}: {median:.2g} ({limits})")
-        lines.append(f"outside the population: {', '.join(self.outlying) or 'no device'}")
+        if self.out_of_control:
+            lines.append(f"fits outside the control limits: {len(self.out_of_control)}")
+        outlying = ", ".join(self.outlying)
+        told = f"{outlying}, not in these numbers" if outlying else "no device"
+        lines.append(f"outside the population: {told}")
         return "\n".join(lines)
 
     @property
@@ -364,35 +357,35 @@ def _one(
             f"the covariates {', '.join(covariates)} are constant or follow from each other in "
             "these fits; leave one out"
         )
-    whole = _Sums(y, u**2, X, device, len(labels))
+    whole = _Fits(y, u**2, X, device, len(labels))
     p, outlying = _outlying(whole)
     inside = ~outlying[device]
     X[:, 1:] -= X[inside, 1:].mean(axis=0)
-    posterior = _Posterior.of(whole.of(inside))
-    tau, omega = posterior.scatters()
-    own = whole.of_devices(y / u**2) / whole.of_devices(u**-2)
+    posterior = _Posterior.of(whole.only(inside))
+    tau, omega = posterior.scatters
+    own = whole.sums(y / u**2) / whole.sums(u**-2)
     w = 1.0 / (omega[0] ** 2 + u**2)
-    alone = whole.of_devices(w)
-    shrunken, variance = whole.of_devices(w * y) / alone, 1.0 / alone
-    shrunken[~outlying], variance[~outlying] = posterior.devices()
+    alone = whole.sums(w)
+    shrunken, variance = whole.sums(w * y) / alone, 1.0 / alone
+    shrunken[~outlying], variance[~outlying] = posterior.devices, posterior.variance
     devices = pd.DataFrame({"own": own, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels)
     devices["p"], devices["outlying"] = p, outlying
     if logarithmic:
         devices["u"] *= np.exp(devices["shrunken"])
         devices[["own", "shrunken"]] = np.exp(devices[["own", "shrunken"]])
-    b, C = posterior.coefficients()
+    b, u_b = posterior.b, np.sqrt(np.diag(posterior.C))
     charts = _charts(y - X[:, 1:] @ b[1:], device, inside, ordered)
     return PopulationParameter(
-        name,
-        str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
-        logarithmic,
-        dict(zip(["mean", *covariates], zip(b.tolist(), np.sqrt(np.diag(C)).tolist(), strict=True),
-                 strict=True)),
-        tau,
-        omega,
-        devices,
-        ordered,
-        pd.DataFrame({"device": table["device"].to_numpy(), **charts}),
+        name=name,
+        unit=str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
+        logarithmic=logarithmic,
+        coefficients={n: (float(v), float(e)) for n, v, e in zip(["mean", *covariates], b, u_b,
+                                                                 strict=True)},
+        between_devices=tau,
+        between_runs=omega,
+        devices=devices,
+        ordered=ordered,
+        fits=pd.DataFrame({"device": table["device"].to_numpy(), **charts}),
     )  # fmt: skip
 
 
@@ -410,52 +403,42 @@ def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
 
 
 class _Posterior(NamedTuple):
-    """Solutions on a grid of tau and omega, with weights of sum 1."""
+    """Averages over the posterior of tau and omega under flat priors."""
 
-    data: _Sums
-    nodes: tuple[FloatArray, FloatArray]
-    solutions: list[_Solution]
-    weights: FloatArray
+    b: FloatArray
+    C: FloatArray
+    devices: FloatArray
+    variance: FloatArray
+    scatters: list[tuple[float, float, float]]
 
     @classmethod
-    def of(cls, data: _Sums) -> _Posterior:
-        """Return the posterior under flat priors of tau and omega."""
+    def of(cls, data: _Fits) -> _Posterior:
+        """Return means and covariances, and median and 95.45 % limits of tau and omega."""
         mode = _reml(data)
-        nodes = (_nodes(data, mode, 0), _nodes(data, mode, 1) if data.repeated else np.zeros(1))
-        solutions = [data.at(tau, omega) for tau in nodes[0] for omega in nodes[1]]
-        values = np.array([solution.log_likelihood for solution in solutions])
+        repeated = len(data.y) > data.devices
+        nodes = [_nodes(data, mode, 0), _nodes(data, mode, 1) if repeated else np.zeros(1)]
+        every = [data.at(tau, omega) for tau in nodes[0] for omega in nodes[1]]
+        values = np.array([solution.log_likelihood for solution in every])
         widths = [np.gradient(n) if n.size > 1 else np.ones(1) for n in nodes]
         weights = np.exp(values - values.max()) * np.outer(*widths).ravel()
-        return cls(data, nodes, solutions, weights / weights.sum())
-
-    def coefficients(self) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of b."""
-        b, C = (np.array([getattr(s, name) for s in self.solutions]) for name in ("b", "C"))
-        mean = self.weights @ b
-        away = b - mean
-        return mean, np.tensordot(self.weights, C, 1) + (self.weights[:, None] * away).T @ away
-
-    def devices(self) -> tuple[FloatArray, FloatArray]:
-        """Return mean and variance of each device."""
-        fits = self.data.of_devices(np.ones(len(self.data.y)))
-        x = self.data.of_devices(self.data.X).reshape(len(fits), -1) / fits[:, None]
-        estimates = [solution.shrunken(x) for solution in self.solutions]
-        values, variances = (np.array(part) for part in zip(*estimates, strict=True))
-        mean = self.weights @ values
-        return mean, self.weights @ (variances + (values - mean) ** 2)
-
-    def scatters(self) -> list[tuple[float, float, float]]:
-        """Return median and 95.45 % limits of tau and of omega; zero where there is one node."""
-        weights = self.weights.reshape(len(self.nodes[0]), -1)
-        scatters = []
-        for nodes, marginal in zip(self.nodes, (weights.sum(1), weights.sum(0)), strict=True):
+        weights /= weights.sum()
+        b, C = (np.array([getattr(one, name) for one in every]) for name in ("b", "C"))
+        mean = weights @ b
+        covariance = np.tensordot(weights, C, 1) + (weights[:, None] * (b - mean)).T @ (b - mean)
+        x = data.sums(data.X) / data.sums(np.ones(len(data.y)))[:, None]
+        each = [one.shrunken(x) for one in every]
+        devices, variances = (np.array(part) for part in zip(*each, strict=True))
+        shrunken = weights @ devices
+        variance = weights @ (variances + (devices - shrunken) ** 2)
+        grid, scatters = weights.reshape(len(nodes[0]), -1), []
+        for places, marginal in zip(nodes, (grid.sum(1), grid.sum(0)), strict=True):
             cumulative = np.cumsum(marginal) - 0.5 * marginal
-            low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, nodes)
+            low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, places)
             scatters.append((float(middle), float(low), float(high)))
-        return scatters
+        return cls(mean, covariance, shrunken, variance, scatters)
 
 
-def _reml(data: _Sums) -> tuple[float, float]:
+def _reml(data: _Fits) -> tuple[float, float]:
     """Return the restricted maximum-likelihood estimates of tau and omega, each 0 or more."""
     spread = float(np.sqrt(np.var(data.y) + data.u2.min()))
 
@@ -463,7 +446,7 @@ def _reml(data: _Sums) -> tuple[float, float]:
         tau, omega = np.abs(x) * spread  # even in both, so that zero is an ordinary point
         return -data.at(tau, omega).log_likelihood
 
-    if not data.repeated:
+    if len(data.y) == data.devices:
         best = optimize.minimize_scalar(
             lambda t: objective(np.array([t, 0.0])), bounds=(0.0, _MOST), method="bounded"
         )
@@ -474,7 +457,7 @@ def _reml(data: _Sums) -> tuple[float, float]:
     return float(tau), float(omega)
 
 
-def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
+def _nodes(data: _Fits, mode: tuple[float, float], axis: int) -> FloatArray:
     """Return nodes from zero to where the likelihood is negligible, finer near zero."""
     point = list(mode)
     top = data.at(*point).log_likelihood
@@ -484,7 +467,7 @@ def _nodes(data: _Sums, mode: tuple[float, float], axis: int) -> FloatArray:
     return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
 
 
-def _outlying(data: _Sums) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _outlying(data: _Fits) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return each device's p value against all others, and which are outlying.
 
     Outlying devices are removed one by one, the most distant first, so that they do not mask one
@@ -494,9 +477,10 @@ def _outlying(data: _Sums) -> tuple[FloatArray, NDArray[np.bool_]]:
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
     for _ in range(data.devices // 2):
-        worst = int(np.argmax(np.abs(kept.at(*_reml(kept)).distances())))
+        found = kept.at(*_reml(kept))
+        worst = int(np.argmax(found.away**2 / (found.tau**2 + found.variance)))
         fits = kept.device == worst
-        others = kept.of(~fits)
+        others = kept.only(~fits)
         freedom = others.devices - others.X.shape[1]
         if freedom < 2 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
             break

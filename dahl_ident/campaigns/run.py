@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +16,6 @@ from dahl_ident.arrays import positive_number, whole_number
 from dahl_ident.campaigns.definition import Definition, Task, read_definition
 from dahl_ident.campaigns.engine import (
     PATIENCE,
-    Given,
     Limits,
     Local,
     LostError,
@@ -38,8 +37,7 @@ if TYPE_CHECKING:
 
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
-_TRIALS = 3
-"""Fits that say whether the options of a new campaign can be used at all."""
+_TRIALS = 3  # fits that say whether the options of a new campaign can be used at all
 
 
 @dataclass(frozen=True)
@@ -281,7 +279,7 @@ def _place(jobs: int | None, executor: Executor | None, scheduler: str | None) -
     if scheduler is not None:
         return Scheduler(scheduler, jobs)
     if executor is not None:
-        return Given(executor, jobs or default_workers())
+        return Place(jobs or default_workers(), executor)
     return Local(jobs or default_workers())
 
 
@@ -418,19 +416,16 @@ def _keys(definition: Definition, limits: Limits) -> list[str]:
 
 def _digest(path: Path, seconds: float) -> str:
     """Return the digest of a file whose medium may hang."""
-    outcome: list[str | DataError] = []
+    digest: Future[str] = Future()
 
     def read() -> None:
         try:
-            outcome.append(digest_of(path))
+            digest.set_result(digest_of(path))
         except DataError as exc:
-            outcome.append(exc)
+            digest.set_exception(exc)
 
-    thread = threading.Thread(target=read, daemon=True)
-    thread.start()
-    thread.join(seconds)
-    if not outcome:
-        raise DataError(f"{path}: cannot be read within {seconds:.3g} s")
-    if isinstance(outcome[0], DataError):
-        raise outcome[0]
-    return outcome[0]
+    threading.Thread(target=read, daemon=True).start()
+    try:
+        return digest.result(seconds)
+    except TimeoutError:
+        raise DataError(f"{path}: cannot be read within {seconds:.3g} s") from None

@@ -21,8 +21,7 @@ from collections.abc import Iterator
 from dahl_ident.campaigns.work import THREADS, Job, Row, do, failed
 from dahl_ident.version import __version__
 
-_DEATHS = 3
-"""Deaths of a process after which its job is taken as the cause."""
+_DEATHS = 3  # deaths of a process after which its job is taken as the cause
 _START = "import sys; sys.path[:] = {!r}; from dahl_ident.campaigns.worker import serve; serve()"
 
 

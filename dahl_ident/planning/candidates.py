@@ -57,8 +57,11 @@ class Candidates:
 
     @property
     def offsets(self) -> FloatArray:
-        """Derivatives with respect to the gain and phase of a run, (S, K, 2, 2)."""
-        return np.asarray(np.eye(2) * self.weight)
+        """Derivatives with respect to the gain and phase of a run, (S, K, m, 2).
+
+        Of the fundamental's two rows, which are the first ones; harmonics have errors of their own.
+        """
+        return np.asarray(np.eye(self.rows.shape[2], 2) * self.weight)
 
     def only(self, chosen: NDArray[Any]) -> Candidates:
         """Return some of the candidates."""

@@ -163,26 +163,12 @@ def continuous_design(
     iterations: int = 400,
 ) -> ContinuousDesign:
     """Return the best seconds at each candidate, settling and change-over left out."""
-    K = len(frequency_hz)
-    seconds, active = np.full(K, time / K), np.arange(K)
-    value, excess = np.array(-np.inf), np.inf
-    for _ in range(30):
-        sub, f = objective.only(active), frequency_hz[active]
-        seconds[active] = _shared(sub, f, time, seconds[active], iterations // 10, tolerance)
-        value, sensitivities = sub.at(seconds[active] * f)
-        rate = objective.gradient(sensitivities) * frequency_hz
-        mean = float(rate @ seconds) / time
-        excess = float(rate.max() / mean) - 1.0
-        if excess < tolerance:
-            break
-        # candidates that cannot matter are set aside; those that should be measured return
-        resting = (seconds < 1e-4 * seconds.max()) & (rate < 0.9 * mean)
-        seconds[resting] = 0.0
-        missing = ~resting & (seconds == 0.0) & (rate > mean)
-        seconds[missing] = 1e-3 * time / max(int(missing.sum()), 1)
-        seconds *= time / seconds.sum()
-        active = np.flatnonzero(seconds)
-    return ContinuousDesign(seconds, float(value), excess)
+    even = np.full(len(frequency_hz), time / len(frequency_hz))
+    seconds = _shared(objective, frequency_hz, time, even, iterations, tolerance)
+    value, sensitivities = objective.at(seconds * frequency_hz)
+    rate = objective.gradient(sensitivities) * frequency_hz
+    excess = rate.max() / (rate @ seconds / time) - 1.0
+    return ContinuousDesign(seconds, float(value), float(excess))
 
 
 def _shared(

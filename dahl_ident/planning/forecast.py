@@ -58,6 +58,7 @@ class Forecast:
     directions: Mapping[str, FloatArray]
     scatter: float  # standard deviation of ln gain and phase between runs
     model_error: str  # {"none", "assumed", "estimated"} of the earlier fit
+    departures: int  # W
 
     @classmethod
     def of(cls, question: Question, candidates: Candidates) -> Forecast:
@@ -81,13 +82,9 @@ class Forecast:
         if RESPONSE in question.target:
             directions[RESPONSE] = _response(candidates)
         return cls(
-            knowledge, candidates, known, searched, directions, question.scatter, model_error
-        )
-
-    @property
-    def departures(self) -> int:
-        """W."""
-        return int(self.before.shape[-1]) - len(self.knowledge.names)
+            knowledge, candidates, known, searched, directions, question.scatter, model_error,
+            departures=known.shape[-1] - units.size,
+        )  # fmt: skip
 
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""

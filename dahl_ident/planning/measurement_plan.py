@@ -292,8 +292,12 @@ class Plan:
 
     def __str__(self) -> str:
         """Return the plan as text."""
-        lines = [_headline(self), "", *(self._motions() or self._levels())]
-        columns = ("", "value", "before", "after", "wanted")
+        number, sines = len(self.steps), self.steps[0].motion is None
+        head = f"{number} {'level' if sines else 'motion'}{'s' if number != 1 else ''}"
+        head = f"{self.runs} runs of {head}" if self.runs > 1 else head
+        end = "; meets the target" if self.reached else "; does NOT meet the target"
+        lines = [f"{head} in {self.seconds:.4g} s{end if self.target else ''}.", ""]
+        lines += self._levels() if sines else self._motions()
         rows = [
             (
                 name,
@@ -304,11 +308,10 @@ class Plan:
             )
             for name, e in self.expected.items()
         ]
-        lines.append("")
-        lines += [f"{c[0]:24}" + "".join(f"{text:>11}" for text in c[1:]) for c in (columns, *rows)]
-        lines.append("Relative standard uncertainties; U(...) expanded, 95.45 %."
-                     if any(name.startswith("U(") for name in self.expected)
-                     else "Relative standard uncertainties.")  # fmt: skip
+        lines += ["", *_aligned([("", "value", "before", "after", "wanted"), *rows], 24, [11] * 4)]
+        expanded = any(name.startswith("U(") for name in self.expected)
+        kinds = "; U(...) expanded, 95.45 %." if expanded else "."
+        lines += [f"Relative standard uncertainties{kinds}"]
         lines += [f"{text}." for text in self.undetermined]
         lines += self._spare()
         lines.append(f"Assumed: {'; '.join(self.assumptions)}.")
@@ -330,37 +333,37 @@ class Plan:
         return lines
 
     def _levels(self) -> list[str]:
-        heading = (
-            f"{'':4}{'level [' + self._unit + ']':>13}{'[Hz]':>10}{'settling':>10}"
-            f"{'measured':>10}{'time [s]':>10}"
-        )
-        return [heading] + [
-            f"{i:<4}{s.level:>13.4g}{s.frequency_hz:>10.4g}{s.settling_cycles:>10d}"
-            f"{s.measured_cycles:>10d}{s.seconds:>10.1f}"
+        heading = ("", f"level [{self._unit}]", "[Hz]", "settling", "measured", "time [s]")
+        rows = [
+            (str(i), f"{s.level:.4g}", f"{s.frequency_hz:.4g}", str(s.settling_cycles),
+             str(s.measured_cycles), f"{s.seconds:.1f}")
             for i, s in enumerate(self.steps, start=1)
-        ]
+        ]  # fmt: skip
+        return _aligned([heading, *rows], 4, [13, 10, 10, 10, 10])
 
     def _motions(self) -> list[str]:
-        """Return the table of motions in time; empty for sines."""
         moving = [(s, s.motion) for s in self.steps if s.motion is not None]
-        if not moving:
-            return []
         names = {
             n: f"{n} [{shown_unit(trajectories.UNITS[n], self.motion)}]"
             for _, motion in moving for n in motion.parameters
         }  # fmt: skip
         rows = [
-            (motion.kind,
+            (str(i), motion.kind,
              *(f"{motion.parameters[n]:.4g}" if n in motion.parameters else "-" for n in names),
              f"{1.0 / s.frequency_hz:.4g}", str(s.measured_cycles), f"{s.seconds:.1f}")
-            for s, motion in moving
+            for i, (s, motion) in enumerate(moving, start=1)
         ]  # fmt: skip
-        heading = ("motion", *names.values(), "one [s]", "repeats", "time [s]")
-        widths = [max(len(h), *(len(r[i]) for r in rows)) for i, h in enumerate(heading)]
-        return [
-            f"{number:<4}" + "  ".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True))
-            for number, row in zip(("", *range(1, len(rows) + 1)), (heading, *rows), strict=True)
-        ]
+        table = [("", "motion", *names.values(), "one [s]", "repeats", "time [s]"), *rows]
+        first, *widths = (max(map(len, column)) for column in list(zip(*table, strict=True))[1:])
+        return _aligned(table, 4, [first, *(w + 2 for w in widths)])
+
+
+def _aligned(rows: Sequence[Sequence[str]], first: int, widths: Sequence[int]) -> list[str]:
+    """Return rows of text, the first column to the left."""
+    return [
+        f"{row[0]:{first}}" + "".join(f"{t:>{w}}" for t, w in zip(row[1:], widths, strict=True))
+        for row in rows
+    ]
 
 
 def _row(step: PlanStep) -> dict[str, Any]:
@@ -373,13 +376,3 @@ def _row(step: PlanStep) -> dict[str, Any]:
         "motion": motion.kind, **motion.parameters, "period": motion.period,
         "repeats": step.measured_cycles, "seconds": step.seconds,
     }  # fmt: skip
-
-
-def _headline(plan: Plan) -> str:
-    what = "level" if plan.steps[0].motion is None else "motion"
-    levels = f"{len(plan.steps)} {what}{'s' if len(plan.steps) != 1 else ''}"
-    runs = f"{plan.runs} runs of {levels}" if plan.runs > 1 else levels
-    end = ""
-    if plan.target:
-        end = "; meets the target" if plan.reached else "; does NOT meet the target"
-    return f"{runs} in {plan.seconds:.4g} s{end}."

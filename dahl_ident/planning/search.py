@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from dahl_ident.planning.forecast import Expected, Forecast, typical
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import Question
-from dahl_ident.planning.suspects import Suspects
+from dahl_ident.planning.suspects import forecast_of_suspects
 
 _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
@@ -67,9 +67,10 @@ class Search:
             self.bench = BenchTime.of(candidates, knowledge, **question.costs)
         self.forecast = Forecast.of(question, candidates)
         few = self.forecast.thinned()
-        self._term, self._suspects = few.term(question.target), None
+        self._terms, self._suspects = [few.term(question.target)], None
         if question.larger is not None:
-            self._suspects = Suspects.of(question, few.knowledge, few.candidates)
+            self._suspects = forecast_of_suspects(question, few.knowledge, few.candidates)
+            self._terms.append(self._suspects.term(question.suspects))
         self._pool: NDArray[np.intp] | None = None
 
     def best(self) -> Solution:
@@ -125,10 +126,8 @@ class Search:
         return best
 
     def _objective(self, weight: float = 0.0, runs: int = 1) -> Objective:
-        terms = [replace(self._term, weight=1.0 - weight)]
-        if self._suspects is not None and weight > 0.0:
-            terms.append(replace(self._suspects.term, weight=weight))
-        return Objective(tuple(terms), runs)
+        weighted = zip(self._terms, (1.0 - weight, weight), strict=False)
+        return Objective(tuple(replace(term, weight=w) for term, w in weighted if w > 0.0), runs)
 
     @cached_property
     def _coverage(self) -> Coverage:
@@ -172,16 +171,14 @@ class Search:
 
     def ratio(self, solution: Solution) -> float:
         """Return the largest ratio of an uncertainty to its target, suspects included."""
-        worst = self.suspect_ratio(solution)
-        if self.question.has_numbers:
-            after, _ = self.forecast.after(*solution.design)
-            target = self.question.target
-            worst = max(worst, *(typical(after[name]) / u for name, u in target.items()))
-        return worst
+        numbers = self.question.target if self.question.has_numbers else {}
+        return max(_ratio(self.forecast, numbers, solution), self.suspect_ratio(solution))
 
     def suspect_ratio(self, solution: Solution) -> float:
         """Return the largest ratio of a suspected parameter's uncertainty to its target."""
-        return 0.0 if self._suspects is None else self._suspects.ratio(*solution.design)
+        if self._suspects is None:
+            return 0.0
+        return _ratio(self._suspects, self.question.suspects, solution)
 
     def least_time(self) -> Solution | None:
         """Return the shortest plan that reaches the targets, or the best in the time allowed.
@@ -281,3 +278,9 @@ class Search:
         room = time / runs - self.bench.fixed(ordered)
         cycles = np.floor(room / float((1.0 / c.frequency_hz[ordered]).sum()))
         return None if cycles < 1.0 else (ordered, np.full(len(ordered), cycles), runs)
+
+
+def _ratio(forecast: Forecast, target: Mapping[str, float], solution: Solution) -> float:
+    """Return the largest ratio of an uncertainty to its target, 0 without any."""
+    after = forecast.after(*solution.design)[0] if target else {}
+    return max((typical(after[name]) / u for name, u in target.items()), default=0.0)
