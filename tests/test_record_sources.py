@@ -84,9 +84,13 @@ def test_calibrations_count_as_they_move_the_estimate(
         "delay": replace(record, displacement=CubicSpline(record.time, x)(record.time - u)),
     }[channel]
     law, start = di.Dahl(alpha=1.0), {"f_max": 0.1, "sigma": 30.0 if output == "force" else 300.0}
-    sensors = di.Sensors(**{channel: stats.norm(0.0 if channel == "delay" else 1.0, u)})
+    stated = {"delay": stats.norm(0.0, 1e-9)}  # else it is estimated
+    if channel == "delay":
+        sensors = di.Sensors(delay=stats.norm(0.0, u))
+    else:
+        sensors = di.Sensors(**{channel: stats.norm(1.0, u)}, **stated)
     fit = di.fit(record, law + model, sensors=sensors, start=start)
-    moved = di.fit(wrong, law + model, start=start)
+    moved = di.fit(wrong, law + model, sensors=di.Sensors(**stated), start=start)
     for name in ("f_max", "sigma"):
         shift = abs(moved.params[name].value - fit.params[name].value)
         row = sources(fit, name)[source]
@@ -190,3 +194,101 @@ def test_the_posterior_of_an_approximate_fit_is_approximate() -> None:
     assert found.status.value == "approximate"
     assert "The misfit exceeds the noise." in found.verdict
     assert "alpha between 0.5 and 2" in found.verdict
+
+
+def moving(seed: int, size: float = 8e-3, samples: int = 1500) -> tuple[FloatArray, FloatArray]:
+    """Return times ten times as close as samples at 500 Hz, and a multisine of a dozen lines."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(-2000, 10 * samples) / (10.0 * RATE)
+    lines = rng.uniform(0.4, 6.0, (12, 1)) * t + rng.random((12, 1))
+    return t, np.asarray(size / 12**0.5 * np.sin(2.0 * np.pi * lines).sum(axis=0))
+
+
+def held(
+    law: di.Dahl, seed: int, *, delay: float = 0.0, power: float = 0.0, size: float = 8e-3
+) -> di.Record:
+    """Return a record with 0.5 % noise whose motion lags the force by so many samples.
+
+    The friction rises with a power of the speed.
+    """
+    t, x = moving(seed, size)
+    force = law.force(x) * (np.abs(np.gradient(x, t)) / 0.05) ** power
+    at = t[2000::10]
+    shown = np.interp(at - delay / RATE, t, x)
+    noise = 5e-4 * np.random.default_rng(seed + 100).standard_normal(at.size)
+    return di.Record(at, displacement=shown, force=force[2000::10] + noise)
+
+
+@pytest.mark.parametrize("delay", [-0.5, 0.05, 0.5])
+def test_a_delay_that_nobody_stated_is_estimated(delay: float) -> None:
+    for seed in range(3):
+        fit = di.fit(held(DAHL, seed, delay=delay), di.Dahl())
+        assert fit.trusted, fit.verdict
+        for name, value in (("f_max", 0.1), ("sigma", 30.0)):
+            assert abs(fit.params[name].value - value) < 3.0 * (fit.params[name].stderr or 0.0)
+    assert "delay between the channels" in sources(fit, "sigma")
+    if abs(delay) == 0.5:
+        assert "The motion lags the force by" in fit.verdict
+    again = di.RecordFit.from_json(fit.to_json())
+    assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
+
+
+def test_a_delay_of_a_driven_motion_is_estimated() -> None:
+    clean = driven(3, 1e-3, 1024)
+    x = np.asarray(clean.displacement)
+    late = CubicSpline(clean.time, x)(clean.time - 0.5 / RATE)
+    record = replace(clean, displacement=late)
+    fit = di.fit(record, di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring())
+    for name, value in (("f_max", 0.1), ("sigma", 300.0), ("damping", 0.5), ("stiffness", 50.0)):
+        assert abs(fit.params[name].value - value) < 4.0 * (fit.params[name].stderr or 0.0)
+
+
+@pytest.mark.parametrize("power", [0.02, 0.1])
+def test_friction_that_rises_a_little_with_speed_is_covered(power: float) -> None:
+    fit = di.fit(held(DAHL, 1, power=power), di.Dahl())
+    assert fit.status.usable
+    assert fit.trusted == (power == 0.02)
+    for name, value in (("f_max", 0.1), ("sigma", 30.0)):
+        assert abs(fit.params[name].value - value) < 2.5 * (fit.params[name].stderr or 0.0)
+
+
+@pytest.mark.parametrize("alpha", [0.8, 1.3])
+def test_an_exponent_stated_wrongly_is_not_described(alpha: float) -> None:
+    fit = di.fit(held(di.Dahl(0.1, 30.0, alpha=alpha), 1), di.Dahl(alpha=1.0))
+    assert fit.status == "not described"
+    assert "The records contradict alpha = 1, which was stated" in fit.verdict
+    right = di.fit(held(di.Dahl(0.1, 30.0, alpha=alpha), 1), di.Dahl(alpha=alpha))
+    assert right.trusted, right.verdict
+
+
+def test_the_window_of_differentiation_is_in_the_budget() -> None:
+    """A mass that moves in jerks, of which the filter of the acceleration takes a part away."""
+    t, x = moving(4)
+    x = x + 5e-6 * np.sin(2.0 * np.pi * 40.0 * t)
+    force = DAHL.force(x) + 0.1 * np.gradient(np.gradient(x, t), t)
+    at = slice(2000, None, 2)
+    noise = np.random.default_rng(0).standard_normal((2, x[at].size))
+    record = di.Record(
+        t[at], displacement=x[at] + 1e-8 * noise[0], force=force[at] + 1e-4 * noise[1]
+    )
+    fit = di.fit(record, di.Dahl(alpha=1.0) + di.Mass(), output="force")
+    mass = fit.params["mass"]
+    assert "window of differentiation" in sources(fit, "mass")
+    assert abs(mass.value - 0.1) < 2.0 * (mass.stderr or 0.0)
+
+
+def test_bands_grow_with_the_level_where_the_model_misses() -> None:
+    fit = di.fit(held(DAHL, 1, power=0.1), di.Dahl())
+    for size in (4e-3, 8e-3, 16e-3):
+        band = fit.predict(held(DAHL, 7, power=0.1, size=size))
+        inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
+        assert inside > 0.88
+
+
+def test_few_effective_samples_are_not_trusted() -> None:
+    record = held(DAHL, 2)
+    slow = np.cumsum(np.random.default_rng(3).standard_normal(len(record)))
+    drifting = record.force_samples + 1e-2 * (slow - slow.mean()) / slow.std()
+    fit = di.fit(replace(record, force=drifting), di.Dahl())
+    assert fit.effective_samples < 20
+    assert not fit.trusted

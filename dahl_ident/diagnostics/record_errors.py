@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -19,10 +20,11 @@ from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
-    AssumedExponent,
-    assumed_exponents,
+    HeldValue,
     between_blocks,
     between_records,
+    by_delay,
+    held_exponents,
 )
 from dahl_ident.diagnostics.turning_noise import noise_at_turns
 from dahl_ident.errors import FitError
@@ -35,12 +37,14 @@ _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
 _DRIVE_DRAWS = 4, 16  # of the drive's noise, least and most: the latter know it to a third
 _DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
+_OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 _NOT_FOUND = ", though it was not given: with another no motion was found"
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 TURNS = "displacement at turning points"
+WINDOW = "window of differentiation"
 DISPLACEMENT_GAIN, DELAY = "displacement calibration", "delay between the channels"
 
 
@@ -58,15 +62,20 @@ class RecordErrors:
         Inputs without a stated uncertainty.
     runs : int
         Records that were fitted together.
-    exponents : tuple of AssumedExponent
-        What the records say of exponents that nobody gave.
+    exponents : tuple of HeldValue
+        What the records say of exponents that the fit holds.
     """
 
     contributions: Mapping[str, FloatArray]
     effective: float
     exact: tuple[str, ...]
     runs: int
-    exponents: tuple[AssumedExponent, ...]
+    exponents: tuple[HeldValue, ...]
+
+    @property
+    def assumed(self) -> list[HeldValue]:
+        """The exponents that nobody stated."""
+        return [one for one in self.exponents if one.assumed]
 
     @property
     def covariance(self) -> FloatArray:
@@ -135,25 +144,35 @@ def record_errors(
     scatter = between_records(white, left, so_far, len(problem.free), problem.runs)
     if scatter is not None:
         found[RUNS] = scatter
-    exponents = assumed_exponents(problem, values, white, left)
-    if exponents:
-        found[EXPONENT] = np.asarray(sum(one.contribution for one in exponents))
+    exponents = held_exponents(problem, values, white, left)
+    if assumed := [one.contribution for one in exponents if one.assumed]:
+        found[EXPONENT] = np.asarray(sum(assumed))
+
+    def count(source: str, contribution: FloatArray) -> None:
+        """Count a source that widens the interval of a parameter of the model."""
+        matters = contribution.diagonal() > _MATTERS**2 * covariance.diagonal()
+        if matters[: len(problem.free)].any():
+            found[source] = contribution
+
+    if "delay" not in problem.calibration:
+        with suppress(FitError):  # no motion next to the estimate
+            count(DELAY, by_delay(problem, values, white, left))
     if problem.output == "force":
         moved = _by_displacement(problem, values, jacobians, residuals)
-        matters = moved.diagonal() > _MATTERS**2 * covariance.diagonal()
-        if matters[: len(problem.free)].any():
-            found[DISPLACEMENT] = moved
+        count(DISPLACEMENT, moved)
+        if not problem.model.rate_independent:
+            plain, change_of = problem.outputs(values), _change_of(problem, jacobians)
+            other = problem.differentiated_in(_OTHER_WINDOW * problem.window).outputs(values)
+            change = change_of([b - a for a, b in zip(plain, other, strict=True)])
+            count(WINDOW, np.outer(change, change))
         if problem.with_memory and not problem.displacement_noise:
             more = noise_at_turns(problem, values, jacobians, residuals)
-            more = _beyond(more, found.get(DISPLACEMENT, 0.0 * moved), covariance)
-            matters = more.diagonal() > _MATTERS**2 * covariance.diagonal()
-            if matters[: len(problem.free)].any():
-                found[TURNS] = more
+            count(TURNS, _beyond(more, found.get(DISPLACEMENT, 0.0 * moved), covariance))
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
     found |= _by_calibration(problem, values, jacobians)
-    exact = [name for name in (DISPLACEMENT_GAIN, DELAY) if name not in found]
+    exact = [DISPLACEMENT_GAIN] if DISPLACEMENT_GAIN not in found else []
     by_force = problem.output == "force" or problem.excitation == "force"
     if problem.output == "motion":
         noise = drive_noise([record.force_samples for record in problem.records])
@@ -381,8 +400,8 @@ def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:
     """Return what the estimate rests on and the records cannot test."""
-    parts = [str(one) for one in errors.exponents]
-    known = {one.name for one in errors.exponents}
+    parts = [str(one) for one in errors.assumed]
+    known = {one.name for one in errors.assumed}
     parts += [
         f"{p.name} = {p.value:g} exactly" + (_NOT_FOUND if p.assumed else "")
         for p in problem.model.parameters

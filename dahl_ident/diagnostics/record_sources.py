@@ -25,7 +25,6 @@ BLOCKS = 20
 """Of all records together, from which the model error is estimated."""
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
-_STEP = 0.01  # of an exponent's logarithm, for slopes
 _LONG = 0.05  # of a step of it, beyond which slopes change
 _SHORT = 0.01  # of a step that is the last
 _STEPS = 6
@@ -34,55 +33,61 @@ _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
 
 @dataclass(frozen=True)
-class AssumedExponent:
-    """An exponent that nobody gave, held at its default in the fit.
+class HeldValue:
+    """A value that the fit holds: an exponent, or the delay between the channels.
 
     Attributes
     ----------
-    parameter : Parameter
+    name, unit : str
+    value : float
+        What it is held at.
+    range : tuple of float
+        Where it may lie; nothing but `value` where the user stated it.
     mean, std : float
-        Of its logarithm over the default: what the records and its range say together.
+        What the records and its range say together, relative to `value`: of its logarithm, of a
+        delay in samples.
     by_records : float
         The standard deviation that the records alone know it to.
     contribution : ndarray, shape (P, P)
         Covariance of the estimate through it: as if it were estimated too, and at least as much
         as what the records ask for moves the estimate.
+    assumed : bool
+        Whether nobody stated it.
     """
 
-    parameter: Parameter
+    name: str
+    unit: str
+    value: float
+    range: tuple[float, float]
     mean: float
     std: float
     by_records: float
     contribution: FloatArray
-
-    @property
-    def name(self) -> str:
-        """The parameter's name."""
-        return self.parameter.name
+    assumed: bool
 
     @property
     def contradicted(self) -> bool:
-        """Whether the records ask for another value than the default."""
+        """Whether the records ask for another value."""
         return abs(self.mean) > _CONTRADICTED * self.by_records
 
     @property
     def found(self) -> str:
         """What the records ask for, in words."""
-        value = float(self.parameter.value or 1.0) * np.exp(self.mean)
-        return with_unit(value, value * self.std, self.parameter.unit)
+        value = self.value * np.exp(self.mean)
+        return with_unit(value, value * self.std, self.unit)
 
     def __str__(self) -> str:
-        low, high = self.parameter.prior or (0.0, np.inf)
+        low, high = self.range
         return f"{self.name} between {low:g} and {high:g} (here {self.found})"
 
 
-def assumed_exponents(
+def held_exponents(
     problem: RecordProblem,
     values: FloatArray,
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
-) -> tuple[AssumedExponent, ...]:
-    """Return what the records say of each exponent that nobody gave.
+) -> tuple[HeldValue, ...]:
+    """Return what the records say of each exponent that the fit holds, stated or not.
 
     Gauss-Newton steps from the estimate: one, or more where it is long. As for tables, the range
     counts as a uniform distribution of the logarithm, and for less where the records say more.
@@ -97,11 +102,11 @@ def assumed_exponents(
 
     Returns
     -------
-    tuple of AssumedExponent
+    tuple of HeldValue
     """
     found = []
     for parameter in problem.model.parameters:
-        if parameter.free or not parameter.assumed or parameter.prior is None:
+        if parameter.free or parameter.prior is None:
             continue
         try:
             found.append(_Search(problem, parameter, values).result(jacobians, residuals))
@@ -110,44 +115,83 @@ def assumed_exponents(
     return tuple(found)
 
 
+def by_delay(
+    problem: RecordProblem,
+    values: FloatArray,
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+) -> FloatArray:
+    """Return the covariance of the estimate through the delay, which nobody stated.
+
+    A normal distribution of one sample counts, and for less where the records say more; the
+    estimated delay is taken out already.
+    """
+    place = len(problem.free)
+    sample = 1.0 / problem.records[0].sample_rate
+    slopes = [problem.filtered(slope * sample) for slope in problem.delay_slopes(values)]
+    joint = [np.insert(J, place, s, axis=1) for J, s in zip(jacobians, slopes, strict=True)]
+    mean = float(_step(joint, residuals)[place])
+    return _counted(joint, residuals, place, mean, 1.0, _moved(joint, place))[-1]
+
+
+def _moved(jacobians: Sequence[FloatArray], place: int) -> FloatArray:
+    """Return how the other values change with that at `place`, per unit."""
+    normal = np.asarray(sum(J.T @ J for J in jacobians))
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    normal = normal / np.outer(size, size)
+    others = np.delete(np.arange(size.size), place)
+    moved = -np.linalg.pinv(normal[np.ix_(others, others)], hermitian=True)
+    return np.asarray(moved @ normal[others, place] * size[place] / size[others])
+
+
+def _counted(
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    place: int,
+    mean: float,
+    s: float,
+    moved: FloatArray,
+) -> tuple[float, float, float, FloatArray]:
+    """Return mean and std of a held value, its std by the records alone, and what it moves.
+
+    `s` is the standard deviation of what is known of it beforehand, about 0.
+    """
+    covariance, _ = sandwich(jacobians, residuals)
+    beyond = between_blocks(jacobians, residuals, covariance, place + 1)
+    u2 = float((covariance if beyond is None else covariance + beyond)[place, place])
+    if not np.isfinite(u2):
+        mean, std = 0.0, s
+    else:
+        s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
+        weight = s**2 / (s**2 + u2)
+        mean, std = mean * weight, (u2 * weight) ** 0.5
+    change = moved * max(std, abs(mean))
+    return mean, std, u2**0.5, np.outer(change, change)
+
+
 class _Search:
-    """The estimate with an exponent free, from where the exponent has its default."""
+    """The estimate with an exponent free, from where the exponent is held."""
 
     def __init__(self, problem: RecordProblem, parameter: Parameter, values: FloatArray) -> None:
         self.problem, self.parameter, self.values = problem, parameter, values
         self.default = float(parameter.value or 1.0)
-        low, high = parameter.prior or (self.default, self.default)
-        self.limits = np.log([low / self.default, high / self.default])
+        self.range = parameter.prior or (self.default, self.default)
+        low, high = (np.log(end / self.default) for end in self.range)
+        self.limits = np.array([min(low, 0.0), max(high, 0.0)])
         self.place = len(problem.free)
 
-    def result(
-        self, jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
-    ) -> AssumedExponent:
-        """Return what the records say, given derivatives and residuals at the default."""
-        rest = np.delete(np.arange(self.values.size + 1), self.place)
+    def result(self, jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> HeldValue:
+        """Return what the records say, given derivatives and residuals at the held value."""
         joint = self._joint(jacobians, self.values, 0.0)
-        step = _step(joint, residuals)
-        normal = np.asarray(sum(J.T @ J for J in joint))
-        size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-        normal = normal / np.outer(size, size)
-        moved = -np.linalg.pinv(normal[np.ix_(rest, rest)], hermitian=True)
-        moved = moved @ normal[rest, self.place] * size[self.place] / size[rest]
+        step, moved = _step(joint, residuals), _moved(joint, self.place)
         at, mean = self.values, float(step[self.place])
         if abs(mean) > _LONG:
             at, mean, joint, residuals = self._refined(step)
             moved = (at - self.values) / mean
-        covariance, _ = sandwich(joint, residuals)
-        beyond = between_blocks(joint, residuals, covariance, self.place + 1)
-        u2 = float((covariance if beyond is None else covariance + beyond)[(self.place,) * 2])
         s = float(np.ptp(self.limits)) / 12.0**0.5
-        if not np.isfinite(u2):
-            mean, std = 0.0, s
-        else:
-            s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
-            weight = s**2 / (s**2 + u2)
-            mean, std = mean * weight, (u2 * weight) ** 0.5
-        change = moved * max(std, abs(mean))
-        return AssumedExponent(self.parameter, mean, std, u2**0.5, np.outer(change, change))
+        known = _counted(joint, residuals, self.place, mean, s, moved)
+        p = self.parameter
+        return HeldValue(p.name, p.unit, self.default, self.range, *known, p.assumed)
 
     def _refined(
         self, step: FloatArray
@@ -179,16 +223,10 @@ class _Search:
         self, jacobians: Sequence[FloatArray], at: FloatArray, mean: float
     ) -> list[FloatArray]:
         """Return the derivatives with respect to the parameters and the exponent's logarithm."""
-        problem, name = self.problem, self.parameter.name
-        ends = [
-            problem.with_fixed({name: self.default * np.exp(mean + d)}) for d in (_STEP, -_STEP)
-        ]
-        found = []
-        for i, J in enumerate(jacobians):
-            high, low = (end.predict(at, i, derivatives=False).output for end in ends)
-            slope = problem.filtered((high - low) / (2.0 * _STEP))
-            found.append(np.insert(J, self.place, slope, axis=1))
-        return found
+        held = self.default * float(np.exp(mean))
+        slopes = self.problem.slopes_with_respect_to(self.parameter, at, held)
+        pairs = zip(jacobians, map(self.problem.filtered, slopes), strict=True)
+        return [np.insert(J, self.place, slope, axis=1) for J, slope in pairs]
 
 
 def _step(jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> FloatArray:

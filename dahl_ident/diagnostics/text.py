@@ -356,9 +356,19 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "records_misfit": lambda: "The misfit exceeds the noise.",
     "record_parameter": _record_parameter,
     "unphysical": lambda objection: f"Physically doubtful: {objection}.",
-    "exponent": lambda name, wanted, assumed: (
-        f"The records ask for {name} = {wanted} instead of the assumed {assumed:g}: estimate it "
+    "exponent": lambda name, wanted, held: (
+        f"The records ask for {name} = {wanted} instead of the assumed {held:g}: estimate it "
         f"({name}=None; {name}=free on the command line)."
+    ),
+    "stated_exponent": lambda name, wanted, held: (
+        f"The records contradict {name} = {held:g}, which was stated: they ask for {wanted}."
+    ),
+    "few_effective_samples": lambda effective, unknowns: (
+        f"The residuals are so slow that they are worth {effective:.0f} samples, few for "
+        f"{unknowns} unknowns: record for longer."
+    ),
+    "delay": lambda delay, samples: (
+        f"The motion lags the force by {samples:.2g} samples ({delay:.2g} s): taken out."
     ),
     "record_residuals": lambda rms, output, worst: (
         f"The residuals are {percent(rms)} rms of the measured {output}; {worst}."

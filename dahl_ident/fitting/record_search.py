@@ -35,6 +35,9 @@ _REPEATS = 12  # a limit for weights that do not settle
 _SETTLED = 0.03  # step in standard errors that no longer matters
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is not chance
+_ALIGNED = 0.02  # of the sum of squares that a delay has to explain to be taken out
+_ALIGNMENTS = 4  # steps of the delay: each leaves a hundredth of the one before
+_LONGEST_DELAY = 2.0  # samples: twice the standard deviation that nobody stated
 _SETTLING = 2000  # samples after which simulated noise has forgotten its start
 _MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
 _LOOSE = 1e4  # of the step at which a search of a long record has converged
@@ -204,7 +207,8 @@ class _Search:
             end = self.best(problem, starts, steps)
         if problem.output == "force":
             problem, end = self.without_noise(problem, end)
-        elif self.loss == "linear":
+        problem, end = self.aligned(problem, end)
+        if problem.output == "motion" and self.loss == "linear":
             problem, end = self.weighted(problem, end)
         if self.loss != "linear":
             end = self.robust(problem, end)
@@ -225,6 +229,55 @@ class _Search:
         typical = float(np.median(problem.squares(plain.theta[0]))) ** 0.5 / _MEDIAN
         agreed_scale(excess, max(typical, float(problem.rounding)))
         return end
+
+    def aligned(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
+        """Return the estimate with the delay between the channels that the residuals ask for.
+
+        Steps of the delay with all values free, exponents that nobody stated too, as long as each
+        explains more than chance does. A small share of the residuals may as well be a part of
+        what the model misses: such a delay counts as an uncertainty alone. One beyond what
+        channels sampled together have stands for something else, such as a damper that the model
+        lacks: then, as where the user stated the delay, none is taken out.
+        """
+        share = 2.0 * float(plain.cost[0]) / problem.n_residuals
+        if not plain.converged[0] or "delay" in problem.calibration or share < _EXACT:
+            return problem, plain
+        sample, found, end = 1.0 / problem.records[0].sample_rate, problem, plain
+        for _ in range(_ALIGNMENTS):
+            step, fall = self._delay_step(found, end.theta[0])
+            residuals = found.split_residuals(found.to_values(end.theta[0]))
+            by_chance = _by_chance(float(end.cost[0]), found.n_residuals, residuals)
+            part = _ALIGNED * 2.0 * float(end.cost[0]) if found is problem else 0.0
+            if not fall > max(by_chance, part):
+                break
+            if abs(found.delay + step) > _LONGEST_DELAY * sample:
+                return problem, plain
+            found = found.delayed(found.delay + step)
+            end = self.descend(found, end.theta[0], _STEPS)
+            if not end.converged[0]:
+                return problem, plain
+        return (found, end) if end.cost[0] < plain.cost[0] else (problem, plain)
+
+    def _delay_step(self, problem: RecordProblem, theta: FloatArray) -> tuple[float, float]:
+        """Return the delay's Gauss-Newton step, s, and by how much the sum of squares falls."""
+        values = problem.to_values(theta)
+        held = [*problem.exponent_slopes(values), problem.delay_slopes(values)]
+        count = theta.size + len(held)
+        normal, right = np.zeros((count, count)), np.zeros(count)
+        for number, slopes in enumerate(zip(*held, strict=True)):
+            residual, jacobian = problem.rows(theta, number)
+            more = [problem.filtered(slope / -problem.sizes[number]) for slope in slopes]
+            columns = np.column_stack([jacobian, *more])
+            normal += columns.T @ columns
+            right += columns.T @ residual
+        self.evaluations += 1 + 2 * len(held)
+        size = np.sqrt(normal.diagonal())
+        size[size == 0.0] = 1.0
+        inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+        step = -(inverse @ (right / size))
+        if not inverse[-1, -1] > 0.0:
+            return 0.0, 0.0
+        return float(step[-1] / size[-1]), float(step[-1] ** 2 / inverse[-1, -1])
 
     def without_noise(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate without the displacement's noise, where the residuals ask for it.
@@ -248,8 +301,8 @@ class _Search:
             if not left < least:
                 break
             best, least, noise = trial, left, 2.0 * noise
-        slow = _correlation(problem.split_residuals(problem.to_values(theta)))
-        by_chance = _CONFIRMED * 2.0 * least / problem.n_residuals * (1.0 + slow) / (1.0 - slow)
+        residuals = problem.split_residuals(problem.to_values(theta))
+        by_chance = _by_chance(least, problem.n_residuals, residuals)
         if best is problem or 2.0 * (before - least) < by_chance:
             return problem, plain
         end = self.descend(best, theta, _STEPS)
@@ -385,6 +438,12 @@ class _Search:
             )
         self.evaluations += int(end.evaluations[0])
         return end
+
+
+def _by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
+    """Return the fall of the sum of squares that one more value makes by chance."""
+    slow = _correlation(residuals)
+    return _CONFIRMED * 2.0 * cost / samples * (1.0 + slow) / (1.0 - slow)
 
 
 def _correlation(residuals: Sequence[FloatArray]) -> float:

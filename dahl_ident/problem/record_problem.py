@@ -41,6 +41,8 @@ _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
 _PLAY_STEP = 1e-6  # of the motion's range, for derivatives with respect to the place in a gap
+_EXPONENT_STEP = 0.01  # of an exponent's logarithm, for derivatives
+_DELAY_STEP = 0.02  # of a sample, for derivatives with respect to the delay
 _LEAST = 1e-300  # of a positive value that has vanished
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
 
@@ -159,6 +161,10 @@ class RecordProblem(BaseProblem):
         self.space = Space(parameters, self._bends(parameters), inside=True)
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
+        self.delay = 0.0
+        """Time by which the motion lags the force in the records, s; taken out."""
+        self.window = 1.0
+        """Factor on the window in which displacements are differentiated."""
         self.displacement_noise = 0.0
         """Standard deviation of the displacement, m, within which no movement counts."""
         self._paths: tuple[FloatArray, ...] | None = None
@@ -298,8 +304,48 @@ class RecordProblem(BaseProblem):
         """
         other = copy(self)
         other.displacement_noise = noise
-        x = [np.asarray(record.displacement) for record in self.records] if noise else []
+        x = self._displacements if noise else []
         other._paths = tuple(travelled(wave, noise, lead) for wave in x) or None
+        return other
+
+    def delayed(self, delay: float) -> RecordProblem:
+        """Return the same problem, the motion taken to lag the force by so many seconds."""
+        other = copy(self)
+        other.delay = delay
+        for cached in ("motions", "_drives"):
+            other.__dict__.pop(cached, None)
+        return other.without_noise(self.displacement_noise) if self._paths else other
+
+    def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
+        """Return the derivatives of each record's output with respect to the delay, per s."""
+        step = _DELAY_STEP / self.records[0].sample_rate
+        low, high = (self.delayed(self.delay + d) for d in (-step, step))
+        return _slopes(low, high, values, step)
+
+    def exponent_slopes(self, values: FloatArray) -> list[list[FloatArray]]:
+        """Return the derivatives of each record's output by each exponent that nobody stated."""
+        return [
+            self.slopes_with_respect_to(p, values)
+            for p in self.model.parameters
+            if p.assumed and p.prior is not None and not p.free
+        ]
+
+    def slopes_with_respect_to(
+        self, parameter: Parameter, values: FloatArray, at: float | None = None
+    ) -> list[FloatArray]:
+        """Return the derivatives with respect to the logarithm of a fixed parameter, at a value."""
+        value = float(parameter.value or 1.0) if at is None else at
+        low, high = (
+            self.with_fixed({parameter.name: value * float(np.exp(d))})
+            for d in (-_EXPONENT_STEP, _EXPONENT_STEP)
+        )
+        return _slopes(low, high, values, _EXPONENT_STEP)
+
+    def differentiated_in(self, window: float) -> RecordProblem:
+        """Return the same problem, displacements differentiated in a window of other length."""
+        other = copy(self)
+        other.window = window
+        other.__dict__.pop("motions", None)
         return other
 
     @property
@@ -366,7 +412,21 @@ class RecordProblem(BaseProblem):
     @cached_property
     def motions(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
         """Displacement, velocity and acceleration of each record, for the output "force"."""
-        return self._motions_of([np.asarray(record.displacement) for record in self.records])
+        return self._motions_of(self._displacements)
+
+    @property
+    def _displacements(self) -> list[FloatArray]:
+        """Measured displacements, freed of the delay."""
+        x = [np.asarray(record.displacement) for record in self.records]
+        if not self.delay:
+            return x
+        from scipy.interpolate import CubicSpline
+
+        times = [record.time for record in self.records]
+        return [
+            np.asarray(CubicSpline(t, wave)(t + self.delay))
+            for t, wave in zip(times, x, strict=True)
+        ]
 
     def _motions_of(
         self, displacements: Sequence[FloatArray]
@@ -376,7 +436,7 @@ class RecordProblem(BaseProblem):
         from dahl_ident.engine import differentiated
 
         return tuple(
-            (x, *differentiated(x, 1.0 / record.sample_rate))
+            (x, *differentiated(x, 1.0 / record.sample_rate, self.window))
             for x, record in zip(displacements, self.records, strict=True)
         )
 
@@ -418,10 +478,18 @@ class RecordProblem(BaseProblem):
         """Times of the samples, and the drive's polynomials between them, of each record."""
         from dahl_ident.engine import band_limited
 
-        return tuple(
-            (r.time - r.time[0], band_limited(r.force_samples, 1.0 / r.sample_rate))
-            for r in self.records
-        )
+        found = []
+        for record in self.records:
+            time, interval = record.time - record.time[0], 1.0 / record.sample_rate
+            drive = band_limited(record.force_samples, interval)
+            if self.delay:  # the motion is compared with that of a drive as much later
+                place = np.arange(time.size) - self.delay / interval
+                place = np.clip(place, 0.0, time.size - 1.0)
+                step = np.clip(np.floor(place).astype(int), 0, time.size - 2)
+                late = np.polynomial.polynomial.polyval(place - step, drive[:, step], tensor=False)
+                drive = band_limited(late, interval)
+            found.append((time, drive))
+        return tuple(found)
 
     def to_search(self, values: ArrayLike) -> FloatArray:
         """Return search coordinates; values that have vanished are as small as numbers can be."""
@@ -554,7 +622,7 @@ class RecordProblem(BaseProblem):
             return nowhere
         for number in range(len(self.records)):
             try:
-                residual, jacobian = self._rows(theta, number)
+                residual, jacobian = self.rows(theta, number)
             except FitError:
                 return nowhere
             residual, jacobian = residual / size, jacobian / size
@@ -582,7 +650,7 @@ class RecordProblem(BaseProblem):
             gradient, hessian = chart.T @ gradient, chart.T @ hessian @ chart
         return Quadratic(np.asarray(cost), gradient, hessian)
 
-    def _rows(
+    def rows(
         self, theta: FloatArray, number: int, *, derivatives: bool = True
     ) -> tuple[FloatArray, FloatArray]:
         """Return the filtered residuals of a record, and their derivatives."""
@@ -599,7 +667,7 @@ class RecordProblem(BaseProblem):
         """Return residuals, (m,), and Jacobian, (m, P), of all records at theta, (P,)."""
         at = self.space.checked(theta)
         try:
-            rows = [self._rows(at, number) for number in range(len(self.records))]
+            rows = [self.rows(at, number) for number in range(len(self.records))]
         except FitError:
             return np.full(self.n_residuals, np.nan), np.full((self.n_residuals, at.size), np.nan)
         residuals, jacobians = zip(*rows, strict=True)
@@ -609,7 +677,7 @@ class RecordProblem(BaseProblem):
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
         """Return the squared residuals of all samples at theta, (P,)."""
         places = range(len(self.records))
-        return np.concatenate([self._rows(theta, i, derivatives=False)[0] ** 2 for i in places])
+        return np.concatenate([self.rows(theta, i, derivatives=False)[0] ** 2 for i in places])
 
     @property
     def rounding(self) -> FloatArray:
@@ -623,6 +691,14 @@ class RecordProblem(BaseProblem):
         if size == 0.0:
             raise DataError("the output of the records is constant; nothing can be fitted to it")
         return (size,) * len(self.records)
+
+
+def _slopes(
+    low: RecordProblem, high: RecordProblem, values: FloatArray, step: float
+) -> list[FloatArray]:
+    """Return the difference of two problems' outputs over twice the step, record by record."""
+    pairs = zip(low.outputs(values), high.outputs(values), strict=True)
+    return [(b - a) / (2.0 * step) for a, b in pairs]
 
 
 def _before(path: FloatArray, play: float) -> FloatArray:

@@ -270,7 +270,7 @@ def _assumed(fit: Fit) -> Iterator[str]:
     if fixed:
         yield f"Held fixed: {listed(fixed)}."
     if isinstance(fit, RecordFit):
-        for one in fit.errors.exponents:
+        for one in fit.errors.assumed:
             yield f"Not given: {one}; its range counts in the uncertainty."
         yield f"Taken as exact: {listed(fit.errors.exact)}."
         if fit.weighted:

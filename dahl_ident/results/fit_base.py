@@ -25,7 +25,7 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
-from dahl_ident.diagnostics.record_goodness import RecordGoodness
+from dahl_ident.diagnostics.record_checks import RecordGoodness
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError, choices

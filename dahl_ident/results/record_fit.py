@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,25 +19,26 @@ from dahl_ident.data.record import cut
 from dahl_ident.data.storage import plain_data, read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
-from dahl_ident.diagnostics.checks import contradicted, doubted
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, checked_levels, percent
 from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
-from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
-from dahl_ident.diagnostics.physics import below_zero, is_single, slight
+from dahl_ident.diagnostics.judgement import Judgement
+from dahl_ident.diagnostics.record_checks import (
+    RecordGoodness,
+    misses,
+    record_goodness,
+    record_judgement,
+    undetermined,
+)
 from dahl_ident.diagnostics.record_errors import (
-    MODEL,
     NOISE,
     RecordErrors,
     errors_on_constraints,
-    record_assumptions,
     record_budget,
     record_derived,
     record_errors,
     variances,
 )
-from dahl_ident.diagnostics.record_goodness import RecordGoodness, record_goodness
-from dahl_ident.diagnostics.record_identifiability import undetermined
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.elements import Model
 from dahl_ident.elements.description import describe_model, model_from_description
@@ -46,7 +47,6 @@ from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, V
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.record_search import Tell, hold_model, solve_records
-from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_base import Fit
 from dahl_ident.results.fit_storage import (
@@ -59,18 +59,15 @@ from dahl_ident.results.fit_storage import (
 from dahl_ident.results.hold_out import HeldOutPart, HoldOut
 from dahl_ident.results.progress import fit_progress
 from dahl_ident.results.result import Parameters
-from dahl_ident.units import shown_unit, si_unit
+from dahl_ident.units import shown_unit
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     from dahl_ident.plots import Axes
 
 SCHEMA = "dahl_ident.record_fit"
-_SCHEMA_VERSION = 2  # of the layout; others are refused
+_SCHEMA_VERSION = 3  # of the layout; others are refused
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
-_WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
-_FAIRLY = 0.1  # share of variance left beyond which the model does not describe the records
-_STRUCTURED = 0.5  # correlation of neighbouring residuals
 
 
 @dataclass(frozen=True)
@@ -153,11 +150,11 @@ class RecordFit(Fit):
     @property
     def assumed(self) -> tuple[str, ...]:
         """Names of parameters that were not given; the uncertainty counts their ranges."""
-        return tuple(one.name for one in self.errors.exponents)
+        return tuple(one.name for one in self.errors.assumed)
 
     def verdict_on(self, name: str) -> tuple[Verdict, str]:
         """Return whether the records determine a parameter, and what they say of it."""
-        lost = [str(f) for f in self._undetermined if f.values["name"] == name]
+        lost = [str(f) for f in undetermined(self) if f.values["name"] == name]
         verdict = Verdict.NOT_IDENTIFIED if lost else Verdict.IDENTIFIED
         return verdict, lost[0] if lost else verdict.value
 
@@ -240,134 +237,12 @@ class RecordFit(Fit):
     @cached_property
     def goodness(self) -> RecordGoodness:
         """Statistics of the residuals."""
-        return record_goodness(self.records, self.problem.measured, self.residuals)
-
-    @cached_property
-    def _share_left(self) -> float:
-        """Share of variance left; where residuals are weighted, at the drive's frequencies."""
-        if not self.weighted:
-            return self.goodness.share_left
-        drives = [record.force_samples for record in self.records]
-        return share_in_band(drives, self.problem.measured, self.residuals)
+        return record_goodness(self.problem, self.residuals)
 
     @cached_property
     def judgement(self) -> Judgement:
         """Every finding about the fit, and the status that follows from them."""
-        return Judgement(
-            (
-                *self._constraints,
-                *self._described,
-                *self._undetermined,
-                *self._doubts,
-                *self._slight,
-                *self._notes,
-            )
-        )
-
-    @property
-    def _constraints(self) -> Iterator[Finding]:
-        """Yield the constraints that the records contradict; correlated samples count as few."""
-        cost = self.optimum.constraint_cost
-        if cost is not None:
-            share = self.effective_samples / self.problem.n_samples
-            cost = replace(cost, rise=cost.rise * share, dof=cost.dof * share)
-        yield from contradicted(cost)
-
-    @property
-    def _described(self) -> Iterator[Finding]:
-        """Yield whether the model describes the records."""
-        question, lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
-        far = self._share_left > _FAIRLY
-        if far:
-            yield Finding(question, lost, "records_not_described")
-        if not self.success:
-            yield Finding(question, lost, "no_optimum", {"message": self.message})
-        displaced = all(record.displacement is not None for record in self.records)
-        if self.problem.output == "motion" and (far or not self.success) and displaced:
-            yield Finding(question, lost, "motion_may_be_imposed")
-        if self.misses and not far:
-            yield Finding(question, VerdictStatus.APPROXIMATE, "records_misfit")
-
-    @cached_property
-    def _undetermined(self) -> tuple[Finding, ...]:
-        """Which parameters are not determined, with the reasons."""
-        stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
-        mostly = {
-            p.name: source
-            for i, p in enumerate(self.problem.free)
-            for source, C in self.errors.contributions.items()
-            if np.isfinite(self.covar[i, i]) and C[i, i] > 0.5 * self.covar[i, i]
-        }
-        return undetermined(self.model, self.records, stderr, self.covar, self.var_names, mostly)
-
-    @property
-    def _doubts(self) -> Iterator[Finding]:
-        """Yield what speaks against the estimates physically, or against an assumption."""
-        question, doubtful = Question.DESCRIBED, VerdictStatus.APPROXIMATE
-        values = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
-        stderr = {p.name: self.params[p.name].stderr or 0.0 for p in self.problem.free}
-        single = [e for e in self.problem.model.elements if is_single(e) and e.parameters[0].free]
-        yield from below_zero([e.parameters[0] for e in single], values, stderr)
-        for element in self.model.elements:
-            if not is_single(element):
-                for text in element.physics([p.value or 0.0 for p in element.parameters]):
-                    yield Finding(question, doubtful, "unphysical", {"objection": text})
-        for one in self.errors.exponents:
-            if one.contradicted:
-                asked = {
-                    "name": one.name, "wanted": str(one.found), "assumed": one.parameter.value
-                }  # fmt: skip
-                yield Finding(question, doubtful, "exponent", asked)
-
-    @property
-    def _slight(self) -> Iterator[Finding]:
-        """Yield what carries less force than the misfit, and may stand for a part of it."""
-        if self.problem.output == "motion" or not self.misses:
-            return
-        size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
-        for element in self.model.elements:
-            parameter, values = element.parameters[0], [p.value or 0.0 for p in element.parameters]
-            if parameter.name in self.var_names and is_single(element):
-                force = [
-                    element.force_history(values, x, v, 0.0, acceleration=a)
-                    for x, v, a in self.problem.motions
-                ]
-                share = float(np.concatenate([f - f.mean() for f in force]).std() / size)
-                p = self.params[parameter.name]
-                yield from slight(
-                    self.problem.free[self.var_names.index(p.name)], p.value, p.stderr or 0.0,
-                    share, float(np.sqrt(self._share_left)),
-                )  # fmt: skip
-
-    @property
-    def _notes(self) -> Iterator[Finding]:
-        """Yield the size of the residuals, and what the estimate rests on."""
-        question, note, goodness = Question.DESCRIBED, VerdictStatus.TRUSTED, self.goodness
-        size = {
-            "rms": goodness.share_left**0.5, "output": self.problem.output,
-            "worst": goodness.worst_text,
-        }  # fmt: skip
-        yield Finding(question, note, "record_residuals", size)
-        if self.weighted:
-            within = {"rms": self._share_left**0.5}
-            yield Finding(question, note, "slow_residuals", within)
-        if self.problem.displacement_noise:
-            noise = {
-                "noise": self.problem.displacement_noise,
-                "unit": si_unit("displacement", self.records[0].motion),
-                "travel": self.problem.noise_travel,
-            }
-            yield Finding(question, note, "displacement_noise", noise)
-        yield from doubted(*self.provenances)
-        samples = {"effective": self.effective_samples, "samples": self.problem.n_samples}
-        yield Finding(question, note, "effective_samples", samples)
-        yield record_assumptions(self.problem, self.errors)
-
-    @property
-    def misses(self) -> bool:
-        """Whether the model misses more than noise."""
-        structured = self.goodness.correlation > _STRUCTURED and self._share_left > _WELL
-        return structured or MODEL in self.errors.contributions
+        return record_judgement(self)
 
     @cached_property
     def coverage_factor(self) -> float:
@@ -527,7 +402,7 @@ class RecordFit(Fit):
         problem = RecordProblem(
             [record], own.model, output=own.output, excitation=own.excitation,
             calibration=own.calibration,
-        ).without_noise(own.displacement_noise)  # fmt: skip
+        ).delayed(own.delay).without_noise(own.displacement_noise)  # fmt: skip
         if initial == "fitted":
             return problem, hold_model(problem, values)
         if initial != "rest":
@@ -537,8 +412,13 @@ class RecordFit(Fit):
         return problem, full
 
     def band(self, problem: RecordProblem, output: FloatArray, variance: FloatArray) -> RecordBand:
-        """Return a predicted record with its bands, from the variance of what is predicted."""
+        """Return a predicted record with its bands, from the variance of what is predicted.
+
+        What a model misses is a share of the output: its scatter grows with the record's level.
+        """
         scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
+        if misses(self):
+            scatter *= max(1.0, _level(problem) / _level(self.problem)) ** 2
         half = self.coverage_factor * np.sqrt(variance + scatter)
         return RecordBand(
             problem.records[0].time, output, np.sqrt(variance), output - half, output + half,
@@ -608,6 +488,7 @@ class RecordFit(Fit):
                     "excitation": problem.excitation,
                     "calibration": problem.calibration,
                     "whitening": problem.whitening.tolist(),
+                    "delay": problem.delay,
                     "displacement_noise": problem.displacement_noise,
                     "optimum": plain_data(describe_optimum(self.optimum), not_finite=str),
                     "first_order": self.first_order,
@@ -638,7 +519,7 @@ class RecordFit(Fit):
             )  # fmt: skip
             problem.runs = tuple(held["runs"])
             problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
-            problem = problem.without_noise(held["displacement_noise"])
+            problem = problem.delayed(held["delay"]).without_noise(held["displacement_noise"])
             optimum = optimum_from(problem, held["optimum"])
             return cls(optimum, first_order=held["first_order"])
         except ModelError:
@@ -650,6 +531,13 @@ class RecordFit(Fit):
     def load(cls, path: str | Path) -> RecordFit:
         """Return the fit that ``save`` wrote."""
         return cls.from_json(read_text(path))
+
+
+def _level(problem: RecordProblem) -> float:
+    """Return the size of the input of records: of the displacement, or of the drive."""
+    force = problem.output == "force"
+    waves = [np.asarray(r.displacement if force else r.force_samples) for r in problem.records]
+    return float(np.sqrt(np.mean(np.concatenate([w - w.mean() for w in waves]) ** 2)))
 
 
 def solved(
