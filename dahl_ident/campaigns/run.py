@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -222,37 +222,40 @@ def campaign(
     {'device': ['clean', 'noisy'], 'sigma': [30.0, 30.0]}
     """
     definition = read_definition(source)
-    limits = (timeout, memory)
-    for name, limit in zip(("timeout", "memory"), limits, strict=True):
+    for name, limit in (("timeout", timeout), ("memory", memory)):
         if limit is not None:
             positive_number(limit, name)
-    jobs = None if jobs is None else whole_number(jobs, "jobs", 1)
+    workers = None if jobs is None else whole_number(jobs, "jobs", 1)
     folder, laws = definition.folder, _laws(definition)
     if dry_run:
-        keys = _keys(definition, Limits(*limits))
+        tasks = _by_key(definition, Limits(timeout, memory))
         agree = _options_agree(definition, redo)
-        known = set(finished(folder / _JOURNAL)[0]) if agree else set()
-        return _split(definition, keys, known)
+        return _split(definition, tasks, finished(folder / _JOURNAL)[0] if agree else ())
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as exc:
         raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
+    lost: LostError | None = None
     with locked(folder / _JOURNAL, DataError):
         agree = _options_agree(definition, redo)
         with closing(Journal(folder / _JOURNAL)) as journal:
-            allowed = Limits(*limits, journal.seconds)
-            keys = _keys(definition, allowed)
-            outcome = _split(definition, keys, set(journal.places))
-            tagged = list(zip(keys, definition.tasks, strict=True))
-            missing = [tag for tag in tagged if tag[0] not in journal.places]
-            jobs_of = ((tag, _job(definition, tag, send_files, laws)) for tag in missing)
-            lost: LostError | None = None
-            with _place(jobs, executor, scheduler) as place:
-                done = run_jobs(jobs_of, place, allowed, patience)
+            limits = Limits(timeout, memory, journal.seconds)
+            tasks = _by_key(definition, limits)
+            outcome = _split(definition, tasks, journal.places)
+            missing = [key for key in tasks if key not in journal.places]
+            work = ((key, _job(definition, tasks[key], send_files, laws)) for key in missing)
+            if scheduler is not None:
+                place: Place = Scheduler(scheduler, workers)
+            elif executor is not None:
+                place = Place(workers or default_workers(), executor)
+            else:
+                place = Local(workers or default_workers())
+            with place:
+                done = run_jobs(work, place, limits, patience)
                 if not agree:
                     done = _unless_refused(done, min(_TRIALS, len(missing)), definition.source)
                 try:
-                    for number, ((key, _), row) in enumerate(done, start=1):
+                    for number, (key, row) in enumerate(done, start=1):
                         if not agree:
                             write_whole(
                                 folder / "options.json", _options(definition), overwrite=True
@@ -263,24 +266,15 @@ def campaign(
                             progress(number, len(missing), row)
                 except LostError as exc:
                     lost = exc
-            there = [tag for tag in tagged if tag[0] in journal.places]
-            done_rows = journal.rows(key for key, _ in there)
-            rows = (_whole(t, row) for (_, t), row in zip(there, done_rows, strict=True))
-            statuses = write_tables(rows, folder)
+            there = [key for key in tasks if key in journal.places]
+            rows = zip(there, journal.rows(there), strict=True)
+            statuses = write_tables((_whole(tasks[key], row) for key, row in rows), folder)
     if lost is not None:
         raise DataError(
-            f"{lost}; {len(there)} of {len(keys)} fits are in {folder / 'results.csv'}, and the "
+            f"{lost}; {len(there)} of {len(tasks)} fits are in {folder / 'results.csv'}, and the "
             "same command does the others"
         ) from lost
     return replace(outcome, statuses=statuses)
-
-
-def _place(jobs: int | None, executor: Executor | None, scheduler: str | None) -> Place:
-    if scheduler is not None:
-        return Scheduler(scheduler, jobs)
-    if executor is not None:
-        return Place(jobs or default_workers(), executor)
-    return Local(jobs or default_workers())
 
 
 def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
@@ -330,20 +324,17 @@ def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     return {**labels, **task.covariates, **row, "version": __version__}
 
 
-def _split(definition: Definition, keys: list[str], known: set[str]) -> Campaign:
-    named = list(zip(keys, definition.tasks, strict=True))
-    return Campaign(
-        definition.folder,
-        tuple(task.name for key, task in named if key in known),
-        tuple(task.name for key, task in named if key not in known),
-        {},
+def _split(definition: Definition, tasks: Mapping[str, Task], known: Container[str]) -> Campaign:
+    done, to_do = (
+        tuple(task.name for key, task in tasks.items() if (key in known) == there)
+        for there in (True, False)
     )
+    return Campaign(definition.folder, done, to_do, {})
 
 
 def _job(
-    definition: Definition, tag: tuple[str, Task], send_files: bool, laws: tuple[str | LawFile, ...]
+    definition: Definition, task: Task, send_files: bool, laws: tuple[str | LawFile, ...]
 ) -> Job:
-    task = tag[1]
     contents: list[bytes | None] = [None] * len(task.files)
     if send_files:
         with suppress(OSError, DataError):  # the worker then says what is wrong with the path
@@ -383,8 +374,8 @@ def _options_agree(definition: Definition, redo: bool) -> bool:
     return not changed
 
 
-def _keys(definition: Definition, limits: Limits) -> list[str]:
-    """Return the key of each task.
+def _by_key(definition: Definition, limits: Limits) -> dict[str, Task]:
+    """Return the tasks by their keys.
 
     A file's digest is computed again only if its size or modification time differs from that stored
     with the last digest. A file that takes longer than a fit may is left to its fit.
@@ -395,7 +386,7 @@ def _keys(definition: Definition, limits: Limits) -> list[str]:
     except (OSError, ValueError):
         cache = {}
     digests: dict[str, list[Any]] = {}
-    keys = []
+    tasks = {}
     for task in definition.tasks:
         of_files = []
         for path in task.files:
@@ -408,10 +399,10 @@ def _keys(definition: Definition, limits: Limits) -> list[str]:
             except (OSError, DataError):
                 known = [0, 0, "unreadable"]  # a row that says so, until it can be read
             of_files.append(known[2])
-        keys.append(definition.key([task.name, *task.runs, *of_files], __version__))
+        tasks[definition.key([task.name, *task.runs, *of_files], __version__)] = task
     if definition.folder.is_dir() and digests != cache:
         write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
-    return keys
+    return tasks
 
 
 def _digest(path: Path, seconds: float) -> str:
