@@ -85,6 +85,15 @@ def sandwich(
     return found, samples / max(ratio, 1e-300)
 
 
+def inverse_normal(jacobians: Sequence[FloatArray]) -> FloatArray:
+    """Return the inverse of the normal matrix J'J of all records, pseudo where it is singular."""
+    normal = np.asarray(sum(J.T @ J for J in jacobians))
+    size = np.sqrt(normal.diagonal())
+    size = np.where(size > 0.0, size, 1.0)
+    scale = np.outer(size, size)
+    return np.asarray(np.linalg.pinv(normal / scale, hermitian=True) / scale)
+
+
 def autoregression(
     residual: FloatArray, jacobian: FloatArray | None = None
 ) -> tuple[FloatArray, float]:

@@ -13,7 +13,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, positive_array
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
-from dahl_ident.diagnostics.correlated_residuals import sandwich
+from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import listed
@@ -344,11 +344,7 @@ def _change_of(
 ) -> Callable[[Sequence[FloatArray]], FloatArray]:
     """Return how the estimate changes with the measured outputs, to first order."""
     white = [problem.filtered(J) for J in jacobians]
-    normal = np.asarray(sum(J.T @ J for J in white))
-    size = np.sqrt(normal.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
-    inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
-    inverse = inverse / np.outer(size, size)
+    inverse = inverse_normal(white)
 
     def change(output: Sequence[FloatArray]) -> FloatArray:
         parts = zip(white, map(problem.filtered, output), strict=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.correlated_residuals import sandwich
+from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
@@ -130,18 +130,17 @@ def by_delay(
     sample = 1.0 / problem.records[0].sample_rate
     slopes = [problem.filtered(slope * sample) for slope in problem.delay_slopes(values)]
     joint = [np.insert(J, place, s, axis=1) for J, s in zip(jacobians, slopes, strict=True)]
-    mean = float(_step(joint, residuals)[place])
-    return _counted(joint, residuals, place, mean, 1.0, _moved(joint, place))[-1]
+    step, moved = _freed(joint, residuals, place)
+    return _counted(joint, residuals, place, float(step[place]), 1.0, moved)[-1]
 
 
-def _moved(jacobians: Sequence[FloatArray], place: int) -> FloatArray:
-    """Return how the other values change with that at `place`, per unit."""
-    normal = np.asarray(sum(J.T @ J for J in jacobians))
-    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-    normal = normal / np.outer(size, size)
-    others = np.delete(np.arange(size.size), place)
-    moved = -np.linalg.pinv(normal[np.ix_(others, others)], hermitian=True)
-    return np.asarray(moved @ normal[others, place] * size[place] / size[others])
+def _freed(
+    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray], place: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss-Newton step, and how the other values change with that at `place`."""
+    inverse = inverse_normal(jacobians)
+    step = inverse @ sum(J.T @ e for J, e in zip(jacobians, residuals, strict=True))
+    return step, np.delete(inverse[:, place], place) / max(inverse[place, place], 1e-300)
 
 
 def _counted(
@@ -183,7 +182,7 @@ class _Search:
     def result(self, jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> HeldValue:
         """Return what the records say, given derivatives and residuals at the held value."""
         joint = self._joint(jacobians, self.values, 0.0)
-        step, moved = _step(joint, residuals), _moved(joint, self.place)
+        step, moved = _freed(joint, residuals, self.place)
         at, mean = self.values, float(step[self.place])
         if abs(mean) > _LONG:
             at, mean, joint, residuals = self._refined(step)
@@ -214,7 +213,7 @@ class _Search:
                 problem.filtered(y - p.output) for y, p in zip(problem.measured, found, strict=True)
             ]
             joint = self._joint([problem.filtered(p.by) for p in found], at, mean)
-            step = _step(joint, left)
+            step, _ = _freed(joint, left, self.place)
             if abs(float(step[self.place])) < _SHORT:
                 break
         return at, mean, joint, left
@@ -227,15 +226,6 @@ class _Search:
         slopes = self.problem.slopes_with_respect_to(self.parameter, at, held)
         pairs = zip(jacobians, map(self.problem.filtered, slopes), strict=True)
         return [np.insert(J, self.place, slope, axis=1) for J, slope in pairs]
-
-
-def _step(jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> FloatArray:
-    """Return the Gauss-Newton step of values."""
-    normal = np.asarray(sum(J.T @ J for J in jacobians))
-    size = np.sqrt(normal.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
-    right = sum(J.T @ e for J, e in zip(jacobians, residuals, strict=True)) / size
-    return np.asarray(np.linalg.pinv(normal / np.outer(size, size), hermitian=True) @ right / size)
 
 
 def between_blocks(

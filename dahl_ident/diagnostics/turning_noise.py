@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft, special
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.correlated_residuals import autocovariances, correlated
+from dahl_ident.diagnostics.correlated_residuals import autocovariances, correlated, inverse_normal
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -53,10 +53,7 @@ def noise_at_turns(
     -------
     ndarray, shape (P, P)
     """
-    normal = np.asarray(sum(J.T @ J for J in jacobians))
-    size = np.sqrt(normal.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
-    inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size)
+    inverse = inverse_normal(jacobians)
     excess, strength, scatter = 0.0, 0.0, 0.0
     moved = np.zeros((values.size, values.size))
     for number, (J, e) in enumerate(zip(jacobians, residuals, strict=True)):
