@@ -20,7 +20,7 @@ prior 1/s.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -30,7 +30,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, ValidationError, choices
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 
 _DECADES = 1e5  # beyond the data's sizes, either way: as data far from the knee leave open
 _WIDER = 10.0  # a gain that is farther from 1 is a mistake; times an estimate, for its bounds
@@ -215,38 +215,31 @@ class JointPrior:
 
 
 def joint_prior(
-    problem: Problem,
+    problem: BaseProblem,
     priors: Mapping[str, PriorLike] | None = None,
     estimate: FloatArray | None = None,
     assumed: Mapping[str, PriorLike] | None = None,
 ) -> JointPrior:
-    """Return the prior of every free parameter of a problem."""
-    return prior_of(
-        problem.parameters,
-        np.full(len(problem.names), np.nan) if estimate is None else estimate,
-        {"given": priors or {}, "assumed": assumed or {}, "sensors": problem.priors},
-        lambda parameter, at: _default(problem, parameter, at),
-    )
+    """Return the prior of every free parameter of the device and of the sensors.
 
-
-def prior_of(
-    parameters: Sequence[Parameter],
-    estimate: FloatArray,
-    sources: Mapping[str, Mapping[str, Any]],
-    default: Callable[[Parameter, float], tuple[float, float]],
-) -> JointPrior:
-    """Return the prior of every parameter from the first source that has one, or else bounds."""
+    The first source that has one counts: given, assumed, sensors; else wide bounds.
+    """
+    parameters = problem.parameters[: problem.n_reported]
     names = [p.name for p in parameters]
-    unknown = [name for name in sources.get("given", {}) if name not in names]
+    sources: dict[str, Mapping[str, Any]] = {
+        "given": priors or {}, "assumed": assumed or {}, "sensors": problem.priors
+    }  # fmt: skip
+    unknown = [name for name in sources["given"] if name not in names]
     if unknown:
         raise ModelError(
             f"there is a prior for {', '.join(unknown)}, but free are {choices(names, *unknown)}"
         )
     parts = []
-    for parameter, at in zip(parameters, estimate.tolist(), strict=True):
-        source = next((s for s, priors in sources.items() if parameter.name in priors), None)
+    for i, parameter in enumerate(parameters):
+        at = float("nan") if estimate is None else float(estimate[i])
+        source = next((s for s, known in sources.items() if parameter.name in known), None)
         if source is None:
-            parts.append(ParameterPrior(parameter, default(parameter, at), "default"))
+            parts.append(ParameterPrior(parameter, _default(problem, parameter, at), "default"))
         else:
             prior = _checked_prior(parameter, sources[source][parameter.name])
             parts.append(ParameterPrior(parameter, prior, source, at))
@@ -299,34 +292,27 @@ def _check_support(parameter: Parameter, given: Distribution) -> None:
         )
 
 
-def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[float, float]:
-    """Return default bounds of the value; `estimate` is one, not finite where unknown."""
+def _default(problem: BaseProblem, parameter: Parameter, estimate: float) -> tuple[float, float]:
+    """Return wide bounds of the value; `estimate` is one, not finite where unknown."""
     if parameter.name == "delay":
-        half = float(np.pi / problem.stiffness_data.omega.max())
+        half = np.pi * float(problem.unit_sizes((0, 0, 1)).min())
         return -half, half
     if parameter.name in ("force_gain", "displacement_gain"):
         return 1.0 / _WIDER, _WIDER
     # the problem shows units of rotation where the data do; dimensions follow those declared
-    declared = next((p for p in problem.model.parameters if p.name == parameter.name), parameter)
-    return default_bounds(declared, estimate, lambda: _sizes(problem, declared))
-
-
-def default_bounds(
-    parameter: Parameter, estimate: float, sizes_of: Callable[[], FloatArray]
-) -> tuple[float, float]:
-    """Return wide bounds of a value."""
+    parameter = next((p for p in problem.model.parameters if p.name == parameter.name), parameter)
     if parameter.prior is not None:
         low, high = _widened(parameter, *parameter.prior)
     elif not any(parameter.dimension):
         raise _without_default(parameter)
     elif parameter.positive:
-        sizes = sizes_of()
+        sizes = problem.unit_sizes(parameter.dimension)
         seen = sizes[sizes > 0.0]
         if not seen.size:
             raise _without_default(parameter)
         low, high = float(seen.min()) / _DECADES, float(seen.max()) * _DECADES
     else:
-        high = _RESONANCE * float(sizes_of().max())
+        high = _RESONANCE * float(problem.unit_sizes(parameter.dimension).max())
         if np.isfinite(estimate):
             high = max(high, _WIDER * abs(estimate))
         low = -high
@@ -341,14 +327,6 @@ def _widened(parameter: Parameter, low: float, high: float) -> tuple[float, floa
     if parameter.positive:
         return low / _BEYOND, high * _BEYOND
     return low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-
-
-def _sizes(problem: Problem, parameter: Parameter) -> FloatArray:
-    """Return the sizes that a parameter's unit has in the rows: of force, displacement, time."""
-    view = problem.stiffness_data
-    force, displacement, time = parameter.dimension
-    size = (np.abs(view.stiffness) * view.amplitude) ** force * view.amplitude**displacement
-    return np.asarray(size / view.omega**time)
 
 
 def _without_default(parameter: Parameter) -> ValidationError:

@@ -16,7 +16,6 @@ and Davison, Statistica Sinica 22 (2012) 813-845).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,9 +23,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import LogDensity
-from dahl_ident.bayes.priors import JointPrior, PriorLike, default_bounds, prior_of
+from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.errors import FitError, SamplingError
-from dahl_ident.fitting.record_start import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
 
@@ -130,42 +128,3 @@ class RecordDensity(LogDensity):
         except FitError:  # the motion grows beyond all bounds
             return np.inf
         return total if np.isfinite(total) else np.inf
-
-
-def record_prior(
-    problem: RecordProblem, priors: Mapping[str, PriorLike] | None, estimate: FloatArray
-) -> JointPrior:
-    """Return the prior of every free parameter of a model of records.
-
-    Parameters
-    ----------
-    problem : RecordProblem
-    priors : mapping of str to distribution or (low, high), optional
-        By parameter name; the rest gets wide bounds from the size of force and motion.
-    estimate : ndarray
-        Least-squares values, the model's first.
-    """
-    return prior_of(
-        problem.free,
-        estimate[: len(problem.free)],
-        {"given": priors or {}},
-        lambda parameter, at: default_bounds(
-            parameter, at, lambda: _sizes(problem, parameter.dimension)
-        ),
-    )
-
-
-def _sizes(problem: RecordProblem, powers: tuple[int, int, int]) -> FloatArray:
-    """Return the size in each record of a unit, by powers of force, displacement and time."""
-    sizes = []
-    for number, record in enumerate(problem.records):
-        if problem.output == "force":
-            x = np.asarray(record.displacement)
-            v = np.gradient(x, record.time)
-        else:
-            x, v, _ = in_band(problem, number)
-        length, time = np.std(x), np.std(x) / np.std(v)
-        push = record.force_samples
-        force = np.std(push if push.any() else v / time)  # a free decay: of unit mass
-        sizes.append(force ** powers[0] * length ** powers[1] * time ** powers[2])
-    return np.asarray(sizes)

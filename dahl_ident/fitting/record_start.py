@@ -17,6 +17,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, LinearSystem
 from dahl_ident.errors import ModelError
+from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
 _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
@@ -86,7 +87,7 @@ class _Scan:
                 a = np.gradient(v, record.time)
             force = problem.measured[number]
         else:
-            x, v, a = in_band(problem, number)
+            x, v, a = in_band(record, problem.measured[number])
             force = record.force_samples
         n = min(x.size, _LONGEST)
         energy = np.concatenate([[0.0], np.cumsum((v - v.mean()) ** 2)])
@@ -286,64 +287,9 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
     for number, measured in enumerate(problem.measured):
         own = problem.own(full, number)
         if problem.output == "motion":
-            x, v, _ = in_band(problem, number)
+            x, v, _ = in_band(problem.records[number], measured)
             own[0], own[1] = x[0], v[0]
         else:
             total = problem.predict(full, number, derivatives=False).output
             own[-2] = float(np.mean(measured - total))
     return full
-
-
-def in_band(problem: RecordProblem, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement, velocity and acceleration of a record, within the drive's band.
-
-    Differentiated by Fourier transform of the record, its linear trend removed and mirrored at its
-    ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive.
-
-    Parameters
-    ----------
-    problem : RecordProblem
-        Whose record it is.
-    number : int
-        Which one.
-
-    Returns
-    -------
-    tuple of three ndarray, shape (n,)
-    """
-    record = problem.records[number]
-    y, n = problem.measured[number], len(record)
-    drive = record.force_samples
-    line = np.linspace(y[0], y[-1], n)
-    rest = y - line
-    spectrum = np.fft.rfft(np.concatenate([rest, -rest[-2:0:-1]]))
-    m = 2 * n - 2
-    s = 2j * np.pi * np.fft.rfftfreq(m, 1.0 / record.sample_rate)
-    power = np.abs(np.fft.rfft(np.hanning(n) * (drive - drive.mean()))) ** 2
-    if not power.any():  # a free decay: what moves is the band
-        power = np.abs(np.fft.rfft(np.hanning(n) * (y - y.mean()))) ** 2
-    bins = np.flatnonzero(power >= 1e-4 * power.max())
-    highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
-    lowest = 0.5 * bins[0] / power.size
-    place = np.arange(spectrum.size) / spectrum.size
-    spectrum[place > highest] = 0.0
-    order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
-    found = []
-    for wanted in range(order, 3):
-        factor = s ** (wanted - order)
-        wave = np.fft.irfft(spectrum * factor, m)[:n]
-        if wanted == order:
-            wave = wave + line
-        elif wanted == order + 1:
-            wave = wave + (y[-1] - y[0]) / record.duration
-        found.append(wave)
-    if order:
-        from scipy.integrate import cumulative_trapezoid
-        from scipy.signal import butter, detrend, sosfiltfilt
-
-        cut = min(max(lowest, 1.0 / n), 0.5)
-        passed = butter(4, cut, "highpass", output="sos")
-        for _ in range(order):
-            wave = cumulative_trapezoid(found[0], dx=1.0 / record.sample_rate, initial=0)
-            found.insert(0, np.asarray(sosfiltfilt(passed, detrend(wave))))
-    return found[0], found[1], found[2]

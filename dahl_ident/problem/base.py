@@ -90,6 +90,10 @@ class BaseProblem(ABC):
         """The number of priors, those of assumed parameters included."""
         return len(self.priors) + len(self.ranges)
 
+    @abstractmethod
+    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
+        """Return sizes that a unit has in the data, by powers of force, displacement and time."""
+
     # Tables
 
     @property

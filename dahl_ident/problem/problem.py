@@ -359,6 +359,12 @@ class Problem(BaseProblem):
         changes = [np.broadcast_to(d, shape) for d in found.changes]
         return np.array(np.broadcast_to(found.value, shape)), np.stack(changes, axis=-1)
 
+    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
+        """Return the size of a unit in each row, by powers of force, displacement and time."""
+        view, (force, displacement, time) = self.stiffness_data, dimension
+        size = (np.abs(view.stiffness) * view.amplitude) ** force * view.amplitude**displacement
+        return np.asarray(size / view.omega**time)
+
     @cached_property
     def stiffness_data(self) -> StiffnessData:
         """The data as dynamic stiffness at known amplitudes, sensors at their starts."""

@@ -1,4 +1,4 @@
-"""Noise in records: the spectrum of residuals, and the drive's content outside its band."""
+"""Noise in records, and their motion within the drive's band."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.data import Record
 
 HIGHEST_ORDER = 60  # of autoregressions: a limit on time; Akaike's criterion chooses below
 SAMPLES_PER_ORDER = 20  # with fewer, the coefficients follow the noise
@@ -112,6 +113,57 @@ def excited(drive: FloatArray) -> NDArray[np.bool_]:
     if not power.any():
         return np.ones(power.size, dtype=np.bool_)
     return np.asarray(power >= _BAND * power.max())
+
+
+def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return displacement, velocity and acceleration of a record, within the drive's band.
+
+    Differentiated by Fourier transform of the record, its linear trend removed and mirrored at its
+    ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive.
+
+    Parameters
+    ----------
+    record : Record
+    y : ndarray, shape (n,)
+        Its motion, as measured.
+
+    Returns
+    -------
+    tuple of three ndarray, shape (n,)
+    """
+    n = len(record)
+    drive = record.force_samples
+    line = np.linspace(y[0], y[-1], n)
+    rest = y - line
+    spectrum = np.fft.rfft(np.concatenate([rest, -rest[-2:0:-1]]))
+    m = 2 * n - 2
+    s = 2j * np.pi * np.fft.rfftfreq(m, 1.0 / record.sample_rate)
+    power = _power(drive if _power(drive).any() else y)  # in a free decay what moves is the band
+    bins = np.flatnonzero(power >= _BAND * power.max())
+    highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
+    lowest = 0.5 * bins[0] / power.size
+    place = np.arange(spectrum.size) / spectrum.size
+    spectrum[place > highest] = 0.0
+    order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
+    found = []
+    for wanted in range(order, 3):
+        factor = s ** (wanted - order)
+        wave = np.fft.irfft(spectrum * factor, m)[:n]
+        if wanted == order:
+            wave = wave + line
+        elif wanted == order + 1:
+            wave = wave + (y[-1] - y[0]) / record.duration
+        found.append(wave)
+    if order:
+        from scipy.integrate import cumulative_trapezoid
+        from scipy.signal import butter, detrend, sosfiltfilt
+
+        cut = min(max(lowest, 1.0 / n), 0.5)
+        passed = butter(4, cut, "highpass", output="sos")
+        for _ in range(order):
+            wave = cumulative_trapezoid(found[0], dx=1.0 / record.sample_rate, initial=0)
+            found.insert(0, np.asarray(sosfiltfilt(passed, detrend(wave))))
+    return found[0], found[1], found[2]
 
 
 def _power(wave: FloatArray) -> FloatArray:

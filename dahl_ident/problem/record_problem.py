@@ -30,6 +30,7 @@ from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.base import BaseProblem, Quadratic
 from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
+from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.space import Space
 
 if TYPE_CHECKING:
@@ -379,6 +380,20 @@ class RecordProblem(BaseProblem):
     def every_parameter(self) -> tuple[Parameter, ...]:
         """The model's parameters, fixed ones included, and what each record adds."""
         return (*self.model.parameters, *self.parameters[self.n_reported :])
+
+    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
+        """Return the size of a unit in each record, by powers of force, displacement and time."""
+        sizes = []
+        for record, y in zip(self.records, self.measured, strict=True):
+            if self.output == "force":
+                x = np.asarray(record.displacement)
+                v = np.gradient(x, record.time)
+            else:
+                x, v, _ = in_band(record, y)
+            push, time = record.force_samples, np.std(x) / np.std(v)
+            force = np.std(push if push.any() else v / time)  # a free decay: of unit mass
+            sizes.append(np.prod(np.power([force, np.std(x), time], dimension)))
+        return np.array(sizes)
 
     @property
     def extent(self) -> str:

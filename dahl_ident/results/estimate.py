@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from dahl_ident.bayes.chain import ChainSettings, Pool
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
-from dahl_ident.bayes.record_density import RecordDensity, record_prior
+from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.bayes.sample import ChainSample, Start, sample_chain, sample_points
 from dahl_ident.bayes.walker_start import (
     centre_and_covariance,
@@ -526,7 +526,7 @@ def _checked(model: Element | None) -> Element:
 
 def _record_density(fit: RecordFit, priors: Mapping[str, PriorLike] | None) -> RecordDensity:
     values, count = fit.optimum.values, len(fit.problem.free)
-    prior = record_prior(fit.problem, priors, values)
+    prior = joint_prior(fit.problem, priors, values)
     covariance = fit.covar[:count, :count]
     return RecordDensity(fit.problem, values, covariance, fit.errors.dof, prior)
 
