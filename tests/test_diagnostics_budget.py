@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import BoucWen, Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
+from dahl_ident import BoucWen, Dahl, Damper, FrequencyResponse, Sensors, Spring, fit, load_dataset
 from dahl_ident.diagnostics import ErrorModel, budget, error_model
 from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.mixed_model import MixedModel
@@ -401,3 +401,26 @@ class TestLevels:
         spread = [np.exp(rng.uniform(0.0, 4.6, n)) for n in 50 * [12, 30, 100, 300]]
         alarms = sum(self.repeated(A) > 0 for A in spread)
         assert stats.binomtest(alarms, len(spread), 0.01, alternative="greater").pvalue > 0.01
+
+
+def test_the_estimate_does_not_depend_on_the_unit_of_force() -> None:
+    """Harmonics of tiny covariances that the model misses: the search is far from the estimate."""
+    rng, A = np.random.default_rng(1), np.geomspace(0.1, 10.0, 12) * X_C
+    f, law = np.tile([0.5, 2.0], 6), BoucWen(30.0, 300.0, 300.0, exponent=2.0) + Damper(0.3)
+    R = np.array([law.dynamic_stiffness(A, 2.0 * np.pi * f, harmonic=k) for k in (1, 3)])
+    size = np.abs(R[0]) * np.array([[3e-3], [1e-5]])
+    R = (R + size * (rng.standard_normal((2, 12)) + 1j * rng.standard_normal((2, 12)))).ravel()
+    found = [
+        fit(
+            FrequencyResponse(
+                np.tile(f, 2), unit * R, np.tile(A, 2), harmonic=np.repeat([1, 3], 12),
+                covariance=(unit * size.ravel())[:, None, None] ** 2 * np.eye(2),
+            ),
+            Dahl() + Damper(), throw=False,
+        ).params
+        for unit in (1.0, 1e5)
+    ]  # fmt: skip
+    for name in ("f_max", "sigma", "damping"):
+        one, other = (params[name] for params in found)
+        assert one.stderr is not None
+        assert 1e-5 * other.value == pytest.approx(one.value, abs=0.02 * one.stderr)

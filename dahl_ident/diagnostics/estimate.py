@@ -359,10 +359,16 @@ def _weighted(factors: FloatArray, rows: FloatArray) -> FloatArray:
 def _moved(
     problem: Problem, theta: FloatArray, step: FloatArray, basis: Basis | None
 ) -> FloatArray:
-    def part(move: FloatArray) -> float:
-        return min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
+    """Return theta after a step, or the part of it that changes no logarithm by much."""
+    logarithmic = problem.space.positive
+    if basis is not None:  # coordinates that change one
+        logarithmic = (basis.slopes[logarithmic] != 0.0).any(axis=0)
 
-    low, high = problem.bounds()
-    if basis is None:
-        return np.clip(theta + step * part(step), low, high)
-    return np.clip(basis.at(theta).moved(theta, step, part), low, high)
+    def part(move: FloatArray) -> float:
+        return min(
+            1.0, _LONGEST_STEP / max(float(np.abs(move[logarithmic]).max(initial=0.0)), TINY)
+        )
+
+    if basis is not None:
+        return np.clip(basis.at(theta).moved(theta, step, part), *problem.bounds())
+    return np.clip(theta + step * part(step), *problem.bounds())
