@@ -45,6 +45,7 @@ _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-12
 _TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, TESTS)
+_COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
 _CHANNELS = {
     "force_gain": "force calibration",
     "displacement_gain": "displacement calibration",
@@ -148,50 +149,28 @@ class Budget(Mapping[str, ParameterBudget]):
     def __len__(self) -> int:
         return len(self.parameters)
 
-    def __str__(self) -> str:
-        lines = [["", "source", "type", "u", "dof", "share", "k", "U"]]
+    @property
+    def _cells(self) -> Iterator[tuple[str, ...]]:
+        """Yield name, value, then source, type, u, dof, share, k and U: the combined one first."""
         for p in self.parameters:
-            value = " ".join([p.name, "=", rounded(p.value, p.u)[0], p.unit]).rstrip()
-            lines.append(
-                [
-                    value,
-                    "combined",
-                    "",
-                    _u(p, p.u),
-                    _dof(p.dof),
-                    "100 %",
-                    f"{p.k:.2f}",
-                    _u(p, p.U),
-                ]
-            )
-            lines += [
-                [
-                    "",
-                    r.source,
-                    r.kind,
-                    _u(p, r.u),
-                    _dof(r.dof),
-                    f"{100.0 * r.share:.0f} %",
-                    "",
-                    "",
-                ]
-                for r in p.rows
-            ]
+            whole = ("combined", "", _u(p, p.u), _dof(p.dof), "100 %", f"{p.k:.2f}", _u(p, p.U))
+            yield (p.name, rounded(p.value, p.u)[0], *whole)
+            for r in p.rows:
+                share = f"{100.0 * r.share:.0f} %"
+                yield ("", "", r.source, r.kind, _u(p, r.u), _dof(r.dof), share, "", "")
+
+    def __str__(self) -> str:
+        lines: list[tuple[str, ...]] = [("", *_COLUMNS)]
+        lines += [
+            (f"{name} = {value} {self[name].unit}".rstrip() if name else "", *cells)
+            for name, value, *cells in self._cells
+        ]
         text = table(lines, left=(0, 1, 2))
         return f"{text}\ntaken as exact: {listed(self.exact)}" if self.exact else text
 
     def _repr_html_(self) -> str:
-        rows = [
-            cells
-            for p in self.parameters
-            for cells in (
-                (f"{p.name} [{p.unit}]", rounded(p.value, p.u)[0], "combined", "", _u(p, p.u),
-                 _dof(p.dof), "100 %", f"{p.k:.2f}", _u(p, p.U)),
-                *(("", "", r.source, r.kind, _u(p, r.u), _dof(r.dof), f"{r.share:.0%}", "", "")
-                  for r in p.rows),
-            )
-        ]  # fmt: skip
-        return html_table(("", "value", "source", "type", "u", "dof", "share", "k", "U"), rows)
+        rows = ((f"{n} [{self[n].unit}]" if n else "", *cells) for n, *cells in self._cells)
+        return html_table(("", "value", *_COLUMNS), rows)
 
     def to_latex(self) -> str:
         """Return a table of values with expanded uncertainties; it needs no package of LaTeX."""

@@ -39,7 +39,6 @@ from dahl_ident.diagnostics.information import Information, shares
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, wald_intervals
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum, Status
-from dahl_ident.problem import Problem
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
@@ -284,7 +283,7 @@ def judged(
         for name, f, p in zip(problem.names, fisher, profile, strict=True)
     }
     beyond = {} if errors is None else _lost_beyond_noise(errors, verdicts, natural)
-    blind = {**_signs_unseen(optimum), **_order_unseen(optimum)}
+    blind = _unseen(optimum)
     verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
     if errors is not None:
         for name, size in zip(problem.names, natural.tolist(), strict=True):
@@ -345,61 +344,48 @@ def _lost_beyond_noise(
     return found
 
 
-def _signs_unseen(optimum: Optimum) -> dict[str, str]:
-    """Return what is said of friction parameters whose sign the data do not show, by name.
+def _unseen(optimum: Optimum) -> dict[str, str]:
+    """Return what is said of friction parameters whose sign or order the data do not show.
 
-    Where a mirrored law is the same to a sine, it is to the exact motion's fundamental.
+    Where a mirrored law is the same to a sine, it is to the exact motion's fundamental; so it is
+    with parameters that pulling and pushing exchange. A move that should have cost something, by
+    the derivatives, costs nothing.
     """
-    problem, found = _to_a_sine(optimum.problem), dict[str, str]()
-    for i in problem.friction_columns.tolist():
-        parameter, turned = problem.parameters[i], optimum.theta.copy()
-        turned[i] = -turned[i]
-        error = optimum.stderr[parameter.name]
-        if parameter.positive or not abs(turned[i]) > error:
-            continue
-        y, other = problem.residuals(np.array([optimum.theta, turned]), optimum.scale or 1.0)
-        if abs(float(other @ other - y @ y)) < _NO_DIFFERENCE:
-            size = with_unit(abs(float(optimum.values[i])), error, parameter.unit)
-            found[parameter.name] = (
-                f"its size is {size}, its sign is not determined: the fundamental is the same for "
-                "either; measure the mean force or even harmonics too"
-            )
-    return found
-
-
-def _to_a_sine(problem: Problem) -> Problem:
-    """Return the problem with the describing function, unless harmonics of motions are known."""
+    problem, scale, found = optimum.problem, optimum.scale or 1.0, dict[str, str]()
     driven = problem.data.controlled == "force"
-    if (problem.data.harmonic[driven] != 1).any():
-        return problem
-    return problem.with_steady("describing function")
+    if not (problem.data.harmonic[driven] != 1).any():  # harmonics of motions need the motion
+        problem = problem.with_steady("describing function")
+    theta, error = optimum.theta, np.sqrt(np.diagonal(optimum.covariance))
 
+    def alike(other: FloatArray) -> bool:
+        y, moved = problem.residuals(np.array([theta, other]), scale)
+        return abs(float(moved @ moved - y @ y)) < _NO_DIFFERENCE
 
-def _order_unseen(optimum: Optimum) -> dict[str, str]:
-    """Return what is said of parameters that could be exchanged without a difference, by name.
+    def shown(i: int, value: float) -> str:
+        parameter = problem.parameters[i]
+        return with_unit(value, optimum.stderr[parameter.name], parameter.unit)
 
-    Such as exponents of pulling and pushing, whose fundamental is that of the mirrored law. All
-    that is exchanged must be like in kind; a move that should have cost something costs nothing.
-    """
-    problem, found = _to_a_sine(optimum.problem), dict[str, str]()
-    scale = optimum.scale or 1.0
+    for i in problem.friction_columns.tolist():
+        turned = theta.copy()
+        turned[i] = -turned[i]
+        if not problem.parameters[i].positive and abs(theta[i]) > error[i] and alike(turned):
+            found[problem.names[i]] = (
+                f"its size is {shown(i, abs(float(optimum.values[i])))}, its sign is not "
+                "determined: the fundamental is the same for either; measure the mean force or "
+                "even harmonics too"
+            )
     for order in _exchanges(optimum):
-        move = optimum.theta[order] - optimum.theta
-        jacobian = problem.residuals_and_jacobian(optimum.theta, scale, tails=False)[1]
-        if not float(np.sum((jacobian @ move) ** 2)) > _DIFFERENT:
+        move = theta[order] - theta
+        jacobian = problem.residuals_and_jacobian(theta, scale, tails=False)[1]
+        if not (float(np.sum((jacobian @ move) ** 2)) > _DIFFERENT and alike(theta[order])):
             continue
-        y, other = problem.residuals(np.array([optimum.theta, optimum.theta[order]]), scale)
-        if not abs(float(other @ other - y @ y)) < _NO_DIFFERENCE:
-            continue
-        for i in np.flatnonzero(np.abs(move) > np.sqrt(np.diagonal(optimum.covariance))).tolist():
-            name, partner = problem.names[i], problem.names[order[i]]
-            value, error = float(optimum.values[i]), optimum.stderr[name]
-            swapped = float(optimum.values[order[i]]), optimum.stderr[partner]
-            unit = problem.parameters[i].unit
-            found[name] = (
-                f"either {with_unit(value, error, unit)} or {with_unit(*swapped, unit)}, as "
-                f"{name} and {partner} are exchangeable: these data are the same for either order; "
-                "measure the mean force or even harmonics too"
+        for i in np.flatnonzero(np.abs(move) > error).tolist():
+            j = int(order[i])
+            values = [shown(k, float(optimum.values[k])) for k in (i, j)]
+            found[problem.names[i]] = (
+                f"either {' or '.join(values)}, as {problem.names[i]} and {problem.names[j]} are "
+                "exchangeable: these data are the same for either order; measure the mean force "
+                "or even harmonics too"
             )
         break
     return found
