@@ -29,7 +29,6 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident import population
-from dahl_ident.campaigns.definition import read_definition
 from dahl_ident.campaigns.engine import Limits, Local, run_jobs
 from dahl_ident.campaigns.run import _unless_refused
 from dahl_ident.campaigns.work import Job, failed
@@ -207,7 +206,7 @@ def test_a_wrong_table_of_covariates_is_named(tmp_path: Path, text: str, message
     make_tables(tmp_path, 2)
     (tmp_path / "devices.csv").write_text(text)
     with pytest.raises(DataError, match=message):
-        read_definition(definition(tmp_path))
+        di.campaign(definition(tmp_path), dry_run=True)
 
 
 def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path: Path) -> None:
@@ -216,14 +215,14 @@ def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path: Path) 
     (tmp_path / "devices.csv").write_text("device,day\na_b,1\na,1\n")
     pattern = f"{tmp_path.as_posix()}/{{device}}-{{day}}.csv"
     with pytest.raises(DataError, match="day stands in the pattern and in the table"):
-        read_definition(definition(tmp_path, files__pattern=pattern))
+        di.campaign(definition(tmp_path, files__pattern=pattern), dry_run=True)
     for place in ("a_b/c", "a/b_c"):
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place / "x.csv").write_text("")
     both = {"pattern": f"{tmp_path.as_posix()}/{{device}}/{{run}}/x.csv", "kind": "response"}
     content = {"files": both, "model": [{"kind": "dahl"}], "output": {"per": "run"}}
     with pytest.raises(DataError, match="are both called a_b_c"):
-        read_definition(content)
+        di.campaign(content, dry_run=True)
 
 
 @pytest.mark.parametrize(
@@ -287,19 +286,18 @@ def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> N
 
 def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path) -> None:
     make_tables(tmp_path, 2)
-    tasks = read_definition(definition(tmp_path)).tasks
-    options = read_definition(definition(tmp_path)).options
+    options: dict[str, Any] = {"kind": "response", "model": [{"kind": "dahl"}], "posterior": None}
+    options |= {"read": {}, "fit": {}}
     jobs = [
-        (task.name, Job(task.name, tuple((str(p), None) for p in task.files), task.runs, options,
-                        None))
-        for task in tasks
-    ]  # fmt: skip
+        (name, Job(name, ((str(tmp_path / f"{name}_r0.csv"), None),), ("r0",), options, None))
+        for name in ("d000", "d001")
+    ]
     deadly = Job("deadly", _Deadly(), ("r",), options, None)
     with Local(2) as place:
         rows = dict(run_jobs([jobs[0], ("deadly", deadly), *jobs[1:]], place, Limits()))
     assert rows["deadly"]["status"] == "failed"
     assert "died" in rows["deadly"]["error"]
-    assert {rows[task.name]["status"] for task in tasks} == {"trusted"}
+    assert {rows[name]["status"] for name, _ in jobs} == {"trusted"}
 
 
 class _Deadly(tuple[Any, ...]):
@@ -613,7 +611,9 @@ def test_covariates_in_a_pipe_are_refused(tmp_path: Path) -> None:
     make_tables(tmp_path, 2)
     os.mkfifo(tmp_path / "table.csv")
     with pytest.raises(DataError, match="is a pipe; expected a file"):
-        read_definition(definition(tmp_path, files__covariates=str(tmp_path / "table.csv")))
+        di.campaign(
+            definition(tmp_path, files__covariates=str(tmp_path / "table.csv")), dry_run=True
+        )
 
 
 def test_a_law_of_a_module_is_known_where_it_is_fitted(
