@@ -195,12 +195,7 @@ class Binding:
 
     def named(self, role: str) -> list[Channel]:
         """Return the columns that are called what the role is, or said to be it by the format."""
-        declared = self.columns[role]
-        return [
-            c
-            for c in self.source.channels
-            if c.role == role or (c.role is None and c.is_called(declared))
-        ]
+        return [c for c in self.source.channels if c.is_called(self.columns[role])]
 
     def channel(self, role: str) -> Channel | None:
         """Return the channel of a role, or None where the file has none."""

@@ -24,8 +24,16 @@ from dahl_ident.arrays import (
     refuse_masked,
 )
 from dahl_ident.data.quantities import polar_std
-from dahl_ident.errors import ValidationError, choices
-from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, QUANTITIES, Motion, si_unit
+from dahl_ident.errors import UnitError, ValidationError, choices
+from dahl_ident.units import (
+    DRIVE_KINDS,
+    MOTION_KINDS,
+    QUANTITIES,
+    Motion,
+    kind_of,
+    parse_unit,
+    si_unit,
+)
 
 Check = Callable[[ArrayLike, str], NDArray[Any]]
 CONTROLLED = ("displacement", "force")
@@ -230,6 +238,16 @@ class FileColumn:
         """Return the header with which it is saved."""
         unit = f" [{self.unit_of(data.motion, data.quantity)}]" if self.unit else ""
         return self.header or f"{self.names[0]}{unit}"
+
+    def measures(self, unit: str | None, what: str) -> bool:
+        """Return whether a unit, that `what` has, is of one of the kinds."""
+        if unit is None or not self.kinds:
+            return False
+        try:
+            kind_of(parse_unit(unit), self.kinds, what)
+        except UnitError:
+            return False
+        return True
 
     @property
     def example(self) -> str:

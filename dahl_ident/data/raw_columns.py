@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import math
 import re
@@ -18,7 +17,7 @@ from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
 from dahl_ident.data.columns import FileColumn
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DahlIdentError, DataError, UnitError
-from dahl_ident.units import kind_of, parse_unit
+from dahl_ident.units import parse_unit
 
 _NUMBER = re.compile(
     r"\s*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan",
@@ -114,16 +113,18 @@ class Channel:
         return _SUFFIXES.get(match[2].casefold(), match[2].replace("_per_", "/"))
 
     def is_called(self, declared: FileColumn) -> bool:
-        """Return whether the name is a column's, perhaps with a unit of its kind behind it."""
+        """Return whether the format says that it is this column, or else its name does.
+
+        A unit of the column's kinds may stand at the end of the name.
+        """
         name = self.short or self.name
-        if plain(name) in declared.names:
-            return True
-        match, unit = _UNIT_AT_END.fullmatch(name), self.unit_in_name
-        if match is None or unit is None or plain(match[1]) not in declared.names:
-            return False
-        with contextlib.suppress(UnitError):
-            return bool(declared.kinds) and bool(kind_of(parse_unit(unit), declared.kinds, name))
-        return False
+        if self.role is not None:
+            return self.role == declared.names[0]
+        match = _UNIT_AT_END.fullmatch(name)
+        stem = match is not None and plain(match[1]) in declared.names
+        return plain(name) in declared.names or (
+            stem and declared.measures(self.unit_in_name, self.name)
+        )
 
     @property
     def header(self) -> str:

@@ -10,7 +10,6 @@ response. Standard deviations without a unit have that of their column.
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import re
 from collections.abc import Mapping
@@ -36,9 +35,7 @@ from dahl_ident.errors import DataError, UnitError, ValidationError
 from dahl_ident.units import (
     DRIVE_KINDS,
     MOTION_KINDS,
-    QUANTITIES,
     Quantity,
-    kind_of,
     parse_quantity,
     parse_unit,
     si_unit,
@@ -115,10 +112,9 @@ def response_from(
 
 def _as_gain(channel: Channel) -> Channel:
     """Return an "amplitude" in the unit of a response as what it is, a gain."""
-    if plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names and channel.unit:
-        with contextlib.suppress(UnitError):
-            kind_of(parse_unit(channel.unit), QUANTITIES, channel.name)
-            return replace(channel, role="gain")
+    named = plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names
+    if named and RESPONSE_COLUMNS["gain"].measures(channel.unit, channel.name):
+        return replace(channel, role="gain")
     return channel
 
 
@@ -128,7 +124,7 @@ def _with_stated(
     """Take the level that the file's header states, where neither a column nor the user does."""
     levels = [RESPONSE_COLUMNS[role] for role in ("drive", "amplitude")]
     known = {"drive", "amplitude"} & columns.roles.keys() or any(
-        c.role is None and any(map(c.is_called, levels)) for c in source.channels
+        any(map(c.is_called, levels)) for c in source.channels
     )
     stated = dict(source.stated)
     if "amplitude" in stated:
@@ -501,11 +497,8 @@ def _per_drive(text: str) -> tuple[str, str, int] | None:
     forms = [("", text, 0)]
     for kind, symbol in (("voltage", "V"), ("current", "A")):
         forms += [(kind, f"({text})*{symbol}/N", -1), (kind, f"({text})*N/{symbol}", 1)]
-    for form in forms:
-        with contextlib.suppress(UnitError):
-            kind_of(parse_unit(form[1]), QUANTITIES, "the gain")
-            return form if form[2] else None  # none of one of the six quantities as it is
-    return None
+    form = next((f for f in forms if RESPONSE_COLUMNS["gain"].measures(f[1], "the gain")), None)
+    return form if form and form[2] else None  # none of one of the six quantities as it is
 
 
 def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:

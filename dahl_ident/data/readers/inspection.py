@@ -4,33 +4,38 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS, FileColumn
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.record import gaps, is_even, sample_rate
 from dahl_ident.data.record_table import is_stamped
 from dahl_ident.data.tabular import as_html, as_text, extent, listed
 from dahl_ident.errors import UnitError
-from dahl_ident.units import MOTION_KINDS, kind_of, parse_unit
+from dahl_ident.units import MOTION_KINDS, parse_unit
 
-# The roles that are proposed, those of a response without a unit that claims a channel among them.
-_RECORD_ROLES = tuple(RECORD_COLUMNS)
-_RESPONSE_ROLES = (
-    "frequency", "amplitude", "drive", "response", "real", "imag", "gain", "gain_db", "phase",
-    "level",
-)  # fmt: skip
-_BY_NAME_ONLY = ("response", "real", "imag", "gain_db")  # any of them has the gain's unit
 _INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # s, of single numbers
 _RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # Hz
 _FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
-_FREQUENCY = RESPONSE_COLUMNS["frequency"]
-_PROPOSED = RESPONSE_COLUMNS | {"frequency": replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))}
+# The columns that are proposed; the units of some say nothing: any of them has the gain's.
 _RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("voltage", "current"))}
+_RESPONSE = {
+    role: replace(RESPONSE_COLUMNS[role], kinds=RESPONSE_COLUMNS[role].kinds if by_unit else ())
+    for by_unit, roles in (
+        (True, ("frequency", "amplitude", "drive")),
+        (False, ("response", "real", "imag")),
+        (True, ("gain",)),
+        (False, ("gain_db",)),
+        (True, ("phase",)),
+        (False, ("level",)),
+    )
+    for role in roles
+}
+_FREQUENCY = RESPONSE_COLUMNS["frequency"]
+_F_TOO = replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))
 
 
 @dataclass(frozen=True)
@@ -106,9 +111,10 @@ def _summary(channel: Channel) -> ChannelSummary:
 
 
 def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
-    """Describe the sampling of the first channel that is time, by its name or its unit."""
-    by_name = [c for c in source.channels if _named(c, "time", _RECORD)]
-    by_unit = [c for c in source.channels if _of_kind(c, "time", _RECORD)]
+    """Describe the sampling of the first channel that is time, and its gaps; of many, some."""
+    time_column = RECORD_COLUMNS["time"]
+    by_name = [c for c in source.channels if c.is_called(time_column)]
+    by_unit = [c for c in source.channels if time_column.measures(c.unit, c.name)]
     for channel in by_name or by_unit:
         if channel.values.dtype.kind not in "fiu" or channel.size < 2:
             continue
@@ -118,32 +124,24 @@ def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
             continue
         if not np.isfinite(time).all():
             return "time is not finite everywhere", ()
-        if time.ndim == 1 and time.size > 1 and np.all(np.diff(time) > 0.0):
-            evenness = "even" if is_even(time) else "uneven"
-            text = (
-                f"{sample_rate(time):.6g} Hz, {evenness}, {time.size} samples in "
-                f"{time[-1] - time[0]:.6g} s"
+        if time.ndim != 1 or not np.all(np.diff(time) > 0.0):
+            return "time does not increase with every sample", ()
+        text = (
+            f"{sample_rate(time):.6g} Hz, {'even' if is_even(time) else 'uneven'}, {time.size} "
+            f"samples in {time[-1] - time[0]:.6g} s"
+        )
+        start, stop = gaps(time).T
+        lines = tuple(f"{a:.6g} to {b:.6g} s" for a, b in zip(start, stop, strict=True))
+        if len(lines) > _FEW_GAPS:
+            lengths = stop - start
+            longest = lines[int(np.argmax(lengths))]
+            lines = (
+                f"{len(lines)} gaps, {lengths.sum():.4g} s in all, median {np.median(lengths):.4g} "
+                "s",
+                f"the longest {longest}, the first {lines[0]}, the last {lines[-1]}",
             )
-            return text, _gap_lines(gaps(time))
-        return "time does not increase with every sample", ()
+        return text, lines
     return "", ()
-
-
-def _gap_lines(found: FloatArray) -> tuple[str, ...]:
-    """Return each gap where they are few; of many their number, the longest and the first."""
-    lines = tuple(f"{a:.6g} to {b:.6g} s" for a, b in found)
-    if len(lines) <= _FEW_GAPS:
-        return lines
-    lengths = found[:, 1] - found[:, 0]
-    longest = int(np.argmax(lengths))
-    return (
-        f"{len(lines)} gaps, {lengths.sum():.4g} s in all, median {np.median(lengths):.4g} s",
-        f"the longest {lines[longest]}, the first {lines[0]}, the last {lines[-1]}",
-    )
-
-
-def _named(channel: Channel, role: str, columns: Mapping[str, FileColumn]) -> bool:
-    return channel.role == role or channel.is_called(columns[role])
 
 
 def _proposal(source: Source) -> str:
@@ -152,26 +150,37 @@ def _proposal(source: Source) -> str:
     if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
         groups = {path: channel for path, channel in groups.items() if channel.size > 1}
     response = _is_response(groups.values())
-    columns = _PROPOSED if response else _RECORD
+    every = RESPONSE_COLUMNS | {"frequency": _F_TOO} if response else RECORD_COLUMNS
+    proposed = _RESPONSE | {"frequency": _F_TOO} if response else _RECORD
     roles: dict[str, str] = {}
-    for role in _RESPONSE_ROLES if response else _RECORD_ROLES:
+    for role, column in proposed.items():
         free = {p: c for p, c in groups.items() if p not in roles.values()}
-        by_name = (p for p, c in free.items() if _named(c, role, columns))
+        by_name = (p for p, c in free.items() if c.is_called(column))
         by_unit = (
             p
             for p, c in free.items()
-            if _of_kind(c, role, columns) and not _has_name(c, columns, columns)
+            if column.measures(c.unit, c.name) and not any(map(c.is_called, every.values()))
         )
         best = next(by_name, None) or min(by_unit, key=_likeness, default=None)
         if best is not None and not (role in MOTION_KINDS and set(MOTION_KINDS) & roles.keys()):
             roles[role] = best
     lines = [line for role, path in roles.items() for line in _entry(role, path, groups[path])]
-    others = [path for path in groups if path not in roles.values()]
-    found = [path for path in others if _has_name(groups[path], columns.keys() - roles, columns)]
-    unused = [path for path in others if path not in found]
-    for what, paths in (("read by their names", found), ("not used", unused)):
+    further = [column for role, column in every.items() if role not in roles]
+    others = {path: c for path, c in groups.items() if path not in roles.values()}
+    by_name_too = [path for path, c in others.items() if any(map(c.is_called, further))]
+    unused = [path for path in others if path not in by_name_too]
+    for what, paths in (("read by their names", by_name_too), ("not used", unused)):
         lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
-    return "\n".join([*lines, *_to_fill_in(roles.keys(), response, _stated_rate(source))])
+    required = [("frequency",)] if response else [("time",), MOTION_KINDS, ("force", "drive")]
+    missing = [several[0] for several in required if not set(several) & roles.keys()]
+    if missing:
+        named = ", ".join(missing)
+        lines.append(f"# not found: {named}. Fill in, and remove the comment signs:")
+    lines += [f'# {role} = {{column = "", unit = ""}}' for role in missing]
+    if "time" in missing:
+        rate = _stated_rate(source)
+        lines.append(f"{rate}, in place of the time; above all lines in brackets")
+    return "\n".join(lines)
 
 
 def _likeness(path: str) -> int:
@@ -194,43 +203,14 @@ def _stated_rate(source: Source) -> str:
     return "# sample_rate = 1000.0  # Hz"
 
 
-def _to_fill_in(found: Collection[str], response: bool, rate: str) -> Iterator[str]:
-    """Yield comments that become the entries of required roles once they are filled in."""
-    required = [("frequency",)] if response else [("time",), MOTION_KINDS, ("force", "drive")]
-    missing = [roles[0] for roles in required if not set(roles) & set(found)]
-    if missing:
-        yield f"# not found: {', '.join(missing)}. Fill in, and remove the comment signs:"
-    for role in missing:
-        yield f'# {role} = {{column = "", unit = ""}}'
-    if "time" in missing:
-        yield f"{rate}, in place of the time; above all lines in brackets"
-
-
-def _has_name(channel: Channel, roles: Iterable[str], columns: Mapping[str, FileColumn]) -> bool:
-    return any(_named(channel, role, columns) for role in roles)
-
-
 def _is_response(channels: Collection[Channel]) -> bool:
     """Return whether channels are a table of response; f is force only with time or motion."""
 
-    def any_is(role: str, columns: Mapping[str, FileColumn]) -> bool:
-        return any(_named(c, role, columns) or _of_kind(c, role, columns) for c in channels)
+    def any_is(column: FileColumn) -> bool:
+        return any(c.is_called(column) or column.measures(c.unit, c.name) for c in channels)
 
-    if any_is("frequency", RESPONSE_COLUMNS):
-        return True
-    sampled = any(any_is(role, _RECORD) for role in ("time", *MOTION_KINDS))
-    return not sampled and any_is("frequency", _PROPOSED)
-
-
-def _of_kind(channel: Channel, role: str, columns: Mapping[str, FileColumn]) -> bool:
-    kinds = columns[role].kinds
-    if channel.unit is None or not kinds or role in _BY_NAME_ONLY:
-        return False
-    try:
-        kind_of(parse_unit(channel.unit), kinds, channel.name)
-    except UnitError:
-        return False
-    return True
+    sampled = any(any_is(_RECORD[role]) for role in ("time", *MOTION_KINDS))
+    return any_is(_FREQUENCY) or (not sampled and any_is(_F_TOO))
 
 
 def _entry(role: str, path: str, channel: Channel) -> Iterator[str]:
