@@ -94,7 +94,7 @@ class Mechanism:
                 "prescribed displacement at most s^2, a mass, has a force"
             )
         q0, q1, q2 = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
-        parts: list[Signal] = [LawForce(law, displacement) for law in self.laws]
+        parts: list[Signal] = [_law_force(law, displacement) for law in self.laws]
         if np.any(rest.numerator):
             import control
 
@@ -272,20 +272,17 @@ class EngineMotion:
         return motion.output[back[knots.size :]], motion.states[-1]
 
 
-class LawForce:
-    """The force of any law under a prescribed displacement, at any times after its start."""
+def _law_force(element: Element, displacement: Waveform) -> Signal:
+    """Return the force of any law under a prescribed displacement, at any times from its start."""
+    turns = displacement.turning_times()
 
-    def __init__(self, element: Element, displacement: Waveform) -> None:
-        self._element = element
-        self._displacement = displacement
-        self._turns = displacement.turning_times()
+    def force(time: FloatArray) -> FloatArray:
+        every, back = np.unique(np.concatenate([turns, time]), return_inverse=True)
+        motion = displacement.motion(every)
+        forces = element.force_history(_values(element), motion.value, motion.velocity)
+        return np.asarray(forces[back[turns.size :]])
 
-    def __call__(self, time: FloatArray) -> FloatArray:
-        """Return the force at any times."""
-        every, back = np.unique(np.concatenate([self._turns, time]), return_inverse=True)
-        motion = self._displacement.motion(every)
-        force = self._element.force_history(_values(self._element), motion.value, motion.velocity)
-        return np.asarray(force[back[self._turns.size :]])
+    return force
 
 
 def _values(element: Element) -> list[float]:

@@ -14,7 +14,6 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.synthetic.lab import simulate
@@ -32,17 +31,10 @@ def write(one: DataSet, directory: Path) -> None:
     provenance = dict(data.provenance or {})
     bare = replace(data, provenance={"dataset": one.name})
     file = bare.save(directory / one.file, overwrite=True)
-    sidecar: dict[str, Any] = {
-        "name": one.name,
-        "kind": one.kind,
-        "file": one.file,
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-        "teaches": one.teaches,
-        "identifiable": list(one.identifiable),
-        "not_identifiable": list(one.not_identifiable),
-        "caution": one.caution,
-        **provenance,
-    }
+    names = ("teaches", "identifiable", "not_identifiable", "caution")
+    sidecar = {name: getattr(one, name) for name in ("name", "kind", "file")}
+    sidecar["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    sidecar |= {name: getattr(one, name) for name in names} | provenance
     text = json.dumps(sidecar, indent=1, ensure_ascii=False) + "\n"
     (directory / f"{one.name}.json").write_text(text, encoding="utf-8")
 

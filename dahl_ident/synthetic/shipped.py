@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -40,15 +40,9 @@ class DataSet:
     @classmethod
     def of(cls, declared: dict[str, Any]) -> DataSet:
         """Return the data set that a JSON file declares."""
-        return cls(
-            declared["name"],
-            Experiment.from_dict(declared["experiment"]),
-            declared["seed"],
-            declared["teaches"],
-            tuple(declared["identifiable"]),
-            tuple(declared["not_identifiable"]),
-            declared["caution"],
-        )
+        values = {f.name: declared[f.name] for f in fields(cls)}
+        values |= {name: tuple(v) for name, v in values.items() if isinstance(v, list)}
+        return cls(**values | {"experiment": Experiment.from_dict(declared["experiment"])})
 
     @property
     def kind(self) -> str:
