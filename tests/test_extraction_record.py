@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from benchmarks.extraction_validation import Noise, accuracy, one_over_f, steady, white
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.elements import Dahl
+from dahl_ident.elements import Dahl, Damper, Mass
 from dahl_ident.errors import DahlIdentError, ExtractionError, ValidationError
 from dahl_ident.extraction import extract
+from dahl_ident.results import fit
+from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table, simulate
 
 RATE = 200.0
 FRICTION = Dahl(f_max=1.0, sigma=1.0)
@@ -296,6 +298,34 @@ def test_noise_is_not_taken_for_a_distortion_of_the_force(third: float) -> None:
     data = extract(record, harmonics=(1,), controlled="force")
     assert data.quality["force_share"][0] < 0.93
     assert data.quality["force_distortion"][0] == pytest.approx(third, abs=0.02)
+
+
+def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance() -> None:
+    plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24)
+    steps = SteppedSine(
+        (0.08, 0.4), controlled="force", settling_periods=30, num_periods=40, ramp_periods=3.0
+    )
+    noisy = Acquisition(200.0, Channel(noise_std=2e-6), Channel(noise_std=2e-5))
+    record = simulate(Experiment(plant, steps, noisy), seed=2)
+    assert isinstance(record, Record)
+    data = extract(record, controlled="force", harmonics=(1, 3, 5))
+    exact = simulate(Experiment(plant, steps, table=Table(harmonics=(1, 3, 5))), seed=2)
+    assert isinstance(exact, FrequencyResponse)
+    assert (data.quantity, set(data.quality["verdict"])) == ("receptance", {"good"})
+    assert data.harmonic.tolist() == exact.harmonic.tolist() == [1, 3, 5] * 2
+    off = data.response - exact.response
+    parts = np.stack([off.real, off.imag], -1)
+    assert data.covariance is not None
+    chi = np.einsum("ni,nij,nj->n", parts, np.linalg.inv(data.covariance), parts) / 2.0
+    assert chi.max() < 8.0  # F(2, dof) is above it once in 2,000 rows
+    assert 0.2 < chi.mean() < 2.5
+    params = fit(data, Dahl() + Mass() + Damper()).params
+    assert params["f_max"].value == pytest.approx(0.1, rel=1e-3)
+    assert params["sigma"].value == pytest.approx(30.0, rel=1e-3)
+    moving = np.gradient(record.motion_samples, record.time)
+    by_velocity = Record(record.time, velocity=moving, force=record.force)
+    with pytest.raises(ExtractionError, match="the mean of a displacement is not known from its v"):
+        extract(by_velocity, controlled="force", harmonics=(0, 1))
 
 
 def test_distortion_of_an_acceleration_is_that_of_the_displacement() -> None:

@@ -46,7 +46,7 @@ class Extracting:
         str | None,
         _extracting(
             "Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
-            "asymmetric force; if force is controlled, only 1."
+            "asymmetric force; if force is controlled, only 1, and others are of the displacement."
         ),
     ] = None
     controlled: Annotated[str, controlled_option(_EXTRACTING)] = "displacement"

@@ -126,7 +126,7 @@ def _table(
         ]
         return np.concatenate(each)
 
-    joint = per_row("joint")
+    joint, held = per_row("joint"), "drive" if settings.of_displacement else "amplitude"
     return FrequencyResponse(
         per_row("frequency_hz"),
         per_row("response"),
@@ -134,11 +134,11 @@ def _table(
         drive=per_row("drive"),
         covariance=joint[:, 1:, 1:],
         dof=per_row("dof"),
-        amplitude_std=np.sqrt(joint[:, 0, 0]),
-        amplitude_covariance=joint[:, 0, 1:],
+        **{f"{held}_std": np.sqrt(joint[:, 0, 0]), f"{held}_covariance": joint[:, 0, 1:]},
         **labels,
         controlled=settings.controlled,
         harmonic=per_row("harmonic"),
+        quantity="receptance" if settings.of_displacement else "dynamic_stiffness",
         motion=record.motion,
         drive_factor_uncertainty=0.0
         if record.force is not None

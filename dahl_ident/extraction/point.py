@@ -9,7 +9,8 @@ With the phasors X of displacement and F of force and their errors e_X, e_F,
 
 so the response shares the displacement's error with the amplitude. A velocity or an acceleration
 is integrated at the fitted frequency: its phasor at harmonic k is divided by ``j k omega`` once
-or twice.
+or twice. Where the force was held and harmonics of the displacement are asked for, X and F change
+places: R_k = X_k exp(-j k phi)/abs(F_1), phi being the force's phase.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ _ALIASED = 0.01  # of the fundamental, above which aliases are reported
 _LOOKED_AT = 10_000  # samples from which their residual is taken
 _FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
 _Row = tuple[complex, FloatArray, FloatArray, float]
-"""A response, its covariance, the amplitude's covariance with it, and its degrees of freedom."""
+"""A response, its covariance, that of what was held with it, and its degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,11 @@ class Settings:
         return cls(orders, num_periods, settling_periods, min_share, controlled, hertz, mode)
 
     @property
+    def of_displacement(self) -> bool:
+        """Whether the rows are X_k/F_1, and not F_k/X_1."""
+        return self.controlled == "force" and self.harmonics != (1,)
+
+    @property
     def integrations(self) -> int:
         """How often the motion channel has to be integrated."""
         return ("displacement", "velocity", "acceleration").index(self.motion_channel)
@@ -136,8 +142,8 @@ class Settings:
 class Point:
     """One amplitude and frequency: responses of the fundamental and the harmonics.
 
-    `joint` is the covariance of amplitude, real and imaginary part of each response, (rows, 3, 3);
-    `repeating` is the part of it that is alike in every cycle.
+    `joint` is the covariance of the amplitude (or drive, in rows X_k/F_1) with real and imaginary
+    part of each response, (rows, 3, 3); `repeating` is the part of it that is alike in every cycle.
     """
 
     frequency_hz: float
@@ -159,6 +165,11 @@ def measure(
 
     In a sweep amplitude and response may change linearly, and no cycles are left out.
     """
+    if settings.of_displacement and settings.integrations and 0 in settings.harmonics:
+        raise ExtractionError(
+            f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "
+            "out of harmonics="
+        )
     available = whole_cycles(segment)
     if available < FEWEST_CYCLES:
         raise ExtractionError(
@@ -296,10 +307,15 @@ class _Phasors:
     def harmonics(self) -> list[int]:
         return [k for k in self.settings.harmonics if k <= self.fit.orders]
 
-    @cached_property
-    def integrator(self) -> complex:
-        """Displacement over the motion channel at the fundamental."""
-        return complex((1j * self.fit.segment.omega) ** -self.settings.integrations)
+    @property
+    def held(self) -> int:
+        """The channel over which responses are: 0 for the motion, 1 for the force."""
+        return int(self.settings.of_displacement)
+
+    def integrator(self, harmonic: int) -> ComplexArray:
+        """Return displacement over the motion channel, and 1 for the force, shape (2,)."""
+        s = 1j * max(harmonic, 1) * self.fit.segment.omega  # the mean is not integrated
+        return np.array([s**-self.settings.integrations, 1.0], dtype=np.complex128)
 
     def phasors(self, harmonic: int) -> ComplexArray:
         """Return the phasors of the motion channel and the force, shape (2,)."""
@@ -309,8 +325,9 @@ class _Phasors:
         return both
 
     @cached_property
-    def displacement(self) -> complex:
-        return complex(self.phasors(1)[0] * self.integrator)
+    def fundamentals(self) -> ComplexArray:
+        """Phasors of displacement and force, shape (2,)."""
+        return self.phasors(1) * self.integrator(1)
 
     @cached_property
     def rounding(self) -> FloatArray:
@@ -341,7 +358,7 @@ class _Phasors:
     @cached_property
     def errors(self) -> ComplexArray:
         """Errors of the fundamental phasors of displacement and force; their products sum up."""
-        scale = np.array([[self.integrator], [1.0]])
+        scale = self.integrator(1)[:, None]
         noise = self.noise[1].lines * np.sqrt(self.fit.phasor_variance(1))
         return np.asarray(scale * np.hstack([noise, np.diag(self.repeating[1])]))
 
@@ -353,52 +370,54 @@ class _Phasors:
 
     @cached_property
     def distorted(self) -> float:
-        """The displacement's harmonics beyond its noise over its fundamental."""
-        # to a harmonic of the force each adds about the stiffness times its own size
-        power = 0.0
+        """The harmonics of what was held, beyond their noise, over its fundamental."""
+        # to a harmonic of what answers each adds about the response times its own size
+        power, channel = 0.0, self.held
         for k in (k for k in self.noise if k > 1):
-            size, variance = abs(self.fit.phasors(k)[0]), float(self.variance(k)[0])
+            scale = abs(self.integrator(k) / self.integrator(1))[channel] ** 2
+            size, variance = abs(self.fit.phasors(k)[channel]), float(self.variance(k)[channel])
             if size**2 > fdtri(2, self.noise[k].dof, 1.0 - BY_CHANCE) * variance:
-                power += (size**2 - variance) / k ** (2 * self.settings.integrations)
-        return float(np.sqrt(power) / abs(self.fit.phasors(1)[0]))
+                power += (size**2 - variance) * scale
+        return float(np.sqrt(power) / abs(self.fit.phasors(1)[channel]))
 
     def forgotten(self, harmonic: int) -> float:
-        """Return the standard deviation that the transient's size leaves in a force phasor."""
-        if self.settings.transient_channel == 0 or self.transient.departure == 0.0:
+        """Return the standard deviation that the transient's size leaves in what answers."""
+        if self.settings.transient_channel == self.held or self.transient.departure == 0.0:
             return 0.0
         added = complex(self.transient_phasors[harmonic])
         size = abs(added) if harmonic else abs(added.real)
         return size * self.transient.departure_std / abs(self.transient.departure)
 
     @property
-    def amplitude_variance(self) -> float:
-        return 0.5 * float(np.sum(np.abs(self.errors[0]) ** 2))
+    def held_variance(self) -> float:
+        return 0.5 * float(np.sum(np.abs(self.errors[self.held]) ** 2))
 
-    def referred(self, force: complex, harmonic: int) -> complex:
-        """Return a force phasor over the displacement's amplitude, turned by k times its phase."""
-        X = self.displacement
-        return complex(force * (abs(X) / X) ** harmonic / abs(X))
+    def referred(self, answer: complex, harmonic: int) -> complex:
+        """Return a phasor over the size of what was held, turned by k times its phase."""
+        H = complex(self.fundamentals[self.held])
+        return complex(answer * (abs(H) / H) ** harmonic / abs(H))
 
     def response(self, harmonic: int) -> complex:
-        return self.referred(complex(self.phasors(harmonic)[1]), harmonic)
+        answers = self.phasors(harmonic) * self.integrator(harmonic)
+        return self.referred(complex(answers[1 - self.held]), harmonic)
 
-    def changed(self, motion: complex, force: ComplexArray) -> ComplexArray:
-        """Return how the responses change where the motion's and the force's phasors do."""
-        relative = motion / self.phasors(1)[0]
-        changes = [
-            self.referred(complex(f), k)
-            - self.response(k) * complex(relative.real, k * relative.imag)
-            for k, f in zip(self.harmonics, force, strict=True)
-        ]
-        return np.array(changes)
+    def changed(self, changes: dict[int, ComplexArray]) -> ComplexArray:
+        """Return how the responses change where phasors of the motion channel and the force do."""
+        relative = complex(changes[1][self.held] / self.phasors(1)[self.held])
+        return np.array(
+            [
+                self.referred(complex((changes[k] * self.integrator(k))[1 - self.held]), k)
+                - self.response(k) * complex(relative.real, k * relative.imag)
+                for k in self.harmonics
+            ]
+        )
 
     @property
     def bias(self) -> ComplexArray:
         """What the transient adds to the response of each harmonic."""
-        added = self.transient_phasors
-        if self.settings.transient_channel == 0:
-            return self.changed(complex(added[1]), np.zeros(len(self.harmonics), complex))
-        return self.changed(0.0, np.where(self.harmonics, added[self.harmonics], 0.0))
+        one = np.eye(2)[self.settings.transient_channel]  # to whose mean it adds nothing
+        added = {k: self.transient_phasors[k] * one * (k > 0) for k in (1, *self.harmonics)}
+        return self.changed(added)
 
     @property
     def lag(self) -> ComplexArray:
@@ -406,8 +425,8 @@ class _Phasors:
         # the force lags the amplitude by less than half a cycle, whatever beta is
         if not self.fit.trending:
             return np.zeros(len(self.harmonics), dtype=np.complex128)
-        force = np.array([self.fit.slopes(k)[1] for k in self.harmonics])
-        return self.changed(complex(self.fit.slopes(1)[0]), force) / self.cycles
+        slopes = {k: self.fit.slopes(k) for k in (1, *self.harmonics)}
+        return self.changed(slopes) / self.cycles
 
     @property
     def mean_moves(self) -> bool:
@@ -428,38 +447,39 @@ class _Phasors:
 
     @property
     def fundamental(self) -> _Row:
-        X, N = self.displacement, self.response(1)
-        e_X, e_F = self.errors
-        e_N = (e_F - N * e_X) / X
+        H, N = complex(self.fundamentals[self.held]), self.response(1)
+        e_H, e_answer = self.errors[self.held], self.errors[1 - self.held]
+        e_N = (e_answer - N * e_H) / H
         variance = float(np.sum(np.abs(e_N) ** 2))
-        with_amplitude = 0.5 * complex(e_N @ e_X.conj()) * X / abs(X)
-        cross = np.array([with_amplitude.real, with_amplitude.imag])
+        with_held = 0.5 * complex(e_N @ e_H.conj()) * H / abs(H)
+        cross = np.array([with_held.real, with_held.imag])
         return N, 0.5 * variance * np.eye(2), cross, self.noise[1].dof
 
     def harmonic(self, k: int, distorted: float) -> _Row:
-        """Return a row above the fundamental, or of the mean force."""
+        """Return a row above the fundamental, or of the mean."""
         noise = self.noise[k]
-        A, N = abs(self.displacement), self.response(k)
+        A, N = abs(self.fundamentals[self.held]), self.response(k)
         along = np.array([N.real, N.imag])
         across = np.array([-N.imag, N.real])
-        relative = self.amplitude_variance / A**2
-        force = float(self.variance(k)[1]) / A**2
+        relative = self.held_variance / A**2
+        scale = abs(self.integrator(k)[1 - self.held]) / A
+        answer = float(self.variance(k)[1 - self.held]) * scale**2
         if k == 0:
-            force += (self.forgotten(0) / A) ** 2
-        force += (distorted * abs(self.response(1))) ** 2
-        part = 0.5 * force * np.eye(2) if k else np.diag([force, 0.0])
+            answer += (self.forgotten(0) * scale) ** 2
+        answer += (distorted * abs(self.response(1))) ** 2
+        part = 0.5 * answer * np.eye(2) if k else np.diag([answer, 0.0])
         covariance = part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
         referred = relative * (1.0 + k**2) * abs(N) ** 2
-        own = force / max(force + referred, TINY)
+        own = answer / max(answer + referred, TINY)
         dof = 1.0 / (own**2 / noise.dof + (1.0 - own) ** 2 / self.noise[1].dof)
         return N, covariance, -along * relative * A, dof
 
     def rows(self, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Return the responses, their joint covariance with the amplitude, and dof."""
+        """Return the responses, their joint covariance with what was held, and dof."""
         rows = [self.fundamental if k == 1 else self.harmonic(k, distorted) for k in self.harmonics]
         response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
         joint = np.empty((len(rows), 3, 3))
-        joint[:, 0, 0] = self.amplitude_variance
+        joint[:, 0, 0] = self.held_variance
         joint[:, 0, 1:] = joint[:, 1:, 0] = cross
         joint[:, 1:, 1:] = covariance
         return response, joint, dof
@@ -509,16 +529,18 @@ class _Phasors:
         objections = []
         N, covariance, _, dof = self.fundamental
         std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))
-        if settled and creates_energy(np.asarray(N.imag), std, np.asarray(dof)):
+        loss = -N.imag if self.settings.of_displacement else N.imag
+        if settled and creates_energy(np.asarray(loss), std, np.asarray(dof)):
             objections.append("creates energy: a sign is reversed")
         fit = self.fit
         aliased = alias_error(fit, 1, self.cycles) > _ALIASED * np.abs(fit.phasors(1))
         if aliased.any() or aliases_unseen(fit, self.cycles):
             samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
             objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
-        distorted = quality["displacement_distortion"]
+        held = ("displacement", "force")[self.held]  # which the rows take for a sine
+        distorted = quality[f"{held}_distortion"]
         if distorted > _DISTORTED:
-            objections.append(f"displacement distorted {100 * distorted:.2g} %")
+            objections.append(f"{held} distorted {100 * distorted:.2g} %")
         for name in ("displacement", "force"):
             steps, clipped = quality[f"{name}_steps"], quality[f"{name}_clipped"]
             if steps < _FEW_STEPS:
@@ -566,8 +588,8 @@ def _point(phasors: _Phasors, cycles: int, dropped: int) -> Point:
         verdicts.append("; ".join([unsettled][: not good] + shared) or "good")
     return Point(
         frequency_hz=segment.omega / (2.0 * np.pi),
-        amplitude=abs(phasors.displacement),
-        drive=float(abs(phasors.phasors(1)[1])),
+        amplitude=float(abs(phasors.fundamentals[0])),
+        drive=float(abs(phasors.fundamentals[1])),
         harmonic=phasors.harmonics,
         response=response,
         joint=joint,

@@ -80,7 +80,8 @@ def extract(
         Which harmonics become rows, 0 (the mean force) to 9; fewer where the sampling cannot
         separate them. Default: 1, 3, 5, 7, 9, and 0, 2, 4, 6, 8 as well where the force is
         asymmetric, which a warning says. 1 alone where the force was controlled, since the
-        displacement then has harmonics of its own.
+        displacement then has harmonics of its own; if others are given, those are the rows:
+        X_k/F_1, in a table of receptance.
     controlled : {"displacement", "force"}, default "displacement"
         What the laboratory held constant. Where it is the force, the transient is looked for in the
         displacement's mean.
@@ -95,7 +96,8 @@ def extract(
     Returns
     -------
     FrequencyResponse
-        Dynamic stiffness with `covariance`, `dof`, `amplitude_std` and `amplitude_covariance`.
+        Dynamic stiffness with `covariance`, `dof`, `amplitude_std` and `amplitude_covariance`; of
+        harmonics of the displacement receptance, with `drive_std` and `drive_covariance`.
         The covariance is such that ``d' C^-1 d / 2`` follows F(2, dof). Its `quality` columns:
 
         ``settled``
