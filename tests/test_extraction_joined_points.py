@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dahl_ident.extraction.joined_points import joined
+from dahl_ident.extraction.from_record import joined
 from dahl_ident.extraction.point import Point
 
 MEANS = (

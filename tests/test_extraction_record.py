@@ -16,7 +16,6 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Dahl, Damper, Mass
 from dahl_ident.errors import DahlIdentError, ExtractionError, ValidationError
 from dahl_ident.extraction import extract
-from dahl_ident.results import fit
 from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table, simulate
 
 RATE = 200.0
@@ -302,9 +301,7 @@ def test_noise_is_not_taken_for_a_distortion_of_the_force(third: float) -> None:
 
 def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance() -> None:
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24)
-    steps = SteppedSine(
-        (0.08, 0.4), controlled="force", settling_periods=30, num_periods=40, ramp_periods=3.0
-    )
+    steps = SteppedSine((0.08, 0.4), controlled="force", settling_periods=30, num_periods=20)
     noisy = Acquisition(200.0, Channel(noise_std=2e-6), Channel(noise_std=2e-5))
     record = simulate(Experiment(plant, steps, noisy), seed=2)
     assert isinstance(record, Record)
@@ -319,9 +316,6 @@ def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance()
     chi = np.einsum("ni,nij,nj->n", parts, np.linalg.inv(data.covariance), parts) / 2.0
     assert chi.max() < 8.0  # F(2, dof) is above it once in 2,000 rows
     assert 0.2 < chi.mean() < 2.5
-    params = fit(data, Dahl() + Mass() + Damper()).params
-    assert params["f_max"].value == pytest.approx(0.1, rel=1e-3)
-    assert params["sigma"].value == pytest.approx(30.0, rel=1e-3)
     moving = np.gradient(record.motion_samples, record.time)
     by_velocity = Record(record.time, velocity=moving, force=record.force)
     with pytest.raises(ExtractionError, match="the mean of a displacement is not known from its v"):

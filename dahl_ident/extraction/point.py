@@ -1,45 +1,18 @@
-r"""One measured point: dynamic stiffness at one amplitude and frequency, with its errors.
-
-With the phasors X of displacement and F of force and their errors e_X, e_F,
-
-    X_1 = A exp(j phi)                dA + j A dphi = e_X exp(-j phi)
-    N   = F_1/X_1                     dN  = (e_F - N e_X)/X_1
-    N_k = F_k exp(-j k phi)/A         dN_k = e_Fk exp(-j k phi)/A - N_k (dA/A + j k dphi)
-    N_0 = F_0/A                       dN_0 = e_F0/A - N_0 dA/A,   real
-
-so the response shares the displacement's error with the amplitude. A velocity or an acceleration
-is integrated at the fitted frequency: its phasor at harmonic k is divided by ``j k omega`` once
-or twice. Where the force was held and harmonics of the displacement are asked for, X and F change
-places: R_k = X_k exp(-j k phi)/abs(F_1), phi being the force's phase.
-"""
+"""One measured point: the responses of a segment, what was left out, and what speaks against it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtri
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray, positive_number, whole_number
-from dahl_ident.data.columns import CONTROLLED, one_of
-from dahl_ident.data.plausibility import creates_energy
-from dahl_ident.errors import ExtractionError, ValidationError
-from dahl_ident.extraction.aliasing import alias_error, aliases_unseen
-from dahl_ident.extraction.cycles import scattered
-from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise, line_noise
-from dahl_ident.extraction.plateaus import MODES, Mode
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.errors import ExtractionError
+from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise
+from dahl_ident.extraction.phasors import Phasors, Settings, without
 from dahl_ident.extraction.segment_quality import (
-    BY_CHANCE,
-    EVEN,
-    asymmetry,
-    clipped_share,
-    crest_samples,
-    distortion,
     fundamental_share,
-    quantisation_errors,
     sensor_step,
 )
 from dahl_ident.extraction.sine_fit import (
@@ -48,7 +21,6 @@ from dahl_ident.extraction.sine_fit import (
     Samples,
     Segment,
     SineFit,
-    columns,
     first_cycles,
     last_cycles,
     sine_fit,
@@ -57,7 +29,6 @@ from dahl_ident.extraction.sine_fit import (
 )
 from dahl_ident.extraction.transient import (
     MOST_CYCLES,
-    SIGNIFICANT,
     Transient,
     estimate_transient,
 )
@@ -65,77 +36,6 @@ from dahl_ident.extraction.transient import (
 TOO_FAST = "swept too fast"
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
-_DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
-_MOVING_MEAN = 0.02  # of the amplitude, over the segment, where the force is controlled
-_BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
-_ROUNDING = 1e-9  # of the response
-_ALIASED = 0.01  # of the fundamental, above which aliases are reported
-_LOOKED_AT = 10_000  # samples from which their residual is taken
-_FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
-_Row = tuple[complex, FloatArray, FloatArray, float]
-"""A response, its covariance, that of what was held with it, and its degrees of freedom."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How segments are turned into points; see :func:`dahl_ident.extraction.extract`."""
-
-    harmonics: tuple[int, ...]
-    num_periods: int | None
-    settling_periods: int | None
-    min_share: float
-    controlled: str
-    frequency: float | None
-    mode: Mode
-    motion_channel: str = "displacement"
-
-    @classmethod
-    def of(
-        cls,
-        *,
-        frequency: float | None = None,
-        mode: Mode = "auto",
-        num_periods: int | None = None,
-        settling_periods: int | None = None,
-        harmonics: Sequence[int] | None = None,
-        controlled: str = "displacement",
-        min_share: float = 0.6,
-    ) -> Settings:
-        """Return settings once they are in range; all harmonics where none are named."""
-        if num_periods is not None:
-            num_periods = whole_number(num_periods, "num_periods", FEWEST_CYCLES)
-        if settling_periods is not None:
-            settling_periods = whole_number(settling_periods, "settling_periods", 0)
-        if harmonics is None:
-            harmonics = (1,) if controlled == "force" else range(HARMONICS + 1)
-        orders = tuple(whole_number(k, "harmonics", 0) for k in harmonics)
-        if not orders or max(orders) > HARMONICS or len(set(orders)) < len(orders):
-            raise ValidationError(
-                f"harmonics is {list(harmonics)!r}; expected different numbers from 0 to "
-                f"{HARMONICS}"
-            )
-        one_of(controlled, "controlled", CONTROLLED)
-        if not 0.0 <= min_share < 1.0:
-            raise ValidationError(f"min_share is {min_share!r}; expected a share from 0 to below 1")
-        one_of(mode, "mode", MODES)
-        hertz = None if frequency is None else positive_number(frequency, "frequency")
-        return cls(orders, num_periods, settling_periods, min_share, controlled, hertz, mode)
-
-    @property
-    def of_displacement(self) -> bool:
-        """Whether the rows are X_k/F_1, and not F_k/X_1."""
-        return self.controlled == "force" and self.harmonics != (1,)
-
-    @property
-    def integrations(self) -> int:
-        """How often the motion channel has to be integrated."""
-        return ("displacement", "velocity", "acceleration").index(self.motion_channel)
-
-    @property
-    def transient_channel(self) -> int:
-        """Where the transient shows: in the force, or in a displacement that is free."""
-        free = self.controlled == "force" and self.motion_channel == "displacement"
-        return 0 if free else 1
 
 
 @dataclass(frozen=True)
@@ -201,7 +101,7 @@ def measure(
     response = complex(rough.phasors(1)[1]) / X
     channel = settings.transient_channel
     transient = estimate_transient(rough, channel, float(np.angle(X)), response)
-    steady = _without(transient, first, settings)
+    steady = without(transient, first, settings)
     _check_share(rough, steady, settings, samples.within_blocks(first))
     if sweep:
         dropped = 0
@@ -210,7 +110,7 @@ def measure(
     else:
         dropped = _settling_periods(rough.segment, transient, cycles, settings, steps, own)
     used = last_cycles(whole, cycles - dropped)
-    phasors = _Phasors.of(
+    phasors = Phasors.of(
         used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep
     )
     _check_share(phasors.fit, phasors.fit.segment, settings, samples.within_blocks(used))
@@ -233,16 +133,6 @@ def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: Flo
             )
 
 
-def _without(transient: Transient, segment: Segment, settings: Settings) -> Segment:
-    """Return the segment without its transient, where that stands out of the noise."""
-    if not transient.significant:
-        return segment
-    channels = segment.channels.copy()
-    part = transient.lasting(segment.theta)
-    channels[settings.transient_channel, part] -= transient.waveform(segment.part(part))
-    return replace(segment, channels=channels)
-
-
 def _settling_periods(
     segment: Segment,
     transient: Transient,
@@ -256,7 +146,7 @@ def _settling_periods(
         return 0
     looked_at = min(cycles, MOST_CYCLES)
     only_first = replace(settings, harmonics=(1,))
-    phasors = _Phasors.of(segment, transient, looked_at, only_first, steps, samples, sweep=False)
+    phasors = Phasors.of(segment, transient, looked_at, only_first, steps, samples, sweep=False)
     q = np.arange(cycles - FEWEST_CYCLES + 1)
     kept = looked_at / (cycles - q)
     bias = abs(phasors.bias[0]) * np.exp(-transient.rate * q) * kept
@@ -265,292 +155,7 @@ def _settling_periods(
     return int(np.argmax(good) if good.any() else np.argmin(bias**2 + 2.0 * error**2))
 
 
-@dataclass(frozen=True)
-class _Phasors:
-    """Displacement and force of one segment with their noise.
-
-    `fit` is without the transient where that is significant; `transient_phasors` is what the
-    transient adds to the phasors of its channel, and belongs to the response. `steps` are those of
-    the two sensors, 0 where they have none; the block means are made of `samples`.
-    """
-
-    fit: SineFit
-    cycles: int
-    settings: Settings
-    noise: dict[int, LineNoise]
-    transient: Transient
-    transient_phasors: ComplexArray
-    steps: FloatArray
-    samples: Samples
-
-    @classmethod
-    def of(
-        cls,
-        segment: Segment,
-        transient: Transient,
-        cycles: int,
-        settings: Settings,
-        steps: FloatArray,
-        samples: Samples,
-        *,
-        sweep: bool,
-    ) -> _Phasors:
-        """Fit a segment without its transient, which is not noise, and join the phasors' noise."""
-        fit = sine_fit(_without(transient, segment, settings), trend=sweep)
-        orders = [1, *sorted({*settings.harmonics, *EVEN} - {1})]
-        orders = [k for k in orders if k <= fit.orders]
-        noise = dict(zip(orders, line_noise(fit, orders, cycles, fit.residual), strict=True))
-        added = transient.phasors(fit)
-        return cls(fit, cycles, settings, noise, transient, added, steps, samples)
-
-    @property
-    def harmonics(self) -> list[int]:
-        return [k for k in self.settings.harmonics if k <= self.fit.orders]
-
-    @property
-    def held(self) -> int:
-        """The channel over which responses are: 0 for the motion, 1 for the force."""
-        return int(self.settings.of_displacement)
-
-    def integrator(self, harmonic: int) -> ComplexArray:
-        """Return displacement over the motion channel, and 1 for the force, shape (2,)."""
-        s = 1j * max(harmonic, 1) * self.fit.segment.omega  # the mean is not integrated
-        return np.array([s**-self.settings.integrations, 1.0], dtype=np.complex128)
-
-    def phasors(self, harmonic: int) -> ComplexArray:
-        """Return the phasors of the motion channel and the force, shape (2,)."""
-        both = self.fit.phasors(harmonic)
-        if self.transient.significant and harmonic:  # the mean is that of the steady loop
-            both[self.settings.transient_channel] += self.transient_phasors[harmonic]
-        return both
-
-    @cached_property
-    def fundamentals(self) -> ComplexArray:
-        """Phasors of displacement and force, shape (2,)."""
-        return self.phasors(1) * self.integrator(1)
-
-    @cached_property
-    def rounding(self) -> FloatArray:
-        """Root mean square error of a phasor of the motion channel and the force by rounding."""
-        if not self.steps.any():
-            return np.zeros(2)
-        fit, segment = self.fit, self.fit.segment
-        residual = np.sqrt(fit.residual_variance)  # of single samples
-        if segment.block > 1:
-            time, motion, force = (
-                scattered(v, _LOOKED_AT)
-                for v in (self.samples.time, self.samples.motion, self.samples.force)
-            )
-            own = segment.with_samples(time, np.stack([motion, force]))
-            tau = (time - segment.centre) / segment.half_width
-            sine = fit.coefficients.T @ columns(own.theta, tau, fit.orders, fit.trending)
-            left = _without(self.transient, own, self.settings).channels - sine
-            residual = np.sqrt(np.mean(left**2, axis=1))
-        samples_a_cycle = self.samples.time.size / self.cycles
-        return quantisation_errors(np.abs(fit.phasors(1)), self.steps, residual, samples_a_cycle)
-
-    @cached_property
-    def repeating(self) -> dict[int, FloatArray]:
-        """Errors of the phasors of both channels that are alike in every cycle, by harmonic."""
-        aliased = {k: alias_error(self.fit, k, self.cycles) for k in self.noise}
-        return {k: np.hypot(self.rounding, error) for k, error in aliased.items()}
-
-    @cached_property
-    def errors(self) -> ComplexArray:
-        """Errors of the fundamental phasors of displacement and force; their products sum up."""
-        scale = self.integrator(1)[:, None]
-        noise = self.noise[1].lines * np.sqrt(self.fit.phasor_variance(1))
-        return np.asarray(scale * np.hstack([noise, np.diag(self.repeating[1])]))
-
-    def variance(self, harmonic: int) -> FloatArray:
-        """Return E abs(error)^2 of the phasors of the motion channel and the force, shape (2,)."""
-        noise = np.diagonal(self.noise[harmonic].matrix).real
-        repeating = self.repeating[harmonic]
-        return np.asarray(noise * self.fit.phasor_variance(harmonic) + repeating**2)
-
-    @cached_property
-    def distorted(self) -> float:
-        """The harmonics of what was held, beyond their noise, over its fundamental."""
-        # to a harmonic of what answers each adds about the response times its own size
-        power, channel = 0.0, self.held
-        for k in (k for k in self.noise if k > 1):
-            scale = abs(self.integrator(k) / self.integrator(1))[channel] ** 2
-            size, variance = abs(self.fit.phasors(k)[channel]), float(self.variance(k)[channel])
-            if size**2 > fdtri(2, self.noise[k].dof, 1.0 - BY_CHANCE) * variance:
-                power += (size**2 - variance) * scale
-        return float(np.sqrt(power) / abs(self.fit.phasors(1)[channel]))
-
-    def forgotten(self, harmonic: int) -> float:
-        """Return the standard deviation that the transient's size leaves in what answers."""
-        if self.settings.transient_channel == self.held or self.transient.departure == 0.0:
-            return 0.0
-        added = complex(self.transient_phasors[harmonic])
-        size = abs(added) if harmonic else abs(added.real)
-        return size * self.transient.departure_std / abs(self.transient.departure)
-
-    @property
-    def held_variance(self) -> float:
-        return 0.5 * float(np.sum(np.abs(self.errors[self.held]) ** 2))
-
-    def referred(self, answer: complex, harmonic: int) -> complex:
-        """Return a phasor over the size of what was held, turned by k times its phase."""
-        H = complex(self.fundamentals[self.held])
-        return complex(answer * (abs(H) / H) ** harmonic / abs(H))
-
-    def response(self, harmonic: int) -> complex:
-        answers = self.phasors(harmonic) * self.integrator(harmonic)
-        return self.referred(complex(answers[1 - self.held]), harmonic)
-
-    def changed(self, changes: dict[int, ComplexArray]) -> ComplexArray:
-        """Return how the responses change where phasors of the motion channel and the force do."""
-        relative = complex(changes[1][self.held] / self.phasors(1)[self.held])
-        return np.array(
-            [
-                self.referred(complex((changes[k] * self.integrator(k))[1 - self.held]), k)
-                - self.response(k) * complex(relative.real, k * relative.imag)
-                for k in self.harmonics
-            ]
-        )
-
-    @property
-    def bias(self) -> ComplexArray:
-        """What the transient adds to the response of each harmonic."""
-        one = np.eye(2)[self.settings.transient_channel]  # to whose mean it adds nothing
-        added = {k: self.transient_phasors[k] * one * (k > 0) for k in (1, *self.harmonics)}
-        return self.changed(added)
-
-    @property
-    def lag(self) -> ComplexArray:
-        """Half of what the response of each harmonic changes in a cycle; 0 but in a sweep."""
-        # the force lags the amplitude by less than half a cycle, whatever beta is
-        if not self.fit.trending:
-            return np.zeros(len(self.harmonics), dtype=np.complex128)
-        slopes = {k: self.fit.slopes(k) for k in (1, *self.harmonics)}
-        return self.changed(slopes) / self.cycles
-
-    @property
-    def mean_moves(self) -> bool:
-        """Whether the mean of a free displacement is still on its way to its place."""
-        # where a soft spring alone centres it, its approach is not an exponential
-        fit, channel = self.fit, self.settings.transient_channel
-        moved = 2.0 * float(fit.coefficients[1, channel])
-        if self.transient.significant:
-            first, last = self.transient.waveform(fit.segment)[[0, -1]]
-            moved += float(last - first)
-        by_noise = 2.0 * np.sqrt(fit.inverse[1, 1] * fit.residual_variance[channel])
-        least = max(
-            _MOVING_MEAN * abs(self.phasors(1)[0]),
-            _BEYOND_NOISE * float(by_noise),
-            SIGNIFICANT * self.transient.departure_std,
-        )
-        return channel == 0 and abs(moved) > least
-
-    @property
-    def fundamental(self) -> _Row:
-        H, N = complex(self.fundamentals[self.held]), self.response(1)
-        e_H, e_answer = self.errors[self.held], self.errors[1 - self.held]
-        e_N = (e_answer - N * e_H) / H
-        variance = float(np.sum(np.abs(e_N) ** 2))
-        with_held = 0.5 * complex(e_N @ e_H.conj()) * H / abs(H)
-        cross = np.array([with_held.real, with_held.imag])
-        return N, 0.5 * variance * np.eye(2), cross, self.noise[1].dof
-
-    def harmonic(self, k: int, distorted: float) -> _Row:
-        """Return a row above the fundamental, or of the mean."""
-        noise = self.noise[k]
-        A, N = abs(self.fundamentals[self.held]), self.response(k)
-        along = np.array([N.real, N.imag])
-        across = np.array([-N.imag, N.real])
-        relative = self.held_variance / A**2
-        scale = abs(self.integrator(k)[1 - self.held]) / A
-        answer = float(self.variance(k)[1 - self.held]) * scale**2
-        if k == 0:
-            answer += (self.forgotten(0) * scale) ** 2
-        answer += (distorted * abs(self.response(1))) ** 2
-        part = 0.5 * answer * np.eye(2) if k else np.diag([answer, 0.0])
-        covariance = part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
-        referred = relative * (1.0 + k**2) * abs(N) ** 2
-        own = answer / max(answer + referred, TINY)
-        dof = 1.0 / (own**2 / noise.dof + (1.0 - own) ** 2 / self.noise[1].dof)
-        return N, covariance, -along * relative * A, dof
-
-    def rows(self, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Return the responses, their joint covariance with what was held, and dof."""
-        rows = [self.fundamental if k == 1 else self.harmonic(k, distorted) for k in self.harmonics]
-        response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
-        joint = np.empty((len(rows), 3, 3))
-        joint[:, 0, 0] = self.held_variance
-        joint[:, 0, 1:] = joint[:, 1:, 0] = cross
-        joint[:, 1:, 1:] = covariance
-        return response, joint, dof
-
-    @property
-    def asymmetry(self) -> float:
-        """The force's even harmonics over its fundamental where they are significant."""
-        fit = self.fit
-        if fit.trending or self.settings.controlled == "force":
-            return 0.0
-        even = [k for k in EVEN if k <= fit.orders]
-        motion, force = np.array([fit.phasors(k) for k in [1, *even]]).T
-        # the transient has even harmonics too: what its error leaves of them is noise
-        variance = [float(self.variance(k)[1]) + self.forgotten(k) ** 2 for k in even]
-        orders = np.array(even, dtype=np.float64)
-        return asymmetry(
-            orders,
-            force[1:] / force[0],
-            np.array(variance) / abs(force[0]) ** 2,
-            np.array([self.noise[k].dof for k in even]),
-            np.abs(motion[1:] / motion[0]) / orders**self.settings.integrations,
-        )
-
-    def channel_quality(self) -> dict[str, Any]:
-        """Return the columns that judge the two waveforms."""
-        fit, steps = self.fit, self.steps
-        shares = fundamental_share(fit, fit.segment, self.samples.within_blocks(fit.segment))
-        amplitudes, block = np.abs(fit.phasors(1)), fit.segment.block
-        noise = np.sqrt(np.diagonal(self.noise[1].matrix).real * block)
-        crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase / block)
-        with np.errstate(divide="ignore"):
-            in_steps = amplitudes / steps
-        return {
-            "displacement_share": shares[0],
-            "force_share": shares[1],
-            "displacement_distortion": distortion(fit, 0, self.settings.integrations),
-            "force_distortion": distortion(fit, 1),
-            "asymmetry": self.asymmetry,
-            "displacement_steps": in_steps[0],
-            "force_steps": in_steps[1],
-            "displacement_clipped": clipped_share(self.samples.motion, steps[0], noise[0], crest),
-            "force_clipped": clipped_share(self.samples.force, steps[1], noise[1], np.inf),
-        }
-
-    def objections(self, settled: bool, quality: dict[str, Any]) -> list[str]:
-        """Return what speaks against all rows."""
-        objections = []
-        N, covariance, _, dof = self.fundamental
-        std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))
-        loss = -N.imag if self.settings.of_displacement else N.imag
-        if settled and creates_energy(np.asarray(loss), std, np.asarray(dof)):
-            objections.append("creates energy: a sign is reversed")
-        fit = self.fit
-        aliased = alias_error(fit, 1, self.cycles) > _ALIASED * np.abs(fit.phasors(1))
-        if aliased.any() or aliases_unseen(fit, self.cycles):
-            samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
-            objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
-        held = ("displacement", "force")[self.held]  # which the rows take for a sine
-        distorted = quality[f"{held}_distortion"]
-        if distorted > _DISTORTED:
-            objections.append(f"{held} distorted {100 * distorted:.2g} %")
-        for name in ("displacement", "force"):
-            steps, clipped = quality[f"{name}_steps"], quality[f"{name}_clipped"]
-            if steps < _FEW_STEPS:
-                objections.append(f"{name} only {steps:.2g} sensor steps")
-            if clipped:
-                objections.append(f"{name} clipped in {100 * clipped:.2g} % of samples")
-        return objections
-
-
-def _point(phasors: _Phasors, cycles: int, dropped: int) -> Point:
+def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
     """Return the rows of a segment, and what speaks for and against them."""
     distorted = phasors.distorted
     response, joint, dof = phasors.rows(distorted)

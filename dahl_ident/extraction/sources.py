@@ -22,8 +22,8 @@ from dahl_ident.data.levels import labelled
 from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.extraction.from_record import record_response
+from dahl_ident.extraction.phasors import Settings
 from dahl_ident.extraction.plateaus import Mode
-from dahl_ident.extraction.point import Settings
 
 PathLike = str | Path
 Columns = Mapping[str, Any] | str | Path
