@@ -240,6 +240,8 @@ class ErrorModel:
     @cached_property
     def within_runs(self) -> ComplexArray:
         """Responses (n,), each run's by its own parameters, gain and phase."""
+        if self.runs is None:
+            return self.estimate.predicted
         return linearization(self.problem, self.theta, self.runs).fitted
 
     @cached_property

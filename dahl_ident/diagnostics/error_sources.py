@@ -39,7 +39,8 @@ APART = "suspicious points"
 TESTS = "jackknife over tests"
 
 _OFTEN = 0.15  # of tables in which noise alone may look like a model error or noisy levels
-_SELDOM = 0.01  # the same for what a level has in common
+_SOMETIMES = 0.05  # the same for what a level has in common: at 1 % it is missed too often
+_SELDOM = 0.01  # the same for suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
 _MOST_NOISY = 100  # levels with a noise of their own: the cost is cubic in their number
@@ -348,7 +349,7 @@ def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
         kinds = (predicted, by_level, by_both)
         for change in kinds:
             columns = estimate.changed(in_common * change)
-            yield Source(LEVELS, columns, 0.5, own="gain", chance=_SELDOM / len(kinds))
+            yield Source(LEVELS, columns, 0.5, own="gain", chance=_SOMETIMES / len(kinds))
     repeated = repeats(repeated_levels(data), data.harmonic == 1)
     if len(repeated) >= _FEWEST:
         shared = np.concatenate([repeated, 1j * repeated])

@@ -65,16 +65,9 @@ class Linearization:
         return found
 
 
-def linearization(
-    problem: Problem, theta: FloatArray, runs: RunDeviations | None = None
-) -> Linearization:
-    """Return residuals and derivatives at theta, without the rows of priors."""
+def linearization(problem: Problem, theta: FloatArray, runs: RunDeviations) -> Linearization:
+    """Return residuals and derivatives at theta and the runs' deviations, without priors."""
     m = problem.n_residuals
-    if runs is None:
-        y, J = problem.residuals_and_jacobian(theta, tails=False)
-        every = np.ones(m // 2, dtype=bool)
-        R = problem.predict(theta)
-        return Linearization(y[:m], J[:m], R, R, [(problem, every, theta)])
     residuals = np.zeros(m)
     J = np.zeros((m, len(theta)))
     predicted, fitted = np.zeros((2, m // 2), dtype=np.complex128)
@@ -223,16 +216,15 @@ class ResidualSpace(_Space):
         scale = optimum.scale
         self._scale = scale if np.isfinite(scale) and scale > 0.0 else 1.0
         y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
-        if self._estimate is not None:
-            y, J = self._estimate.weighted(y), self._estimate.weighted(J)
         own = np.zeros((m, 0))
         if runs is not None:
             near = linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
             own = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
-            if self._estimate is not None:
-                y, J = self._estimate.weighted(y), self._estimate.weighted(J)
-                own = self._estimate.weighted(own)
+        if self._estimate is not None:
+            y, J = self._estimate.weighted(y), self._estimate.weighted(J)
+            own = self._estimate.weighted(own) if runs is not None else own
+        if runs is not None:
             self.dof -= _orthonormal(np.hstack([J[:m], own])).shape[1]
             self.dof += _orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
