@@ -386,6 +386,10 @@ def _misleads(record: Record) -> bool:
     )
 
 
+class _StoppedError(BaseException):
+    """Reading takes too long; no reader may take this for damage."""
+
+
 def _work(pipe: Connection) -> None:
     """Judge files until there are no more; the process may die of one."""
     with contextlib.suppress(ImportError):
@@ -395,7 +399,7 @@ def _work(pipe: Connection) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, used + BYTES))
 
     def stop(*_: Any) -> None:
-        raise TimeoutError
+        raise _StoppedError
 
     readers._parsed = ParsedOnce(readers._parsed)
     signal.signal(signal.SIGALRM, stop)
@@ -410,7 +414,7 @@ def _work(pipe: Connection) -> None:
             signal.alarm(_WAITING * SECONDS)
             try:
                 outcome, why = judge(path, name, kind), ""
-            except TimeoutError:
+            except _StoppedError:
                 outcome, why = "hung", ""
             except MemoryError:
                 outcome, why = "above 2 GB", ""

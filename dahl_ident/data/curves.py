@@ -114,9 +114,9 @@ def held_amplitude(data: Table) -> FloatArray:
     held, other = data.amplitude, data.drive
     if is_force_controlled(data):
         held, other = other, held
-    found = other if held is None else held
-    assert found is not None  # a table has one of the two
-    return np.asarray(found)
+    amplitude = other if held is None else held
+    assert amplitude is not None  # a table has one of the two
+    return np.asarray(amplitude)
 
 
 def held_label(data: Table) -> str:

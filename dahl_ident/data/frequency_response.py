@@ -475,11 +475,11 @@ class FrequencyResponse(Tabular):
         for name, label, known in (("level", level, self.levels), ("run", run, self.runs)):
             if label is None:
                 continue
-            wanted = [label] if np.ndim(label) == 0 else list(label)
-            absent = [w for w in wanted if w not in known]
+            labels = [label] if np.ndim(label) == 0 else list(label)
+            absent = [w for w in labels if w not in known]
             if not known or absent:
                 raise ValidationError(f"no {name} {absent}; there are {listed(known) or 'none'}")
-            keep &= np.isin(getattr(self, name), wanted)
+            keep &= np.isin(getattr(self, name), labels)
         if frequency_hz is not None:
             low, high = frequency_hz
             keep &= (self.frequency_hz >= low) & (self.frequency_hz <= high)

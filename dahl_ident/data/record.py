@@ -320,10 +320,12 @@ def unbroken(record: Record, shortest: int) -> list[Record]:
     named = [f"{record.time[a - 1]:.6g} to {record.time[a]:.6g} s" for a in after.tolist()]
     shown = [*named[:_SHOWN_GAPS], *["others"][: len(named) > _SHOWN_GAPS]]
     parts = "one part is used" if len(kept) == 1 else f"{len(kept)} parts are fitted"
-    said = f"nothing is known from {', '.join(shown)}; {parts}, each from a first state of its own"
+    message = (
+        f"nothing is known from {', '.join(shown)}; {parts}, each from a first state of its own"
+    )
     lost = record.n - sum(part.stop - part.start for part in kept)
-    said += f"; {lost} samples in shorter parts are left out" if lost else ""
-    known = _doubted(record, said)
+    message += f"; {lost} samples in shorter parts are left out" if lost else ""
+    known = _doubted(record, message)
     return [replace(cut(record, part), provenance=known) for part in kept]
 
 
@@ -336,7 +338,7 @@ def at_even_times(record: Record) -> Record:
 
     usual = float(np.median(np.diff(time)))
     grid = np.linspace(time[0], time[-1], 1 + round((time[-1] - time[0]) / usual))
-    said = (
+    message = (
         f"the samples from {time[0]:.6g} to {time[-1]:.6g} s are not evenly spaced; resampled at "
         f"{1.0 / usual:.6g} Hz"
     )
@@ -344,14 +346,14 @@ def at_even_times(record: Record) -> Record:
     columns: dict[str, Any] = {
         name: make_interp_spline(time, getattr(record, name))(grid) for name in names
     }
-    return replace(record, time=grid, **columns, provenance=_doubted(record, said))
+    return replace(record, time=grid, **columns, provenance=_doubted(record, message))
 
 
-def _doubted(record: Record, said: str) -> dict[str, Any]:
+def _doubted(record: Record, message: str) -> dict[str, Any]:
     """Warn, and return a record's provenance with the warning."""
     known = dict(record.provenance or {})
-    warnings.warn(f"{known.get('file', 'the record')}: {said}", DataWarning, stacklevel=3)
-    known["warnings"] = [*known.get("warnings", ()), said]
+    warnings.warn(f"{known.get('file', 'the record')}: {message}", DataWarning, stacklevel=3)
+    known["warnings"] = [*known.get("warnings", ()), message]
     return known
 
 

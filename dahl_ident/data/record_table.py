@@ -41,10 +41,10 @@ def record_from(
     complete: Any = slice(None)
     if missing == "drop":
         numbers = {c.name: _numeric(c) for c in channels.values()}
-        complete = np.all([np.isfinite(found) for found in numbers.values()], axis=0)
-        for name, found in numbers.items():
-            for mark in missing_marks(found[np.isfinite(found)]):
-                marked = found == mark
+        complete = np.all([np.isfinite(values_of) for values_of in numbers.values()], axis=0)
+        for name, values_of in numbers.items():
+            for mark in missing_marks(values_of[np.isfinite(values_of)]):
+                marked = values_of == mark
                 bound.doubt(
                     f"{np.sum(marked)} samples left out: column {name!r} is {mark:g} in them, a "
                     "mark of a missing value"
@@ -102,21 +102,21 @@ def _channels(bound: Binding) -> dict[str, Channel]:
             "displacement, velocity and acceleration. Name it, such as displacement='x'; there "
             f"are {listed([c.header for c in bound.source.channels], 20)}"
         )
-    found = {role: bound.required(role) for role in motions}
+    channels = {role: bound.required(role) for role in motions}
     if bound.map.sample_rate is None:
-        found["time"] = bound.required("time")
+        channels["time"] = bound.required("time")
     for role in ("force", "drive"):
         channel = bound.channel(role)
         if channel is not None:
-            found[role] = channel
-    if not {"force", "drive"} & found.keys():
+            channels[role] = channel
+    if not {"force", "drive"} & channels.keys():
         if {c.name for c in bound.source.channels} >= _PLANNED:
             raise DataError(
                 f"{bound.source.name}: a waveform for the exciter, as a plan writes it, holds no "
                 "measured force. Play it, record displacement and force, and read that record"
             )
         bound.required("force")
-    return found
+    return channels
 
 
 def _numeric(channel: Channel) -> FloatArray:
@@ -156,21 +156,21 @@ def _seconds(bound: Binding, channel: Channel) -> FloatArray:
     """Return the time since the first stamp: ISO 8601, or times of one day."""
     nanoseconds = np.empty(channel.size, dtype=np.int64)
     for i, cell in enumerate(channel.values.flat):
-        found = _STAMP.fullmatch(str(cell))
-        text = "" if found is None else found["stamp"]
-        stamp = text if found is None or found["date"] else f"1970-01-01T{text}"
+        match = _STAMP.fullmatch(str(cell))
+        text = "" if match is None else match["stamp"]
+        stamp = text if match is None or match["date"] else f"1970-01-01T{text}"
         moment: Any = np.datetime64("NaT")
         with contextlib.suppress(ValueError):
             moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
-        if found is None or np.isnat(moment):
+        if match is None or np.isnat(moment):
             raise DataError(
                 f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is not a time stamp such as "
                 "2024-03-31T12:00:00.5 or 12:00:00.5"
             )
         nanoseconds[i] = moment.astype(np.int64)
-        if found["sign"]:  # local time, ahead of UTC by so much
-            ahead = (60 * int(found["hours"]) + int(found["minutes"])) * 60_000_000_000
-            nanoseconds[i] -= -ahead if found["sign"] == "-" else ahead
+        if match["sign"]:  # local time, ahead of UTC by so much
+            ahead = (60 * int(match["hours"]) + int(match["minutes"])) * 60_000_000_000
+            nanoseconds[i] -= -ahead if match["sign"] == "-" else ahead
     time = np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
     _require_increasing(bound.source, channel, time)
     time = _without_rounding(bound, time)

@@ -110,9 +110,9 @@ def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[Flo
     if time.size < _FEWEST_SAMPLES or depth > _DEEPEST:
         return []
     for quantile in _QUANTILES:
-        found = _runs_at(time, motion, quantile, depth)
-        if found:
-            return found
+        runs = _runs_at(time, motion, quantile, depth)
+        if runs:
+            return runs
     return []
 
 
@@ -130,21 +130,21 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
     long = np.flatnonzero(pause >= _FEWEST_SAMPLES)
     quiet = long[pause[long] > _QUIET * _lobe_spacing(beyond, above, long)]
     breaks = np.concatenate([[0], quiet + 1, [beyond.size]])
-    found: list[FloatArray] = []
+    runs: list[FloatArray] = []
     done = 0
     for first, last in pairwise(breaks.tolist()):
         rising = first + np.flatnonzero(~above[first : last - 1] & above[first + 1 : last])
         if rising.size < 2:
             continue
-        found.append(_crossings(time, moved, beyond[rising], beyond[rising + 1]))
+        runs.append(_crossings(time, moved, beyond[rising], beyond[rising + 1]))
         # a cycle before and after, the motion may have been on its way to or from these
         at = beyond[rising]
         start = max(int(2 * at[0] - at[1]), 0)
-        found += _crossing_runs(time[done:start], motion[done:start], depth + 1)
+        runs += _crossing_runs(time[done:start], motion[done:start], depth + 1)
         done = int(2 * at[-1] - at[-2])
     if done:
-        found += _crossing_runs(time[done:], motion[done:], depth + 1)
-    return found
+        runs += _crossing_runs(time[done:], motion[done:], depth + 1)
+    return runs
 
 
 def scattered(samples: FloatArray, count: int) -> FloatArray:

@@ -234,20 +234,20 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
     if isinstance(records, Mapping):
         named: list[tuple[str | None, Record | PathLike]] = []
         for name, source in records.items():
-            found = _files(source)
-            if len(found) != 1:
+            files = _files(source)
+            if len(files) != 1:
                 raise ValidationError(
-                    f"records[{name!r}] names {len(found)} files; expected one record or file "
+                    f"records[{name!r}] names {len(files)} files; expected one record or file "
                     "for each name"
                 )
-            named.append((str(name), found[0]))
+            named.append((str(name), files[0]))
     else:
         alone = isinstance(records, str | Path)
         sources = [records] if isinstance(records, str | Path) else records
-        found = [file for source in sources for file in _files(source)]
-        if alone and found == [str(records)]:
-            return [(None, found[0])]
-        named = list(zip(_labels(found), found, strict=True))
+        files = [file for source in sources for file in _files(source)]
+        if alone and files == [str(records)]:
+            return [(None, files[0])]
+        named = list(zip(_labels(files), files, strict=True))
     if not named:
         raise ValidationError("records is empty; expected at least one record or file")
     return named
@@ -268,10 +268,10 @@ def matching(pattern: str) -> list[str]:
     """Return the files that a pattern matches, in order; a path without one by itself."""
     if not _PATTERN.search(pattern) or Path(pattern).exists():
         return [pattern]
-    found = sorted(glob(pattern, recursive=True))  # noqa: PTH207 # may be absolute
-    if not found:
+    files = sorted(glob(pattern, recursive=True))  # noqa: PTH207 # may be absolute
+    if not files:
         raise DataError(f"{pattern}: no file matches this pattern")
-    return found
+    return files
 
 
 def _labels(sources: Sequence[Record | PathLike]) -> list[str]:

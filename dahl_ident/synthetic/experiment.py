@@ -138,23 +138,23 @@ class Experiment:
         DataError
             If a key is unknown or missing; it names those that are known.
         """
-        given = _checked(description, cls, "the experiment")
-        excitation = dict(given["excitation"])
+        values = _checked(description, cls, "the experiment")
+        excitation = dict(values["excitation"])
         kind = excitation.pop("kind", None)
         if kind not in _EXCITATIONS:
             raise DataError(
                 f"the excitation has the kind {kind!r}; expected one of {', '.join(_EXCITATIONS)}"
             )
-        acquisition = _checked(given.get("acquisition", {}), Acquisition, "acquisition")
+        acquisition = _checked(values.get("acquisition", {}), Acquisition, "acquisition")
         for name in acquisition.keys() & {"displacement", "force"}:
             acquisition[name] = _built(Channel, acquisition[name], f"acquisition.{name}")
-        table = given.get("table")
+        table = values.get("table")
         return cls(
-            plant=model_from_description(given["plant"]),
+            plant=model_from_description(values["plant"]),
             excitation=_built(_EXCITATIONS[kind], excitation, "excitation"),
             acquisition=Acquisition(**acquisition),
             table=None if table is None else _built(Table, table, "table"),
-            motion=given.get("motion", "translation"),
+            motion=values.get("motion", "translation"),
         )
 
     def to_json(self) -> str:
@@ -238,9 +238,9 @@ def _checked(given: Any, cls: type[Any], where: str) -> dict[str, Any]:
     unknown = [key for key in given if key not in known]
     missing = [key for key, required in known.items() if required and key not in given]
     if unknown or missing:
-        found = [f"the unknown {', '.join(unknown)}"] if unknown else []
-        found += [f"no {', '.join(missing)}"] if missing else []
-        raise DataError(f"{where} has {' and '.join(found)}; expected {', '.join(known)}")
+        faults = [f"the unknown {', '.join(unknown)}"] if unknown else []
+        faults += [f"no {', '.join(missing)}"] if missing else []
+        raise DataError(f"{where} has {' and '.join(faults)}; expected {', '.join(known)}")
     return dict(given)
 
 

@@ -74,13 +74,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Write the synthetic data sets anew.")
     parser.add_argument("names", nargs="*", help="all, if none is named")
     parser.add_argument("--directory", type=Path, default=None, help="where to write them")
-    given = parser.parse_args(arguments)
+    parsed = parser.parse_args(arguments)
     known = data_sets()
-    unknown = [name for name in given.names if name not in known]
+    unknown = [name for name in parsed.names if name not in known]
     if unknown:
         parser.error(f"there is no data set {', '.join(unknown)}; there are {', '.join(known)}")
-    directory = given.directory or datasets_directory()
-    for name in given.names or known:
+    directory = parsed.directory or datasets_directory()
+    for name in parsed.names or known:
         write(known[name], directory)
         sys.stdout.write(f"{directory / known[name].file}\n")
     (directory / "README.md").write_text(readme(), encoding="utf-8")

@@ -23,7 +23,7 @@ from dahl_ident.data.column_map import SETTINGS, column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.levels import labelled
 from dahl_ident.data.raw_columns import Source
-from dahl_ident.data.readers.file import FORMATS, open_file
+from dahl_ident.data.readers.file import FORMATS, File, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
 from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from, record_size
@@ -335,6 +335,14 @@ def open_source(
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
         raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is not a workbook")
+    source = _parsed(file, sheet)
+    for doubt in source.doubts:
+        warnings.warn(f"{file.name}: {doubt}", DataWarning, stacklevel=3)
+    return replace(source, options=options or {})
+
+
+def _parsed(file: File, sheet: str | None) -> Source:
+    """Pass a file to its reader."""
     form = FORMATS[file.format]
     module, _, name = form.reader.partition(".")
     read = getattr(import_module(f"{__name__}.{module}"), name)  # each imported when first used
@@ -351,9 +359,7 @@ def open_source(
         if not form.damaged:
             raise
         raise DataError(f"{file.name}: {form.damaged} is damaged: {exc}") from exc
-    for doubt in source.doubts:
-        warnings.warn(f"{file.name}: {doubt}", DataWarning, stacklevel=3)
-    return replace(source, options=options or {})
+    return source
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -399,14 +405,14 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
         raise DataError(
             f"level_from_name {expression!r} is not a regular expression: {exc}"
         ) from exc
-    found = pattern.search(name)
-    if found is None or not pattern.groups:
+    match = pattern.search(name)
+    if match is None or not pattern.groups:
         raise DataError(
             f"{name}: level_from_name {expression!r} finds no group in the name; put what is the "
             "level in round brackets, such as '([0-9.]+)N'"
         )
-    groups: dict[str, Any] = {k: v for k, v in found.groupdict().items() if v is not None}
-    level = str(groups.get("level", found[1]))
+    groups: dict[str, Any] = {k: v for k, v in match.groupdict().items() if v is not None}
+    level = str(groups.get("level", match[1]))
     try:
         groups["level"] = float(level)
     except ValueError:

@@ -238,7 +238,7 @@ class _Bounded(io.BufferedReader):
 
 def _begun_again(file: File) -> list[int]:
     """Return the numbers of later segments that state the sampling of a waveform again."""
-    found, number = [], 0
+    again, number = [], 0
     with file.opened() as stream:
         while lead := stream.read(_LEAD_IN.size):
             if len(lead) < _LEAD_IN.size or not lead.startswith(b"TDSm"):
@@ -252,9 +252,9 @@ def _begun_again(file: File) -> list[int]:
                 break
             start = stream.tell()
             if number > 1 and b"wf_increment" in stream.read(min(metadata, _LONGEST_METADATA)):
-                found.append(number)
+                again.append(number)
             stream.seek(start + following)
-    return found
+    return again
 
 
 @contextlib.contextmanager

@@ -79,8 +79,8 @@ class _Sdf:
 
     def record(self, at: int, kind: int) -> bytes:
         """Return a record, once its kind and size agree with the file."""
-        found, size = struct.unpack_from(">hi", self.data, at) if at >= 0 else (None, 0)
-        if found != kind or not 6 <= size <= len(self.data) - at:
+        stored, size = struct.unpack_from(">hi", self.data, at) if at >= 0 else (None, 0)
+        if stored != kind or not 6 <= size <= len(self.data) - at:
             raise ValueError(
                 f"at byte {at} is not a whole record of type {kind}; is the file cut off?"
             )
@@ -92,9 +92,9 @@ class _Sdf:
             raise ValueError(f"{self.counts[kind]} records of type {kind}")
         at = self.places[kind]
         for _ in range(self.counts[kind]):
-            found = self.record(at, kind)
-            at += len(found)
-            yield found
+            record = self.record(at, kind)
+            at += len(record)
+            yield record
 
     def source(self) -> Source:
         results = [self.result(record) for record in self.records(_DATA)]

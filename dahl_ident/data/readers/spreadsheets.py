@@ -35,18 +35,18 @@ def read_workbook(file: File, sheet: str | None = None) -> Source:
             raise DataError(f"{file.name}: no sheet {sheet!r}; there are {listed(sheets)}")
         sheets = {sheet: sheets[sheet]}
     tables = {name: _table(file, name, rows) for name, rows in sheets.items()}
-    found = {name: table for name, table in tables.items() if table is not None}
-    if not found:
+    with_table = {name: table for name, table in tables.items() if table is not None}
+    if not with_table:
         raise DataError(
             f"{file.name}: no table of numbers on {listed(tables)}; expected at least two columns "
             "of numbers under a header line"
         )
-    if len(found) > 1:
+    if len(with_table) > 1:
         raise DataError(
-            f"{file.name}: sheets {listed(found)} hold tables; name one with "
-            f"sheet={next(iter(found))!r}"
+            f"{file.name}: sheets {listed(with_table)} hold tables; name one with "
+            f"sheet={next(iter(with_table))!r}"
         )
-    return next(iter(found.values()))
+    return next(iter(with_table.values()))
 
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:

@@ -195,9 +195,9 @@ def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
     for dialects in (_DIALECTS, _LAST_DIALECTS):
         merit = (False, 0)  # a header that fits the columns counts more than another number
         for delimiter, mark in _possible(dialects, texts):
-            found = _in_dialect(lines, passed, delimiter, mark)
-            if found is not None and found[0] > merit:
-                merit, best = found
+            candidate = _in_dialect(lines, passed, delimiter, mark)
+            if candidate is not None and candidate[0] > merit:
+                merit, best = candidate
         if best is not None:
             break
     if best is None:
@@ -246,17 +246,17 @@ def _in_dialect(
         start = later if row is not None and len(row) == run.width else start
     row = rows[start] or []
     filled = max((i + 1 for i, cell in enumerate(row) if cell.strip()), default=run.width)
-    found = header([row for row in rows[:start] if row is not None], run.width, filled)
+    named = header([row for row in rows[:start] if row is not None], run.width, filled)
     comments: tuple[str, ...] = ()
-    if not found.names:
-        found = header(_commented(lines[:start], delimiter), run.width, filled)
-        comments = tuple(text.strip() for _, text in lines[:start]) if found.names else ()
+    if not named.names:
+        named = header(_commented(lines[:start], delimiter), run.width, filled)
+        comments = tuple(text.strip() for _, text in lines[:start]) if named.names else ()
         repeated = next((text for text in reversed(comments) if text), "")
     layout = _Layout(
-        delimiter, mark, start + 1, lines[start][0], run.width, found,
-        repeated.encode() if found.names else b"", comments,
+        delimiter, mark, start + 1, lines[start][0], run.width, named,
+        repeated.encode() if named.names else b"", comments,
     )  # fmt: skip
-    return (bool(found.names), run.score), layout
+    return (bool(named.names), run.score), layout
 
 
 def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list[str]]:
@@ -268,10 +268,10 @@ def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list
 def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
     """Return what an earlier save of this package wrote into a comment line."""
     for i, (_, text) in enumerate(lines):
-        found = re.match(rf"\s*#\s*{METADATA_MARK}(.*)", text)
-        if found:
+        comment = re.match(rf"\s*#\s*{METADATA_MARK}(.*)", text)
+        if comment:
             try:
-                return read_metadata(found[1])
+                return read_metadata(comment[1])
             except ValueError as exc:
                 raise DataError(
                     f"{name}, line {i + 1}: the comment after '{METADATA_MARK}' is not what this "
