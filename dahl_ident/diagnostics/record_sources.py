@@ -140,7 +140,10 @@ def _freed(
     """Return the Gauss-Newton step, and how the other values change with that at `place`."""
     inverse = inverse_normal(jacobians)
     step = inverse @ sum(J.T @ e for J, e in zip(jacobians, residuals, strict=True))
-    return step, np.delete(inverse[:, place], place) / max(inverse[place, place], 1e-300)
+    moved = np.delete(inverse[:, place], place)
+    if not any(J[:, place].any() for J in jacobians):  # such as a delay where nothing drives
+        return step, np.zeros(moved.size)
+    return step, moved / inverse[place, place]
 
 
 def _counted(
