@@ -245,7 +245,10 @@ class TestPlan:
         ranges, target = {"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}, {"f_max": 0.02}
         plan = di.plan(model, ranges=ranges, limits=limits, noise=0.01, target=target)
         assert plan.reached
-        usable = [_status(plan, model, 0.01, seed) != "not determined" for seed in range(30)]
+        usable = [
+            di.fit(_measured(plan, 0.01, seed), model).status.value in ("trusted", "approximate")
+            for seed in range(30)
+        ]
         assert sum(usable) >= 29
         short = di.plan(model, ranges=ranges, noise=0.01, target=target,
                         limits={**limits, "time": 0.5 * plan.seconds})  # fmt: skip
@@ -257,21 +260,12 @@ class TestPlan:
         """One amplitude, or two levels without a covariance, cannot show a wrong model."""
         limits = {"displacement": (1e-4, 9.0 * X_C), "frequency_hz": 5.0, "time": 60.0}
         plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max", draws=20)
-        A = np.array([step.level for step in plan.steps])
-        std = 0.01 / np.sqrt([step.measured_cycles for step in plan.steps])
-        exact, rng = (
-            di.Dahl(F_MAX, SIGMA, alpha=1.0).describing_function(A),
-            np.random.default_rng(1),
-        )
-        usable = 0
-        for _ in range(20):
-            response = exact * np.exp(std * (rng.standard_normal((2, len(A))).T @ [1.0, 1.0j]))
-            covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
-            data = FrequencyResponse(
-                np.full(len(A), 5.0), response, A, covariance=covariance if known else None
-            )
-            usable += di.fit(data, LINEAR).status in ("trusted", "approximate")
-        assert usable >= 19
+        usable = [
+            di.fit(_measured(plan, 0.01, seed, known=known), LINEAR).status.value
+            in ("trusted", "approximate")
+            for seed in range(20)
+        ]
+        assert sum(usable) >= 19
 
     def test_levels_do_not_lean_on_ranges(self) -> None:
         """In gross slip two close levels would do for the spring if stiffness were known."""
@@ -375,14 +369,7 @@ class TestPlan:
     def test_an_assumed_exponent_counts_as_in_a_fit(self) -> None:
         plan = di.plan(di.Dahl(), ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.02)
         assert plan.expected["alpha"].before == pytest.approx(np.log(4.0) / np.sqrt(12.0))
-        A = np.array([step.level for step in plan.steps])
-        std = 0.02 / np.sqrt([step.measured_cycles for step in plan.steps])
-        exact = di.Dahl(F_MAX, SIGMA).describing_function(A)
-        noise = np.random.default_rng(1).standard_normal((2, len(A)))
-        response = exact * np.exp(std * (noise.T @ [1.0, 1.0j]))
-        covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
-        data = FrequencyResponse(np.ones(len(A)), response, A, covariance=covariance)
-        fit = di.fit(data, di.Dahl())
+        fit = di.fit(_measured(plan, 0.02, 1), di.Dahl())
         for name in ("f_max", "sigma"):
             found = fit.params[name]
             assert found.stderr is not None
@@ -555,16 +542,15 @@ class TestProof:
             assert error == pytest.approx(plan.expected[name].after, rel=0.4)
 
 
-def _status(plan: Plan, model: Any, noise: float, seed: int) -> str:
-    """Return the status of a fit to a table that was measured as the plan says."""
+def _measured(plan: Plan, noise: float, seed: int, *, known: bool = True) -> FrequencyResponse:
+    """Return a table measured as the plan says, with its covariance where that is known."""
     A = np.array([step.level for step in plan.steps])
     std = noise / np.sqrt([step.measured_cycles for step in plan.steps])
     pair = np.random.default_rng(seed).standard_normal((2, len(A)))
     response = di.Dahl(F_MAX, SIGMA, alpha=1.0).describing_function(A)
     response = response * np.exp(std * (pair.T @ [1.0, 1.0j]))
-    covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2)
-    data = FrequencyResponse(np.full(len(A), 5.0), response, A, covariance=covariance)
-    return di.fit(data, model).status.value
+    covariance = (std * np.abs(response))[:, None, None] ** 2 * np.eye(2) if known else None
+    return FrequencyResponse(np.full(len(A), 5.0), response, A, covariance=covariance)
 
 
 def _errors(plan: Plan, truth: di.Model, noise: float, count: int) -> FloatArray:

@@ -129,6 +129,9 @@ def plan(
     alike at levels close to each other, so levels are spread; where the earlier data are too few
     to tell it from noise, levels are chosen as if both were equally large. A posterior has none.
 
+    Without earlier data, a plan has as many levels as a fit to them alone needs to tell a wrong
+    model from noise; where the time does not allow it, the target is not reached.
+
     The criterion is the mean of its logarithm over the draws; see
     :mod:`dahl_ident.planning.design`.
 
