@@ -290,7 +290,7 @@ def compare(scenario: Scenario, count: int, seed: int, whole: int = 0) -> Iterat
     first = scenario.plan(1e6, None, candidates=60)
     bench, grid = first.search.bench, first.search.logarithmic_grid(1e6, scenario.levels)
     assert grid is not None
-    levels = grid[0]
+    levels = grid.levels
     time = bench.seconds(levels, np.full(len(levels), float(CYCLES)))
     options = first.search.forecast.candidates
     even = Design(

@@ -8,11 +8,11 @@ import numpy as np
 
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_range
-from dahl_ident.planning.design import Objective, continuous_design
+from dahl_ident.planning.design import Design, Objective, continuous_design
 from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
 from dahl_ident.planning.motion_information import evaluate_motions, motions_of
 from dahl_ident.planning.question import BenchLimits, Question, is_expanded
-from dahl_ident.planning.search import LONGEST, Search, Solution
+from dahl_ident.planning.search import LONGEST, Search
 from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.units import si_unit
 
@@ -45,7 +45,7 @@ def options_of(
 
 
 def undetermined(
-    search: Search, found: Solution, expected: Mapping[str, Expected]
+    search: Search, found: Design, expected: Mapping[str, Expected]
 ) -> tuple[str, ...]:
     """Return a sentence for each undetermined quantity, with the limit that prevents it."""
     q = search.question
@@ -106,7 +106,7 @@ def _within_reach(question: Question, name: str, limits: BenchLimits) -> float:
     return float(np.exp(-0.5 * design.value))
 
 
-def assumptions_of(search: Search, found: Solution) -> tuple[str, ...]:
+def assumptions_of(search: Search, found: Design) -> tuple[str, ...]:
     """Return the assumptions of the prediction."""
     q, known = search.question, search.question.knowledge
     force, length = (si_unit(kind, known.motion) for kind in ("force", "displacement"))

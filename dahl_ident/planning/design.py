@@ -207,12 +207,15 @@ def _shared(
 
 
 @dataclass(frozen=True)
-class Selection:
-    """Levels in the order of the run, whole cycles at each, and the criterion."""
+class Design:
+    """Levels in the order of a run, whole cycles at each, and how many runs."""
 
     levels: NDArray[np.intp]
     cycles: FloatArray
-    value: float
+    runs: int
+    value: float  # of the criterion
+    seconds: float  # of all runs
+    ratio: float = np.nan  # the largest one of an uncertainty to its target
 
 
 @dataclass(frozen=True)
@@ -228,10 +231,10 @@ class Coverage:
         enough = np.ptp(self.amplitude[levels], axis=-1) >= self.span
         return np.asarray(enough | (levels.shape[-1] < 2))
 
-    def holds(self, levels: NDArray[np.intp], runs: int) -> bool:
-        """Return whether the data of some runs at these levels can be judged."""
-        span = float(np.ptp(self.amplitude[levels]))
-        return runs * len(levels) >= self.fewest and bool(span >= self.span)
+    def holds(self, design: Design) -> bool:
+        """Return whether the data of a design can be judged."""
+        span = float(np.ptp(self.amplitude[design.levels]))
+        return design.runs * len(design.levels) >= self.fewest and bool(span >= self.span)
 
 
 class Exchange:
@@ -247,7 +250,7 @@ class Exchange:
         self._objective, self._bench, self._pool = objective, bench, pool
         self._coverage = coverage or Coverage(1, 0.0, np.zeros(len(bench.frequency_hz)))
 
-    def best(self, time: float, start: Sequence[int] = ()) -> Selection | None:
+    def best(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels for one run of `time` s; None where nothing can be measured."""
         chosen, value, fewest = list(start), -np.inf, self._coverage.fewest
         if chosen:
@@ -321,7 +324,7 @@ class Exchange:
         values, _ = self._objective.only(joined).at(cycles)
         return [int(k) for k in joined[np.argsort(-values)[:_TRIED], -1]]
 
-    def whole(self, levels: Sequence[int], time: float) -> Selection:
+    def whole(self, levels: Sequence[int], time: float) -> Design:
         """Return whole cycles at the levels; the remaining time goes where it helps most."""
         ordered = self._bench.order(levels)
         f = self._bench.frequency_hz[ordered]
@@ -329,8 +332,9 @@ class Exchange:
         cycles = np.maximum(np.floor(shared + 1e-9), float(LEAST_CYCLES))
         while True:
             value, sensitivities = sub.at(cycles)
-            possible = 1.0 / f <= time - self._bench.seconds(ordered, cycles) + 1e-9
+            seconds, runs = self._bench.seconds(ordered, cycles), self._objective.runs
+            possible = 1.0 / f <= time - seconds + 1e-9
             if not possible.any():
-                return Selection(ordered, cycles, float(value))
+                return Design(ordered, cycles, runs, float(value), runs * seconds)
             gain = np.where(possible, sub.gradient(sensitivities) * f, -np.inf)
             cycles[int(np.argmax(gain))] += 1.0

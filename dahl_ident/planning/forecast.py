@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.planning.candidates import Candidates
-from dahl_ident.planning.design import Term, packed_information
+from dahl_ident.planning.design import Design, Term, packed_information
 from dahl_ident.planning.knowledge import Knowledge, spread
 from dahl_ident.planning.question import RESPONSE, Question, is_expanded, least_factor, powers_of
 
@@ -111,11 +110,11 @@ class Forecast:
         starts = np.cumsum([0, *(c.shape[-1] for c in columns[:-1])])
         return replace(term, targets=np.concatenate(columns, axis=-1), starts=starts)
 
-    def covariance(self, levels: Any, cycles: FloatArray, runs: int, scatter: float) -> FloatArray:
+    def covariance(self, design: Design, scatter: float) -> FloatArray:
         """Return the covariance of parameters and departures after a design, (S, Q, Q)."""
-        c = self.candidates.only(levels)
+        c = self.candidates.only(design.levels)
         term = Term(packed_information(c.rows, c.offsets, scatter), self.before, scatter)
-        return covariance_of(self.before + runs * term.of_run(cycles)[0])
+        return covariance_of(self.before + design.runs * term.of_run(design.cycles)[0])
 
     def uncertainty(self, covariance: FloatArray) -> dict[str, FloatArray]:
         """Return the relative standard uncertainty of every quantity at every draw."""
@@ -124,30 +123,28 @@ class Forecast:
             for name, c in self.directions.items()
         }
 
-    def after(
-        self, levels: Any, cycles: FloatArray, runs: int
-    ) -> tuple[dict[str, FloatArray], dict[str, float]]:
+    def after(self, design: Design) -> tuple[dict[str, FloatArray], dict[str, float]]:
         """Return every quantity's uncertainty at every draw, and the share of scatter in it.
 
         Expanded uncertainties have the coverage factor of the runs' degrees of freedom; noise has
         many.
         """
-        after = self.uncertainty(self.covariance(levels, cycles, runs, self.scatter))
+        after = self.uncertainty(self.covariance(design, self.scatter))
         shares = dict.fromkeys(after, 0.0)
         if self.scatter > 0.0:
-            quiet = self.uncertainty(self.covariance(levels, cycles, runs, 0.0))
+            quiet = self.uncertainty(self.covariance(design, 0.0))
             for name, least in quiet.items():
                 if np.isfinite(typical(after[name])):
                     shares[name] = max(0.0, 1.0 - (typical(least) / typical(after[name])) ** 2)
         for name, share in shares.items():
             if is_expanded(name):
-                dof = max(runs - 1, 1) / share**2 if share > 0.0 else np.inf
+                dof = max(design.runs - 1, 1) / share**2 if share > 0.0 else np.inf
                 after[name] = coverage_factor(dof) * after[name]
         return after, shares
 
-    def expected(self, levels: Any, cycles: FloatArray, runs: int) -> dict[str, Expected]:
+    def expected(self, design: Design) -> dict[str, Expected]:
         """Return the expected uncertainty of each quantity after a design."""
-        after, shares = self.after(levels, cycles, runs)
+        after, shares = self.after(design)
         before = self.uncertainty(covariance_of(self.before))
         values, names = self.knowledge.values, self.knowledge.names
         return {

@@ -14,6 +14,7 @@ from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.advice import assumptions_of, options_of, undetermined
 from dahl_ident.planning.candidates import CONTROLLED, evaluate
+from dahl_ident.planning.design import Design
 from dahl_ident.planning.forecast import SEARCHED
 from dahl_ident.planning.knowledge import Ranges, gather
 from dahl_ident.planning.measurement_plan import Plan, PlanStep
@@ -27,7 +28,7 @@ from dahl_ident.planning.question import (
     recorded_force,
     target_of,
 )
-from dahl_ident.planning.search import Search, Solution
+from dahl_ident.planning.search import Search
 from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.steady_state import STEADY, Steady
 
@@ -227,22 +228,22 @@ def _of_motions(question: Question) -> Plan:
     return _plan(second, other) if better else _plan(first, one)
 
 
-def _plan(search: Search, found: Solution) -> Plan:
-    q, (levels, cycles, runs) = search.question, found.design
+def _plan(search: Search, found: Design) -> Plan:
+    q, levels = search.question, found.levels
     options, change_over = search.forecast.candidates.only(levels), q.costs["change_over"]
     settling = search.bench.settling_cycles(levels)
     steps = tuple(
         PlanStep(level, f, int(wait), int(n), change_over + (wait + n) / f, motion)
         for level, f, wait, n, motion in zip(
             options.level.tolist(), options.frequency_hz.tolist(), settling.tolist(),
-            cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
+            found.cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
         )
     )  # fmt: skip
-    expected = search.forecast.expected(levels, cycles, runs)
+    expected = search.forecast.expected(found)
     return Plan(
         controlled=q.controlled,
         steps=steps,
-        runs=runs,
+        runs=found.runs,
         seconds=found.seconds,
         expected=expected,
         target=dict(q.target) if q.has_numbers else {},

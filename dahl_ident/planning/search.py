@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.candidates import Candidates
-from dahl_ident.planning.design import Coverage, Exchange, Objective, Selection, continuous_design
+from dahl_ident.planning.design import Coverage, Design, Exchange, Objective, continuous_design
 from dahl_ident.planning.forecast import Expected, Forecast, typical
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
@@ -34,21 +33,6 @@ _APART = 2.0  # times the range that a fit takes as one amplitude: measured ones
 _GRID_LEVELS = 10  # of the usual plan that the best one is compared with
 _CORRECTIONS = 6  # of the repeats of motions, each by the whole information
 _FILLED = 0.999  # fraction of the target that corrected repeats aim at
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Levels for one run, the number of runs, and the largest ratio of uncertainty to target."""
-
-    selection: Selection
-    runs: int
-    seconds: float
-    ratio: float
-
-    @property
-    def design(self) -> tuple[NDArray[np.intp], FloatArray, int]:
-        """Levels, cycles and runs."""
-        return self.selection.levels, self.selection.cycles, self.runs
 
 
 class Search:
@@ -73,7 +57,7 @@ class Search:
             self._terms.append(self._suspects.term(question.suspects))
         self._pool: NDArray[np.intp] | None = None
 
-    def best(self) -> Solution:
+    def best(self) -> Design:
         """Return the least time that reaches the targets, or the best in the time allowed."""
         q = self.question
         found = self.least_time() if q.has_numbers else self.solve(q.limits.time)
@@ -86,18 +70,18 @@ class Search:
             )
         return found if q.recorded is None else self._exactly(found)
 
-    def score(self, solution: Solution) -> tuple[bool, float]:
-        """Return what is larger for the better of two solutions of the same question."""
+    def score(self, design: Design) -> tuple[bool, float]:
+        """Return what is larger for the better of two designs of the same question."""
         if self.question.has_numbers:
-            reached = self.reached(solution)
-            return reached, -solution.seconds if reached else -solution.ratio
+            reached = self.reached(design)
+            return reached, -design.seconds if reached else -design.ratio
         term = self.forecast.thinned().term(self.question.target)
-        value, _ = Objective((term,)).only(solution.selection.levels).at(solution.selection.cycles)
+        value, _ = Objective((term,)).only(design.levels).at(design.cycles)
         return True, float(value)
 
-    def solve(self, time: float, start: Sequence[int] = ()) -> Solution | None:
+    def solve(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels and runs for a time; None where it is too short."""
-        best: Solution | None = None
+        best: Design | None = None
         least = np.inf
         for weight in (0.0,) if self._suspects is None else _WEIGHTS:
             found = self._solve(time, weight, start)
@@ -110,18 +94,16 @@ class Search:
                 break
         return best
 
-    def _solve(self, time: float, weight: float, start: Sequence[int]) -> Solution | None:
+    def _solve(self, time: float, weight: float, start: Sequence[int]) -> Design | None:
         q, best = self.question, None
         most = _MOST_RUNS if q.scatter > 0.0 else 1
         for runs in (q.runs,) if q.runs else range(1, most + 1):
             objective = self._objective(weight, runs)
             search = Exchange(objective, self.bench, self._promising(time), self._coverage)
             found = search.best(time / runs, start)
-            if found is None or (best is not None and found.value <= best.selection.value):
+            if found is None or (best is not None and found.value <= best.value):
                 break
-            seconds = runs * self.bench.seconds(found.levels, found.cycles)
-            best = Solution(found, runs, seconds, np.nan)
-            best = replace(best, ratio=self.ratio(best))
+            best = replace(found, ratio=self.ratio(found))
             start = found.levels.tolist()
         return best
 
@@ -141,14 +123,14 @@ class Search:
         fewest = min((LEAST_DOF + fitted + 1) // 2, candidates.count)
         return Coverage(fewest, span, amplitude)
 
-    def can_be_judged(self, solution: Solution) -> bool:
-        """Return whether the data of a solution alone can tell a wrong model from noise."""
-        return self._coverage.holds(solution.selection.levels, solution.runs)
+    def can_be_judged(self, design: Design) -> bool:
+        """Return whether the data of a design alone can tell a wrong model from noise."""
+        return self._coverage.holds(design)
 
-    def reached(self, solution: Solution) -> bool:
-        """Return whether a solution reaches every target, with data that can be judged."""
-        judged = not self.question.has_numbers or self.can_be_judged(solution)
-        return bool(solution.ratio <= 1.0) and judged
+    def reached(self, design: Design) -> bool:
+        """Return whether a design reaches every target, with data that can be judged."""
+        judged = not self.question.has_numbers or self.can_be_judged(design)
+        return bool(design.ratio <= 1.0) and judged
 
     def _promising(self, time: float) -> NDArray[np.intp]:
         """Return promising candidates: those of the continuous design, and evenly spread ones."""
@@ -169,32 +151,32 @@ class Search:
             self._pool = np.unique(np.concatenate([best[seconds[best] > 0.0], even]))
         return self._pool
 
-    def ratio(self, solution: Solution) -> float:
+    def ratio(self, design: Design) -> float:
         """Return the largest ratio of an uncertainty to its target, suspects included."""
         numbers = self.question.target if self.question.has_numbers else {}
-        return max(_ratio(self.forecast, numbers, solution), self.suspect_ratio(solution))
+        return max(_ratio(self.forecast, numbers, design), self.suspect_ratio(design))
 
-    def suspect_ratio(self, solution: Solution) -> float:
+    def suspect_ratio(self, design: Design) -> float:
         """Return the largest ratio of a suspected parameter's uncertainty to its target."""
         if self._suspects is None:
             return 0.0
-        return _ratio(self._suspects, self.question.suspects, solution)
+        return _ratio(self._suspects, self.question.suspects, design)
 
-    def least_time(self) -> Solution | None:
+    def least_time(self) -> Design | None:
         """Return the shortest plan that reaches the targets, or the best in the time allowed.
 
         Where no time is given, that is a month.
         """
         most = min(self.question.limits.time, LONGEST)
         time = min(most, 30.0 * float(np.median(self.bench.alone)) + 1.0)
-        best: Solution | None = None
-        last: Solution | None = None
+        best: Design | None = None
+        last: Design | None = None
         start: list[int] = []
         short, wide = 0.0, np.inf
         for _ in range(_TIMES):
             found = self.solve(time, start)
             if found is not None:
-                start = found.selection.levels.tolist()
+                start = found.levels.tolist()
             if found is not None and self.reached(found):
                 best = found if best is None or found.seconds < best.seconds else best
                 if found.ratio >= _CLOSE:
@@ -214,7 +196,7 @@ class Search:
                 continue
             if short >= _CLOSE * best.seconds:
                 break
-            fixed = best.runs * float(self.bench.fixed(best.selection.levels))
+            fixed = best.runs * float(self.bench.fixed(best.levels))
             time = fixed + (best.seconds - fixed) * (best.ratio / _AIMED) ** 2
             narrow = np.log(best.seconds / max(short, 1e-3 * best.seconds))
             if not short < time < 0.99 * best.seconds or narrow > _NARROWS * wide:
@@ -222,18 +204,18 @@ class Search:
             wide = narrow
         return best or last
 
-    def _exactly(self, found: Solution) -> Solution:
+    def _exactly(self, found: Design) -> Design:
         """Return the repeats that reach the targets by the information of the whole records.
 
         The search takes each repeat of a motion as worth the same; the first ones, which also have
         to determine the state at the start, the offset and the drift, are worth less.
         """
-        q, candidates, levels = self.question, self.forecast.candidates, found.selection.levels
+        q, candidates, levels = self.question, self.forecast.candidates, found.levels
         assert q.recorded is not None
         sums = [RepeatSums.of(q.knowledge, candidates.motions[k], q.recorded) for k in levels]
         risen, best = False, found
         for attempt in range(_CORRECTIONS):
-            rows, cycles = candidates.rows.copy(), best.selection.cycles
+            rows, cycles = candidates.rows.copy(), best.cycles
             for k, one, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
                 rows[:, k] = one.rows(int(repeats)) * q.knowledge.units
             self.forecast = replace(self.forecast, candidates=replace(candidates, rows=rows))
@@ -244,21 +226,16 @@ class Search:
             if done or not (q.has_numbers and possible) or attempt == _CORRECTIONS - 1:
                 break
             risen = risen or best.ratio > 1.0
-            best = replace(best, selection=replace(best.selection, cycles=better))
+            best = replace(best, cycles=better)
         return best
 
     def expected_after(self, time: float, *, grid: bool = False) -> dict[str, Expected]:
         """Return what the best plan of a time, or a grid, determines; empty if it is too short."""
-        if grid:
-            design = self.logarithmic_grid(time)
-        else:
-            design = None if (found := self.solve(time)) is None else found.design
-        return {} if design is None else self.forecast.expected(*design)
+        design = self.logarithmic_grid(time) if grid else self.solve(time)
+        return {} if design is None else self.forecast.expected(design)
 
-    def logarithmic_grid(
-        self, time: float, levels: int = _GRID_LEVELS
-    ) -> tuple[NDArray[np.intp], FloatArray, int] | None:
-        """Return levels, cycles and runs of an even logarithmic grid, equal cycles at each.
+    def logarithmic_grid(self, time: float, levels: int = _GRID_LEVELS) -> Design | None:
+        """Return an even logarithmic grid of levels, equal cycles at each.
 
         In the same order and with the same settling; of several frequencies a third of the levels
         at each of three. None where the time is too short.
@@ -277,10 +254,14 @@ class Search:
         ordered, runs = self.bench.order(np.unique(chosen)), self.question.runs or 1
         room = time / runs - self.bench.fixed(ordered)
         cycles = np.floor(room / float((1.0 / c.frequency_hz[ordered]).sum()))
-        return None if cycles < 1.0 else (ordered, np.full(len(ordered), cycles), runs)
+        if cycles < 1.0:
+            return None
+        each = np.full(len(ordered), cycles)
+        seconds = runs * self.bench.seconds(ordered, each)
+        return Design(ordered, each, runs, np.nan, seconds)
 
 
-def _ratio(forecast: Forecast, target: Mapping[str, float], solution: Solution) -> float:
+def _ratio(forecast: Forecast, target: Mapping[str, float], design: Design) -> float:
     """Return the largest ratio of an uncertainty to its target, 0 without any."""
-    after = forecast.after(*solution.design)[0] if target else {}
+    after = forecast.after(design)[0] if target else {}
     return max((typical(after[name]) / u for name, u in target.items()), default=0.0)
