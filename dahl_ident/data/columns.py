@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -66,6 +66,15 @@ def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
             f"{name} is {value!r}; expected one of {choices(allowed, str(value))}"
         )
     return value
+
+
+def set_checked(instance: Any, check: Callable[[Any, str], Any], *names: str) -> None:
+    """Replace fields of a frozen dataclass by what a check returns; a default of None stays."""
+    optional = {one.name for one in fields(instance) if one.default is None}
+    for name in names:
+        value = getattr(instance, name)
+        if value is not None or name not in optional:
+            object.__setattr__(instance, name, check(value, name))
 
 
 def complex_values(value: ArrayLike, name: str) -> NDArray[np.complex128]:

@@ -23,7 +23,7 @@ from dahl_ident.arrays import (
     positive_number,
     whole_number,
 )
-from dahl_ident.data.columns import one_of
+from dahl_ident.data.columns import one_of, set_checked
 from dahl_ident.errors import ValidationError
 from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.synthetic.mechanism import Signal
@@ -88,15 +88,10 @@ class Channel:
     limit: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("gain", "hum_hz"):
-            object.__setattr__(self, name, positive_number(getattr(self, name), name))
-        for name in ("delay", "offset", "drift"):
-            object.__setattr__(self, name, finite_number(getattr(self, name), name))
-        for name in ("noise_std", "flicker_std", "hum_amplitude", "resolution"):
-            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
-        for name in ("antialias_hz", "limit"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, positive_number(getattr(self, name), name))
+        set_checked(self, positive_number, "gain", "hum_hz", "antialias_hz", "limit")
+        set_checked(self, finite_number, "delay", "offset", "drift")
+        not_negative = ("noise_std", "flicker_std", "hum_amplitude", "resolution")
+        set_checked(self, non_negative_number, *not_negative)
 
     def response(self, omega: FloatArray) -> ComplexArray:
         """Return measured over true phasor at angular frequencies: gain, filter and delay."""
@@ -173,11 +168,8 @@ class Acquisition:
     dropped_fraction: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.sample_rate_hz is not None:
-            rate = positive_number(self.sample_rate_hz, "sample_rate_hz")
-            object.__setattr__(self, "sample_rate_hz", rate)
-        for name in ("jitter_std", "dropped_fraction"):
-            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        set_checked(self, positive_number, "sample_rate_hz")
+        set_checked(self, non_negative_number, "jitter_std", "dropped_fraction")
         if self.dropped_fraction > 0.9:
             raise ValidationError(
                 f"dropped_fraction is {self.dropped_fraction!r}; expected a share from 0 to 0.9"
@@ -265,8 +257,8 @@ class Table:
     steady: Steady = "exact"
 
     def __post_init__(self) -> None:
-        for name in ("displacement_std", "force_std", "outlier_fraction", "outlier_size"):
-            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        shares = ("displacement_std", "force_std", "outlier_fraction", "outlier_size")
+        set_checked(self, non_negative_number, *shares)
         one_of(self.steady, "steady", STEADY)
         if self.outlier_fraction > 1.0:
             raise ValidationError(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from dahl_ident.arrays import non_negative_number, positive_array, positive_number, whole_number
-from dahl_ident.data.columns import one_of
+from dahl_ident.data.columns import one_of, set_checked
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic.randomness import Draws
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
@@ -66,14 +66,12 @@ class SteppedSine:
     rest: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("levels", "frequencies_hz"):
-            object.__setattr__(self, name, _numbers(getattr(self, name), name))
+        set_checked(self, _numbers, "levels", "frequencies_hz")
         one_of(self.controlled, "controlled", get_args(Controlled))
         one_of(self.order, "order", get_args(Order))
         whole_number(self.settling_periods, "settling_periods", 0)
         whole_number(self.num_periods, "num_periods", 1)
-        for name in ("ramp_periods", "rest"):
-            object.__setattr__(self, name, non_negative_number(getattr(self, name), name))
+        set_checked(self, non_negative_number, "ramp_periods", "rest")
 
     def grid(self, seed: int) -> list[tuple[float, float]]:
         """Return level and frequency of every step in the order of the run."""
@@ -139,8 +137,8 @@ class FrequencySweep:
 
     def __post_init__(self) -> None:
         several = isinstance(self.level, Sequence)
-        if isinstance(self.level, Sequence):
-            object.__setattr__(self, "level", _numbers(self.level, "level"))
+        if several:
+            set_checked(self, _numbers, "level")
         _check_passage(self, *["level"][several:], "start_hz", "stop_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
@@ -212,12 +210,10 @@ def _numbers(given: Sequence[float], name: str) -> tuple[float, ...]:
 
 def _check_passage(passage: FrequencySweep | AmplitudeRamp, *positive: str) -> None:
     """Check a steady sweep, and turn its numbers into floats."""
-    for name in positive:
-        object.__setattr__(passage, name, positive_number(getattr(passage, name), name))
+    set_checked(passage, positive_number, *positive)
     one_of(passage.spacing, "spacing", get_args(Spacing))
     one_of(passage.controlled, "controlled", get_args(Controlled))
-    ramp = non_negative_number(passage.ramp_periods, "ramp_periods")
-    object.__setattr__(passage, "ramp_periods", ramp)
+    set_checked(passage, non_negative_number, "ramp_periods")
 
 
 Excitation = SteppedSine | FrequencySweep | AmplitudeRamp
