@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.quantities import COMPLIANCES
-from dahl_ident.diagnostics.estimate import WeightedEstimate
+from dahl_ident.diagnostics.estimate import WeightedEstimate, tests_of
 from dahl_ident.problem import Problem
 
 _SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
@@ -368,20 +368,10 @@ def own_errors(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Sour
 
 def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
     """Return what a departure is relative to: the row's response, a harmonic's fundamental."""
-    data = problem.data
-    first = data.harmonic == 1
-    if first.all():
-        return predicted.copy()
-    held = np.ones(data.n) if data.amplitude is None else data.amplitude
-    _, which = np.unique(np.column_stack([data.frequency_hz, held]), axis=0, return_inverse=True)
-    which = which.ravel()
-    partner = np.full(which.max() + 1, -1)
-    partner[which[first][::-1]] = np.flatnonzero(first)[::-1]  # the first of several
-    rows = ~first & (partner[which] >= 0)
-    own, size = predicted[rows], predicted.copy()
-    phase = np.divide(own, np.abs(own), out=np.zeros_like(own), where=own != 0.0)
-    size[rows] = np.abs(predicted[partner[which[rows]]]) * phase
-    return size
+    _, fundamental = tests_of(problem.data)
+    size = np.abs(predicted)
+    phase = np.divide(predicted, size, out=np.zeros_like(predicted), where=size != 0.0)
+    return np.asarray(size[fundamental] * phase)
 
 
 def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArray:

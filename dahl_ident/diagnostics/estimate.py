@@ -297,17 +297,20 @@ def row_weights(problem: Problem) -> FloatArray:
     return weight
 
 
-def fundamental_size(data: FrequencyResponse) -> FloatArray:
-    """Return the size of the measured fundamental of each row's test, (n,)."""
-    size, first = np.abs(data.response), data.harmonic == 1
-    if first.all() or not first.any():
-        return size
-    held = np.ones(data.n) if data.amplitude is None else data.amplitude
-    _, test = np.unique(np.column_stack([data.frequency_hz, held]), axis=0, return_inverse=True)
-    total, count = (np.bincount(test.ravel(), w) for w in (np.where(first, size, 0.0), first))
-    mean = np.divide(total, count, out=np.full(len(count), np.nan), where=count > 0)
-    found = np.where(first, size, mean[test.ravel()])
-    return np.asarray(np.where(np.isnan(found), size, found))
+def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the number of each row's test, and the row of its fundamental, (n,) each.
+
+    A test is all rows of one level in one run; a row without a fundamental has itself.
+    """
+    runs = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
+    levels = (v for v in (data.amplitude, data.drive) if v is not None)
+    places = (runs, data.frequency_hz, *levels)
+    test = np.unique(np.column_stack(places), axis=0, return_inverse=True)[1].ravel()
+    first = np.flatnonzero(data.harmonic == 1)
+    fundamental = np.full(test.max() + 1, -1)
+    fundamental[test[first][::-1]] = first[::-1]  # the first of several
+    others = (data.harmonic != 1) & (fundamental[test] >= 0)
+    return test, np.where(others, fundamental[test], np.arange(data.n))
 
 
 def _weights(
@@ -322,7 +325,7 @@ def _weights(
     target = dof - float(y[m:] @ y[m:])
     if dof <= 0 or target <= 0.0 or y[:m] @ y[:m] <= target:
         return 0.0, np.broadcast_to(np.eye(2), (n, 2, 2))
-    size = fundamental_size(problem.data)
+    size = np.abs(problem.data.response)[tests_of(problem.data)[1]]
     both = np.asarray(size[None] * np.array([[1.0], [1.0j]]), dtype=np.complex128)
     D = problem.residual_change(theta, both)
     D = D.reshape(2, n, 2).transpose(1, 2, 0)

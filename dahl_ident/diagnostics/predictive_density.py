@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.estimate import tests_of
 from dahl_ident.diagnostics.mixed_model import MixedModel, State
 from dahl_ident.fitting import Optimum
 
@@ -75,7 +76,10 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     True
     """
     problem, data = optimum.problem, optimum.problem.data
-    owner, test, run = _tests(optimum)
+    test, owner = tests_of(data)
+    run = np.zeros(data.n, dtype=np.intp)
+    if data.run is not None:
+        run = np.unique(data.run, return_inverse=True)[1].astype(np.intp)
     size = np.abs(data.response)[owner]
     size = np.where(size > 0.0, size, size.max())  # a row of nothing counts as the largest
     predicted = problem.predict(optimum.theta)
@@ -120,22 +124,6 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
 
 def _parts(values: ComplexArray) -> FloatArray:
     return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
-
-
-def _tests(optimum: Optimum) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Return each row's fundamental, its test and its run."""
-    data = optimum.problem.data
-    labels = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
-    places = [labels, data.frequency_hz]
-    places += [np.asarray(v) for v in (data.amplitude, data.drive) if v is not None]
-    _, which = np.unique(np.column_stack(places), axis=0, return_inverse=True)
-    which = which.ravel()
-    owner = np.arange(data.n)
-    first = np.full(which.max() + 1, -1)
-    first[which[data.harmonic == 1]] = np.flatnonzero(data.harmonic == 1)
-    has = first[which] >= 0
-    owner = np.where((data.harmonic != 1) & has, first[which], owner)
-    return owner, which, np.asarray(labels, dtype=np.intp)
 
 
 def _stated(optimum: Optimum, size: FloatArray) -> FloatArray:
