@@ -14,8 +14,8 @@ from dahl_ident.fitting.optimum import (
     OptimumBatch,
     at_bound,
     estimated_scale,
+    information_of,
     inverse,
-    robust_information,
 )
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import BaseProblem
@@ -114,7 +114,7 @@ def optima(
         inner, lost = inverse(problem.information(theta, scale))
     else:  # one table
         one = problem.table(0)
-        inner, lost = inverse(robust_information(one, theta[0], scale, loss, int(dof[0]))[None])
+        inner, lost = inverse(information_of(one, theta[0], scale, loss, int(dof[0]))[None])
     values = problem.to_values(theta)
     with np.errstate(invalid="ignore"):  # infinite variances of what no residual holds
         covariance = inner * (final / scale)[:, None, None] ** 2
@@ -129,7 +129,9 @@ def optima(
             limit, phi, hessian = at
             one = problem.table(table)
             chart = limit.chart.derivative(theta[table])
-            own = _information(one, theta[table], scale, loss, int(dof[table]), chart, hessian)
+            own = hessian
+            if loss is not None or not problem.gaussian:
+                own = information_of(one, theta[table], scale, loss, int(dof[table]), chart)
             ratio = (final[table] / scale) ** 2
             small, gone = inverse(own)
             small = small * ratio
@@ -164,18 +166,3 @@ def optima(
         combinations=combinations,
         meanings={table: at[0].meaning for table, at in ends.limits.items()},
     )
-
-
-def _information(
-    problem: BaseProblem,
-    theta: FloatArray,
-    scale: float,
-    loss: Loss | None,
-    dof: int,
-    slopes: FloatArray,
-    hessian: FloatArray,
-) -> FloatArray:
-    """Return the information of phi at a limit; `slopes` is dtheta/dphi."""
-    if loss is not None:
-        return robust_information(problem, theta, scale, loss, dof, slopes)
-    return hessian if problem.gaussian else problem.information(theta, scale, slopes)

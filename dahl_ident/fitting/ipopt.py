@@ -35,9 +35,10 @@ from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import (
     ConstraintCost,
     Optimum,
+    agreed_scale,
     estimated_scale,
+    information_of,
     inverse,
-    robust_information,
     scale_ratio,
 )
 from dahl_ident.fitting.record_search import Tell
@@ -53,8 +54,6 @@ _LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size make
 _ACTIVE = 1e-6  # an inequality nearer to its limit than this holds there
 _STEP = 1e-4  # of ln p, between gradients whose difference is the Hessian
 _MOST_STARTS = 6  # the lowest minima of the global grid, and what the user gave
-_RESCALINGS = 30  # of the noise's scale; a handful is the rule
-_SAME_SCALE = 1e-10  # change of ln scale that ends them
 _WORDS = {
     "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
     "Restoration_Failed": "it could not return to a point that satisfies the constraints",
@@ -148,14 +147,16 @@ def solve_ipopt(
     target = Target(problem, begin.scale if adapts else 1.0, loss)
     found = _search(target, begin, relations)
     dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
-    for _ in range(_RESCALINGS if adapts and relations.texts else 0):
-        ratio = scale_ratio(
-            problem, found.theta, target.scale, loss_named(loss, problem.parts), dof
-        )
-        if abs(ratio - 1.0) < _SAME_SCALE:
-            break
-        target = replace(target, scale=target.scale * ratio)
-        found = _descend(target, found.theta, relations, found.evaluations)
+    if adapts and relations.texts:
+
+        def excess(scale: float) -> float:
+            nonlocal target, found
+            target = replace(target, scale=scale)
+            found = _descend(target, found.theta, relations, found.evaluations)
+            rho = loss_named(loss, problem.parts)
+            return float(np.log(scale_ratio(problem, found.theta, scale, rho, dof)))
+
+        agreed_scale(excess, target.scale)
     return _ended(target, found, relations, begin)
 
 
@@ -441,7 +442,8 @@ def _constrained(
     if not problem.scale_known and loss is None and not problem.priors:
         scale = float(estimated_scale(problem, found.cost, dof))
     covariance, undetermined = _on_constraints(
-        _information(target, found, dof), found.slopes[np.array(relations.equal, dtype=np.bool_)]
+        information_of(problem, found.theta, target.scale, loss, dof),
+        found.slopes[np.array(relations.equal, dtype=np.bool_)],
     )
     active = [text for text, hit in zip(relations.texts, found.active, strict=True) if hit]
     status, message = result.status, result.message
@@ -484,14 +486,6 @@ def _constraint_cost(
         return None
     rise = 2.0 * max(found.cost - begin.cost, 0.0) / begin.scale**2
     return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
-
-
-def _information(target: Target, found: _Found, dof: int) -> FloatArray:
-    """Return the information of theta, constraints aside."""
-    problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
-    if loss is None:
-        return problem.information(found.theta, target.scale)
-    return robust_information(problem, found.theta, target.scale, loss, dof)
 
 
 def _on_constraints(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, overload
@@ -280,31 +280,20 @@ class OptimumBatch(Sequence[Optimum]):
     @classmethod
     def joined(cls, problem: BaseProblem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
         """Return the optima of all parts, one after the other, as those of `problem`."""
-
-        def side_by_side(name: str) -> Any:
-            return np.concatenate([getattr(part, name) for part in parts])
-
         combinations, meanings, first = {}, {}, 0
         for part in parts:
             combinations.update({first + at: c for at, c in part.combinations.items()})
             meanings.update({first + at: text for at, text in part.meanings.items()})
             first += len(part)
-        return cls(
-            problem=problem,
-            theta=side_by_side("theta"),
-            values=side_by_side("values"),
-            covariance=side_by_side("covariance"),
-            scale=side_by_side("scale"),
-            dof=side_by_side("dof"),
-            cost=side_by_side("cost"),
-            nfev=side_by_side("nfev"),
-            status=tuple(status for part in parts for status in part.status),
-            undetermined=side_by_side("undetermined"),
-            method=parts[0].method,
-            loss=parts[0].loss,
-            combinations=combinations,
-            meanings=meanings,
-        )
+        names = ("theta", "values", "covariance", "scale", "dof", "cost", "nfev", "undetermined")
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+        }
+        status = tuple(one for part in parts for one in part.status)
+        return replace(
+            parts[0], problem=problem, status=status, combinations=combinations,
+            meanings=meanings, **arrays,
+        )  # fmt: skip
 
     def _message(self, index: int) -> str:
         """Return the status with the names and numbers that belong to it."""
@@ -390,15 +379,17 @@ def _is_rounding(problem: BaseProblem, scale: float) -> bool:
     return not problem.scale_known and bool(scale < _BARELY * problem.rounding)
 
 
-def robust_information(
+def information_of(
     problem: BaseProblem,
     theta: FloatArray,
     scale: float,
-    loss: Loss,
+    loss: Loss | None,
     dof: int,
     chart: FloatArray | None = None,
 ) -> FloatArray:
-    """Return the inverse of a robust estimate's covariance; `chart` is dtheta/dphi, (P, Q)."""
+    """Return the inverse of an estimate's covariance; `chart` is dtheta/dphi, (P, Q)."""
+    if loss is None:
+        return problem.information(theta, scale, chart)
     r, J = problem.residuals_and_jacobian(theta, scale, tails=False)
     if chart is not None:
         J = J @ chart

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
@@ -28,13 +30,20 @@ def minimise_by_scipy(
     """
     from scipy import optimize
 
-    rows = _Rows(problem, scale, loss, chart)
+    rows = _rows(problem, scale, loss, chart)
+
+    def residuals(at: FloatArray) -> FloatArray:
+        return rows(at)[0]
+
+    def jacobian(at: FloatArray) -> FloatArray:
+        return rows(at)[1]
+
     bounds = problem.bounds() if chart is None else (-np.inf, np.inf)
     converged, nfev, cost, at = False, 1, np.inf, start
-    if np.isfinite(rows.residuals(start)).all():
+    if np.isfinite(residuals(start)).all():
         with np.errstate(all="ignore"):
             found = optimize.least_squares(
-                rows.residuals, start, rows.jacobian, bounds=bounds, x_scale="jac",
+                residuals, start, jacobian, bounds=bounds, x_scale="jac",
                 ftol=_COST, xtol=_STEP, gtol=_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
         at, converged, nfev = np.asarray(found.x), found.status > 0, int(found.nfev)
@@ -51,52 +60,40 @@ def minimise_by_scipy(
     )
 
 
-class _Rows:
-    """Residuals and Jacobian by separate calls, as scipy wants them, evaluated together."""
+def _rows(
+    problem: BaseProblem, scale: float, loss: Loss | None, chart: Chart | None
+) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """Return residuals and Jacobian, of which half the sum of squares is the cost, of a theta.
 
-    def __init__(
-        self, problem: BaseProblem, scale: float, loss: Loss | None, chart: Chart | None
-    ) -> None:
-        self._problem, self._scale, self._loss, self._chart = problem, scale, loss, chart
-        self._logarithmic = problem.space.positive
-        self._theta = np.full(len(problem.parameters), np.nan)
-        self._pair: tuple[FloatArray, FloatArray] = (self._theta, self._theta)
+    scipy asks for one and then for the other: the last place is kept.
+    """
+    last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    m = problem.n_residuals
 
-    def residuals(self, theta: FloatArray) -> FloatArray:
-        return self._at(theta)[0]
+    def rows(phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+        key = phi.tobytes()
+        if key not in last:
+            last.clear()
+            last[key] = evaluated(phi)
+        return last[key]
 
-    def jacobian(self, theta: FloatArray) -> FloatArray:
-        return self._at(theta)[1]
-
-    def _at(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if not np.array_equal(theta, self._theta):
-            self._theta = theta.copy()
-            self._pair = self._evaluate(self._theta)
-        return self._pair
-
-    def _evaluate(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        chart = self._chart
-        at = theta if chart is None else chart.theta(theta)
-        values = self._problem.to_values(at)
-        if not np.isfinite(values).all() or (values[self._logarithmic] == 0.0).any():
-            m = self._problem.n_residuals + len(self._problem.priors)
-            return np.full(m, np.nan), np.full((m, theta.size), np.nan)
-        r, J = self._weighted(at)
+    def evaluated(phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+        at = phi if chart is None else chart.theta(phi)
+        values = problem.to_values(at)
+        if not np.isfinite(values).all() or (values[problem.space.positive] == 0.0).any():
+            size = m + len(problem.priors)
+            return np.full(size, np.nan), np.full((size, phi.size), np.nan)
+        r, J = problem.residuals_and_jacobian(at, scale, tails=loss is None)
+        if loss is not None:
+            both = np.column_stack([r[:m], J[:m]]).T  # of two residuals a row, or of one
+            pairs = both[:, ::2] + 1j * both[:, 1::2] if problem.parts == 2 else both + 0j
+            y, changes = bend(pairs[0], list(pairs[1:]), loss)
+            bent = np.array([y, *changes]).view(np.float64)[:, :: 3 - problem.parts]
+            r[:m], J[:m] = bent[0], bent[1:].T
         if chart is not None:
             J = J @ chart.derivative(at)
         if not np.isfinite(J).all():
             r = np.full(r.shape, np.nan)  # a step that scipy takes back
         return r, J
 
-    def _weighted(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian of which half the sum of squares is the cost."""
-        r, J = self._problem.residuals_and_jacobian(theta, self._scale, tails=self._loss is None)
-        if self._loss is None:
-            return r, J
-        m = self._problem.n_residuals
-        rows = np.column_stack([r[:m], J[:m]]).T  # of two residuals a row, or of one
-        pairs = rows[:, ::2] + 1j * rows[:, 1::2] if self._problem.parts == 2 else rows + 0j
-        y, changes = bend(pairs[0], list(pairs[1:]), self._loss)
-        bent = np.array([y, *changes]).view(np.float64)[:, :: 3 - self._problem.parts]
-        r[:m], J[:m] = bent[0], bent[1:].T
-        return r, J
+    return rows
