@@ -226,6 +226,8 @@ class State:
         F = self.information
         size = np.sqrt(np.maximum(np.diagonal(F), 0.0))
         part = np.flatnonzero(free & (size > TINY))
+        if not part.size:  # scipy's nnls aborts the process
+            return self.variances
         units, s = 1.0 / size[part], self.variances.copy()
         scaled = units[:, None] * F[np.ix_(part, part)] * units
         R = np.linalg.cholesky(scaled + _ALIKE * np.eye(len(part))).T
