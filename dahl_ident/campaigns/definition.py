@@ -307,14 +307,14 @@ def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
 
 
 def _covariates(
-    folder: Path, given: Any
+    folder: Path, table: Any
 ) -> dict[tuple[str, str | None], dict[str, float | str]] | None:
     """Return the rows of the table by device and run, None where there is no table."""
-    if given is None:
+    if table is None:
         return None
-    if not isinstance(given, str):
-        raise ValidationError(f"[files] covariates is {given!r}; expected the path of a table")
-    path = folder / given
+    if not isinstance(table, str):
+        raise ValidationError(f"[files] covariates is {table!r}; expected the path of a table")
+    path = folder / table
     try:
         with regular(path).open(encoding="utf-8-sig", newline="") as file:
             header, *lines = list(csv.reader(file)) or [[]]

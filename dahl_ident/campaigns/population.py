@@ -298,14 +298,15 @@ def population(
     return Population(evaluated, len(chosen), {str(k): int(v) for k, v in left_out.items()})
 
 
-def _parameters(table: pd.DataFrame, given: Sequence[str] | None) -> list[str]:
-    if given is None:
-        names = [c for c in table if f"u_{c}" in table and not str(c).startswith("posterior_")]
-        if not names:
-            raise DataError("the table has no parameter with an uncertainty (columns p and u_p)")
-        return [str(name) for name in names]
-    _require(table, [column for name in given for column in (name, f"u_{name}")])
-    return list(given)
+def _parameters(table: pd.DataFrame, names: Sequence[str] | None) -> list[str]:
+    if names is not None:
+        _require(table, [column for name in names for column in (name, f"u_{name}")])
+        return list(names)
+    columns = [str(c) for c in table if f"u_{c}" in table]
+    estimated = [c for c in columns if not c.startswith("posterior_")]
+    if not estimated:
+        raise DataError("the table has no parameter with an uncertainty (columns p and u_p)")
+    return estimated
 
 
 def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:
@@ -454,8 +455,8 @@ def _outlying(data: _Fits) -> tuple[FloatArray, NDArray[np.bool_]]:
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
     for _ in range(data.devices // 2):
-        found = kept.at(*_reml(kept))
-        worst = int(np.argmax(found.away**2 / (found.tau**2 + found.variance)))
+        solution = kept.at(*_reml(kept))
+        worst = int(np.argmax(solution.away**2 / (solution.tau**2 + solution.variance)))
         fits = kept.device == worst
         others = kept.only(~fits)
         freedom = others.devices - others.X.shape[1]

@@ -45,7 +45,7 @@ def options_of(
 
 
 def undetermined(
-    search: Search, found: Design, expected: Mapping[str, Expected]
+    search: Search, design: Design, expected: Mapping[str, Expected]
 ) -> tuple[str, ...]:
     """Return a sentence for each undetermined quantity, with the limit that prevents it."""
     q = search.question
@@ -58,11 +58,11 @@ def undetermined(
         if expected[name].after > 1.001 * u:
             what = "" if is_expanded(name) else "a standard uncertainty of "
             lost[name] = f"{name} reaches {what}{percent(expected[name].after)}, not {percent(u)}"
-    if q.suspects and search.suspect_ratio(found) > 1.0:
+    if q.suspects and search.suspect_ratio(design) > 1.0:
         names = ", ".join(q.suspects)
         lost.setdefault(names, f"{names} is not seen as well as wanted")
     sentences = [f"{text}; {_prevented_by(search, name)}" for name, text in lost.items()]
-    if not search.can_be_judged(found):
+    if not search.can_be_judged(design):
         sentences.append(
             "these levels are too few to tell a wrong model from noise, so that a fit to them "
             "alone cannot be used; give more time"
@@ -106,7 +106,7 @@ def _within_reach(question: Question, name: str, limits: BenchLimits) -> float:
     return float(np.exp(-0.5 * design.value))
 
 
-def assumptions_of(search: Search, found: Design) -> tuple[str, ...]:
+def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
     """Return the assumptions of the prediction."""
     q, known = search.question, search.question.knowledge
     force, length = (si_unit(kind, known.motion) for kind in ("force", "displacement"))
@@ -133,7 +133,7 @@ def assumptions_of(search: Search, found: Design) -> tuple[str, ...]:
             f"{', '.join(known.assumed)} within the range that a fit assumes (fix it in the model "
             "to plan without)"
         ] * bool(known.assumed)
-    most = found.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time)
+    most = design.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time)
     return (
         *noise, *within, _MODEL_ERROR[search.forecast.model_error], "calibrations are exact",
         *["no plan takes more than 30 days unless a time is given"] * most,

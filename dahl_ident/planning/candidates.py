@@ -148,11 +148,11 @@ def evaluate(
     kept = np.flatnonzero(possible)
     relative = changes[:, kept] / predicted[:, kept, None]
     amplitude, force = amplitude[:, kept], force[:, kept]
-    found = Candidates(
+    candidates = Candidates(
         question.controlled, level[kept], frequency_hz[kept], amplitude, force,
         np.stack([relative.real, relative.imag], axis=2), question.noise.variance(force, amplitude),
     )  # fmt: skip
-    return replace(found, rows=found.rows * found.weight)
+    return replace(candidates, rows=candidates.rows * candidates.weight)
 
 
 def allowed(limits: BenchLimits, sizes: Mapping[str, FloatArray], count: int) -> NDArray[np.bool_]:

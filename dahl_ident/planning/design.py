@@ -136,8 +136,8 @@ class Objective:
 
     def at(self, cycles: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
         """Return the criterion at the cycles of every candidate, (..., K), and sensitivities."""
-        found = [term.at(cycles, self.runs) for term in self.terms]
-        return np.asarray(sum(value for value, _ in found)), [slope for _, slope in found]
+        terms = [term.at(cycles, self.runs) for term in self.terms]
+        return np.asarray(sum(value for value, _ in terms)), [slope for _, slope in terms]
 
     def gradient(self, sensitivities: Sequence[FloatArray]) -> FloatArray:
         """Return derivatives with respect to the cycles of this objective's candidates."""

@@ -228,28 +228,28 @@ def _of_motions(question: Question) -> Plan:
     return _plan(second, other) if better else _plan(first, one)
 
 
-def _plan(search: Search, found: Design) -> Plan:
-    q, levels = search.question, found.levels
+def _plan(search: Search, design: Design) -> Plan:
+    q, levels = search.question, design.levels
     options, change_over = search.forecast.candidates.only(levels), q.costs["change_over"]
     settling = search.bench.settling_cycles(levels)
     steps = tuple(
         PlanStep(level, f, int(wait), int(n), change_over + (wait + n) / f, motion)
         for level, f, wait, n, motion in zip(
             options.level.tolist(), options.frequency_hz.tolist(), settling.tolist(),
-            found.cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
+            design.cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
         )
     )  # fmt: skip
-    expected = search.forecast.expected(found)
+    expected = search.forecast.expected(design)
     return Plan(
         controlled=q.controlled,
         steps=steps,
-        runs=found.runs,
-        seconds=found.seconds,
+        runs=design.runs,
+        seconds=design.seconds,
         expected=expected,
         target=dict(q.target) if q.has_numbers else {},
-        reached=search.reached(found),
-        undetermined=undetermined(search, found, expected),
-        assumptions=assumptions_of(search, found),
+        reached=search.reached(design),
+        undetermined=undetermined(search, design, expected),
+        assumptions=assumptions_of(search, design),
         change_over=change_over,
         motion=q.knowledge.motion,
         search=search,

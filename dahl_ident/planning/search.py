@@ -60,15 +60,15 @@ class Search:
     def best(self) -> Design:
         """Return the least time that reaches the targets, or the best in the time allowed."""
         q = self.question
-        found = self.least_time() if q.has_numbers else self.solve(q.limits.time)
-        if found is None:
+        design = self.least_time() if q.has_numbers else self.solve(q.limits.time)
+        if design is None:
             least = float((self.bench.alone + LEAST_CYCLES / self.bench.frequency_hz).min())
             raise ValidationError(
                 f"limits['time'] is {q.limits.time:g} s, and the quickest "
                 f"{'level' if q.recorded is None else 'motion'} takes {least:.3g} "
                 "s to change over, settle and measure; give more time"
             )
-        return found if q.recorded is None else self._exactly(found)
+        return design if q.recorded is None else self._exactly(design)
 
     def score(self, design: Design) -> tuple[bool, float]:
         """Return what is larger for the better of two designs of the same question."""
@@ -84,12 +84,12 @@ class Search:
         best: Design | None = None
         least = np.inf
         for weight in (0.0,) if self._suspects is None else _WEIGHTS:
-            found = self._solve(time, weight, start)
-            if found is None:
+            design = self._solve(time, weight, start)
+            if design is None:
                 return None
-            ratio = self.suspect_ratio(found)
+            ratio = self.suspect_ratio(design)
             if best is None or ratio < least:
-                best, least = found, ratio
+                best, least = design, ratio
             if ratio <= 1.0:
                 break
         return best
@@ -100,11 +100,11 @@ class Search:
         for runs in (q.runs,) if q.runs else range(1, most + 1):
             objective = self._objective(weight, runs)
             search = Exchange(objective, self.bench, self._promising(time), self._coverage)
-            found = search.best(time / runs, start)
-            if found is None or (best is not None and found.value <= best.value):
+            design = search.best(time / runs, start)
+            if design is None or (best is not None and design.value <= best.value):
                 break
-            best = replace(found, ratio=self.ratio(found))
-            start = found.levels.tolist()
+            best = replace(design, ratio=self.ratio(design))
+            start = design.levels.tolist()
         return best
 
     def _objective(self, weight: float = 0.0, runs: int = 1) -> Objective:
@@ -174,23 +174,23 @@ class Search:
         start: list[int] = []
         short, wide = 0.0, np.inf
         for _ in range(_TIMES):
-            found = self.solve(time, start)
-            if found is not None:
-                start = found.levels.tolist()
-            if found is not None and self.reached(found):
-                best = found if best is None or found.seconds < best.seconds else best
-                if found.ratio >= _CLOSE:
+            latest = self.solve(time, start)
+            if latest is not None:
+                start = latest.levels.tolist()
+            if latest is not None and self.reached(latest):
+                best = latest if best is None or latest.seconds < best.seconds else best
+                if latest.ratio >= _CLOSE:
                     break
             else:
                 short = max(short, time)
             if best is None:
                 if time >= most:
-                    return found or last
-                if found is not None and found.ratio > 1.0 and last is not None:
-                    by_time = 0.5 * np.log(found.seconds / last.seconds)
-                    if np.log(last.ratio / found.ratio) < _HELPS * by_time:
+                    return latest or last
+                if latest is not None and latest.ratio > 1.0 and last is not None:
+                    by_time = 0.5 * np.log(latest.seconds / last.seconds)
+                    if np.log(last.ratio / latest.ratio) < _HELPS * by_time:
                         return last
-                last = found or last
+                last = latest or last
                 factor = 4.0 if last is None else float(np.clip(last.ratio**2, 1.3, 1e3))
                 time = min(factor * time, most)
                 continue
@@ -204,16 +204,16 @@ class Search:
             wide = narrow
         return best or last
 
-    def _exactly(self, found: Design) -> Design:
+    def _exactly(self, design: Design) -> Design:
         """Return the repeats that reach the targets by the information of the whole records.
 
         The search takes each repeat of a motion as worth the same; the first ones, which also have
         to determine the state at the start, the offset and the drift, are worth less.
         """
-        q, candidates, levels = self.question, self.forecast.candidates, found.levels
+        q, candidates, levels = self.question, self.forecast.candidates, design.levels
         assert q.recorded is not None
         sums = [RepeatSums.of(q.knowledge, candidates.motions[k], q.recorded) for k in levels]
-        risen, best = False, found
+        risen, best = False, design
         for attempt in range(_CORRECTIONS):
             rows, cycles = candidates.rows.copy(), best.cycles
             for k, one, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
