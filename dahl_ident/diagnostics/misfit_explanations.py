@@ -276,7 +276,7 @@ def least_misfit_without(optimum: Optimum, rows: Sequence[int]) -> float:
     if not kept.any():
         return 0.0
     y = (1.0 - predicted[kept] / response[kept]).view(np.float64)
-    J = np.ascontiguousarray((problem.prediction_jacobian(theta) / response[:, None])[kept].T)
+    J = np.ascontiguousarray((problem.prediction_jacobian(theta)[kept] / response[kept, None]).T)
     J = J.view(np.float64).T
     move = np.linalg.lstsq(J[:, np.isfinite(J).all(axis=0)], y, rcond=None)[0]
     left = y - J[:, np.isfinite(J).all(axis=0)] @ move

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
@@ -22,7 +21,6 @@ from dahl_ident.data import Record
 from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
 from dahl_ident.elements import Element, Parameter
-from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
 from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
@@ -31,6 +29,8 @@ from dahl_ident.noise import Rho
 from dahl_ident.problem.base import BaseProblem, Quadratic
 from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
 from dahl_ident.problem.record_noise import in_band
+from dahl_ident.problem.record_prediction import Prediction, force_of, motion_of
+from dahl_ident.problem.record_unknowns import bends, nuisance
 from dahl_ident.problem.space import Space
 
 if TYPE_CHECKING:
@@ -40,28 +40,10 @@ if TYPE_CHECKING:
 Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
-_SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
-_PLAY_STEP = 1e-6  # of the motion's range, for derivatives with respect to the place in a gap
 _EXPONENT_STEP = 0.01  # of an exponent's logarithm, for derivatives
 _DELAY_STEP = 0.02  # of a sample, for derivatives with respect to the delay
 _LEAST = 1e-300  # of a positive value that has vanished
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What a record's samples should be.
-
-    Attributes
-    ----------
-    output : ndarray, shape (n,)
-        Predicted samples.
-    by : ndarray, shape (n, P)
-        Derivatives with respect to the problem's values; P = 0 where they were not asked for.
-    """
-
-    output: FloatArray
-    by: FloatArray
 
 
 Watch = Callable[["RecordProblem", FloatArray, float], None]
@@ -133,7 +115,7 @@ class RecordProblem(BaseProblem):
         self.output: Output = output or ("motion" if self.model.has_inertia else "force")
         if self.output not in ("force", "motion"):
             raise ValidationError(f"output is {output!r}; expected force or motion")
-        if self.output == "force" and not self._coefficients.are_values:
+        if self.output == "force" and not self.coefficients.are_values:
             raise ModelError(
                 "a linear system with free parameters moves with a plant, but has no force over "
                 "time: fix it, fit the motion, or build it from Mass, Damper and Spring"
@@ -158,8 +140,8 @@ class RecordProblem(BaseProblem):
             self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
         self.motion = self.records[0].motion
         self._check_scale()
-        parameters = (*self.free, *self._nuisance())
-        self.space = Space(parameters, self._bends(parameters), inside=True)
+        parameters = (*self.free, *nuisance(self.model, self.records, self.output))
+        self.space = Space(parameters, bends(self.free, len(parameters), self.records), inside=True)
         self.whitening = np.ones(1)
         """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
         self.delay = 0.0
@@ -168,7 +150,7 @@ class RecordProblem(BaseProblem):
         """Factor on the window in which displacements are differentiated."""
         self.displacement_noise = 0.0
         """Standard deviation of the displacement, m, within which no movement counts."""
-        self._paths: tuple[FloatArray, ...] | None = None
+        self.paths: tuple[FloatArray, ...] | None = None
         self.watch: Watch | None = None
         """Called after each evaluation of the cost."""
 
@@ -198,55 +180,6 @@ class RecordProblem(BaseProblem):
                 f"{why}, so that the motion determines only the ratios of masses, forces, dampers "
                 "and springs; give one of them, such as the mass: Mass(1.0), --mass 1.0"
             )
-
-    def _nuisance(self) -> list[Parameter]:
-        found = []
-        channel = self.records[0].motion_channel
-        unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]
-        for number in range(len(self.records)):
-            tail = f"_{number + 1}" if len(self.records) > 1 else ""
-            if self.output == "motion":
-                found.append(Parameter(f"initial_displacement{tail}", "m", "at the first sample"))
-                found.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))
-            for element in self.model.elements:
-                name = f"{element.name}_" if element.name else ""
-                if element.has_memory:
-                    found.append(Parameter(f"{name}{element.start[0]}{tail}", *element.start[1:]))
-                else:
-                    found += [
-                        Parameter(f"{name}state_{i + 1}{tail}", "m", "at the first sample")
-                        for i in range(element.n_states)
-                    ]
-            if self.output == "force":
-                found.append(Parameter(f"offset{tail}", "N", "constant in the measured force"))
-                found.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
-            else:
-                found.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
-        return found
-
-    def _bends(self, parameters: Sequence[Parameter]) -> FloatArray:
-        """Return below which size a parameter is searched as a number, and not as a logarithm.
-
-        Rates such as those of Bouc-Wen may have either sign, but beyond a tenth of the motion's
-        inverse size they go with a stiffness in proportion. 0 for those that are searched in one
-        way alone.
-        """
-        time, length = 1.0, 1.0
-        wave = np.concatenate([y - y.mean() for y in (r.motion_samples for r in self.records)])
-        steps = float(np.std(np.diff(wave)))
-        if steps > 0.0:
-            time = float(np.std(wave)) / steps / self.records[0].sample_rate
-            order = ("displacement", "velocity", "acceleration").index(
-                self.records[0].motion_channel
-            )
-            length = float(np.std(wave)) * time**order
-        found = np.zeros(len(parameters))
-        for i, p in enumerate(self.free):
-            if not p.positive and not np.isfinite([p.lower, p.upper]).any():
-                force, by_length, by_time = p.dimension
-                if not force and (by_length or by_time):
-                    found[i] = _SMALL * length**by_length * time**by_time
-        return found
 
     def shortened(self, samples: int) -> RecordProblem:
         """Return the problem with about `samples` samples in all.
@@ -294,7 +227,7 @@ class RecordProblem(BaseProblem):
         """Return the same problem with other values of parameters that are fixed."""
         other = copy(self)
         other.model = self.model.with_fixed(values)
-        for of_model in ("_system", "_coefficients", "_first"):
+        for of_model in ("system", "coefficients", "first"):
             other.__dict__.pop(of_model, None)  # equations are shorter where a value is 0 or 1
         return other
 
@@ -306,16 +239,16 @@ class RecordProblem(BaseProblem):
         other = copy(self)
         other.displacement_noise = noise
         x = self._displacements if noise else []
-        other._paths = tuple(travelled(wave, noise, lead) for wave in x) or None
+        other.paths = tuple(travelled(wave, noise, lead) for wave in x) or None
         return other
 
     def delayed(self, delay: float) -> RecordProblem:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
         other = copy(self)
         other.delay = delay
-        for cached in ("motions", "_drives"):
+        for cached in ("motions", "drives"):
             other.__dict__.pop(cached, None)
-        return other.without_noise(self.displacement_noise) if self._paths else other
+        return other.without_noise(self.displacement_noise) if self.paths else other
 
     def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
         """Return the derivatives of each record's output with respect to the delay, per s."""
@@ -352,10 +285,10 @@ class RecordProblem(BaseProblem):
     @property
     def noise_travel(self) -> float:
         """Travel that the displacement's noise would add, over the travel that counts."""
-        if self._paths is None:
+        if self.paths is None:
             return 0.0
         measured = [np.abs(np.diff(np.asarray(r.displacement))).sum() for r in self.records]
-        counted = [np.abs(np.diff(path)).sum() for path in self._paths]
+        counted = [np.abs(np.diff(path)).sum() for path in self.paths]
         return float(sum(measured) / sum(counted) - 1.0)
 
     def filtered(self, waves: FloatArray) -> FloatArray:
@@ -414,7 +347,8 @@ class RecordProblem(BaseProblem):
     n_numbers = n_residuals
 
     @cached_property
-    def _rates(self) -> tuple[float, ...]:
+    def rates(self) -> tuple[float, ...]:
+        """Sampling rates, Hz."""
         return tuple(record.sample_rate for record in self.records)
 
     @cached_property
@@ -475,21 +409,22 @@ class RecordProblem(BaseProblem):
 
         rng = np.random.default_rng(draw)
         other = copy(self)
-        other._drives = tuple(
+        other.drives = tuple(
             (time, drive + band_limited(std * rng.standard_normal(time.size), 1.0 / r.sample_rate))
-            for (time, drive), r, std in zip(self._drives, self.records, stds, strict=True)
+            for (time, drive), r, std in zip(self.drives, self.records, stds, strict=True)
         )
         return other
 
     @cached_property
-    def _system(self) -> System:
+    def system(self) -> System:
+        """The plant's equations of motion, compiled."""
         from dahl_ident.engine import translate
 
         channel = self.records[0].motion_channel
-        return translate(plant_equations(self._coefficients.model, self.excitation, channel))
+        return translate(plant_equations(self.coefficients.model, self.excitation, channel))
 
     @cached_property
-    def _drives(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    def drives(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
         """Times of the samples, and the drive's polynomials between them, of each record."""
         from dahl_ident.engine import band_limited
 
@@ -524,88 +459,23 @@ class RecordProblem(BaseProblem):
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Prediction:
         """Return what the samples of record `number` should be."""
         if self.output == "force":
-            return self._force(values, number, derivatives=derivatives)
-        return self._motion(values, number, derivatives=derivatives)
-
-    def _force(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
-        x, v, a = self.motions[number]
-        path = x if self._paths is None else self._paths[number]
-        record = self.records[number]
-        own = self.own(values, number)
-        time = record.time - record.time[0]
-        *states, offset, drift = own.tolist()
-        total = offset + drift * time
-        by = np.zeros((x.size, len(self.parameters) if derivatives else 0))
-        start, column = 0, 0
-        first = len(self.free) + number * self.per_record
-        model = self.model.sampled(1.0 / self._rates[number])
-        for element, at in model.of(self.full_values(values)):
-            state, moved = (states[start], path) if element.has_memory else (0.0, x)
-            in_gap = element.has_memory and element.start is not Behaviour.start
-            if derivatives:
-                if in_gap:
-                    found = _from_middle(element, at, moved, state)
-                else:
-                    found = element.force_history_gradient(at, moved, v, state, acceleration=a)
-                total = total + found.value
-                for parameter, slope in zip(element.parameters, found.by_parameter, strict=True):
-                    if parameter.free:
-                        by[:, column] = slope
-                        column += 1
-                if element.has_memory:
-                    by[:, first + start] = found.by_state
-            elif in_gap:
-                total = total + element.force_history(at, _before(moved, state))[1:]
-            else:
-                total = total + element.force_history(at, moved, v, state, acceleration=a)
-            if element.has_memory:
-                start += 1
-            elif element.n_states:
-                stop = start + element.n_states
-                free = element.free_responses(x.size)
-                total = total + free @ states[start:stop]
-                if derivatives:
-                    by[:, first + start : first + stop] = free
-                start = stop
-        if derivatives:
-            by[:, first + start] = 1.0
-            by[:, first + start + 1] = time
-        return Prediction(total, by)
-
-    def _motion(self, values: FloatArray, number: int, *, derivatives: bool) -> Prediction:
-        from dahl_ident.engine import march
-
-        own, free = self.own(values, number), values[: len(self.free)]
-        starts = own.size - 1
-        at, slopes = (part[0] for part in self._coefficients(np.array([self.full_values(values)])))
-        slopes = slopes[:, self._chosen]
-        chosen = np.flatnonzero(slopes.any(axis=1)).tolist()
-        first, by_start, by_value = self._first(own[:starts], at)
-        time, drive = self._drives[number]
-        found = march(
-            self._system, time, drive, time, first, at, chosen=chosen, derivatives=derivatives
-        )
-        by = np.zeros((found.output.size, len(self.parameters) if derivatives else 0))
-        if derivatives:
-            column = free.size + number * self.per_record
-            by_number = found.by_parameter + found.by_first @ by_value[:, chosen]
-            by[:, : free.size] = by_number @ slopes[chosen]
-            by[:, column : column + starts] = found.by_first @ by_start
-            by[:, column + starts] = 1.0
-        return Prediction(found.output + own[starts], by)
+            return force_of(self, values, number, derivatives=derivatives)
+        return motion_of(self, values, number, derivatives=derivatives)
 
     @cached_property
-    def _chosen(self) -> list[int]:
+    def chosen(self) -> list[int]:
         """Places of the free parameters among all."""
         return [i for i, p in enumerate(self.model.parameters) if p.free]
 
     @cached_property
-    def _coefficients(self) -> Coefficients:
+    def coefficients(self) -> Coefficients:
+        """How the equations' numbers follow from the parameters."""
         return Coefficients(self.model)
 
     @cached_property
-    def _first(self) -> FirstState:
-        return FirstState(self._coefficients.model)
+    def first(self) -> FirstState:
+        """How first states follow from what a record adds."""
+        return FirstState(self.coefficients.model)
 
     def outputs(self, values: FloatArray) -> list[FloatArray]:
         """Return the predicted output of each record."""
@@ -714,22 +584,3 @@ def _slopes(
     """Return the difference of two problems' outputs over twice the step, record by record."""
     pairs = zip(low.outputs(values), high.outputs(values), strict=True)
     return [(b - a) / (2.0 * step) for a, b in pairs]
-
-
-def _before(path: FloatArray, play: float) -> FloatArray:
-    """Return a path that comes to its first sample from the middle of a gap."""
-    return np.concatenate([[path[0] - play], path])
-
-
-def _from_middle(
-    element: Element, values: Sequence[float], path: FloatArray, play: float
-) -> HistoryGradient:
-    """Return the force of an element that starts somewhere in its gap, with its derivatives.
-
-    That with respect to the place is a central difference.
-    """
-    step = _PLAY_STEP * float(np.ptp(path))
-    found = element.force_history_gradient(values, _before(path, play))
-    high, low = (element.force_history(values, _before(path, play + s)) for s in (step, -step))
-    by_play = (high - low)[1:] / (2.0 * step)
-    return HistoryGradient(found.value[1:], by_play, tuple(s[1:] for s in found.by_parameter))

@@ -1,0 +1,128 @@
+"""What the samples of a record should be: forces of a displacement, or the motion of a plant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
+
+if TYPE_CHECKING:
+    from dahl_ident.problem.record_problem import RecordProblem
+
+_PLAY_STEP = 1e-6  # of the motion's range, for derivatives with respect to the place in a gap
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a record's samples should be.
+
+    Attributes
+    ----------
+    output : ndarray, shape (n,)
+        Predicted samples.
+    by : ndarray, shape (n, P)
+        Derivatives with respect to the problem's values; P = 0 where they were not asked for.
+    """
+
+    output: FloatArray
+    by: FloatArray
+
+
+def force_of(
+    problem: RecordProblem, values: FloatArray, number: int, *, derivatives: bool
+) -> Prediction:
+    """Return the force of a measured displacement at the samples of record `number`."""
+    x, v, a = problem.motions[number]
+    path = x if problem.paths is None else problem.paths[number]
+    record = problem.records[number]
+    own = problem.own(values, number)
+    time = record.time - record.time[0]
+    *states, offset, drift = own.tolist()
+    total = offset + drift * time
+    by = np.zeros((x.size, len(problem.parameters) if derivatives else 0))
+    start, column = 0, 0
+    first = len(problem.free) + number * problem.per_record
+    model = problem.model.sampled(1.0 / problem.rates[number])
+    for element, at in model.of(problem.full_values(values)):
+        state, moved = (states[start], path) if element.has_memory else (0.0, x)
+        in_gap = element.has_memory and element.start is not Behaviour.start
+        if derivatives:
+            if in_gap:
+                found = _from_middle(element, at, moved, state)
+            else:
+                found = element.force_history_gradient(at, moved, v, state, acceleration=a)
+            total = total + found.value
+            for parameter, slope in zip(element.parameters, found.by_parameter, strict=True):
+                if parameter.free:
+                    by[:, column] = slope
+                    column += 1
+            if element.has_memory:
+                by[:, first + start] = found.by_state
+        elif in_gap:
+            total = total + element.force_history(at, _before(moved, state))[1:]
+        else:
+            total = total + element.force_history(at, moved, v, state, acceleration=a)
+        if element.has_memory:
+            start += 1
+        elif element.n_states:
+            stop = start + element.n_states
+            free = element.free_responses(x.size)
+            total = total + free @ states[start:stop]
+            if derivatives:
+                by[:, first + start : first + stop] = free
+            start = stop
+    if derivatives:
+        by[:, first + start] = 1.0
+        by[:, first + start + 1] = time
+    return Prediction(total, by)
+
+
+def motion_of(
+    problem: RecordProblem, values: FloatArray, number: int, *, derivatives: bool
+) -> Prediction:
+    """Return the motion of a driven plant at the samples of record `number`."""
+    from dahl_ident.engine import march
+
+    own, free = problem.own(values, number), values[: len(problem.free)]
+    starts = own.size - 1
+    at, slopes = (part[0] for part in problem.coefficients(np.array([problem.full_values(values)])))
+    slopes = slopes[:, problem.chosen]
+    chosen = np.flatnonzero(slopes.any(axis=1)).tolist()
+    first, by_start, by_value = problem.first(own[:starts], at)
+    time, drive = problem.drives[number]
+    found = march(
+        problem.system, time, drive, time, first, at, chosen=chosen, derivatives=derivatives
+    )
+    by = np.zeros((found.output.size, len(problem.parameters) if derivatives else 0))
+    if derivatives:
+        column = free.size + number * problem.per_record
+        by_number = found.by_parameter + found.by_first @ by_value[:, chosen]
+        by[:, : free.size] = by_number @ slopes[chosen]
+        by[:, column : column + starts] = found.by_first @ by_start
+        by[:, column + starts] = 1.0
+    return Prediction(found.output + own[starts], by)
+
+
+def _before(path: FloatArray, play: float) -> FloatArray:
+    """Return a path that comes to its first sample from the middle of a gap."""
+    return np.concatenate([[path[0] - play], path])
+
+
+def _from_middle(
+    element: Element, values: Sequence[float], path: FloatArray, play: float
+) -> HistoryGradient:
+    """Return the force of an element that starts somewhere in its gap, with its derivatives.
+
+    That with respect to the place is a central difference.
+    """
+    step = _PLAY_STEP * float(np.ptp(path))
+    found = element.force_history_gradient(values, _before(path, play))
+    high, low = (element.force_history(values, _before(path, play + s)) for s in (step, -step))
+    by_play = (high - low)[1:] / (2.0 * step)
+    return HistoryGradient(found.value[1:], by_play, tuple(s[1:] for s in found.by_parameter))
