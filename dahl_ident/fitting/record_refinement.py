@@ -31,10 +31,10 @@ def aligned(search: Descent, problem: RecordProblem, plain: Minima) -> tuple[Rec
     """Return the estimate with the delay between the channels that the residuals ask for.
 
     Steps of the delay with all values free, exponents that nobody stated too, as long as each
-    explains more than chance does. A small share of the residuals may as well be a part of
-    what the model misses: such a delay counts as an uncertainty alone. One beyond what
-    channels sampled together have stands for something else, such as a damper that the model
-    lacks: then, as where the user stated the delay, none is taken out.
+    explains more than chance does. Where it explains little, or what remains is not noise, it may
+    as well stand for a part of what the model misses: such a delay counts as an uncertainty alone.
+    So does one beyond what channels sampled together have, such as that of a damper that the model
+    lacks. None is taken out where the user stated the delay.
     """
     share = 2.0 * float(plain.cost[0]) / problem.n_residuals
     if not plain.converged[0] or "delay" in problem.calibration or share < EXACT:
@@ -53,7 +53,10 @@ def aligned(search: Descent, problem: RecordProblem, plain: Minima) -> tuple[Rec
         end = search.descend(found, end.theta[0], STEPS)
         if not end.converged[0]:
             return problem, plain
-    return (found, end) if end.cost[0] < plain.cost[0] else (problem, plain)
+    residuals = found.split_residuals(found.to_values(end.theta[0]))
+    if not end.cost[0] < plain.cost[0] or correlation(residuals) > SLOW:
+        return problem, plain
+    return found, end
 
 
 def without_noise(
