@@ -62,7 +62,7 @@ REASONS = {
     ),
     "ten levels, gain and amplitude off by 2 % each": (
         "an error of the level that all its rows share is counted only where noise would show "
-        "as much in 5 % of the tables; where it is taken for one of each row, sigma is known "
+        "as much in 2 % of the tables; where it is taken for one of each row, sigma is known "
         "worse than stated."
     ),
     "cubic spring, 5 % of the force": (

@@ -39,7 +39,7 @@ APART = "suspicious points"
 TESTS = "jackknife over tests"
 
 _OFTEN = 0.15  # of tables in which noise alone may look like a model error or noisy levels
-_SOMETIMES = 0.05  # the same for what a level has in common: at 1 % it is missed too often
+_SOMETIMES = 0.02  # the same for what a level has in common: at 1 % it is missed too often
 _SELDOM = 0.01  # the same for suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # of shapes, chosen evenly where rows are more

@@ -31,7 +31,7 @@ from dahl_ident.arrays import TINY, FloatArray
 _STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
 _CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
-_LEAST_NOISE = 1e-8  # of the mean square of the residuals: K stays finite
+_LEAST_NOISE = 1e-6  # of the mean square of the residuals: less is lost in rounding
 _UNSEEN = 1e-100  # root of the information on a variance of which nothing is known
 _ALIKE = 1e-9  # added to correlations of one: sources that do the same share a variance
 
