@@ -7,9 +7,14 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 JOBS   ?= 2
 
+INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python
+
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint types rooms kernels unit test-lowest examples docs bench validation fuzz nuts \
-	mutants dist lock clean
+.PHONY: help install demo test checks lint types rooms kernels unit lowest test-lowest examples docs bench \
+	validation fuzz nuts mutants dist lock clean
+
+# Hundreds of processes start from these files: what Python has compiled is kept.
+unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -17,8 +22,9 @@ help:  ## this list
 # The stamp is newer than what it was made from, so a second call installs nothing.
 $(VENV)/.installed: pyproject.toml requirements/dev.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/dev.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements/dev.txt uv
+	$(INSTALL) $(BIN)/python --requirements requirements/dev.txt
+	$(INSTALL) $(BIN)/python --no-deps --editable .
 	touch $@
 
 install: $(VENV)/.installed  ## the pinned environment in .venv
@@ -28,8 +34,10 @@ demo: install  ## the whole chain on shipped data
 
 # The kernels are compiled once, in parallel with the checks, and not by every process of pytest.
 test: install  ## every check that a change must pass
-	$(MAKE) --jobs $(JOBS) --output-sync types lint rooms kernels
+	$(MAKE) --jobs $(JOBS) --output-sync checks
 	$(MAKE) unit
+
+checks: types kernels lint rooms
 
 lint: install  ## ruff, check and format
 	$(BIN)/ruff check .
@@ -49,17 +57,17 @@ kernels: install  ## the engine, compiled if it is not
 unit: install  ## tests and doctests, warnings as errors
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
-# What depends on versions: one file or two for each library that the package stands on.
-LOWEST := package app law_checks generic_friction readers_formats readers_text frequency_response \
-	units cli report_content export plots fitting ipopt bayes_priors posterior control_nonlinearity
-
-test-lowest: install  ## what depends on versions, on the lowest declared ones
+# The lowest declared versions, with the kernels compiled on them.
+.venv-lowest/.installed: $(VENV)/.installed
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-lowest
-	$(BIN)/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
-		--editable ".[dev]"
+	$(INSTALL) .venv-lowest/bin/python --resolution lowest-direct --editable ".[dev]"
 	.venv-lowest/bin/python -c '$(COMPILED)'
-	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal \
-		$(wildcard $(LOWEST:%=tests/test_%.py))
+	touch $@
+
+lowest: .venv-lowest/.installed
+
+test-lowest: lowest  ## the tests marked as dependent on versions, on the lowest declared ones
+	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal -m versions tests
 
 examples: install  ## renew the outputs in README, manual and notebooks
 	$(BIN)/python -m tests.examples
@@ -90,7 +98,7 @@ fuzz: install  ## thousands of damaged files of every format, and the table of w
 
 nuts: install  ## an independent sampler on the same posterior, in an environment of its own
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-nuts
-	$(BIN)/uv pip install --quiet --python .venv-nuts/bin/python --editable ".[nuts,peers]"
+	$(INSTALL) .venv-nuts/bin/python --editable ".[nuts,peers]"
 	.venv-nuts/bin/python -m benchmarks.nuts
 
 mutants: install  ## a sample of small changes that the tests should notice: which survive (hours)
@@ -102,7 +110,7 @@ dist: install  ## wheel and source archive in dist/, tried in an empty environme
 	$(BIN)/uv build --quiet --out-dir dist
 	$(BIN)/uvx --quiet twine check --strict dist/*
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python .venv-dist
-	$(BIN)/uv pip install --quiet --python .venv-dist/bin/python dist/*.whl
+	$(INSTALL) .venv-dist/bin/python dist/*.whl
 	empty=$$(mktemp -d) && cd $$empty && $(CURDIR)/.venv-dist/bin/dahl-ident demo && rm -rf $$empty
 
 lock: install  ## renew the pinned environment from pyproject.toml

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tests.command_line import Runner
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -18,6 +20,21 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("repeatable")
+
+
+@pytest.fixture(autouse=True)
+def _blank_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write figures blank, which saves most of a report's time, but where a test is marked."""
+    if any(map(request.node.get_closest_marker, ("pictures", "mpl_image_compare"))):
+        return
+    import matplotlib.figure
+
+    drawn = matplotlib.figure.Figure.savefig
+
+    def blank(figure: Figure, place: Any, **options: Any) -> None:
+        drawn(matplotlib.figure.Figure(figure.get_size_inches()), place, **options)
+
+    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", blank)
 
 
 @pytest.fixture

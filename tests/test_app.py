@@ -71,12 +71,14 @@ def fitted(server: Server, work: str) -> str:
         ("POST", {"Content-Length": None, "Transfer-Encoding": "chunked"}, 411),
     ],
 )
+@pytest.mark.versions
 def test_a_request_that_is_not_of_the_page_is_refused(
     server: Server, method: str, headers: dict[str, str | None], status: int
 ) -> None:
     assert server.request(method, "/", headers=headers)[0] == status
 
 
+@pytest.mark.versions
 def test_the_token_is_needed_once_and_pages_load_nothing_from_elsewhere(server: Server) -> None:
     assert server.request("GET", "/?token=guess", headers={"Cookie": None})[0] == 403
     status, headers, _ = server.request("GET", "/")
@@ -92,6 +94,7 @@ def test_the_token_is_needed_once_and_pages_load_nothing_from_elsewhere(server: 
         "Ölprüfung.csv", "*.csv", "<b>bold.csv", "x" * 300 + ".csv", "report.toml",
     ],
 )  # fmt: skip
+@pytest.mark.versions
 def test_the_name_of_a_file_is_not_a_path(server: Server, name: str) -> None:
     place = server.upload([(name, NOISY.read_bytes())])
     folder = server.folder / place[1:]
@@ -104,6 +107,7 @@ def test_the_name_of_a_file_is_not_a_path(server: Server, name: str) -> None:
     assert name in unescape(shown)
 
 
+@pytest.mark.versions
 def test_of_two_files_with_one_name_both_are_kept(server: Server) -> None:
     place = server.upload([("run.csv", b"one"), ("run.csv", b"two")])
     server.upload([("run.csv", b"three")], f"{place}/files")

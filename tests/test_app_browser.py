@@ -159,7 +159,9 @@ def test_nothing_is_lost_by_reload_back_button_or_a_second_tab(page: Page, serve
     _click(page, "form > .buttons button", _RUN)
     run = page.value("location.pathname")
     page.call("Page.reload")
+    page.wait(f"{_RUN} && {_READY}")
     assert "noisy.csv" in server.page(run)  # another tab
+    server.send(f"{run}/cancel")
     page.wait(_ENDED)
     page.value("history.back()")
     page.wait(f"location.pathname.endsWith('/model') && {_READY}")

@@ -15,6 +15,8 @@ from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.problem import Problem
 from tests.bayes_cases import friction_table
 
+pytestmark = pytest.mark.versions
+
 
 def problem(**options: Any) -> Problem:
     return Problem(friction_table(), di.Dahl(), **options)

@@ -421,6 +421,7 @@ def equal(table: pd.DataFrame, other: pd.DataFrame) -> None:
 
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
+@pytest.mark.versions
 def test_a_dask_scheduler_gives_the_serial_table(tmp_path: Path, run: Runner) -> None:
     make_tables(tmp_path, 3)
     with Cluster(tmp_path) as cluster:
@@ -672,6 +673,7 @@ def test_cells_that_spreadsheets_run_are_inert(tmp_path: Path) -> None:
     assert back.level.tolist() == labels.tolist()
 
 
+@pytest.mark.pictures
 def test_command_line(tmp_path: Path, run: Runner) -> None:
     make_tables(tmp_path, 4)
     path = as_toml(tmp_path)

@@ -339,6 +339,7 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
     run.line(found[1].strip())
 
 
+@pytest.mark.versions
 def test_help_lists_all_commands(run: Runner) -> None:
     text = run("--help").out
     assert [name for name in COMMANDS if name not in text] == []
@@ -348,10 +349,12 @@ def test_help_lists_all_commands(run: Runner) -> None:
     assert re.findall(r"[a-z]+", there)[: len(COMMANDS)] == sorted(COMMANDS)
 
 
+@pytest.mark.versions
 def test_no_colour_off_a_terminal(run: Runner) -> None:
     assert "\x1b[" not in run("datasets").out + run("--no-color", "datasets").out
 
 
+@pytest.mark.versions
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys\nfrom dahl_ident.cli import main\n"
@@ -397,6 +400,7 @@ def test_a_chain_goes_on_from_its_file(run: Runner) -> None:
     assert second["summary"]["sigma"]["mean"] == whole["summary"]["sigma"]["mean"]
 
 
+@pytest.mark.versions
 def test_the_status_is_coloured_on_a_terminal_unless_no_color(tmp_path: Path) -> None:
     pty = pytest.importorskip("pty", reason="terminals are POSIX")
     table = tmp_path / "noisy.csv"

@@ -112,7 +112,7 @@ def test_elements_that_do_not_exist_are_refused(text: str, message: str) -> None
         elements([text])
 
 
-def test_a_law_that_a_user_wrote_is_simulated_fitted_and_sampled(run: Runner) -> None:
+def test_a_law_that_a_user_wrote_is_simulated_and_fitted(run: Runner) -> None:
     class Typed(di.Friction):
         kind = "typed_jenkins"
         equation = "dF/dx = stiffness below f_max"
@@ -131,14 +131,9 @@ def test_a_law_that_a_user_wrote_is_simulated_fitted_and_sampled(run: Runner) ->
         made = run("simulate", "--element", law, "--levels", "1e-3:0.1:8", *noise, "-o", "t.csv")
         assert made.status == 0, made.err
         fit = json.loads(run("fit", "t.csv", "--element", "typed_jenkins", "--json").out)
-        grid = run(
-            "sample", "t.csv", "--element", "typed_jenkins", "--method", "grid", "--json"
-        )  # fmt: skip
-        summary = json.loads(grid.out)["summary"]
         for name, truth in (("stiffness", 30.0), ("f_max", 0.1)):
             estimate = fit["params"][name]
             assert abs(estimate["value"] - truth) < 4.0 * estimate["stderr"]
-            assert abs(summary[name]["mean"] - estimate["value"]) < estimate["stderr"]
     finally:
         del KINDS["typed_jenkins"]
 

@@ -14,6 +14,8 @@ from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.synthetic import SteppedSine
 from dahl_ident.synthetic.mechanism import Mechanism
 
+pytestmark = pytest.mark.versions
+
 TWO = Dahl(0.1, 30.0, name="a") + Dahl(0.03, 90.0, 1.5, name="b")
 
 

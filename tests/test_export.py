@@ -23,6 +23,8 @@ from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from tests.command_line import Runner
 
+pytestmark = pytest.mark.versions
+
 DAHL = di.Dahl(0.1, 30.0, alpha=1.0)
 
 

@@ -40,6 +40,7 @@ def model(f_max: float, sigma: float) -> ComplexArray:
 
 
 @pytest.mark.parametrize("noise", ["measured", "relative", "absolute"])
+@pytest.mark.versions
 def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
     problem = Problem(table(covariance=COVARIANCE), Dahl(), noise=noise)
     found = solve(problem)
@@ -87,6 +88,7 @@ def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
         assert found.scale**2 == pytest.approx(peer.redchi, rel=1e-9)
 
 
+@pytest.mark.versions
 def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
     true = np.array([0.1, 30.0, 0.3, 0.24, 0.3])
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
@@ -114,6 +116,7 @@ def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
 
 
 @pytest.mark.parametrize("exponent", [-30, 30])
+@pytest.mark.versions
 def test_units_do_not_matter(exponent: int) -> None:
     here = solve(Problem(table(), Dahl()))
     a = 10.0**exponent
@@ -196,6 +199,7 @@ def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
     assert np.mean(scales) == pytest.approx(0.05, rel=0.03)
 
 
+@pytest.mark.versions
 def test_a_prior_joins_data_of_known_scale() -> None:
     data = table(covariance=COVARIANCE)
     exact = solve(Problem(data, Dahl()))

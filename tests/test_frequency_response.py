@@ -324,6 +324,7 @@ class TestSelection:
 
 
 @pytest.mark.filterwarnings("ignore::dahl_ident.errors.DataWarning")
+@pytest.mark.versions
 class TestTables:
     @pytest.mark.parametrize("motion", ["translation", "rotation"])
     @pytest.mark.parametrize("ending", [".csv", ".csv.gz", ".tsv", ".parquet", ".h5", ".hdf5"])
@@ -478,6 +479,7 @@ class TestTables:
         assert full_table(5).save(path, overwrite=True).read_bytes() != before
 
 
+@pytest.mark.versions
 class TestControl:
     def test_one_system_a_level(self) -> None:
         data = FrequencyResponse(

@@ -14,6 +14,8 @@ from dahl_ident import Backlash, Dahl, Friction, Model, Parameter
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ModelError
 
+pytestmark = pytest.mark.versions
+
 
 class Jenkins(Friction):
     """An elastoplastic element: stiff up to its limit, then full slip."""

@@ -158,6 +158,7 @@ CASES: dict[str, Callable[[], AnyProblem]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.versions
 def test_same_optimum_as_least_squares(case: str) -> None:
     problem = CASES[case]()
     assert_same(solve_ipopt(problem), solve(problem))
@@ -220,6 +221,7 @@ def test_bound() -> None:
     assert found.values == pytest.approx(solve(problem).values, rel=1e-6)
 
 
+@pytest.mark.versions
 def test_equality_is_the_estimate_of_the_ratio_fixed() -> None:
     problem = Problem(friction_data(), Dahl())
     found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] == 250 * p["f_max"]])
@@ -412,6 +414,7 @@ def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) 
     assert "IPOPT says: it reached the maximum number of iterations." in found.message
 
 
+@pytest.mark.versions
 def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     solve_ipopt(Problem(friction_data(), Dahl()), constraints=lambda p: [p["sigma"] <= 29])
     assert capfd.readouterr() == ("", "")

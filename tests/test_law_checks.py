@@ -188,6 +188,7 @@ def drive(model: di.Model) -> None:
     plant_equations(model)
 
 
+@pytest.mark.versions
 def test_what_cannot_be_compiled_is_named() -> None:
     def loops(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
         found = np.zeros(np.broadcast(force, direction, values[0]).shape)

@@ -95,6 +95,7 @@ def test_what_a_signature_needs_is_where_the_function_is() -> None:
 
 
 @pytest.mark.parametrize("name", PUBLIC_NAMES)
+@pytest.mark.versions
 def test_every_public_name_loads_and_is_documented(name: str) -> None:
     value = getattr(di, name)
     assert name in dir(di)
@@ -106,6 +107,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         di.dahl  # noqa: B018 - the access is the test
 
 
+@pytest.mark.versions
 def test_import_loads_no_heavy_library() -> None:
     code = "import sys, dahl_ident; print(' '.join(sys.modules))"
     loaded = subprocess.run(
@@ -115,6 +117,7 @@ def test_import_loads_no_heavy_library() -> None:
     assert not heavy & set(loaded)
 
 
+@pytest.mark.versions
 def test_fitting_a_table_loads_only_what_it_needs() -> None:
     code = "import sys, dahl_ident; dahl_ident.fit; print(' '.join(sys.modules))"
     loaded = subprocess.run(

@@ -215,6 +215,7 @@ def test_waveforms() -> Figure:
     return the_figure(plots.plot_waveforms(t, channels, fitted=[None, 0.97 * force]))
 
 
+@pytest.mark.versions
 def test_records_draw_themselves() -> None:
     record = di.Record([0.0, 0.1, 0.2], velocity=[0.0, 1.0, 0.0], force=[0.0, 2.0, 1.0])
     rows = record.plot()
@@ -265,6 +266,7 @@ def _awkward(count: int) -> tuple[list[str], np.ndarray[Any, Any], list[bool]]:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.versions
 def test_labels_of_corner_and_trace_do_not_collide(count: int) -> None:
     names, draws, log = _awkward(count)
     grid = plots.plot_corner(names, draws, log=log)
@@ -333,6 +335,7 @@ def test_a_fitted_phase_lies_on_the_turn_of_its_points() -> None:
 
 
 @pytest.mark.parametrize("draw", SINGLES.values(), ids=SINGLES.keys())
+@pytest.mark.versions
 def test_single_plots_draw_on_the_axes_given(draw: Callable[[Axes], Axes]) -> None:
     figure, ax = plt.subplots()
     assert draw(ax) is ax
@@ -341,6 +344,7 @@ def test_single_plots_draw_on_the_axes_given(draw: Callable[[Axes], Axes]) -> No
 
 
 @pytest.mark.parametrize("draw", PAIRS)
+@pytest.mark.versions
 def test_plots_of_two_parts_draw_on_the_axes_given(draw: Callable[[Any], Any]) -> None:
     figure, pair = plt.subplots(2, 1)
     assert list(draw(pair)) == list(pair)
@@ -368,6 +372,7 @@ def test_only_wide_ranges_are_drawn_over_their_logarithm() -> None:
     plt.close("all")
 
 
+@pytest.mark.versions
 def test_every_axis_has_its_unit() -> None:
     top, bottom = _amplitude(None)
     assert (top.get_ylabel(), bottom.get_ylabel()) == ("gain [N/m]", "phase [degrees]")
@@ -475,6 +480,7 @@ def test_axes_of_the_user_are_drawn_on_in_the_house_style() -> None:
     plt.close(figure)
 
 
+@pytest.mark.versions
 def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path: Path) -> None:
     backend = tmp_path / "notebook_like.py"
     backend.write_text(

@@ -69,7 +69,7 @@ def test_intervals_are_those_of_the_budget_where_all_is_linear() -> None:
     low, high = grid.quantile("f_max", Q)
     assert high - low == pytest.approx(2.0 * budget.U, rel=0.02)
     assert np.sqrt(low * high) == pytest.approx(budget.value, abs=0.1 * budget.u)
-    chain = di.posterior(fit, seed=1, ess=1000.0)
+    chain = di.posterior(fit, seed=1, ess=500.0)
     assert chain.names == grid.names
     share = np.mean((chain.values[:, 0] > low) & (chain.values[:, 0] < high))
     assert share == pytest.approx(0.9545, abs=0.03)

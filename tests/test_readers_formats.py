@@ -23,6 +23,8 @@ from scipy.io import savemat
 from dahl_ident.data import Record, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, MissingDependencyError, UnitError
 
+pytestmark = pytest.mark.versions
+
 h5py: Any = importlib.import_module("h5py")
 openpyxl: Any = importlib.import_module("openpyxl")
 

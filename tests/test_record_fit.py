@@ -74,6 +74,7 @@ def driven(
 
 
 @pytest.mark.parametrize("kind", ["random", "trapezoid"])
+@pytest.mark.versions
 def test_force_from_displacement(kind: str) -> None:
     truth = DAHL + di.Spring(5.0) + di.Damper(0.3)
     fit = di.fit(recorded(truth, kind, 1500, 1e-3), di.Dahl() + di.Spring() + di.Damper())
@@ -92,6 +93,7 @@ def test_exact_where_there_is_no_noise() -> None:
 
 
 @pytest.mark.parametrize("channel", ["displacement", "velocity", "acceleration"])
+@pytest.mark.versions
 def test_motion_from_force(channel: str) -> None:
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
     truth = {"f_max": 0.1, "sigma": 300.0, "mass": 0.3, "damping": 0.5, "stiffness": 50.0}

@@ -70,6 +70,7 @@ class Outline(HTMLParser):
         self.outside += [p for p in places if p and not p.startswith(("data:", "#"))]
 
 
+@pytest.mark.versions
 def test_html_is_one_file_with_headings_in_order_and_alt_texts(page_file: Path) -> None:
     outline = Outline(page_file.read_text(encoding="utf-8"))
     assert outline.outside == []
@@ -103,12 +104,14 @@ def test_html_tells_the_numbers_side_by_side(page_file: Path, fit: di.FitResult)
         assert fact in text
 
 
+@pytest.mark.pictures
 def test_the_same_result_gives_the_same_pictures(fit: di.FitResult, tmp_path: Path) -> None:
     one, two = (report(fit, tmp_path / name) for name in ("a.html", "b.html"))
     pictures = [re.findall(r'src="data:image[^"]*"', p.read_text()) for p in (one, two)]
     assert pictures[0] == pictures[1]
 
 
+@pytest.mark.versions
 def test_json_holds_the_numbers(fit: di.FitResult, posterior: Posterior, tmp_path: Path) -> None:
     told = json.loads(report([fit, posterior], tmp_path / "report.json").read_text())
     f_max = told["fits"][0]["parameters"]["f_max"]
@@ -119,6 +122,7 @@ def test_json_holds_the_numbers(fit: di.FitResult, posterior: Posterior, tmp_pat
     assert told["versions"]["numpy"] == np.__version__
 
 
+@pytest.mark.versions
 def test_markdown_links_pictures_that_exist(fit: di.FitResult, tmp_path: Path) -> None:
     place = report(fit, tmp_path / "my report.md")
     text = place.read_text(encoding="utf-8")
@@ -130,6 +134,8 @@ def test_markdown_links_pictures_that_exist(fit: di.FitResult, tmp_path: Path) -
     assert not any("<img src=x" in line.replace(r"\<img", "") for line in prose)
 
 
+@pytest.mark.pictures
+@pytest.mark.versions
 def test_pdf_has_text_pictures_and_outline(fit: di.FitResult, tmp_path: Path) -> None:
     pypdf = pytest.importorskip("pypdf")
     reader = pypdf.PdfReader(report(fit, tmp_path / "report.pdf"))
@@ -178,6 +184,7 @@ def test_a_fit_that_ran_away_is_not_trusted(tmp_path: Path) -> None:
     assert not re.search(r">\s*(nan|inf)\b|data-value=.nan", text)
 
 
+@pytest.mark.pictures
 def test_a_plant_over_frequency_is_reported(tmp_path: Path) -> None:
     frequency, drive = (
         g.ravel() for g in np.meshgrid(np.geomspace(0.1, 3.0, 9), [0.05, 0.15, 1.0])
@@ -286,6 +293,7 @@ def test_provenance_of_several_files_is_listed(fit: di.FitResult, tmp_path: Path
     assert "run0.csv run1.csv" in told["command"]
 
 
+@pytest.mark.pictures
 def test_measured_loops_and_settling_are_shown(tmp_path: Path) -> None:
     friction = di.Dahl(0.1, 30.0)
     t = np.arange(6000) / 200.0

@@ -78,6 +78,7 @@ POUND_FORCE = 0.45359237 * 9.80665  # international avoirdupois pound, standard 
         ("1", 1.0),
     ],
 )
+@pytest.mark.versions
 def test_factors(text: str, factor: float) -> None:
     assert parse_unit(text).factor == pytest.approx(factor, rel=1e-14)
 
@@ -242,6 +243,7 @@ REGISTRY: Any = pint.UnitRegistry()
     ),
     st.booleans(),
 )
+@pytest.mark.versions
 def test_common_units_are_read_as_pint_reads_them(
     parts: list[tuple[str, str, int]], bracket: bool
 ) -> None:
