@@ -124,6 +124,8 @@ class TestBeam:
     @staticmethod
     def fitted(beam: FrequencyResponse, controlled: str) -> FitResult:
         data = beam.select(level=[label for label in beam.levels if controlled in label])
+        if controlled == "Force":  # exact motions, row by row
+            data = data.select(rows=np.arange(data.n) % 4 == 0)
         return fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
 
     @pytest.mark.parametrize(
