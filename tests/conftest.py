@@ -32,7 +32,8 @@ def _blank_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     drawn = matplotlib.figure.Figure.savefig
 
     def blank(figure: Figure, place: Any, **options: Any) -> None:
-        drawn(matplotlib.figure.Figure(figure.get_size_inches()), place, **options)
+        size = (figure.get_figwidth(), figure.get_figheight())
+        drawn(matplotlib.figure.Figure(size), place, **options)
 
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", blank)
 
