@@ -7,13 +7,13 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 JOBS   ?= 2
 
-INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python
+INSTALL := $(BIN)/uv pip install --quiet --python
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test checks lint types rooms kernels unit lowest test-lowest examples docs bench \
 	validation fuzz nuts mutants dist lock clean
 
-# Hundreds of processes start from these files: what Python has compiled is kept.
+# What Python compiles of a module that is used is kept for the hundreds of processes of the tests.
 unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## this list
