@@ -11,8 +11,8 @@ from scipy.optimize import brentq
 from benchmarks.harness import Row, median_of_pairs, peak_bytes, print_table, seconds
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.general_dahl import (
-    describing_function,
-    describing_function_gradient,
+    stiffness,
+    stiffness_gradient,
 )
 
 ALPHA = 2.0
@@ -42,8 +42,8 @@ def run() -> list[Row]:
     beta = 10.0 ** rng.uniform(-3.0, 3.0, OURS)
     alpha = np.asarray(ALPHA)
     calls = (
-        ("N", partial(describing_function, beta, alpha), OURS, 5e-6, 2),
-        ("N and derivatives", partial(describing_function_gradient, beta, alpha), OURS, 1e-5, 8),
+        ("N", partial(stiffness, beta, alpha), OURS, 5e-6, 2),
+        ("N and derivatives", partial(stiffness_gradient, beta, alpha), OURS, 1e-5, 8),
     )
     rows = []
     for name, call, n, bound, floats_out in calls:
@@ -53,7 +53,7 @@ def run() -> list[Row]:
         rows.append(
             Row(f"{name}, peak memory", peak_bytes(call), size, "input and output", 20.0, unit="B")
         )
-    few = partial(describing_function_gradient, beta[:30], alpha)
+    few = partial(stiffness_gradient, beta[:30], alpha)
     once = min(seconds(few) for _ in range(100))
     rows.append(Row("N and derivatives, one call for 30", once, 5e-4, "the bound", 1.0))
     ours, peer = median_of_pairs(calls[0][1], partial(by_quad, beta[:PEERS]), REPEATS)

@@ -16,7 +16,7 @@ import mpmath as mp
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.general_dahl import describing_function_gradient, harmonic_gradient
+from dahl_ident.elements.general_dahl import stiffness_gradient
 
 DIGITS = 50
 STEP = mp.mpf(10) ** -18
@@ -56,15 +56,8 @@ def exact_harmonics(beta: float, alpha: float, harmonics: Sequence[int]) -> list
 def kernel_harmonics(beta: float, alpha: float, harmonics: Sequence[int]) -> list[Harmonic]:
     """Return the same from the kernel."""
     b, a = np.asarray(beta), np.asarray(alpha)
-    found = []
-    for k in harmonics:
-        if k == 1:
-            parts = [beta * h for h in describing_function_gradient(b, a)]
-        else:
-            value, by_ln_beta, by_alpha = harmonic_gradient(b, a, k)
-            parts = [value, value - by_ln_beta, by_ln_beta, by_alpha]
-        found.append(Harmonic(*map(complex, parts)))
-    return found
+    rows = [[beta * part for part in stiffness_gradient(b, a, k)] for k in harmonics]
+    return [Harmonic(*map(complex, row)) for row in rows]
 
 
 def errors(beta: float, alpha: float, harmonics: Sequence[int]) -> FloatArray:

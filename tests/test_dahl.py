@@ -218,7 +218,7 @@ def test_bad_histories_are_named(displacement: Any, text: str) -> None:
 
 def test_other_bad_arguments_are_named() -> None:
     friction = Dahl(1.0, 1.0)
-    with pytest.raises(ValidationError, match=r"initial_force is 1\.5; .* \(f_max = 1\.0\)"):
+    with pytest.raises(ValidationError, match=r"initial_force is 1\.5; .* -1 and 1"):
         friction.force([0.0, 1.0], initial_force=1.5)
     with pytest.raises(ValidationError, match=r"initial_force is nan"):
         friction.force([0.0, 1.0], initial_force=np.nan)

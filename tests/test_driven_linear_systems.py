@@ -66,14 +66,19 @@ def driven(model: Element, repeats: int = 1) -> Driven:
     return Driven(model, np.tile(multisine(SAMPLES)[0], repeats), RATE)
 
 
+def at_rest(element: Element) -> FloatArray:
+    """Return the states that do not change where the displacement stays at `PLACE`."""
+    units = np.vstack([np.zeros(element.n_states), np.eye(element.n_states)])
+    rates = np.array([element.mechanics([], PLACE, 0.0, 1.0, list(z)).rates for z in units])
+    return np.asarray(np.linalg.solve((rates[1:] - rates[0]).T, -rates[0]))
+
+
 def first_state(model: Element) -> FloatArray:
     """Return both masses at `PLACE` at rest, without friction."""
     found = [PLACE, 0.0]
     for element in Model(model).elements:
         if isinstance(element, di.LinearSystem):
-            # the states follow the displacement and have its gain at rest
-            steady = element.sampled(1e4).state_histories([], *np.full((3, 9), [[PLACE], [0], [0]]))
-            found += [float(z[-1]) for z in steady]
+            found += at_rest(element).tolist()
         else:
             found += [0.0] * element.n_states
     return np.array(found)

@@ -171,7 +171,7 @@ def test_linear_history_derivatives() -> None:
 
     found, by_start, by = hysteresis.linear_history_gradient(x, 0.2, 30.0, 0.05)
     np.testing.assert_allclose(found, force(point), rtol=0.0, atol=1e-14)
-    for i, slope in enumerate((by_start, *by.T)):
+    for i, slope in enumerate((by_start, *by)):
         h = np.zeros(3)
         h[i] = 1e-5 * point[i]
         expected = (force(point + h) - force(point - h)) / (2.0 * h[i])

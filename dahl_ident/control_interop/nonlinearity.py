@@ -7,6 +7,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, non_negative_array
 from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.facts import Sine
 from dahl_ident.errors import ModelError
 
 _AT_REST = np.zeros(())
@@ -131,5 +132,5 @@ def friction_and_slope(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return N(A) and A dN/dA."""
     values = friction.known_values()
-    N, by_amplitude = friction.stiffness_slope(values, amplitude, omega)
+    N, by_amplitude, _ = friction.settled(values, Sine(amplitude, omega), 1)
     return N, amplitude * by_amplitude

@@ -29,7 +29,7 @@ from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predict
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.verdicts import Fit
 from dahl_ident.elements import Damper, Element, Friction, Mass, Model, PowerDamper, Spring
-from dahl_ident.elements.element import Alternative
+from dahl_ident.elements.facts import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem

@@ -14,16 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import held_motion
-from dahl_ident.elements.behaviour import (
+from dahl_ident.elements.element import KINDS, Element, class_named, prefixed
+from dahl_ident.elements.facts import (
     Asymptote,
     Combination,
     HistoryGradient,
     Mechanics,
+    Path,
+    Values,
     clipped,
 )
-from dahl_ident.elements.element import KINDS, Element, class_named, prefixed
 from dahl_ident.elements.friction import Friction
+from dahl_ident.elements.held_motion import loops_of
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError
 
@@ -101,12 +103,7 @@ class Backlash(Friction):
         return self._element.slope(force, direction, velocity, values[: len(self.parameters) - 1])
 
     def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
         """Return force and its change, none while the gap is crossed; the play moves then."""
         force, play = states
@@ -126,54 +123,28 @@ class Backlash(Friction):
         play = clipped(start, half)
         return self.slope(0.0, 1.0, 0.0, values) * (start - play), play
 
+    def first_states(
+        self, values: Sequence[float], force: float
+    ) -> tuple[Sequence[float], Mapping[int, tuple[int, float]]]:
+        """Return the force, and the place in the gap: at its end in contact, or in the middle."""
+        end = 0.5 * float(np.sign(force))
+        return (force, end * float(values[-1])), {len(values) - 1: (1, end)}
+
     def _loops(self, at: FloatArray, harmonic: int = 1, chosen: Sequence[int] = ()) -> Loops:
         """Return settled loops at rows of amplitude, frequency and values."""
-        return held_motion.loops_of(self._element, at, harmonic, chosen, gap=True)
+        return loops_of(self._element, at, harmonic, chosen, gap=True)
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force at every sample, unchecked."""
-        if self._is_narrow(values, displacement):
-            return self._element.force_history(values[:-1], displacement, velocity, state)
-        return super().force_history(values, displacement, velocity, state)
-
-    def states_at(self, values: Sequence[float], force: float) -> Sequence[float]:
-        """Return the force, and the place in the gap: in contact, or in the middle."""
-        return force, 0.5 * float(values[-1]) * float(np.sign(force))
-
-    def states_by_parameter(self, force: float) -> dict[int, tuple[int, float]]:
-        """Return that the place in the gap is at its end, where the motion starts in contact."""
-        return {len(self.parameters) - 1: (1, 0.5 * float(np.sign(force)))}
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives."""
-        if self._is_narrow(values, displacement):
-            found = self.element.force_history_gradient(values[:-1], displacement, velocity, state)
-            return found._replace(by_parameter=(*found.by_parameter, np.zeros(displacement.shape)))
-        return super().force_history_gradient(values, displacement, velocity, state)
+        """Return the force at every sample with its derivatives, unchecked."""
+        if float(values[-1]) >= _NARROWEST * float(np.abs(np.diff(path.displacement)).sum()):
+            return super().history(values, path, state, slopes=slopes)
+        found = self.element.history(values[:-1], path, state, slopes=slopes)
+        zero = np.zeros(path.displacement.shape)
+        return found._replace(by_parameter=(*found.by_parameter, zero))
 
-    def _is_narrow(self, values: Sequence[FloatArray | float], displacement: FloatArray) -> bool:
-        """Return whether the gap is too narrow compared with the path to matter."""
-        return float(values[-1]) < _NARROWEST * float(np.abs(np.diff(displacement)).sum())
-
-    def steady_force(
-        self, values: Sequence[FloatArray], path: FloatArray, cycles: int
-    ) -> FloatArray:
+    def steady_force(self, values: Values, path: FloatArray, cycles: int) -> FloatArray:
         """Return the force of the element along the path without the play."""
         half = 0.5 * np.asarray(values[-1])
         y, moved = np.zeros(path.shape[:-1]), np.empty(path.shape)
@@ -182,26 +153,26 @@ class Backlash(Friction):
                 moved[..., i] = y = np.clip(y, path[..., i] - half, path[..., i] + half)
         return self._element.steady_force(values[:-1], y, cycles)
 
-    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
+    def rest_stiffness(self, values: Values) -> FloatArray:
         """Return 0: small motions do not cross the gap."""
         return np.zeros(np.broadcast_shapes(*(np.shape(v) for v in values)))
 
-    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return those of the element."""
         return self._element.force_limits(values[:-1])
 
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return those of the element, whose amplitude is smaller."""
         return self._element.force_bounds(values[:-1])
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return half the gap, and where the element behind it slips."""
         low, high = self._element.knee(values[:-1])
         half = 0.5 * np.asarray(values[-1])
         return np.minimum(half, low), high + half
 
     def transient_decay(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+        self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return the factor by which a deviation shrinks in one cycle: that of the element."""
         moved = np.maximum(amplitude - 0.5 * np.asarray(values[-1]), 0.0)
@@ -246,7 +217,5 @@ class Backlash(Friction):
         return blank.with_bound((*blank.parameters[:-1], gap))
 
     def __repr__(self) -> str:
-        gap = self.parameters[-1]
-        value = "free" if gap.value is None else f"{gap.value:g}"
-        started = " free" if gap.free and gap.value is not None else ""
-        return f"Backlash({self.element!r}, gap={value}{started})"
+        gap = super().__repr__().rpartition("gap=")[2].partition(",")[0].rstrip(")")
+        return f"Backlash({self.element!r}, gap={gap})"

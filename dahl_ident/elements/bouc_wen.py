@@ -17,6 +17,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import Element
+from dahl_ident.elements.facts import Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
@@ -106,14 +107,14 @@ class BoucWen(Friction):
         ahead = direction * force
         return sigma - 0.5 * ((q + p) * ahead + (q - p) * np.fabs(ahead))
 
-    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return sigma/q for both directions where the force saturates, inf where it does not."""
         sigma, q, *_ = np.broadcast_arrays(*values)
         limit = np.full(np.shape(q), np.inf)
         limit = np.asarray(np.divide(sigma, q, out=limit, where=q > 0.0))
         return limit, limit
 
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return 8 sigma/pi and 4/pi sigma/q where the force saturates, inf where it does not.
 
         A tip's force is loaded over at most 2 A; a fundamental is at most 4/pi of it.
@@ -122,7 +123,7 @@ class BoucWen(Friction):
         steepest = np.where(np.asarray(q) >= 0.0, 8.0 / np.pi * np.asarray(sigma), np.inf)
         return steepest, 4.0 / np.pi * self.force_limits(values)[0]
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the inverse of the larger and of the smaller rate."""
         _, q, p, *_ = values
         rates = np.sort(np.abs(np.array(np.broadcast_arrays(q, p), dtype=np.float64)), axis=0)

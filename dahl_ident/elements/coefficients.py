@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import Model
-from dahl_ident.elements.linear_system import LinearEquation, LinearSystem
+from dahl_ident.elements.facts import Mechanics
+from dahl_ident.elements.linear_system import Equation, LinearSystem, coefficients_of, differences
+from dahl_ident.elements.parameter import Parameter
+from dahl_ident.elements.rational import Rational, typical_rate
 
 
 class Coefficients:
     """The numbers in a model's equation of motion, from the values of its parameters.
 
-    They are the values themselves, but for linear systems that have free parameters.
+    They are the values themselves, except for linear systems that have free parameters.
 
     Parameters
     ----------
@@ -26,7 +32,7 @@ class Coefficients:
 
     def __init__(self, model: Model) -> None:
         elements = [
-            LinearEquation(element)
+            _LinearEquation(element)
             if isinstance(element, LinearSystem) and any(p.free for p in element.parameters)
             else element
             for element in model.elements
@@ -40,14 +46,85 @@ class Coefficients:
         numbers, blocks, first = [], [], 0
         for element, other in self._pairs:
             last = first + len(element.parameters)
-            own = values[:, first:last]
+            part = values[:, first:last]
             block = np.zeros((len(values), len(other.parameters), values.shape[1]))
-            if isinstance(other, LinearEquation):
-                own, block[:, :, first:last] = other.coefficients(own)
+            if isinstance(other, _LinearEquation):
+                part, block[:, :, first:last] = other.coefficients(part)
             else:
                 place = np.arange(len(element.parameters))
                 block[:, place, first + place] = 1.0
-            numbers.append(own)
+            numbers.append(part)
             blocks.append(block)
             first = last
         return np.concatenate(numbers, axis=1), np.concatenate(blocks, axis=1)
+
+
+class _LinearEquation(LinearSystem):
+    """A linear system with free parameters; its parameters are those of its equation of motion.
+
+    The equation's degree is that at values near the starts of the system's parameters.
+    """
+
+    def __init__(self, system: LinearSystem) -> None:
+        self.__dict__.update(system.__dict__)
+        self._origin = system
+        Z = system.stiffness_near()
+        self._above, self._below = Z.degrees
+        self._rate = typical_rate(Z.denominator)
+        order = range(1, self._below + 1)
+        labels = ["k", "c", "m", *(f"a{i}" for i in order), *(f"b{i}" for i in order)]
+        first = system.parameters[0].name
+        self.parameters = tuple(
+            Parameter(f"{label} of {first}", "", "coefficient") for label in labels
+        )
+
+    @property
+    def n_states(self) -> int:
+        """Poles of the dynamic stiffness."""
+        return self._below
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether Z(s) grows as s^2."""
+        return self._above - self._below == 2
+
+    def mechanics(
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
+    ) -> Mechanics:
+        """Return mass, the rest of the force, and the changes of the states, in metres."""
+        return Equation(self._rate, self._below, values).mechanics(x, velocity, states)
+
+    def coefficients(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the coefficients, (rows, Q), at values of the system's parameters, and slopes.
+
+        NaN where the values are not finite, or the system has another degree there.
+        """
+        vectors, which = np.unique(values, axis=0, return_inverse=True)
+        names = [p.name for p in self._origin.parameters]
+        rows = np.array(
+            [
+                np.stack([self._at(vector), *differences(self._at, vector, names)], axis=-1)
+                for vector in map(tuple, vectors.tolist())
+            ]
+        )[which.ravel()]
+        return rows[..., 0], rows[..., 1:]
+
+    def _at(self, vector: Sequence[float]) -> FloatArray:
+        """Return the coefficients at one vector of the system's parameters."""
+        if np.isfinite(vector).all():
+            Z = Rational(*self._origin.rational_stiffness(vector)).without_common_zeros_at_0()
+            above, below = (
+                _of_degree(Z.numerator, self._above),
+                _of_degree(Z.denominator, self._below),
+            )
+            if above is not None and below is not None and below[0] != 0.0:
+                return coefficients_of(Rational(above, below), self._rate)
+        return np.full(3 + 2 * self._below, np.nan)
+
+
+def _of_degree(polynomial: FloatArray, degree: int) -> FloatArray | None:
+    """Return a polynomial of a degree; None where it has a higher one."""
+    size = degree + 1
+    if np.any(polynomial[: max(0, polynomial.size - size)]):
+        return None
+    return np.append(np.zeros(max(0, size - polynomial.size)), polynomial[-size:])

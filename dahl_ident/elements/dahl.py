@@ -23,22 +23,21 @@ from dahl_ident.arrays import (
     array_between,
     non_negative_array,
 )
-from dahl_ident.elements import (
-    general_dahl,
-    general_dahl_table,
-    hysteresis,
-    linear_dahl,
-)
+from dahl_ident.elements import general_dahl, general_dahl_table, hysteresis, linear_dahl
 from dahl_ident.elements.backlash import Backlash
-from dahl_ident.elements.behaviour import (
+from dahl_ident.elements.bouc_wen import BoucWen
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.facts import (
+    Alternative,
     Asymptote,
     Combination,
     HistoryGradient,
+    Path,
+    Sine,
     StiffnessGradient,
     UniversalCurve,
+    Values,
 )
-from dahl_ident.elements.bouc_wen import BoucWen
-from dahl_ident.elements.element import Alternative, Element
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.iwan import Iwan
 from dahl_ident.elements.lugre import LuGre
@@ -55,7 +54,7 @@ _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
 """x_c over the largest amplitude, twice, and over the smallest: the limits, to every digit."""
 _SHARP, _SOFT = 1e-6, 1e3  # alpha
 _ONE_SIDED = 0.9  # asymmetry
-_NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that was not requested
+_NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that is not asked for
 
 
 class Dahl(Friction):
@@ -190,64 +189,74 @@ class Dahl(Friction):
         """
         A = non_negative_array(amplitude, "amplitude")
         known = [*(p.name for p in self.parameters), "amplitude"]
-        wanted = known if names is None else list(names)
-        unknown = [name for name in wanted if name not in known]
+        chosen = known if names is None else list(names)
+        unknown = [name for name in chosen if name not in known]
         if unknown:
             raise ValidationError(f"names has {unknown[0]!r}; expected some of {', '.join(known)}")
-        asked = {"with_alpha": self.parameters[2].name in wanted}
-        asked["with_amplitude"] = "amplitude" in wanted
-        result = self._gradient(self.known_values(), A, 1, **asked)
-        found = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
-        return {name: found[name][()] for name in wanted}
+        values = self.known_values()
+        asked = [replace(p, free=p.name in chosen) for p in self.parameters]
+        result = self.with_bound(tuple(asked)).settled(values, Sine(A, np.zeros(())), 2)
+        every = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
+        return {name: every[name][()] for name in chosen}
 
-    def _coefficients(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, harmonic: int
-    ) -> ComplexArray:
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return F_k/X_1 at `values` (f_max, sigma, alpha), unchecked.
+
+        The derivative by alpha costs a quadrature; while alpha is fixed it is left at zero, which
+        no estimate looks at.
+        """
         f_max, sigma, alpha = values
-        beta = sigma * amplitude / f_max
-        if _is_linear(alpha):
-            return np.asarray(f_max * linear_dahl.harmonic(beta, harmonic))
-        return np.asarray(f_max * general_dahl.harmonic(beta, alpha, harmonic))
+        beta, k = sigma * sine.amplitude / f_max, sine.harmonic
+        linear = bool(np.equal(alpha, 1.0).all())
+        if not derivatives:
+            if linear and k == 1:
+                h = linear_dahl.describing_function(beta)
+            elif linear:
+                h = _per(linear_dahl.harmonic(beta, k), beta)
+            else:
+                h = general_dahl.stiffness(beta, alpha, k)
+            return StiffnessGradient(sigma * h, _NONE, ())
+        by_alpha = None
+        if linear and k == 1:
+            h, by_f_max, by_sigma = linear_dahl.describing_function_gradient(beta)
+        elif linear:
+            c, rise = linear_dahl.harmonic_gradient(beta, k)
+            h, by_f_max, by_sigma = _per(c, beta), _per(c - rise, beta), _per(rise, beta)
+        else:
+            h, by_f_max, by_sigma, by_alpha = general_dahl.stiffness_gradient(beta, alpha, k)
+        by_amplitude = _by_amplitude(values, beta, k, by_f_max)
+        if derivatives == 1:
+            return StiffnessGradient(sigma * h, by_amplitude, ())
+        if not self.parameters[2].free:
+            by_alpha = np.zeros(h.shape, dtype=np.complex128)
+        elif by_alpha is None:
+            by_alpha = general_dahl.stiffness_gradient(beta, alpha, k)[3]
+        by = (sigma / f_max * by_f_max, by_sigma, sigma * by_alpha)
+        return StiffnessGradient(sigma * h, by_amplitude, by)
+
+    def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
+        """Return f_max, sigma and one for each, with the numbers that shape the loop."""
+        f_max, sigma, *shape = values
+        return f_max, sigma, (np.ones(()), np.ones(()), *shape)
+
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
+    ) -> HistoryGradient:
+        """Return the force at every sample, exactly (Eqn. 3, segment by segment), unchecked."""
+        f_max, sigma, alpha = (float(v) for v in values)
+        if not slopes:
+            force = hysteresis.force_history(path.displacement, f_max, sigma, alpha, state)
+            return HistoryGradient(force, force, ())
+        if alpha != 1.0 or self.parameters[2].free:
+            return super().history(values, path, state, slopes=True)
+        found = hysteresis.linear_history_gradient(path.displacement, f_max, sigma, state)
+        zero = np.zeros(found.value.shape)
+        return found._replace(by_parameter=(*found.by_parameter, zero))
 
     def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
         return hysteresis.steady_force(theta, amplitude, *values)
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force at every sample, exactly (Eqn. 3, segment by segment), unchecked."""
-        f_max, sigma, alpha = (float(v) for v in values)
-        return hysteresis.force_history(displacement, f_max, sigma, alpha, state)
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives, unchecked.
-
-        While alpha is fixed at 1 the derivative with respect to it is left at zero, as in
-        :meth:`stiffness_gradient`.
-        """
-        f_max, sigma, alpha = (float(v) for v in values)
-        if alpha != 1.0 or self.parameters[2].free:
-            return super().force_history_gradient(values, displacement, velocity, state)
-        force, by_state, by = hysteresis.linear_history_gradient(displacement, f_max, sigma, state)
-        return HistoryGradient(force, by_state, (*by.T, np.zeros(force.shape)))
-
-    def _step(
-        self, values: Sequence[FloatArray], force: FloatArray, step: FloatArray
-    ) -> FloatArray:
+    def _step(self, values: Values, force: FloatArray, step: FloatArray) -> FloatArray:
         f_max, sigma, alpha = values
         sign = np.sign(step)
         margin = 1.0 - sign * force / f_max
@@ -263,36 +272,35 @@ class Dahl(Friction):
         change = hysteresis.margin_change(margin, sigma / f_max * path, alpha)
         return np.array([start - f_max * change, sigma * (margin + change) ** alpha])
 
-    def _check_start(self, values: Sequence[float], initial_force: float) -> None:
-        f_max = values[0]
-        if abs(initial_force) > f_max:
-            raise ValidationError(
-                f"initial_force is {initial_force!r}; expected a force between -f_max and f_max "
-                f"(f_max = {f_max!r})"
-            )
+    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return f_max, with its asymmetry, for both directions."""
+        f_max, _, _, *asymmetry = values
+        a = asymmetry[0] if asymmetry else 0.0
+        return np.asarray(f_max * (1.0 + a)), np.asarray(f_max * (1.0 - a))
 
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return 4 sigma/pi and 4 f_max/pi.
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return 4 sigma/pi and 4/pi of the larger limit.
 
-        The force is largest where the motion turns: there it is at most f_max and, since z^-alpha
-        is convex, at most sigma A. The fundamental of a wave of height 1 is at most 4/pi, that of
+        The range of the force over a cycle is at most that of the limits and, since z^-alpha is
+        convex, at most 2 sigma A. The fundamental of a wave of height 1 is at most 4/pi, that of
         the square wave.
         """
-        f_max, sigma, _ = values
-        return 4.0 / np.pi * np.asarray(sigma), 4.0 / np.pi * np.asarray(f_max)
+        steepest = np.asarray(4.0 / np.pi * values[1])
+        return steepest, np.asarray(4.0 / np.pi * np.maximum(*self.force_limits(values)))
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return x_c = f_max/sigma twice."""
-        x_c = np.asarray(values[0] / values[1])
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return the larger limit over sigma twice."""
+        x_c = np.asarray(np.maximum(*self.force_limits(values)) / values[1])
         return x_c, x_c
 
     def transient_decay(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+        self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
         f_max, sigma, alpha = values
-        beta = np.asarray(sigma * amplitude / f_max)
-        return hysteresis.transient_decay(beta, alpha) + 0.0 * omega
+        return (
+            hysteresis.transient_decay(np.asarray(sigma * amplitude / f_max), alpha) + 0.0 * omega
+        )
 
     def combinations(self) -> tuple[Combination, ...]:
         """Return what microslip and the knee determine."""
@@ -310,61 +318,36 @@ class Dahl(Friction):
         The distances are those at which the model is its limit to five digits or more, three for
         no full slip.
         """
-        alpha = self.parameters[2]
-        pins = {"alpha": 1.0} if alpha.free else {}
+        labels = [p.name for p in type(self).parameters if self.parameter(p.name).free]
+        linear = {"alpha": 1.0} if "alpha" in labels else {}
+        alike = linear | ({"asymmetry": 0.0} if "asymmetry" in labels else {})
         loss = self.combinations()[0]
-        found = [
+        f_max, sigma = ("f_max", {"f_max": 1.0}), ("sigma", {"sigma": 1.0})
+        limits = [
             Asymptote(
-                "no_loss",
-                "a spring",
-                pins,
-                ("f_max", "sigma", _NO_LOSS * high),
-                {"f_max": np.inf},
-                (("sigma", {"sigma": 1.0}),),
+                "no_loss", "a spring", alike, ("f_max", "sigma", _NO_LOSS * high),
+                {"f_max": np.inf}, (sigma,),
             ),
             Asymptote(
-                "microslip",
-                "a spring with a loss that grows with the amplitude",
-                pins,
-                ("f_max", "sigma", _MICROSLIP * high),
-                {"f_max": np.inf, "sigma": np.inf},
-                ((loss.expression, loss.powers),),
-                adds_to_spring="sigma",
+                "microslip", "a spring with a loss that grows with the amplitude", alike,
+                ("f_max", "sigma", _MICROSLIP * high), {"f_max": np.inf, "sigma": np.inf},
+                ((loss.expression, loss.powers),), adds_to_spring="sigma",
             ),
             Asymptote(
-                "gross_slip",
-                "Coulomb friction",
-                pins,
-                ("sigma", "f_max", 1.0 / (_GROSS_SLIP * low)),
-                {"sigma": np.inf},
-                (("f_max", {"f_max": 1.0}),),
+                "gross_slip", "Coulomb friction", linear,
+                ("sigma", "f_max", 1.0 / (_GROSS_SLIP * low)), {"sigma": np.inf}, (f_max,),
             ),
-        ]
-        if alpha.free:
-            found.append(
-                Asymptote(
-                    "sharp_knee",
-                    "elastic up to f_max, then full slip",
-                    {"alpha": _SHARP},
-                    None,
-                    {"alpha": 0.0},
-                    (("f_max", {"f_max": 1.0}), ("sigma", {"sigma": 1.0})),
-                )
-            )
-            found.append(
-                Asymptote(
-                    "no_full_slip",
-                    "dF/dx = sigma exp(-s F/phi), which never slips fully",
-                    {"alpha": _SOFT},
-                    None,
-                    {"f_max": np.inf, "alpha": np.inf},
-                    (
-                        ("f_max/alpha", {"f_max": 1.0, "alpha": -1.0}),
-                        ("sigma", {"sigma": 1.0}),
-                    ),
-                )
-            )
-        return tuple(found)
+            Asymptote(
+                "sharp_knee", "elastic up to f_max, then full slip", {"alpha": _SHARP}, None,
+                {"alpha": 0.0}, (f_max, sigma),
+            ),
+            Asymptote(
+                "no_full_slip", "dF/dx = sigma exp(-s F/phi), which never slips fully",
+                {"alpha": _SOFT}, None, {"f_max": np.inf, "alpha": np.inf},
+                (("f_max/alpha", {"f_max": 1.0, "alpha": -1.0}), sigma),
+            ),
+        ]  # fmt: skip
+        return tuple(limits if linear else limits[:3])
 
     def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
         """Return the other exponent, two elements, and the laws that real devices ask for."""
@@ -418,93 +401,6 @@ class Dahl(Friction):
         alpha = self.parameters[2]
         return TabulatedDahl(self) if alpha.free or alpha.value != 1.0 else self
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1 at `values` (f_max, sigma, alpha), unchecked; `omega` does not matter."""
-        f_max, sigma, alpha = values
-        beta = sigma * amplitude / f_max
-        if harmonic == 1:
-            if _is_linear(alpha):
-                h = linear_dahl.describing_function(beta)
-            else:
-                h = general_dahl.describing_function(beta, alpha)
-            h *= sigma
-            return h
-        if _is_linear(alpha):
-            c = linear_dahl.harmonic(beta, harmonic)
-        else:
-            c = general_dahl.harmonic(beta, alpha, harmonic)
-        return np.asarray(sigma * _per(c, beta))
-
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, unchecked.
-
-        The derivative by alpha costs a quadrature; while alpha is fixed at 1 it is left at zero,
-        which no estimate looks at. :meth:`gradient` always computes it.
-        """
-        return self._gradient(values, amplitude, harmonic, with_alpha=bool(self.parameters[2].free))
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return N and dN/dA, unchecked."""
-        found = self._gradient(values, amplitude, 1, with_alpha=False)
-        return found.value, found.by_amplitude
-
-    def normalised(
-        self, values: Sequence[FloatArray]
-    ) -> tuple[FloatArray, FloatArray, Sequence[FloatArray]]:
-        """Return f_max, sigma and (1, 1, alpha)."""
-        f_max, sigma, alpha = values
-        return f_max, sigma, (np.ones(()), np.ones(()), alpha)
-
-    def _gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        harmonic: int,
-        *,
-        with_alpha: bool,
-        with_amplitude: bool = True,
-    ) -> StiffnessGradient:
-        f_max, sigma, alpha = values
-        beta = sigma * amplitude / f_max
-        closed = _is_linear(alpha)
-        if harmonic == 1 and closed:
-            h, by_f_max, by_sigma = linear_dahl.describing_function_gradient(beta)
-        elif harmonic == 1:
-            h, by_f_max, by_sigma, by_alpha = general_dahl.describing_function_gradient(beta, alpha)
-        else:
-            if closed:
-                c, rise = linear_dahl.harmonic_gradient(beta, harmonic)
-            else:
-                c, rise, by_alpha = general_dahl.harmonic_gradient(beta, alpha, harmonic)
-                by_alpha = _per(by_alpha, beta)
-            h, by_f_max, by_sigma = _per(c, beta), _per(c - rise, beta), _per(rise, beta)
-        if not with_alpha:
-            by_alpha = np.zeros(h.shape, dtype=np.complex128)
-        else:
-            if closed and harmonic == 1:
-                by_alpha = general_dahl.describing_function_gradient(beta, alpha)[3]
-            elif closed:
-                by_alpha = _per(general_dahl.harmonic_gradient(beta, alpha, harmonic)[2], beta)
-            by_alpha = sigma * by_alpha
-        slope = _by_amplitude(values, beta, harmonic, by_f_max) if with_amplitude else _NONE
-        h *= sigma
-        by_f_max *= sigma / f_max
-        return StiffnessGradient(h, slope, (by_f_max, by_sigma, by_alpha))
-
 
 class _AsymmetricDahl(Dahl):
     """Dahl friction with two limits; results that assume symmetry are computed from the slope."""
@@ -533,21 +429,6 @@ class _AsymmetricDahl(Dahl):
         limit = f_max * (1.0 + direction * asymmetry)
         return super().slope(force, direction, velocity, (limit, sigma, alpha))
 
-    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return those of one limit; in microslip the other has no effect."""
-        pins = {"asymmetry": 0.0} if self.parameters[3].free else {}
-        return tuple(
-            replace(a, pinned={**a.pinned, **pins}) if a.name in ("no_loss", "microslip") else a
-            for a in super().asymptotes(low, high)
-        )
-
-    def normalised(
-        self, values: Sequence[FloatArray]
-    ) -> tuple[FloatArray, FloatArray, Sequence[FloatArray]]:
-        """Return f_max, sigma and (1, 1, alpha, asymmetry)."""
-        f_max, sigma, *shape = values
-        return f_max, sigma, (np.ones(()), np.ones(()), *shape)
-
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to an almost vanishing limit."""
         if abs(values[3]) < _ONE_SIDED:
@@ -561,31 +442,12 @@ class _AsymmetricDahl(Dahl):
     def __repr__(self) -> str:
         return super().__repr__().replace(type(self).__name__, "Dahl", 1)
 
-    stiffness = Friction.stiffness
-    stiffness_gradient = Friction.stiffness_gradient
-    stiffness_slope = Friction.stiffness_slope
-    force_history = Friction.force_history
-    force_history_gradient = Friction.force_history_gradient
-    force_bounds = Friction.force_bounds
-    knee = Friction.knee
+    settled = Friction.settled
+    history = Friction.history
     transient_decay = Friction.transient_decay
-    _check_start = Friction._check_start
     _step = Friction._step
     branch = Friction.branch
-    _coefficients = Friction._coefficients
     _loop = Friction._loop
-
-    def _gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        harmonic: int,
-        *,
-        with_alpha: bool,
-        with_amplitude: bool = True,
-    ) -> StiffnessGradient:
-        every = self.with_bound(tuple(p.freed() for p in self.parameters))
-        return every.stiffness_gradient(values, amplitude, np.zeros(()), harmonic)
 
 
 class TabulatedDahl(Dahl):
@@ -594,46 +456,26 @@ class TabulatedDahl(Dahl):
     def __init__(self, element: Dahl) -> None:
         self._name, self.parameters = element.name, element.parameters
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1 at `values`, unchecked; harmonics k > 1 by quadrature."""
-        if harmonic != 1:
-            return super().stiffness(values, amplitude, omega, harmonic)
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return F_k/X_1 at `values`; what the tables do not have by quadrature."""
+        if sine.harmonic != 1 or derivatives > 1:
+            return super().settled(values, sine, derivatives)
         f_max, sigma, alpha = values
-        return np.asarray(
-            sigma * general_dahl_table.describing_function(sigma * amplitude / f_max, alpha)
-        )
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return N and dN/dA, unchecked."""
-        f_max, sigma, alpha = values
-        h, by_ln_beta = general_dahl_table.describing_function_slope(
-            sigma * amplitude / f_max, alpha
-        )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slope = sigma * by_ln_beta / amplitude
-        rests = np.broadcast_to(sigma * amplitude / f_max, slope.shape) < _AT_REST
-        return sigma * h, np.where(rests, _slope_at_rest(values, 1, slope.shape), slope)
-
-
-def _is_linear(alpha: FloatArray) -> bool:
-    return bool(np.equal(alpha, 1.0).all())
+        beta = np.asarray(sigma * sine.amplitude / f_max)
+        h, by_ln_beta = general_dahl_table.stiffness(beta, alpha, slope=derivatives > 0)
+        if not derivatives:
+            return StiffnessGradient(np.asarray(sigma * h), _NONE, ())
+        by_amplitude = _by_amplitude(values, beta, 1, -by_ln_beta)
+        return StiffnessGradient(np.asarray(sigma * h), by_amplitude, ())
 
 
 def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:
     """Return c/beta, with the limit 0 at beta = 0 that every harmonic k > 1 has."""
-    return np.divide(c, beta, out=np.zeros(np.shape(c), dtype=np.complex128), where=beta > 0.0)
+    return np.divide(c, beta, out=np.zeros(np.shape(c), dtype=np.complex128), where=beta > _AT_REST)
 
 
 def _by_amplitude(
-    values: Sequence[FloatArray], beta: FloatArray, harmonic: int, by_ln_f_max: ComplexArray
+    values: Values, beta: FloatArray, harmonic: int, by_ln_f_max: ComplexArray
 ) -> ComplexArray:
     """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
     f_max, sigma, _ = values
@@ -644,9 +486,7 @@ def _by_amplitude(
     return slope
 
 
-def _slope_at_rest(
-    values: Sequence[FloatArray], harmonic: int, shape: tuple[int, ...]
-) -> ComplexArray:
+def _slope_at_rest(values: Values, harmonic: int, shape: tuple[int, ...]) -> ComplexArray:
     """Return dN/dA at A = 0: the loss grows in proportion to A (Rayleigh), the stiffness does not.
 
     N_k/sigma -> j 4 alpha beta / (pi k (4 - k^2)) for odd k.

@@ -1,11 +1,12 @@
-"""Elements and their sums: names, plain data, checked calls, and ``+``."""
+"""Elements and their sums: what every law answers, names, plain data, checked calls, and ``+``."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Self, TypeVar
+from itertools import pairwise
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +22,14 @@ from dahl_ident.arrays import (
     whole_number,
 )
 from dahl_ident.data.record import is_even
-from dahl_ident.elements.behaviour import Behaviour, StiffnessGradient
+from dahl_ident.elements.behaviour import Behaviour
+from dahl_ident.elements.facts import (
+    HistoryGradient,
+    Path,
+    Sine,
+    StiffnessGradient,
+    Values,
+)
 from dahl_ident.elements.law_files import file_of, restored, source_path
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
@@ -35,7 +43,8 @@ KINDS: dict[str, type[Element]] = {}
 def register(cls: type[Element]) -> None:
     """Make a class known by its kind; a file that is run again replaces its own classes."""
     known = KINDS.get(cls.kind)
-    if known is not None and (_home(known), known.__qualname__) != (_home(cls), cls.__qualname__):
+    home, known_home = (known and (source_path(c) or c.__module__) for c in (cls, known or cls))
+    if known and (known_home, known.__qualname__) != (home, cls.__qualname__):
         raise ModelError(
             f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
             f"{known.__qualname__} has already; choose another"
@@ -43,31 +52,10 @@ def register(cls: type[Element]) -> None:
     KINDS[cls.kind] = cls
 
 
-def _home(cls: type[Element]) -> str:
-    return source_path(cls) or cls.__module__
-
-
 def class_named(name: str) -> type[Element] | None:
     """Return the class with this kind, or else with this name; None if there is none."""
     named = [cls for cls in KINDS.values() if cls.__name__ == name]
     return KINDS.get(name) or (named[0] if len(named) == 1 else None)
-
-
-class Alternative(NamedTuple):
-    """Elements in place of one.
-
-    Attributes
-    ----------
-    elements : tuple of Element
-        In parallel.
-    shows : {"shape", "asymmetry", "speed", "masing"}
-        What of the data speaks for them: how force depends on amplitude and the odd harmonics;
-        the mean force and the even harmonics; a force that falls with the speed; or parallel
-        Jenkins elements that would leave much less.
-    """
-
-    elements: tuple[Element, ...]
-    shows: str = "shape"
 
 
 class Element(Behaviour):
@@ -104,6 +92,8 @@ class Element(Behaviour):
         True: Re N falls with the amplitude, whatever the values.
     holds_at_rest : bool
         True: a displacement held constant may take a force.
+    start : tuple of str
+        Name, unit and meaning of the unknown from which the states of a driven motion start.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -125,12 +115,12 @@ class Element(Behaviour):
             for declared in type(self).parameters
         )
 
-    def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
-        """Return, by a few words, what is tried in place of this element; started at `values`.
-
-        `smallest` is the smallest amplitude measured, m.
-        """
-        return {}
+    def with_bound(self, parameters: tuple[Parameter, ...]) -> Self:
+        """Return a copy of this element with other values, bounds or free flags."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__)
+        copy.parameters = parameters
+        return copy
 
     def started(self, values: Sequence[float]) -> Self:
         """Return this element with values to start from where it is free."""
@@ -140,14 +130,6 @@ class Element(Behaviour):
                 for p, v in zip(self.parameters, values, strict=True)
             )
         )
-
-    def tabulated(self) -> Element:
-        """Return this element, or a faster variant of it for very many evaluations."""
-        return self
-
-    def coarser(self) -> Element:
-        """Return this element, or one whose motion under a force costs less and is nearly alike."""
-        return self
 
     def describe(self) -> dict[str, Any]:
         """Return kind, name and parameters as plain data."""
@@ -176,6 +158,10 @@ class Element(Behaviour):
                 for label, p in zip(known, self.parameters, strict=True)
             )
         )
+
+    def tabulated(self) -> Element:
+        """Return this element, or a faster variant of it for very many evaluations."""
+        return self
 
     def dynamic_stiffness(
         self, amplitude: ArrayLike, omega: ArrayLike = 0.0, *, harmonic: int = 1
@@ -270,16 +256,16 @@ class Element(Behaviour):
             None if given is None else np.atleast_1d(motion(given, name, x, self))
             for given, name in ((velocity, "velocity"), (acceleration, "acceleration"))
         )
+        element = self
         if time is not None and x.size > 1:
             t = motion(time, "time", x, self)
             if np.any(np.diff(t) <= 0.0):
                 raise ValidationError("time does not rise from sample to sample")
             v = np.gradient(x, t) if v is None else v
             a = np.gradient(v, t) if a is None else a
-        own = self
-        if time is not None and x.size > 1 and is_even(t):
-            own = self.sampled(float(t[-1] - t[0]) / (x.size - 1))
-        force = own.force_history(values, np.atleast_1d(x), v, start, acceleration=a)
+            if is_even(t):
+                element = self.sampled(float(t[-1] - t[0]) / (x.size - 1))
+        force = element.force_history(values, np.atleast_1d(x), v, start, acceleration=a)
         return force if x.ndim else force[0]
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
@@ -288,13 +274,6 @@ class Element(Behaviour):
             raise ValidationError(
                 f"initial_force is {initial_force!r}, but {self!r} has no memory; leave it out"
             )
-
-    def with_bound(self, parameters: tuple[Parameter, ...]) -> Self:
-        """Return a copy of this element with other values, bounds or free flags."""
-        copy = object.__new__(type(self))
-        copy.__dict__.update(self.__dict__)
-        copy.parameters = parameters
-        return copy
 
     def __add__(self, other: Element) -> Model:
         """Put two elements, or sums of elements, in parallel."""
@@ -348,70 +327,46 @@ class Model(Element):
         self.is_linear = all(element.is_linear for element in flat)
         self.rate_independent = all(element.rate_independent for element in flat)
         self.has_memory = any(element.has_memory for element in flat)
-        names = [p.name for p in self.parameters]
-        if len(set(names)) < len(names):
-            clashes = [name for name, count in Counter(names).items() if count > 1]
+        clashes = [n for n, count in Counter(p.name for p in self.parameters).items() if count > 1]
+        if clashes:
             raise ModelError(
                 f"two elements share the parameter names {', '.join(clashes)}; "
                 "give each a name, such as Dahl(name='pivot')"
             )
-        self._slices: list[slice] = []
-        start = 0
-        for element in flat:
-            self._slices.append(slice(start, start + len(element.parameters)))
-            start += len(element.parameters)
+        ends = np.cumsum([0, *(len(element.parameters) for element in flat)]).tolist()
+        self._slices = [slice(a, b) for a, b in pairwise(ends)]
 
     @property
     def elements(self) -> tuple[Element, ...]:
         """The elements, in the order in which they were added."""
         return self._elements
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return the sum of the elements' F_k/X_1 at `values`, unchecked."""
-        parts = [
-            element.stiffness(values[s], amplitude, omega, harmonic)
-            for element, s in zip(self._elements, self._slices, strict=True)
-        ]
-        total = parts[0]
-        for part in parts[1:]:
-            total = total + part
-        return total
+    def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
+        """Yield every element with its own part of the model's parameter `values`."""
+        for element, s in zip(self._elements, self._slices, strict=True):
+            yield element, values[s]
 
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return the sum of the elements' F_k/X_1 with all derivatives, unchecked."""
-        parts = [
-            element.stiffness_gradient(values[s], amplitude, omega, harmonic)
-            for element, s in zip(self._elements, self._slices, strict=True)
-        ]
-        value, by_amplitude = parts[0].value, parts[0].by_amplitude
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return the sum of the elements' F_k/X_1 with its derivatives, unchecked."""
+        parts = [element.settled(own, sine, derivatives) for element, own in self.of(values)]
+        value, by_amplitude, _ = parts[0]
         for part in parts[1:]:
-            value = value + part.value
-            by_amplitude = by_amplitude + part.by_amplitude
+            value, by_amplitude = value + part.value, by_amplitude + part.by_amplitude
         return StiffnessGradient(
             value, by_amplitude, tuple(d for part in parts for d in part.by_parameter)
         )
 
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the sum of the elements' F/X and its derivative by amplitude, unchecked."""
-        pairs = [e.stiffness_slope(own, amplitude, omega) for e, own in self.of(values)]
-        value, slope = pairs[0]
-        for one, other in pairs[1:]:
-            value, slope = value + one, slope + other
-        return value, slope
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
+    ) -> HistoryGradient:
+        """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
+        parts = [
+            element.history(own, path, state if element.has_memory else 0.0, slopes=slopes)
+            for element, own in self.of(values)
+        ]
+        value = np.asarray(sum(part.value for part in parts))
+        by_state = np.asarray(sum(part.by_state for part in parts))
+        return HistoryGradient(value, by_state, tuple(d for p in parts for d in p.by_parameter))
 
     @property
     def has_inertia(self) -> bool:
@@ -422,26 +377,8 @@ class Model(Element):
         """Return the model for histories of one sampling interval, s."""
         return Model(*(element.sampled(interval) for element in self._elements))
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
-        total = np.zeros(np.shape(displacement))
-        for element, s in zip(self._elements, self._slices, strict=True):
-            start = state if element.has_memory else 0.0
-            total += element.force_history(
-                values[s], displacement, velocity, start, acceleration=acceleration
-            )
-        return total
-
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
-        remember = [e for e in self._elements if e.has_memory]
+        remember = [(e, own) for e, own in self.of(values) if e.has_memory]
         if not remember:
             super()._check_start(values, initial_force)
         if initial_force and len(remember) > 1:
@@ -449,42 +386,35 @@ class Model(Element):
                 f"initial_force is {initial_force!r} for {len(remember)} elements with memory; "
                 "evaluate them one by one, or leave it out"
             )
-        for element, s in zip(self._elements, self._slices, strict=True):
-            if element.has_memory:
-                element._check_start(values[s], initial_force)
+        for element, own in remember:
+            element._check_start(own, initial_force)
 
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the sums of the elements' bounds of abs(N) and A abs(N)."""
-        steepest, largest = np.zeros(()), np.zeros(())
-        for element, s in zip(self._elements, self._slices, strict=True):
-            own = element.force_bounds(values[s])
-            steepest, largest = steepest + own[0], largest + own[1]
+        bounds = [element.force_bounds(own) for element, own in self.of(values)]
+        steepest, largest = (np.asarray(sum(b[i] for b in bounds)) for i in (0, 1))
         return steepest, largest
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the lowest and highest knee of the elements; NaN where all are linear."""
         low, high = np.full((), np.nan), np.full((), np.nan)
-        for element, s in zip(self._elements, self._slices, strict=True):
-            own = element.knee(values[s])
-            low, high = np.fmin(low, own[0]), np.fmax(high, own[1])
+        for element, own in self.of(values):
+            first, last = element.knee(own)
+            low, high = np.fmin(low, first), np.fmax(high, last)
         return low, high
 
     def transient_decay(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+        self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return the decay of the element that forgets most slowly."""
-        slowest = np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
-        for element, s in zip(self._elements, self._slices, strict=True):
-            slowest = np.maximum(slowest, element.transient_decay(values[s], amplitude, omega))
+        slowest = super().transient_decay(values, amplitude, omega)
+        for element, own in self.of(values):
+            slowest = np.maximum(slowest, element.transient_decay(own, amplitude, omega))
         return slowest
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of all elements to their values."""
-        return tuple(
-            text
-            for element, s in zip(self._elements, self._slices, strict=True)
-            for text in element.physics(values[s])
-        )
+        return tuple(text for element, own in self.of(values) for text in element.physics(own))
 
     def tabulated(self) -> Model:
         """Return the model with tables in place of quadratures; itself where it needs none.
@@ -505,49 +435,41 @@ class Model(Element):
         same = all(new is old for new, old in zip(elements, self._elements, strict=True))
         return self if same else Model(*elements)
 
-    def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
-        """Yield every element with its own part of the model's parameter `values`."""
-        for element, s in zip(self._elements, self._slices, strict=True):
-            yield element, values[s]
-
     def with_parameters(self, changes: Mapping[str, Parameter]) -> Model:
         """Return this model with some parameters replaced, by name."""
-        self._check_names(changes)
+        self._known(changes)
         elements = []
         for element in self._elements:
             parameters = tuple(changes.get(p.name, p) for p in element.parameters)
-            if parameters == element.parameters:
-                elements.append(element)
-                continue
-            elements.append(element.with_bound(parameters))
+            same = parameters == element.parameters
+            elements.append(element if same else element.with_bound(parameters))
         return Model(*elements)
 
     def with_free(self, names: Iterable[str]) -> Model:
         """Return this model with the named parameters estimated, started from their values."""
-        known = {p.name: p for p in self.parameters}
         names = list(names)
-        self._check_names(names)
+        known = self._known(names)
         return self.with_parameters({name: known[name].freed() for name in names})
 
     def with_fixed(self, values: Mapping[str, float]) -> Model:
         """Return this model with the named parameters held at the given values."""
-        known = {p.name: p for p in self.parameters}
-        self._check_names(values)
+        known = self._known(values)
         return self.with_parameters({n: known[n].fixed(v) for n, v in values.items()})
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """Return this model with values put in, each parameter staying free or fixed as it was."""
-        known = {p.name: p for p in self.parameters}
-        self._check_names(values)
+        known = self._known(values)
         return self.with_parameters({n: replace(known[n], value=v) for n, v in values.items()})
 
-    def _check_names(self, names: Iterable[str]) -> None:
-        known = [p.name for p in self.parameters]
+    def _known(self, names: Iterable[str]) -> dict[str, Parameter]:
+        """Return the parameters by name; refuse names that are none."""
+        known = {p.name: p for p in self.parameters}
         unknown = [name for name in names if name not in known]
         if unknown:
             raise ModelError(
                 f"the model has no parameter {', '.join(unknown)}; it has {', '.join(known)}"
             )
+        return known
 
     def __repr__(self) -> str:
         return " + ".join(repr(element) for element in self._elements)

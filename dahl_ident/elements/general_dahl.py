@@ -44,7 +44,6 @@ within 1e-12 of beta_s that is their error.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -63,8 +62,8 @@ _NODES_PER_BLOCK = 8192
 """Nodes in work at once, so that the scratch arrays stay small and in the cache."""
 
 
-def describing_function(beta: FloatArray, alpha: FloatArray) -> ComplexArray:
-    """Return h = N/sigma (Eqns. 51 and 52, for any exponent).
+def stiffness(beta: FloatArray, alpha: FloatArray, k: int = 1) -> ComplexArray:
+    """Return h_k = N_k/sigma = c_k/beta (Eqns. 51 and 52, for any exponent); 0 for even k.
 
     Parameters
     ----------
@@ -72,90 +71,36 @@ def describing_function(beta: FloatArray, alpha: FloatArray) -> ComplexArray:
         sigma A / f_max >= 0; unchecked, broadcast with `alpha`.
     alpha : ndarray
         Exponent of Eqn. 2, > 0; unchecked.
-
-    Returns
-    -------
-    ndarray of complex
+    k : int, default 1
+        Harmonic.
 
     Examples
     --------
-    >>> describing_function(np.array([0.0, 1.0]), np.array(2.0)).round(6)
+    >>> stiffness(np.array([0.0, 1.0]), np.array(2.0)).round(6)
     array([1.      +0.j      , 0.544039+0.354193j])
     """
-    return _by_blocks(_stiffness, beta, alpha, 1)[0]
+    return _by_blocks(beta, alpha, k, derivatives=False)[0]
 
 
-def describing_function_gradient(
-    beta: FloatArray, alpha: FloatArray
+def stiffness_gradient(
+    beta: FloatArray, alpha: FloatArray, k: int = 1
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Return h = N/sigma and, over sigma, dN/d ln f_max, dN/d ln sigma and dN/d alpha.
+    """Return h_k and, over sigma, dN_k/d ln f_max, dN_k/d ln sigma and dN_k/d alpha.
 
-    These are h, ``-beta dh/dbeta``, ``h + beta dh/dbeta`` and ``dh/dalpha``; parameters as in
-    `describing_function`.
+    These are h, ``-beta dh/dbeta``, ``h + beta dh/dbeta`` and ``dh/dalpha``.
 
     Examples
     --------
-    >>> h, by_f_max, by_sigma, by_alpha = describing_function_gradient(np.array(1.0), np.array(2.0))
+    >>> h, by_f_max, by_sigma, by_alpha = stiffness_gradient(np.array(1.0), np.array(2.0))
     >>> bool(abs(by_f_max + by_sigma - h) < 1e-15)  # N is homogeneous in f_max, sigma at fixed A
     True
     """
-    h, by_ln_f_max, by_ln_sigma, by_alpha = _by_blocks(_stiffness_gradient, beta, alpha, 1)
+    h, by_ln_f_max, by_ln_sigma, by_alpha = _by_blocks(beta, alpha, k, derivatives=True)
     return h, by_ln_f_max, by_ln_sigma, by_alpha
-
-
-def harmonic(beta: FloatArray, alpha: FloatArray, k: int) -> ComplexArray:
-    """Return c_k = (a_k - j b_k)/f_max of Eqns. 13 and 14; exactly zero for even k.
-
-    Parameters
-    ----------
-    beta, alpha : ndarray
-        As in `describing_function`.
-    k : int
-        Harmonic, >= 1; c_1 is ``beta N/sigma``.
-
-    Returns
-    -------
-    ndarray of complex
-
-    Examples
-    --------
-    >>> print(f"{harmonic(np.array(1e6), np.array(2.0), 3).imag:.3f}")  # square wave: 4/(3 pi)
-    0.424
-    """
-    if k % 2 == 0:
-        return np.zeros(np.broadcast_shapes(beta.shape, alpha.shape), dtype=np.complex128)
-    return _by_blocks(_coefficient, beta, alpha, k)[0]
-
-
-def harmonic_gradient(
-    beta: FloatArray, alpha: FloatArray, k: int
-) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return c_k, ``beta dc_k/dbeta`` and ``dc_k/dalpha``; parameters as in `harmonic`.
-
-    Examples
-    --------
-    >>> c, by_ln_beta, by_alpha = harmonic_gradient(np.array([1.0, 2.0]), np.array(2.0), 3)
-    >>> by_alpha.shape
-    (2,)
-    """
-    if k % 2 == 0:
-        zero = harmonic(beta, alpha, k)
-        return zero, zero.copy(), zero.copy()
-    c, by_ln_beta, by_alpha = _by_blocks(_coefficient_gradient, beta, alpha, k)
-    return c, by_ln_beta, by_alpha
 
 
 def turning_force(beta: FloatArray, alpha: FloatArray) -> FloatArray:
     """Return f_0 = F/f_max at the displacement's maximum; tanh(beta) for alpha = 1 (Eqn. 8).
-
-    Parameters
-    ----------
-    beta, alpha : ndarray
-        As in `describing_function`.
-
-    Returns
-    -------
-    ndarray
 
     Examples
     --------
@@ -222,63 +167,55 @@ def quadrature_rule(k: int) -> Rule:
     )
 
 
-class _Branch:
-    """The falling half of steady loops: columns for the loops, arrays (loops, nodes)."""
+def _stiffness(
+    beta: FloatArray, alpha: FloatArray, k: int, *, derivatives: bool
+) -> tuple[ComplexArray, ...]:
+    """Return h_k of the falling half of loops, (loops, 1), and its derivatives if asked for."""
+    beta = np.maximum(beta, _LEAST_BETA)
+    p, path, length = _close_loop(beta, alpha)
+    log_z0 = np.log1p(np.tanh(length / 2.0))
+    line = np.exp(alpha * (log_z0 - length))  # C
+    rule = quadrature_rule(k)
+    reach = np.minimum(length, _DEEPEST)
+    depth = reach * rule.rise  # l
+    rest = (length - reach) + reach * rule.fall
+    scaled = p * path  # p E(L)
+    sin2 = -np.expm1(-p * depth) / scaled  # of theta/2, as cos2
+    slipped = 1.0 - 1.0 / np.maximum(scaled, 1.0)
+    cos2 = np.exp(-p * depth) * -np.expm1(-p * rest) / scaled + slipped
+    z = np.exp(log_z0 - depth)
+    curved = z * -np.expm1(-alpha * rest)
+    sin = 2.0 * np.sqrt(sin2 * cos2)
+    sin_k, cos_k = sin, 1.0 - 2.0 * sin2
+    if k > 1:
+        theta = 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
+        sin_k, cos_k = np.sin(k * theta), np.cos(k * theta)
+    scale = reach / np.pi
 
-    def __init__(self, beta: FloatArray, alpha: FloatArray, k: int) -> None:
-        self.k, self.alpha = k, alpha
-        self.beta = np.maximum(beta, _LEAST_BETA)
-        self.p, path, self.length = _close_loop(self.beta, alpha)
-        self.log_z0 = np.log1p(np.tanh(self.length / 2.0))
-        self.line = np.exp(alpha * (self.log_z0 - self.length))  # C
-        self.line_force = self.line * beta if k == 1 else np.zeros(beta.shape)
+    def integral(odd: FloatArray, even: FloatArray) -> ComplexArray:
+        """Return Int (odd + j even) dl/pi over beta; 0 where it underflows, as loops at rest do."""
+        total = odd @ rule.midpoint[:, None] + 1j * (even @ rule.fejer[:, None])
+        return np.asarray(scale * total / beta)
 
-        self.rule = quadrature_rule(k)
-        reach = np.minimum(self.length, _DEEPEST)
-        self.half = reach / 2.0
-        self.l = reach * self.rule.rise
-        rest = (self.length - reach) + reach * self.rule.fall
-        scaled = self.p * path  # p E(L)
-        self.sin2 = -np.expm1(-self.p * self.l) / scaled  # of theta/2, as cos2
-        slipped = 1.0 - 1.0 / np.maximum(scaled, 1.0)
-        cos2 = np.exp(-self.p * self.l) * -np.expm1(-self.p * rest) / scaled + slipped
-        self.z = np.exp(self.log_z0 - self.l)
-        self.curved = self.z * -np.expm1(-alpha * rest)
+    bent = integral(sin_k * curved, cos_k * curved) / k
+    spring: ComplexArray = np.asarray((line if k == 1 else 0.0 * line) + 0j)
+    if not derivatives:
+        return (spring + bent,)
 
-        self.sin = 2.0 * np.sqrt(self.sin2 * cos2)
-        self.sin_k, self.cos_k = self.sin, 1.0 - 2.0 * self.sin2
-        if k > 1:
-            theta = 2.0 * np.arctan2(np.sqrt(self.sin2), np.sqrt(cos2))
-            self.sin_k, self.cos_k = np.sin(k * theta), np.cos(k * theta)
+    def moved(shift: FloatArray) -> ComplexArray:
+        """Return (2/pi) Int exp(-j k theta) 2 shift/sin(theta) dl over beta."""
+        shift = shift / sin
+        return np.asarray(2.0 * np.conj(integral(cos_k * shift, sin_k * shift)))
 
-        decay = np.exp(-alpha * self.length)
-        self.turn = decay / (1.0 + decay)  # w
-
-    def coefficient(self) -> ComplexArray:
-        """Return c_k without C beta [k = 1]."""
-        real = (self.sin_k * self.curved) @ self.rule.midpoint[:, None]
-        imag = (self.cos_k * self.curved) @ self.rule.fejer[:, None]
-        return np.asarray(2.0 / (np.pi * self.k) * self.half * (real + 1j * imag))
-
-    def by_ln_beta(self) -> ComplexArray:
-        """Return beta dc_k/dbeta without C beta [k = 1]; Int exp(-j k theta) dtheta = -2j/k."""
-        tilt = self.line * self.beta * np.tanh(self.alpha * self.length / 2.0)
-        moved = self._moved((self.turn - self.sin2) * self.curved)
-        return np.asarray(moved + 4j / (np.pi * self.k) * tilt)
-
-    def by_alpha(self) -> ComplexArray:
-        """Return dc_k/dalpha."""
-        finite = np.where(np.isinf(self.length), 0.0, self.length)
-        whole = self.turn * (self.log_z0 + finite * _log_slope(self.p * finite))
-        here = self.sin2 * (self.log_z0 + self.l * _log_slope(self.p * self.l))
-        return self._moved((whole - here) * self.z)
-
-    def _moved(self, shift: FloatArray) -> ComplexArray:
-        """Return (2/pi) Int exp(-j k theta) 2 shift/sin(theta) dl."""
-        shift = shift / self.sin
-        real = (self.cos_k * shift) @ self.rule.midpoint[:, None]
-        imag = (self.sin_k * shift) @ self.rule.fejer[:, None]
-        return np.asarray(4.0 / np.pi * self.half * (real - 1j * imag))
+    decay = np.exp(-alpha * length)
+    turn = decay / (1.0 + decay)  # w
+    # of c_k without C beta; the integral of exp(-j k theta) dtheta is -2j/k
+    tilt = 4j / (np.pi * k) * (line * beta * np.tanh(alpha * length / 2.0) / beta)
+    by_ln_beta = moved((turn - sin2) * curved) + tilt
+    finite = np.where(np.isinf(length), 0.0, length)
+    whole = turn * (log_z0 + finite * _log_slope(p * finite))
+    by_alpha = moved((whole - sin2 * (log_z0 + depth * _log_slope(p * depth))) * z)
+    return spring + bent, bent - by_ln_beta, spring + by_ln_beta, by_alpha  # C cancels
 
 
 def _log_slope(u: FloatArray) -> FloatArray:
@@ -290,39 +227,17 @@ def _log_slope(u: FloatArray) -> FloatArray:
     return np.where(small, u / 12.0 * series - 0.5, 1.0 / np.expm1(large) - 1.0 / large)
 
 
-def _stiffness(branch: _Branch) -> tuple[ComplexArray, ...]:
-    return (branch.line + branch.coefficient() / branch.beta,)
-
-
-def _stiffness_gradient(branch: _Branch) -> tuple[ComplexArray, ...]:
-    curved, moved = branch.coefficient() / branch.beta, branch.by_ln_beta() / branch.beta
-    return (
-        branch.line + curved,
-        curved - moved,  # C cancels
-        branch.line + moved,
-        branch.by_alpha() / branch.beta,
-    )
-
-
-def _coefficient(branch: _Branch) -> tuple[ComplexArray, ...]:
-    return (branch.line_force + branch.coefficient(),)
-
-
-def _coefficient_gradient(branch: _Branch) -> tuple[ComplexArray, ...]:
-    line = branch.line_force
-    return line + branch.coefficient(), line + branch.by_ln_beta(), branch.by_alpha()
-
-
 def _by_blocks(
-    quantities: Callable[[_Branch], tuple[ComplexArray, ...]],
-    beta: FloatArray,
-    alpha: FloatArray,
-    k: int,
+    beta: FloatArray, alpha: FloatArray, k: int, *, derivatives: bool
 ) -> list[ComplexArray]:
-    """Return the `quantities` of all loops, a block of loops at a time."""
+    """Return what :func:`_stiffness` gives for all loops, a block of loops at a time."""
     beta, alpha = np.broadcast_arrays(beta, alpha)
+    if k % 2 == 0:
+        return [np.zeros(beta.shape, dtype=np.complex128) for _ in range(4)]
     b, a = beta.reshape(-1, 1), alpha.reshape(-1, 1)
     rows = max(1, _NODES_PER_BLOCK // quadrature_rule(k).rise.size)
-    starts = range(0, max(1, b.size), rows)
-    blocks = [quantities(_Branch(b[i : i + rows], a[i : i + rows], k)) for i in starts]
+    blocks = [
+        _stiffness(b[i : i + rows], a[i : i + rows], k, derivatives=derivatives)
+        for i in range(0, max(1, b.size), rows)
+    ]
     return [np.concatenate(pieces).reshape(beta.shape) for pieces in zip(*blocks, strict=True)]

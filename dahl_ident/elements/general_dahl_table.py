@@ -37,58 +37,41 @@ _BELOW, _ABOVE = 10_000, 20_000  # numbers of panels over ln |b| start here
 _VALUES_PER_BLOCK = 8192  # complex, 128 kB: their arrays stay in the processor's cache
 
 
-def describing_function(beta: FloatArray, alpha: FloatArray) -> ComplexArray:
-    """Return h = N/sigma; parameters as in :func:`general_dahl.describing_function`.
+def stiffness(
+    beta: FloatArray, alpha: FloatArray, *, slope: bool = False
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return h = N/sigma, and its derivative with respect to ln beta if asked for, else zeros.
+
+    The derivative errs by 1e-9 of ``1/(1 + beta)``. Parameters as in
+    :func:`general_dahl.stiffness`.
 
     Examples
     --------
-    >>> describing_function(np.array([1e-9, 1.0]), np.array(2.0)).round(6)
+    >>> stiffness(np.array([1e-9, 1.0]), np.array(2.0))[0].round(6)
     array([1.      +0.j      , 0.544039+0.354193j])
     """
-    return _from_tables(beta, alpha, slope=False)[0]
-
-
-def describing_function_slope(
-    beta: FloatArray, alpha: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return h, and its derivative with respect to ln beta, which errs by 1e-9 of ``1/(1 + beta)``.
-
-    Examples
-    --------
-    >>> h, slope = describing_function_slope(np.array([1.0]), np.array(1.0))
-    >>> slope.round(6)
-    array([-0.38193+0.131416j])
-    """
-    return _from_tables(beta, alpha, slope=True)
-
-
-def _from_tables(
-    beta: FloatArray, alpha: FloatArray, *, slope: bool
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return h, and its derivative with respect to ln beta where it is wanted, else zeros."""
     shape = np.broadcast_shapes(beta.shape, alpha.shape)
     pairs = np.broadcast_to(beta, shape).ravel()
     exponents, owner = np.unique(alpha, return_inverse=True)
     owner = np.broadcast_to(owner.reshape(alpha.shape), shape).ravel()
     strip = (np.searchsorted(_WALLS, exponents, side="right") - 1)[owner]
     result = np.zeros((2, pairs.size), dtype=np.complex128)
-    for index in np.unique(strip):
+    for index in np.unique(strip).tolist():
         chosen = np.flatnonzero(strip == index)
         for first in range(0, chosen.size, _VALUES_PER_BLOCK):
             part = chosen[first : first + _VALUES_PER_BLOCK]
-            own, which = np.unique(owner[part], return_inverse=True)
+            used, which = np.unique(owner[part], return_inverse=True)
             if 0 <= index < len(_WALLS) - 1:
-                found = _on_strip(int(index), pairs[part], exponents[own], which, slope=slope)
-                result[0, part], result[1, part] = found
+                result[0, part], result[1, part] = _on_strip(
+                    index, pairs[part], exponents[used], which, slope=slope
+                )
             elif slope:
-                direct = general_dahl.describing_function_gradient(
-                    pairs[part], exponents[own[which]]
+                h, by_ln_f_max, *_ = general_dahl.stiffness_gradient(
+                    pairs[part], exponents[used[which]]
                 )
-                result[0, part], result[1, part] = direct[0], direct[2] - direct[0]
+                result[0, part], result[1, part] = h, -by_ln_f_max
             else:
-                result[0, part] = general_dahl.describing_function(
-                    pairs[part], exponents[own[which]]
-                )
+                result[0, part] = general_dahl.stiffness(pairs[part], exponents[used[which]])
     return result[0].reshape(shape), result[1].reshape(shape)
 
 
@@ -113,20 +96,17 @@ def _on_strip(
     # the Chebyshev polynomials one after the other, never all of them at once
     before, now = np.ones(place.shape), place
     total = terms[0].take(which)
-    if not slope:
-        for term in terms[1:]:
-            total += now * term.take(which)
-            before, now = now, 2.0 * place * now - before
-        return total / (1.0 + beta), 0.0
-    rise = np.zeros_like(total)
-    rose, rises = np.zeros(place.shape), np.ones(place.shape)
+    rise, rose, rises = np.zeros_like(total), np.zeros(place.shape), np.ones(place.shape)
     for term in terms[1:]:
-        own = term.take(which)
-        total += now * own
-        rise += rises * own
-        rose, rises = rises, 2.0 * (now + place * rises) - rose
+        coefficient = term.take(which)
+        total += now * coefficient
+        if slope:
+            rise += rises * coefficient
+            rose, rises = rises, 2.0 * (now + place * rises) - rose
         before, now = now, 2.0 * place * now - before
     h = total / (1.0 + beta)
+    if not slope:
+        return h, 0.0
     return h, rise * stretch / (1.0 + beta) - h * (beta / (1.0 + beta))
 
 
@@ -176,7 +156,7 @@ def _series(strip: int, panel: int) -> ComplexArray:
     else:
         alpha = np.exp(over_alpha)
     beta = np.exp(b)
-    scaled = (1.0 + beta) * general_dahl.describing_function(beta, alpha)
+    scaled = (1.0 + beta) * general_dahl.stiffness(beta, alpha)
     return np.asarray(to_series @ scaled @ to_series.T)
 
 

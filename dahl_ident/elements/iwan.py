@@ -14,9 +14,9 @@ So N is that of a Jenkins element that slips at d_m, less
 
     P = (2 j/(pi k)) Int_0^t (A u/d_m)^g sin(theta) exp(-j k theta) dtheta,   u = sin^2(theta/2),
 
-times sigma/(1 + ratio), with t = pi or, where A > d_m, arccos(1 - 2 d_m/A). For k = 1 it is an
-incomplete beta function; other harmonics and the derivative by chi need Gauss points. In microslip
-P is a constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to the power chi + 3.
+times sigma/(1 + ratio), with t = pi or, where A > d_m, arccos(1 - 2 d_m/A), at Gauss points. In
+microslip P is a constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to the power
+chi + 3.
 """
 
 from __future__ import annotations
@@ -26,10 +26,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.special import beta, betainc
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import SOFTENED, StiffnessGradient
+from dahl_ident.elements.facts import SOFTENED, Sine, StiffnessGradient, Values
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
@@ -37,7 +36,6 @@ _SLIDERS = 30  # Jenkins elements in the place of the law where a force drives i
 _FEW_SLIDERS = 8  # 3e-3 of f_max, at a tenth of the cost: near enough for a search to begin with
 _REST = 1e-100  # m, below every amplitude allowed: d_m/A does not overflow
 _NARROWEST = 1e-6  # of the onset: near chi = -1 the stiffness is never all there
-_DEEP = 1e-8  # d_m/A below which the incomplete beta function is its series
 
 
 class Iwan(Masing):
@@ -120,7 +118,7 @@ class Iwan(Masing):
         """
         _, sigma, chi, ratio = values
         n = self._count
-        d = _onset_of(values)
+        d = _onset(values)
         places: list[Any] = [0.0]
         forces: list[Any] = [0.0]
         for share in (np.arange(1, n + 1) / n).tolist():
@@ -136,7 +134,7 @@ class Iwan(Masing):
         """d_m, m: the displacement at which macroslip begins."""
         return float(_onset(self.known_values()))
 
-    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
+    def backbone(self, values: Values, displacement: FloatArray) -> FloatArray:
         """Return sigma x (1 - (x/d_m)^g/((1 + ratio) (g + 1))), f_max beyond d_m."""
         f_max, sigma, chi, ratio = values
         d = _onset(values)
@@ -144,72 +142,39 @@ class Iwan(Masing):
         lost = (x / d) ** (chi + 1.0) / ((1.0 + ratio) * (chi + 2.0))
         return np.asarray(np.where(displacement < d, sigma * x * (1.0 - lost), f_max))
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1; `omega` does not matter."""
-        _, sigma, chi, ratio = values
-        A = np.asarray(amplitude, dtype=np.float64) + 0.0 * omega
-        m, g = _onset(values) / np.maximum(A, _REST), np.asarray(chi) + 1.0
-        if harmonic == 1:
-            lost = _lost_fundamental(m, g)
-        else:
-            lost = _lost(m, g, harmonic, derivative=False)[0]
-        return np.asarray(sigma * (jenkins(m, harmonic)[0] - lost / (1.0 + ratio)))
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
-        _, sigma, chi, ratio = values
-        A = np.maximum(np.asarray(amplitude, dtype=np.float64), _REST) + 0.0 * omega
-        m, g = _onset(values) / A, np.asarray(chi) + 1.0
-        (stick, by_m), lost = jenkins(m, 1), _lost_fundamental(m, g)
-        by_lnA = -(m * by_m * ratio + g * lost) / (1.0 + ratio)
-        return np.asarray(sigma * (stick - lost / (1.0 + ratio))), np.asarray(sigma * by_lnA / A)
-
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, exactly; one-sided at the onset of macroslip."""
         f_max, sigma, chi, ratio = (np.asarray(v, dtype=np.float64) for v in values)
-        A = np.maximum(np.asarray(amplitude, dtype=np.float64), _REST) + 0.0 * omega
-        g, d = chi + 1.0, _onset(values)
-        m = d / A
-        stick, by_m = jenkins(m, harmonic)
-        lost, lost_by_g = _lost(m, g, harmonic, derivative=True)
+        A = np.maximum(np.asarray(sine.amplitude, dtype=np.float64), _REST) + 0.0 * sine.omega
+        g, m = chi + 1.0, _onset(values) / A
+        stick, by_m = jenkins(m, sine.harmonic)
+        lost, lost_by_g = _lost(m, g, sine.harmonic, derivative=derivatives > 1)
         G = stick - lost / (1.0 + ratio)
         # by ln A at constant parameters: the ends of both integrals move alike
         by_lnA = -(m * by_m * ratio + g * lost) / (1.0 + ratio)
-        share = g / (g + 1.0)
-        lnA_by_ratio = 1.0 / (ratio + share) - 1.0 / (1.0 + ratio)  # of A/d_m
-        lnA_by_g = 1.0 / ((g + 1.0) ** 2 * (ratio + share))
-        by = (
-            -sigma * by_lnA / f_max,
-            G + by_lnA,
-            sigma * (by_lnA * lnA_by_g - lost_by_g / (1.0 + ratio)),
-            sigma * (by_lnA * lnA_by_ratio + lost / (1.0 + ratio) ** 2),
-        )
-        return StiffnessGradient(sigma * G, sigma * by_lnA / A, by)
+        by: tuple[ComplexArray, ...] = ()
+        if derivatives > 1:
+            share = g / (g + 1.0)
+            lnA_by_ratio = 1.0 / (ratio + share) - 1.0 / (1.0 + ratio)  # of A/d_m
+            lnA_by_g = 1.0 / ((g + 1.0) ** 2 * (ratio + share))
+            by = (
+                -sigma * by_lnA / f_max,
+                G + by_lnA,
+                sigma * (by_lnA * lnA_by_g - lost_by_g / (1.0 + ratio)),
+                sigma * (by_lnA * lnA_by_ratio + lost / (1.0 + ratio) ** 2),
+            )
+        return StiffnessGradient(np.asarray(sigma * G), sigma * by_lnA / A, by)
 
-    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
+    def rest_stiffness(self, values: Values) -> FloatArray:
         """Return sigma."""
         return np.asarray(values[1], dtype=np.float64)
 
-    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return f_max, for both directions."""
         top = np.asarray(values[0], dtype=np.float64)
         return top, top
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return where 1 % of the stiffness is gone, and the onset of macroslip."""
         d = _onset(values)
         softened = np.minimum(SOFTENED * (1.0 + np.asarray(values[3])), 1.0)
@@ -218,26 +183,10 @@ class Iwan(Masing):
         return d * np.maximum(share, _NARROWEST), d
 
 
-def _onset(values: Sequence[FloatArray]) -> FloatArray:
-    """Return d_m."""
-    return np.asarray(_onset_of(values))
-
-
-def _onset_of(values: Sequence[Any]) -> Any:
+def _onset(values: Sequence[Any]) -> Any:
+    """Return d_m, in plain arithmetic."""
     f_max, sigma, chi, ratio = values
     return f_max / sigma / (1.0 - 1.0 / ((1.0 + ratio) * (chi + 2.0)))
-
-
-def _lost_fundamental(m: FloatArray, g: FloatArray) -> ComplexArray:
-    """Return P of the fundamental at m = d_m/A."""
-    top = np.minimum(m, 1.0)
-    with np.errstate(under="ignore", over="ignore", invalid="ignore"):
-        rise = np.maximum(m, 1.0) ** -g
-        inside = beta(g + 1.5, 1.5) * betainc(g + 1.5, 1.5, top) * top**-g
-        near = top**1.5 * (1.0 / (g + 1.5) - 0.5 * top / (g + 2.5))
-    real = 8.0 / np.pi * rise * np.where(top < _DEEP, near, inside)
-    imag = 4.0 / np.pi * rise * top * (1.0 / (g + 1.0) - 2.0 * top / (g + 2.0))
-    return np.asarray(real + 1j * imag)
 
 
 @lru_cache(maxsize=64)

@@ -21,9 +21,9 @@ from dahl_ident.elements.parameter import UNITS, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
 if TYPE_CHECKING:
-    from dahl_ident.elements.behaviour import Mechanics
     from dahl_ident.elements.element import Element
-    from dahl_ident.elements.slope_law import SlopeLaw
+    from dahl_ident.elements.facts import Mechanics
+    from dahl_ident.elements.friction import Friction
 
 _TRIALS = 12  # sets of values
 _SPREAD = 0.5  # decades to either side, of values that are tried
@@ -100,7 +100,7 @@ def check_declarations(law: type[Element]) -> None:
             )
 
 
-def check_slope(law: SlopeLaw) -> None:
+def check_slope(law: Friction) -> None:
     """Refuse a law whose slope cannot be that of a friction law.
 
     Raises
@@ -123,7 +123,7 @@ def check_slope(law: SlopeLaw) -> None:
     done.add(declared)
 
 
-def scaling_the_force(law: SlopeLaw) -> tuple[str, ...]:
+def scaling_the_force(law: Friction) -> tuple[str, ...]:
     """Return the labels of parameters that scale the force together: those with a unit of force.
 
     None where their units do not agree with the law.
@@ -134,7 +134,7 @@ def scaling_the_force(law: SlopeLaw) -> tuple[str, ...]:
     return _SCALING[type(law)]
 
 
-def _agrees_with_units(law: SlopeLaw) -> bool:
+def _agrees_with_units(law: Friction) -> bool:
     """Return whether the slope is in proportion to a unit of force, and to parameters with it."""
     powers = [p.dimension[0] for p in law.parameters]
     if not set(powers) <= {0, 1}:
@@ -154,7 +154,7 @@ def _agrees_with_units(law: SlopeLaw) -> bool:
 class _Trial:
     """A law's slope at several sets of values, one a row."""
 
-    def __init__(self, law: SlopeLaw) -> None:
+    def __init__(self, law: Friction) -> None:
         self._law = law
         rng = np.random.default_rng(0)
         known = all(p.value is not None for p in law.parameters)
@@ -433,7 +433,7 @@ def traced(
     ModelError
         If the slope of a user's law fails with symbols, or is another one than with numbers.
     """
-    from dahl_ident.elements.slope_law import SlopeLaw
+    from dahl_ident.elements.friction import Friction
 
     if is_of_package(type(element)):
         return element.mechanics(values, x, v, s, states)
@@ -445,12 +445,12 @@ def traced(
         raise ModelError(
             f"{type(element).__name__} cannot be compiled: {_in_words(exc)}, and on symbols"
         ) from exc
-    if isinstance(element, SlopeLaw) and type(element).mechanics is SlopeLaw.mechanics:
+    if isinstance(element, Friction) and type(element).mechanics is Friction.mechanics:
         _compare(element, values, v, s, states[0])
     return part
 
 
-def _compare(law: SlopeLaw, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
+def _compare(law: Friction, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
     """Refuse a slope that is another one in symbols than in numbers."""
     import casadi as ca
 

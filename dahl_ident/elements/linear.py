@@ -9,8 +9,15 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import power_of_s
-from dahl_ident.elements.behaviour import HistoryGradient, Mechanics, StiffnessGradient
 from dahl_ident.elements.element import Element, motion
+from dahl_ident.elements.facts import (
+    HistoryGradient,
+    Mechanics,
+    Path,
+    Sine,
+    StiffnessGradient,
+    Values,
+)
 from dahl_ident.elements.parameter import Parameter
 
 
@@ -20,85 +27,36 @@ class Lumped(Element):
     order: ClassVar[int]
     is_linear = True
 
-    def _unit_stiffness(self, omega: FloatArray, harmonic: int) -> ComplexArray:
-        if harmonic != 1:
-            # a pure sine of displacement moves a linear element at its own frequency alone
-            return np.zeros(np.shape(omega), dtype=np.complex128)
-        return power_of_s(omega, self.order)
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return p (j omega)^n with its derivatives, unchecked; the amplitude does not matter.
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return p (j omega)^n, unchecked; the amplitude does not matter."""
-        return np.asarray(values[0] * self._unit_stiffness(omega, harmonic) + 0.0 * amplitude)
+        A pure sine of displacement moves a linear element at its own frequency alone.
+        """
+        unit: ComplexArray = np.zeros(np.shape(sine.omega), dtype=np.complex128)
+        if sine.harmonic == 1:
+            unit = power_of_s(sine.omega, self.order)
+        value = np.asarray(values[0] * unit + 0.0 * sine.amplitude)
+        if not derivatives:
+            return StiffnessGradient(value, unit, ())
+        by = (np.broadcast_to(unit, value.shape),) if derivatives > 1 else ()
+        return StiffnessGradient(value, np.zeros_like(value), by)
 
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return p (j omega)^n with its derivatives, unchecked."""
-        value = self.stiffness(values, amplitude, omega, harmonic)
-        unit = np.broadcast_to(self._unit_stiffness(omega, harmonic), value.shape)
-        return StiffnessGradient(value, np.zeros_like(value), (unit,))
-
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return p times the displacement, velocity or acceleration that the element answers."""
-        return np.asarray(values[0] * self._history(displacement, velocity, acceleration))
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force with its derivatives, exactly."""
-        history = self._history(displacement, velocity, acceleration)
+        """Return p times the displacement, velocity or acceleration, and its derivatives."""
+        name = Path._fields[self.order]
+        history = motion(path[self.order], name, path.displacement, self)
         force = np.asarray(values[0] * history)
         return HistoryGradient(force, np.zeros(force.shape), (history,))
 
-    def _history(
-        self,
-        displacement: FloatArray,
-        velocity: FloatArray | None,
-        acceleration: FloatArray | None,
-    ) -> FloatArray:
-        name, history = (
-            ("displacement", displacement),
-            ("velocity", velocity),
-            ("acceleration", acceleration),
-        )[self.order]
-        return motion(history, name, displacement, self)
-
     def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
         """Return p as inertia, or p times the displacement or velocity as force."""
         if self.order == 2:
             return Mechanics(values[0], 0.0)
-        return Mechanics(0.0, values[0] * (displacement, velocity)[self.order])
+        return Mechanics(0.0, values[0] * (x, velocity)[self.order])
 
     def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
         """Return p s^n over 1."""

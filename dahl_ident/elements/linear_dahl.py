@@ -85,21 +85,12 @@ _FOUR_BY_PI = 4.0 / math.pi  # the fundamental of a square wave
 
 
 def describing_function(beta: FloatArray) -> ComplexArray:
-    """Return h(beta) = N/sigma (module docstring), the universal curve of the linear Dahl model.
+    """Return h(beta) = N/sigma, the universal curve of the linear Dahl model.
 
-    Parameters
-    ----------
-    beta : ndarray of float, any shape
-        Normalised amplitudes `sigma A / f_max`, at least 0.
-
-    Returns
-    -------
-    ndarray of complex, the shape of `beta`
-        1 at `beta = 0`; real and imaginary part each within 1e-13 relative.
+    1 at ``beta = 0``; real and imaginary part each within 1e-13 relative, for any shape of beta.
 
     Examples
     --------
-    >>> import numpy as np
     >>> describing_function(np.array([0.0, 1.0])).round(6)
     array([1.      +0.j      , 0.732508+0.303548j])
     """
@@ -116,20 +107,11 @@ def describing_function_gradient(
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return h, -beta h' and h + beta h': N/sigma and its derivatives by ln f_max and ln sigma.
 
-    Parameters
-    ----------
-    beta : ndarray of float, any shape
-        Normalised amplitudes `sigma A / f_max`, at least 0.
-
-    Returns
-    -------
-    h, by_ln_f_max, by_ln_sigma : ndarray of complex, the shape of `beta`
-        Each part is computed without cancellation, so it is accurate by itself save near a
-        change of its sign.
+    Each part is computed without cancellation, so it is accurate by itself except near a change of
+    its sign.
 
     Examples
     --------
-    >>> import numpy as np
     >>> h, by_ln_f_max, by_ln_sigma = describing_function_gradient(np.array(1e6))
     >>> print(f"{by_ln_f_max:.6g} {by_ln_sigma:.6g}")
     2.39365e-09+1.27324e-06j -7.97884e-10+1.27324e-12j
@@ -236,22 +218,11 @@ def _polynomial(u: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
 def harmonic(beta: FloatArray, k: int) -> ComplexArray:
     """Return c_k = (a_k - j b_k)/f_max, the k-th Fourier coefficient of the steady loop.
 
-    Parameters
-    ----------
-    beta : ndarray of float, any shape
-        Normalised amplitudes `sigma A / f_max`, at least 0.
-    k : int
-        The harmonic, at least 1.
-
-    Returns
-    -------
-    ndarray of complex, the shape of `beta`
-        Exactly 0 for even `k`; `beta h(beta)` for `k = 1`; else within 1e-12 of the larger part
-        up to `k = 15` and 1e-9 at 101, with the derivatives of `harmonic_gradient`.
+    Exactly 0 for even `k`; ``beta h(beta)`` for ``k = 1``; else within 1e-12 of the larger part up
+    to ``k = 15`` and 1e-9 at 101, with the derivatives of :func:`harmonic_gradient`.
 
     Examples
     --------
-    >>> import numpy as np
     >>> harmonic(np.array([0.5, 50.0]), 3).round(6)
     array([0.004691-0.01893j , 0.206589+0.352012j])
     """
@@ -261,25 +232,8 @@ def harmonic(beta: FloatArray, k: int) -> ComplexArray:
 def harmonic_gradient(beta: FloatArray, k: int) -> tuple[ComplexArray, ComplexArray]:
     """Return c_k and beta dc_k/dbeta.
 
-    Parameters
-    ----------
-    beta : ndarray of float, any shape
-        Normalised amplitudes `sigma A / f_max`, at least 0.
-    k : int
-        The harmonic, at least 1.
-
-    Returns
-    -------
-    c_k, by_ln_beta : ndarray of complex, the shape of `beta`
-        As in `harmonic`; `a_k - j b_k = f_max c_k` changes with `ln sigma` by
-        `f_max by_ln_beta`, with `ln f_max` by `f_max (c_k - by_ln_beta)`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> c, by_ln_beta = harmonic_gradient(np.array([0.0, 50.0]), 3)
-    >>> by_ln_beta.round(6)
-    array([ 0.      +0.j     , -0.084862+0.06849j])
+    ``a_k - j b_k = f_max c_k`` changes with ln sigma by ``f_max by_ln_beta``, with ln f_max by
+    ``f_max (c_k - by_ln_beta)``.
     """
     if k == 1:
         h, _, by_ln_sigma = describing_function_gradient(beta)

@@ -9,35 +9,35 @@ where a spline of the receptance overshoots its peak; and only between its first
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
-from dahl_ident.elements.behaviour import (
+from dahl_ident.elements.element import Element, motion, prefixed
+from dahl_ident.elements.facts import (
     STENCIL,
     STEP,
     HistoryGradient,
     Mechanics,
+    Path,
+    Sine,
     StiffnessGradient,
+    Values,
 )
-from dahl_ident.elements.element import Element, motion, prefixed
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.elements.rational import Rational, StateSpace, typical_rate
+from dahl_ident.elements.rational import Rational, typical_rate
 from dahl_ident.elements.recursion import matrix_recursion
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.units import QUANTITIES, Quantity
 
 _VANISHES = 1e-12  # of its terms: a sum that is 0 but for rounding
 _UNSTABLE = 1e-9  # of the fastest pole: a real part above grows
-_NO_STEP = (
-    "{} is exactly 0, which gives its derivative no step; start it from a small number, or write "
-    "the function with an offset"
-)
 _FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
 
 
@@ -118,9 +118,7 @@ class LinearSystem(Element):
         self._labels = tuple(given)
         self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
         self._last: tuple[FloatArray, ComplexArray] | None = None
-        self._parts: (
-            tuple[tuple[float, ...], tuple[tuple[float, float, float], StateSpace]] | None
-        ) = None
+        self._known: tuple[tuple[float, ...], Equation] | None = None
         if not is_function:
             check_system(system, "system")
 
@@ -134,33 +132,30 @@ class LinearSystem(Element):
         """What the system's response is."""
         return self._quantity
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return Z(omega); the amplitude does not matter, and a sine answers no harmonic."""
-        Z = self._for_each_vector(values, omega, harmonic, self._curve, size=1)[0]
-        return np.asarray(Z + 0.0 * amplitude)
-
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return Z(omega) with its derivatives by the arguments of a callable system."""
-        rows = 1 + len(self._labels)
-        table = self._for_each_vector(values, omega, harmonic, self._curve_and_slopes, rows)
-        Z, *slopes = (row + 0.0 * amplitude for row in table)
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return Z(omega) with its derivatives; a sine answers no harmonic."""
+        rows = 1 + len(self._labels) if derivatives > 1 else 1
+        table = np.asarray(self._for_each_vector(values, sine, rows))
+        Z, *slopes = (row + 0.0 * sine.amplitude for row in table)
         return StiffnessGradient(Z, np.zeros_like(Z), tuple(slopes))
 
+    def equation_at(self, values: Sequence[Any]) -> Equation:
+        """Return the equation of motion at values of the parameters, what cancels left out."""
+        at = tuple(float(v) for v in values)
+        if self._known is None or self._known[0] != at:
+            control = importlib.import_module("control")
+            Z = Rational(*self.rational_stiffness(at)).without_common_zeros_at_0().trimmed()
+            lean = control.tf(Z.numerator, Z.denominator).minreal()
+            if lean.den[0][0].size < Z.denominator.size:
+                Z = Rational(lean.num[0][0], lean.den[0][0])
+            self.check_growth(Z)
+            rate = typical_rate(Z.denominator)
+            self._known = at, Equation(rate, Z.degrees[1], coefficients_of(Z, rate).tolist())
+        return self._known[1]
+
     @property
-    def _over_time(self) -> tuple[tuple[float, float, float], StateSpace]:
-        """Return stiffness, damping and mass, and the strictly proper rest of Z(s)."""
+    def _equation(self) -> Equation:
+        """The equation of motion of a fixed system."""
         free = [p.name for p in self.parameters if p.free]
         if free:
             raise ModelError(
@@ -168,68 +163,50 @@ class LinearSystem(Element):
                 "time; fix it, fit the motion, or build what is unknown from Mass, Damper and "
                 "Spring"
             )
-        return self._at_values(self.known_values())
+        return self.equation_at(self.known_values())
 
-    def _at_values(
-        self, values: Sequence[FloatArray | float]
-    ) -> tuple[tuple[float, float, float], StateSpace]:
-        at = tuple(float(v) for v in values)
-        if self._parts is None or self._parts[0] != at:
-            self._parts = at, self._split(at)
-        return self._parts[1]
-
-    def _split(self, values: tuple[float, ...]) -> tuple[tuple[float, float, float], StateSpace]:
-        control = importlib.import_module("control")
-        Z = Rational(*self.rational_stiffness(values)).without_common_zeros_at_0().trimmed()
-        lean = control.tf(Z.numerator, Z.denominator).minreal()
-        if lean.den[0][0].size < Z.denominator.size:
-            Z = Rational(lean.num[0][0], lean.den[0][0])
-        self._check_growth(Z)
-        polynomial, rest = Z.split()
-        k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
-        return (k, c, m), rest.state_space()
-
-    def _check_growth(self, Z: Rational) -> None:
+    def check_growth(self, Z: Rational) -> None:
         """Refuse a dynamic stiffness that grows faster than that of a mass."""
-        power = Z.numerator.size - Z.denominator.size
+        power = Z.degrees[0] - Z.degrees[1]
         if power > 2:
             raise ModelError(
                 f"the dynamic stiffness of {self!r} grows as s^{power}; an equation "
                 "of motion allows s^2, a mass: give the system at its point of drive"
             )
 
+    def stiffness_near(self) -> Rational:
+        """Return Z(s) at values near the parameters' own, so that no term vanishes by chance."""
+        shifts = np.random.default_rng(1).uniform(0.8, 1.2, len(self.parameters))
+        near = [
+            float(np.clip(shift * (1.0 if p.value is None else p.value), p.lower, p.upper))
+            for p, shift in zip(self.parameters, shifts, strict=True)
+        ]
+        Z = Rational(*self.rational_stiffness(near)).without_common_zeros_at_0().trimmed()
+        self.check_growth(Z)
+        return Z
+
+    @property
+    def _has_free(self) -> bool:
+        return any(p.free for p in self.parameters)
+
     @property
     def n_states(self) -> int:
         """Poles of the dynamic stiffness."""
-        equation = self._equation
-        return self._over_time[1].order if equation is None else equation.n_states
+        return self.stiffness_near().degrees[1] if self._has_free else self._equation.order
 
     @property
     def has_inertia(self) -> bool:
         """Whether Z(s) grows as s^2."""
-        equation = self._equation
-        return self._over_time[0][2] != 0.0 if equation is None else equation.has_inertia
-
-    @property
-    def _equation(self) -> LinearEquation | None:
-        return LinearEquation(self) if any(p.free for p in self.parameters) else None
+        if not self._has_free:
+            return bool(self._equation.coefficients[2] != 0.0)
+        above, below = self.stiffness_near().degrees
+        return above - below == 2
 
     def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
         """Return mass, the rest of the force, and the changes of the states, in metres."""
-        (k, c, m), rest = self._over_time
-        rates = [
-            b * displacement + sum(a * z for a, z in zip(row, states, strict=True) if a)
-            for row, b in zip(rest.A.tolist(), rest.B.tolist(), strict=True)
-        ]
-        force = sum(a * z for a, z in zip(rest.C.tolist(), states, strict=True))
-        return Mechanics(m, k * displacement + c * velocity + force, rates)
+        return self._equation.mechanics(x, velocity, states)
 
     def sampled(self, interval: float) -> Self:
         """Return this element for histories of one sampling interval, s."""
@@ -239,71 +216,38 @@ class LinearSystem(Element):
 
     def free_responses(self, samples: int) -> FloatArray:
         """Return the force from each state at the first sample, (n, states)."""
-        rest = self._over_time[1]
-        return np.asarray(
-            self._histories(rest, np.zeros((samples - 1, 6)), np.eye(rest.order)) @ rest.C
-        )
+        equation = self._equation
+        states = self._histories(equation, np.zeros((samples - 1, 6)), np.eye(equation.order))
+        return np.asarray(states @ equation.output)
 
-    def state_histories(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray,
-        acceleration: FloatArray,
-    ) -> Sequence[FloatArray]:
-        """Return the states along a displacement, from rest; zero where they would grow."""
-        rest = self._over_time[1]
-        if self._grows(rest):
-            return [np.zeros(displacement.shape)] * rest.order
-        paths = self._paths(displacement, velocity, acceleration)
-        return list(self._histories(rest, paths, np.zeros((rest.order, 1)))[:, 0].T)
-
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force, from rest; between samples the motion is a polynomial of degree 5."""
-        (k, c, m), rest = self._at_values(values)
-        v, a = np.zeros((2, *displacement.shape))
-        if c or m or rest.order:
-            v = motion(velocity, "velocity", displacement, self)
-        if m or rest.order:
-            a = motion(acceleration, "acceleration", displacement, self)
-        force = k * displacement + c * v + m * a
-        if not rest.order:
-            return np.asarray(force)
-        if self._grows(rest):
-            raise ModelError(
-                f"under a prescribed displacement the force of {self!r} grows beyond all bounds; "
-                "give records in which a force drives a mass"
-            )
-        states = self._histories(rest, self._paths(displacement, v, a), np.zeros((rest.order, 1)))
-        return np.asarray(force + states[:, 0] @ rest.C)
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force, which fixed parameters do not change."""
-        _ = self._over_time
-        force = self.force_history(values, displacement, velocity, acceleration=acceleration)
+        """Return the force, from rest; between samples the motion is a polynomial of degree 5.
+
+        Fixed parameters do not change it.
+        """
+        equation = self._equation if slopes else self.equation_at(values)
+        k, c, m = equation.coefficients[:3]
+        x = path.displacement
+        v = a = np.zeros(x.shape)
+        if c or m or equation.order:
+            v = motion(path.velocity, "velocity", x, self)
+        if m or equation.order:
+            a = motion(path.acceleration, "acceleration", x, self)
+        force = np.asarray(k * x + c * v + m * a)
+        if equation.order:
+            poles = np.linalg.eigvals(equation.matrix)
+            if np.any(poles.real > _UNSTABLE * np.abs(poles).max(initial=0.0)):
+                raise ModelError(
+                    f"under a prescribed displacement the force of {self!r} grows beyond all "
+                    "bounds; give records in which a force drives a mass"
+                )
+            rest = np.zeros((equation.order, 1))
+            states = self._histories(equation, self._paths(x, v, a), rest)
+            force = np.asarray(force + states[:, 0] @ equation.output)
         zero = np.zeros(force.shape)
         return HistoryGradient(force, zero, (zero,) * len(self.parameters))
-
-    @staticmethod
-    def _grows(rest: StateSpace) -> bool:
-        poles = np.linalg.eigvals(rest.A)
-        return bool(np.any(poles.real > _UNSTABLE * np.abs(poles).max(initial=0.0)))
 
     def _paths(self, x: FloatArray, v: FloatArray, a: FloatArray) -> FloatArray:
         """Return the coefficients of x in the share of each interval, (n - 1, 6)."""
@@ -321,13 +265,14 @@ class LinearSystem(Element):
             ]
         )  # fmt: skip
 
-    def _histories(self, rest: StateSpace, paths: FloatArray, first: FloatArray) -> FloatArray:
+    def _histories(self, equation: Equation, paths: FloatArray, first: FloatArray) -> FloatArray:
         """Return the states, (n, c, order), driven by polynomials from `first`, (order, c)."""
         from scipy.linalg import expm
 
-        order, h = rest.order, self._step
+        order, h = equation.order, self._step
         chain = np.zeros((order + 6, order + 6))
-        chain[:order, :order], chain[:order, order] = h * rest.A, h * rest.B
+        chain[:order, :order] = h * equation.matrix
+        chain[:1, order] = h * equation.rate
         chain[np.arange(order, order + 5), np.arange(order + 1, order + 6)] = 1.0
         whole = expm(chain)[:order]
         moved = paths @ (whole[:, order:] * [1.0, 1.0, 2.0, 6.0, 24.0, 120.0]).T
@@ -389,27 +334,22 @@ class LinearSystem(Element):
                 "real and imag, with numerator, denominator and dt, or with A, B, C, D and dt"
             ) from None
 
-    def _for_each_vector(
-        self,
-        values: Sequence[FloatArray],
-        omega: FloatArray,
-        harmonic: int,
-        work: Callable[[tuple[float, ...], FloatArray], ComplexArray],
-        size: int,
-    ) -> ComplexArray:
-        """Return what `work` gives for every parameter vector, shape (size, *broadcast)."""
+    def _for_each_vector(self, values: Values, sine: Sine, size: int) -> ComplexArray:
+        """Return Z for every parameter vector, and its slopes where `size` asks, (size, ...)."""
         batch = np.broadcast_shapes(*(np.shape(v) for v in values))
-        shape = np.broadcast_shapes(batch, np.shape(omega))
+        shape = np.broadcast_shapes(batch, np.shape(sine.omega))
         result = np.zeros((size, *shape), dtype=np.complex128)
-        if harmonic != 1:
+        if sine.harmonic != 1:
             return result
         vectors = np.stack([np.broadcast_to(v, batch).ravel() for v in (*values, np.zeros(batch))])
         which = np.broadcast_to(np.arange(vectors.shape[1]).reshape(batch), shape)
-        frequencies = np.broadcast_to(omega, shape)
+        frequencies = np.broadcast_to(sine.omega, shape)
         for i, vector in enumerate(vectors[:-1].T.tolist()):
-            finite = np.isfinite(vector).all()  # a search may try others
             rows = which == i
-            result[:, rows] = work(tuple(vector), frequencies[rows]) if finite else np.nan
+            result[:, rows] = np.nan
+            if np.isfinite(vector).all():  # a search may try others
+                work = self._curve if size == 1 else self._curve_and_slopes
+                result[:, rows] = work(tuple(vector), frequencies[rows])
         return result
 
     def system_at(self, values: Sequence[float]) -> Any:
@@ -420,18 +360,12 @@ class LinearSystem(Element):
         check_system(system, "system")
         return system
 
-    def polynomials(self, values: Sequence[float] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return numerator and denominator of the response, from the highest power of s down.
+    def rational_stiffness(
+        self, values: Sequence[float] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return numerator and denominator of Z(s), from the highest power of s down.
 
-        Parameters
-        ----------
-        values : sequence of float, optional
-            Of the parameters, in their order; left out, those that they have.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value, or the system is discrete or an FRD.
+        At the given `values` of the parameters, or those that they have.
         """
         control = importlib.import_module("control")
         if values is None:
@@ -451,14 +385,8 @@ class LinearSystem(Element):
             numerator = numerator[max(0, numerator.size - _degree(system) - 1) :]
             sizes = np.abs(numerator) * typical_rate(denominator) ** np.arange(numerator.size)[::-1]
             numerator = np.where(sizes > _VANISHES * sizes.max(), numerator, 0.0)
-        return numerator, denominator
-
-    def rational_stiffness(
-        self, values: Sequence[float] | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return numerator and denominator of Z(s), from the highest power of s down."""
         definition = DEFINITIONS[self.quantity]
-        above, below = self.polynomials(values)[:: definition.exponent]
+        above, below = (numerator, denominator)[:: definition.exponent]
         power = definition.power_in_stiffness
         return (
             np.append(above, np.zeros(max(power, 0))),
@@ -474,17 +402,8 @@ class LinearSystem(Element):
         return self._last[1]
 
     def _curve_and_slopes(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
-        rows = [self._curve(vector, omega)]
-        for i, (label, value) in enumerate(zip(self._labels, vector, strict=True)):
-            if value == 0.0:
-                raise ModelError(_NO_STEP.format(label))
-            step = STEP * value
-            terms = [
-                weight / step * self._curve(_moved(vector, i, place * step), omega)
-                for place, weight in STENCIL
-            ]
-            rows.append(np.sum(terms, axis=0))
-        return np.stack(rows)
+        slopes = differences(lambda at: self._curve(at, omega), vector, self._labels)
+        return np.stack([self._curve(vector, omega), *slopes])
 
     def __repr__(self) -> str:
         what = getattr(self._system, "__name__", type(self._system).__name__)
@@ -493,130 +412,59 @@ class LinearSystem(Element):
         return f"LinearSystem({self._quantity} of {what}{separator}{rest}"
 
 
-class LinearEquation(LinearSystem):
-    """The equation of motion of a linear system with free parameters, in its coefficients.
+class Equation(NamedTuple):
+    """Z(s) = k + c s + m s^2 + (b_1 p^(n-1) + ... + b_n)/(p^n + a_1 p^(n-1) + ... + a_n).
 
-    Z(s) = k + c s + m s^2 + (b_1 p^(n-1) + ... + b_n)/(p^n + a_1 p^(n-1) + ... + a_n), p = s/rate.
-    The coefficients are its parameters; :meth:`coefficients` gives them from those of the system.
+    Of p = s/rate.
 
-    Parameters
+    Attributes
     ----------
-    system : LinearSystem
-        With free parameters. Its degree is that at values near their starts, or near 1.
-
-    Raises
-    ------
-    ModelError
-        If it is not rational in s, or Z grows faster than s^2.
+    rate : float
+        rad/s: that of the poles, so that the coefficients are even.
+    order : int
+        n.
+    coefficients : sequence
+        k, c, m, a_1 to a_n, b_1 to b_n; numbers or symbols.
     """
 
-    def __init__(self, system: LinearSystem) -> None:
-        self.__dict__.update(system.__dict__)
-        self._origin = system
-        shifts = np.random.default_rng(1).uniform(0.8, 1.2, len(system.parameters))
-        near = [  # so that no term vanishes by chance
-            float(np.clip(shift * (1.0 if p.value is None else p.value), p.lower, p.upper))
-            for p, shift in zip(system.parameters, shifts, strict=True)
-        ]
-        Z = self._rational(near).trimmed()
-        self._check_growth(Z)
-        self._degrees = Z.numerator.size - 1, Z.denominator.size - 1
-        self._rate = typical_rate(Z.denominator)
-        self._has_mass = self._degrees[0] - self._degrees[1] == 2
-        n = self._degrees[1]
-        labels = ["k", "c", "m", *(f"a{i + 1}" for i in range(n)), *(f"b{i + 1}" for i in range(n))]
-        first = system.parameters[0].name
-        self.parameters = tuple(_parameter(f"{label} of {first}", None) for label in labels)
+    rate: float
+    order: int
+    coefficients: Sequence[Any]
 
-    @property
-    def n_states(self) -> int:
-        """Poles of the dynamic stiffness."""
-        return self._degrees[1]
-
-    @property
-    def has_inertia(self) -> bool:
-        """Whether Z(s) grows as s^2."""
-        return self._has_mass
-
-    def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
-    ) -> Mechanics:
+    def mechanics(self, x: Any, velocity: Any, states: Sequence[Any]) -> Mechanics:
         """Return mass, the rest of the force, and the changes of the states, in metres."""
-        n = self.n_states
-        k, c, m, *others = values
-        a, b = others[:n], others[n:]
-        inputs = [displacement, *states][:n]
-        if n:
-            inputs[0] = displacement - sum(x * z for x, z in zip(a, states, strict=True))
-        force = k * displacement + c * velocity
-        force = force + sum(x * z for x, z in zip(b, states, strict=True))
-        return Mechanics(m, force, [self._rate * x for x in inputs])
+        k, c, m, *others = self.coefficients
+        a, b = others[: self.order], others[self.order :]
+        inputs = [x, *states][: self.order]
+        if self.order:
+            inputs[0] = x - sum(p * z for p, z in zip(a, states, strict=True))
+        force = k * x + c * velocity + sum(p * z for p, z in zip(b, states, strict=True))
+        return Mechanics(m, force, [self.rate * z for z in inputs])
 
-    def coefficients(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the coefficients at values of the system's parameters, and their derivatives.
+    @property
+    def matrix(self) -> FloatArray:
+        """The states' own changes, (order, order), of an equation of numbers."""
+        matrix = np.diag(np.ones(max(self.order - 1, 0)), -1)[: self.order, : self.order]
+        matrix[:1] = -np.asarray(self.coefficients[3 : 3 + self.order])
+        return self.rate * matrix
 
-        Parameters
-        ----------
-        values : ndarray, shape (rows, P)
-
-        Returns
-        -------
-        coefficients : ndarray, shape (rows, Q)
-            NaN where the values are not finite, or the system has another degree there.
-        slopes : ndarray, shape (rows, Q, P)
-            By central differences.
-        """
-        vectors, which = np.unique(values, axis=0, return_inverse=True)
-        rows = np.array([self._with_slopes(vector) for vector in vectors.tolist()])
-        rows = rows[which.ravel()]
-        return rows[..., 0], rows[..., 1:]
-
-    def _with_slopes(self, vector: list[float]) -> FloatArray:
-        """Return coefficients and their derivatives with respect to each parameter, (Q, 1 + P)."""
-        columns = [self._at(vector)]
-        for i, (parameter, value) in enumerate(zip(self._origin.parameters, vector, strict=True)):
-            if value == 0.0:
-                raise ModelError(_NO_STEP.format(parameter.name))
-            step = STEP * value
-            terms = [
-                weight / step * self._at(_moved(tuple(vector), i, place * step))
-                for place, weight in STENCIL
-            ]
-            columns.append(np.sum(terms, axis=0))
-        return np.stack(columns, axis=-1)
-
-    def _at(self, vector: Sequence[float]) -> FloatArray:
-        """Return the coefficients at one vector of the system's parameters."""
-        above, below = self._degrees
-        unknown = np.full(3 + 2 * below, np.nan)
-        if not np.isfinite(vector).all():
-            return unknown
-        Z = self._rational(vector)
-        numerator, denominator = _of_degree(Z.numerator, above), _of_degree(Z.denominator, below)
-        if numerator is None or denominator is None or denominator[0] == 0.0:
-            return unknown
-        polynomial, rest = Rational(numerator, denominator).split()
-        k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
-        powers = self._rate ** np.arange(1, below + 1)
-        b = np.append(np.zeros(below - min(below, rest.numerator.size)), rest.numerator)
-        b = b[b.size - below :] / denominator[0]
-        return np.concatenate([[k, c, m], denominator[1:] / denominator[0] / powers, b / powers])
-
-    def _rational(self, vector: Sequence[float]) -> Rational:
-        return Rational(*self._origin.rational_stiffness(vector)).without_common_zeros_at_0()
+    @property
+    def output(self) -> FloatArray:
+        """The force of each state."""
+        return np.asarray(self.coefficients[3 + self.order :])
 
 
-def _of_degree(polynomial: FloatArray, degree: int) -> FloatArray | None:
-    """Return a polynomial of a degree; None where it has a higher one."""
-    size = degree + 1
-    if np.any(polynomial[: max(0, polynomial.size - size)]):
-        return None
-    return np.append(np.zeros(max(0, size - polynomial.size)), polynomial[-size:])
+def coefficients_of(Z: Rational, rate: float) -> FloatArray:
+    """Return the coefficients of :class:`Equation` of a function that grows no faster than s^2."""
+    n = Z.degrees[1]
+    polynomial, rest = Z.split()
+    k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
+    powers = rate ** np.arange(1, n + 1)
+    a, b = (
+        f[f.size - n :] / Z.denominator[0] / powers
+        for f in (Z.denominator, np.append(np.zeros(n), rest.numerator))
+    )
+    return np.concatenate([[k, c, m], a, b])
 
 
 def dynamic_stiffness(system: Any, quantity: Quantity, omega: FloatArray) -> ComplexArray:
@@ -713,5 +561,23 @@ def _parameter(name: str, given: float | Parameter | None) -> Parameter:
     return Parameter(name, "", "argument of a linear system", given)
 
 
-def _moved(vector: tuple[float, ...], index: int, by: float) -> tuple[float, ...]:
-    return (*vector[:index], vector[index] + by, *vector[index + 1 :])
+def differences(
+    function: Callable[[tuple[float, ...]], NDArray[Any]],
+    vector: Sequence[float],
+    labels: Sequence[str],
+) -> Iterator[NDArray[Any]]:
+    """Yield the derivative with respect to each of a vector's numbers, by central differences."""
+    for i, (label, value) in enumerate(zip(labels, vector, strict=True)):
+        if value == 0.0:
+            raise ModelError(
+                f"{label} is exactly 0, which gives its derivative no step; start it from a small "
+                "number, or write the function with an offset"
+            )
+        step = STEP * value
+        yield np.sum(
+            [
+                weight / step * function((*vector[:i], value + place * step, *vector[i + 1 :]))
+                for place, weight in STENCIL
+            ],
+            axis=0,
+        )

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.behaviour import Asymptote
 from dahl_ident.elements.element import motion
+from dahl_ident.elements.facts import Asymptote, HistoryGradient, Path, Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.recursion import linear_recursion
@@ -96,41 +96,37 @@ class LuGre(Friction):
         _, sigma, *_, micro_damping, viscous = values
         return force + (micro_damping / sigma * slope + viscous) * velocity
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
+    ) -> HistoryGradient:
         """Return the force at every sample; exact where the speed is constant between samples."""
-        v = motion(velocity, "velocity", displacement, self)
+        if slopes:
+            return self._differences(values, path, state)
+        v = motion(path.velocity, "velocity", path.displacement, self)
         f_max, sigma, ratio, speed, *_ = (float(p) for p in values)
-        step = np.diff(displacement)
+        step = np.diff(path.displacement)
         middle = 0.5 * (v[1:] + v[:-1])
         level = f_max * (1.0 + (ratio - 1.0) * np.exp(-((middle / speed) ** 2)))
         keep = np.exp(-sigma * np.abs(step) / level)
-        force = linear_recursion(
-            keep, (np.sign(step) * level * (1.0 - keep))[:, None], np.array([state])
-        )[:, 0]
-        slope = self.slope(force, np.sign(v), v, [np.asarray(p) for p in values])
-        return np.asarray(self.output(force, slope, v, values))
+        terms = np.sign(step) * level * (1.0 - keep)
+        force = linear_recursion(keep, terms[:, None], np.array([state]))[:, 0]
+        slope = self.slope(force, np.sign(v), v, values)
+        force = np.asarray(self.output(force, slope, v, values))
+        return HistoryGradient(force, force, ())
 
-    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the static force, for both directions."""
         top = np.asarray(values[0] * values[2])
         return top, top
 
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return infinity where there is damping, which grows with the frequency."""
         f_max, sigma, ratio, _, micro_damping, viscous = values
         damped = np.asarray(micro_damping + viscous) > 0.0
         steepest = np.where(damped, np.inf, 8.0 / np.pi * np.asarray(sigma))
         return steepest, np.where(damped, np.inf, 4.0 / np.pi * np.asarray(f_max * ratio))
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the Coulomb and the static force over the stiffness."""
         f_max, sigma, ratio, *_ = values
         return np.asarray(f_max / sigma), np.asarray(f_max * ratio / sigma)

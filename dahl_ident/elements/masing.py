@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import Behaviour, Mechanics, clipped
+from dahl_ident.elements.facts import HistoryGradient, Mechanics, Path, Values, clipped
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError
@@ -38,11 +38,10 @@ class Masing(Friction):
     """Parallel Jenkins elements, defined by the force of a first loading; see the module."""
 
     one_state = False
-    force_history_gradient = Behaviour.force_history_gradient
     unique_response = True
 
     @abstractmethod
-    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
+    def backbone(self, values: Values, displacement: FloatArray) -> FloatArray:
         """Return V(x), the force when first loaded from rest to x >= 0, N."""
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
@@ -64,12 +63,7 @@ class Masing(Friction):
         )
 
     def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
         """Return the springs' forces, and their changes: none for a spring that slips."""
         rates = [
@@ -89,44 +83,39 @@ class Masing(Friction):
             reached, sticking = d, sticking - k
         return [k * clipped(place, d) for k, d in zip(stiffnesses, slips, strict=True)]
 
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
+    ) -> HistoryGradient:
         """Return the force at every sample by Masing's rules, exactly, unchecked.
 
         The element comes from rest along the backbone curve to the force `state`.
         """
+        if slopes:
+            return self._differences(values, path, state)
         at = [np.asarray(v, dtype=np.float64) for v in values]
-        if displacement.size < 2:
-            return np.full(displacement.shape, state)
+        x = path.displacement
+        if x.size < 2:
+            return HistoryGradient(np.full(x.shape, state), np.ones(x.shape), ())
         start = np.sign(state) * self._loaded_to(at, abs(state))
-        u = displacement - displacement[0] + start
+        u = x - x[0] + start
         paths = _Paths(start)
-        cut = stretches(displacement)
-        ends = np.cumsum(cut.samples) - 1
+        cut = stretches(x)
         first = 0
-        for heading, last in zip(cut.heading.tolist(), ends.tolist(), strict=True):
+        for heading, last in zip(cut.heading.tolist(), np.cumsum(cut.samples) - 1, strict=True):
             stop = min(last + 1, u.size - 1)
             paths.follow(u[first + 1 : stop + 1], heading)
             first = stop
-        force = paths.force(lambda x: self.backbone(at, x))
-        return np.concatenate([[state], force])
+        force = np.append(state, paths.force(lambda x: self.backbone(at, x)))
+        return HistoryGradient(force, force, ())
 
-    def _loaded_to(self, values: Sequence[FloatArray], force: float) -> float:
+    def _loaded_to(self, values: Values, force: float) -> float:
         """Return where the backbone curve has a force, by bisection."""
-        if force == 0.0:
-            return 0.0
-        low, high = 0.0, force / float(self.rest_stiffness(values))
+        low = high = force / float(self.rest_stiffness(values))
+        farthest = 1e6 * high  # full slip, to rounding
         while float(self.backbone(values, np.asarray(high))) < force * (1.0 - 1e-15):
             low, high = high, 2.0 * high
-            if high > 1e6 * force / float(self.rest_stiffness(values)):
-                break  # full slip, to rounding
+            if high > farthest:
+                break
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             if not low < middle < high:
@@ -139,12 +128,12 @@ class Masing(Friction):
         """Return whether the harmonic is odd: both directions are alike."""
         return harmonic % 2 == 1
 
-    def force_limits(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the sum of all slip forces, for both directions."""
         top = self.backbone(values, np.asarray(2.0 * self.knee(values)[1]))
         return top, top
 
-    def force_bounds(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the stiffness at rest, and 4/pi of the force limit.
 
         A Jenkins element's abs(N) falls with the amplitude.
@@ -152,19 +141,17 @@ class Masing(Friction):
         return self.rest_stiffness(values), 4.0 / np.pi * self.force_limits(values)[0]
 
     def transient_decay(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
+        self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return 0: the first full swing erases the history."""
         return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
 
-    def steady_force(
-        self, values: Sequence[FloatArray], path: FloatArray, cycles: int
-    ) -> FloatArray:
+    def steady_force(self, values: Values, path: FloatArray, cycles: int) -> FloatArray:
         """Return the force along closed paths of displacement, (..., n), loaded from rest."""
         n = path.shape[-1]
         rows = path.reshape(-1, n)
-        found = [self.force_history(values, np.append(0.0, np.tile(x, 2)))[n + 1 :] for x in rows]
-        return np.reshape(found, path.shape)
+        loaded = [np.append(0.0, np.tile(x, 2)) for x in rows]
+        return np.reshape([self.force_history(values, x)[n + 1 :] for x in loaded], path.shape)
 
     def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
         at = [np.asarray(v, dtype=np.float64) for v in values]

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray, positive_array, whole_number
-from dahl_ident.elements.behaviour import StiffnessGradient
+from dahl_ident.arrays import FloatArray, positive_array, whole_number
 from dahl_ident.elements.element import Element, prefixed
+from dahl_ident.elements.facts import Sine, StiffnessGradient, Values
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
@@ -98,57 +98,35 @@ class MaxwellSlip(Masing):
         n = max(1, sum(str(label).startswith("slip_") for label in rest))
         return cls(n, name=name)._described(rest)
 
-    def backbone(self, values: Sequence[FloatArray], displacement: FloatArray) -> FloatArray:
+    def backbone(self, values: Values, displacement: FloatArray) -> FloatArray:
         """Return the sum of k_i min(x, d_i)."""
         stiffnesses, slips = self.sliders(values)
         forces = [k * np.minimum(displacement, d) for k, d in zip(stiffnesses, slips, strict=True)]
         return np.asarray(sum(forces))
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1 in closed form; `omega` does not matter."""
-        return self.stiffness_gradient(values, amplitude, omega, harmonic).value
-
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, exactly."""
-        shape = np.broadcast_shapes(*(np.shape(v) for v in (*values, amplitude, omega)))
-        A = np.asarray(amplitude, dtype=np.float64)
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives in closed form."""
+        A = np.asarray(sine.amplitude, dtype=np.float64)
+        shape = np.broadcast_shapes(*(np.shape(v) for v in (*values, A, sine.omega)))
         N = np.zeros(shape, dtype=np.complex128)
         by_A, by_k, by_d = np.zeros_like(N), [], []
         for k, d in zip(*self.sliders(values), strict=True):
             with np.errstate(divide="ignore", over="ignore"):
-                unit, by_ratio = jenkins(np.asarray(d) / A, harmonic)
-            safe = np.where(A > 0.0, A, 1.0)
-            slope = k * by_ratio / safe
+                unit, by_ratio = jenkins(np.asarray(d) / A, sine.harmonic)
             N += k * unit
-            by_A -= slope * (d / safe)
-            by_k.append(np.broadcast_to(unit, shape))
-            by_d.append(np.broadcast_to(slope, shape))
-        return StiffnessGradient(N, by_A, (*by_k, *by_d))
+            if derivatives:
+                safe = np.where(A > 0.0, A, 1.0)
+                slope = k * by_ratio / safe
+                by_A -= slope * (d / safe)
+                by_k.append(np.broadcast_to(unit, shape))
+                by_d.append(np.broadcast_to(slope, shape))
+        return StiffnessGradient(N, by_A, (*by_k, *by_d) if derivatives > 1 else ())
 
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
-        found = self.stiffness_gradient(values, amplitude, omega)
-        return found.value, found.by_amplitude
-
-    def rest_stiffness(self, values: Sequence[FloatArray]) -> FloatArray:
+    def rest_stiffness(self, values: Values) -> FloatArray:
         """Return the sum of all stiffnesses."""
         return np.asarray(sum(np.asarray(k) for k in self.sliders(values)[0]))
 
-    def knee(self, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the smallest and the largest slip displacement."""
         slips = np.array(np.broadcast_arrays(*self.sliders(values)[1]))
         return slips.min(axis=0), slips.max(axis=0)

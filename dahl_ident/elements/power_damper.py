@@ -19,14 +19,17 @@ from typing import Any
 import numpy as np
 from scipy.special import gamma, rgamma
 
-from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.behaviour import (
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.element import Element, motion
+from dahl_ident.elements.facts import (
     HistoryGradient,
     Mechanics,
+    Path,
+    Sine,
     StiffnessGradient,
+    Values,
     central_differences,
 )
-from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.parameter import Parameter
 
 _AT_REST = 1e-12  # square of the speed, over the reference speed, that counts as rest
@@ -93,97 +96,47 @@ class PowerDamper(Element):
         given = {"coefficient": coefficient, "exponent": exponent}
         self._bind({**given, "reference_speed": reference_speed}, name)
 
-    def stiffness(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> ComplexArray:
-        """Return F_k/X_1, unchecked; infinite at rest for an exponent below 1."""
-        c, p, speed = values
-        shape = np.broadcast_shapes(*(np.shape(v) for v in (*values, amplitude, omega)))
-        if harmonic % 2 == 0:
-            return np.zeros(shape, dtype=np.complex128)
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives, unchecked; infinite at rest for exponents below 1.
+
+        That with respect to the exponent is by differences of the share of the harmonic.
+        """
+        c, p, speed = (np.asarray(v, dtype=np.float64) for v in values)
+        A, omega = (np.asarray(v, dtype=np.float64) for v in sine[:2])
+        shape = np.broadcast_shapes(*(v.shape for v in (c, p, speed, A, omega)))
+        share = _share(p, sine.harmonic)
         with np.errstate(all="ignore"):
-            # A^(p - 1) on its own, so that p = 1 needs no amplitude
-            size = c * (omega / speed) ** p * np.asarray(amplitude, np.float64) ** (p - 1.0)
-            size = np.where(np.asarray(omega) > 0.0, size, 0.0)
-        return np.broadcast_to(1j * size * _share(p, harmonic), shape).copy()
+            # A^(p - 1) alone, so that p = 1 needs no amplitude
+            size = np.where(omega > 0.0, (omega / speed) ** p * A ** (p - 1.0), 0.0)
+            unit = np.broadcast_to(1j * size * share if sine.harmonic % 2 else 0j, shape).copy()
+            N = c * unit
+            by_amplitude = np.where(A > 0.0, (p - 1.0) * N / A, 0.0)
+            if derivatives < 2:
+                return StiffnessGradient(N, by_amplitude, ())
+            logarithm = np.log(A * omega / speed)
+            by_p = np.where(np.isfinite(logarithm), logarithm * N, 0.0)
+        if sine.harmonic % 2:
+            by_share = central_differences(lambda q: _share(q, sine.harmonic), [p], 0, p.shape)
+            by_p = by_p + 1j * np.where(np.isfinite(size), c * size * by_share, 0.0)
+        return StiffnessGradient(N, by_amplitude, (unit, by_p, -p / speed * N))
 
-    def stiffness_gradient(
-        self,
-        values: Sequence[FloatArray],
-        amplitude: FloatArray,
-        omega: FloatArray,
-        harmonic: int = 1,
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, unchecked."""
-        c, p, speed = (np.asarray(v) for v in values)
-        N = self.stiffness(values, amplitude, omega, harmonic)
-        with np.errstate(all="ignore"):
-            unit = self.stiffness((np.ones(()), p, speed), amplitude, omega, harmonic)
-            by_amplitude = np.where(amplitude > 0.0, (p - 1.0) * N / amplitude, 0.0)
-            logarithm = np.log(np.asarray(amplitude) * omega / speed)
-            steps = unit / _share(p, harmonic)
-        share = central_differences(lambda q: _share(q, harmonic), [p], 0, p.shape)
-        grow = np.where(np.isfinite(logarithm), logarithm * N, 0.0)
-        by_p = grow + c * np.where(np.isfinite(steps), steps, 0.0) * share
-        if not np.all(np.isfinite(steps)):  # a harmonic that vanishes at this exponent
-            fundamental = self.stiffness(values, amplitude, omega) / _share(p, 1)
-            by_p = np.where(np.isfinite(steps), by_p, fundamental * share)
-        return StiffnessGradient(
-            N, by_amplitude, (unit, np.asarray(by_p, np.complex128), -p / speed * N)
-        )
-
-    def stiffness_slope(
-        self, values: Sequence[FloatArray], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return F/X of the fundamental and its derivative with respect to amplitude, unchecked."""
-        N = self.stiffness(values, amplitude, omega)
-        with np.errstate(all="ignore"):
-            slope = np.where(amplitude > 0.0, (values[1] - 1.0) * N / amplitude, 0.0)
-        return N, np.asarray(slope, dtype=np.complex128)
-
-    def force_history(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force for the velocity at every sample, unchecked."""
-        c, p, speed = values
-        v = motion(velocity, "velocity", displacement, self) / speed
-        return np.asarray(c * np.sign(v) * np.abs(v) ** p)
-
-    def force_history_gradient(
-        self,
-        values: Sequence[FloatArray | float],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force with its derivatives, exactly."""
+        """Return the force for the velocity at every sample with its derivatives, unchecked."""
         c, p, speed = values
-        v = motion(velocity, "velocity", displacement, self) / speed
+        v = motion(path.velocity, "velocity", path.displacement, self) / speed
         unit = np.asarray(np.sign(v) * np.abs(v) ** p)
+        force = np.asarray(c * unit)
+        if not slopes:
+            return HistoryGradient(force, force, ())
         with np.errstate(divide="ignore"):
             logarithm = np.where(v == 0.0, 0.0, np.log(np.abs(v)))
-        by = (unit, c * unit * logarithm, -c * p / speed * unit)
-        return HistoryGradient(np.asarray(c * unit), np.zeros(unit.shape), by)
+        by = (unit, force * logarithm, -p / speed * force)
+        return HistoryGradient(force, np.zeros(unit.shape), by)
 
     def mechanics(
-        self,
-        values: Sequence[Any],
-        displacement: Any,
-        velocity: Any,
-        direction: Any,
-        states: Sequence[Any],
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
         """Return the force; within 1e-6 of the reference speed from rest it is smooth."""
         c, p, speed = values

@@ -10,7 +10,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.elements.behaviour import Behaviour, HistoryGradient
+from dahl_ident.elements.behaviour import Behaviour
+from dahl_ident.elements.facts import HistoryGradient
 
 if TYPE_CHECKING:
     from dahl_ident.problem.record_problem import RecordProblem

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.facts import Sine
 
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
@@ -70,7 +71,7 @@ class Nonlinear:
         slope = np.zeros(amplitude.shape, dtype=np.complex128)
         (omega,) = _rows((self.omega,), vector)
         for element, values in zip(self.elements, self.values, strict=True):
-            N, by_amplitude = element.stiffness_slope(_rows(values, vector), amplitude, omega)
+            N, by_amplitude, _ = element.settled(_rows(values, vector), Sine(amplitude, omega), 1)
             force += amplitude * N
             slope += amplitude * (N + amplitude * by_amplitude)
         return force, slope

@@ -1,0 +1,203 @@
+"""What elements answer with: a stiffness or force with derivatives, limits, products of powers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.arrays import ComplexArray, FloatArray
+
+if TYPE_CHECKING:
+    from dahl_ident.elements.element import Element
+
+Values = Sequence[FloatArray]
+"""Of an element's parameters, in their order."""
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+STEP = 1e-3  # relative: truncation, its fourth power, and rounding are then both below 1e-12
+STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
+"""Central difference of fourth order: places and weights."""
+
+SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee: seen in data of 1 % noise
+
+
+def clipped(value: Any, limit: Any) -> Any:
+    """Return a value between -limit and limit, in arithmetic that symbols have too."""
+    return 0.5 * (np.fabs(value + limit) - np.fabs(value - limit))
+
+
+class Sine(NamedTuple):
+    """A sine of displacement, and the harmonic of the force that is asked for; arrays broadcast.
+
+    Attributes
+    ----------
+    amplitude : ndarray
+        A, m.
+    omega : ndarray
+        rad/s; 0 for a law that does not depend on the rate.
+    harmonic : int
+        1: the fundamental; 0: the mean force over the amplitude.
+    """
+
+    amplitude: FloatArray
+    omega: FloatArray
+    harmonic: int = 1
+
+
+class Path(NamedTuple):
+    """A history of displacement, with velocity and acceleration where they are known."""
+
+    displacement: FloatArray
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
+
+
+class StiffnessGradient(NamedTuple):
+    """A dynamic stiffness with its first derivatives; all of one broadcast shape.
+
+    Attributes
+    ----------
+    value : ndarray of complex
+        Z(A, omega), N/m (N m/rad in rotation).
+    by_amplitude : ndarray of complex
+        dZ/dA.
+    by_parameter : tuple of ndarray of complex
+        dZ/dp for each parameter p of the element, in the order of its `parameters`; empty where
+        they are not asked for, and 0 for a fixed one where it would cost something.
+    """
+
+    value: ComplexArray
+    by_amplitude: ComplexArray
+    by_parameter: tuple[ComplexArray, ...]
+
+
+class HistoryGradient(NamedTuple):
+    """A force over time with its first derivatives; all of one shape.
+
+    Attributes
+    ----------
+    value : ndarray
+        Force, N.
+    by_state : ndarray
+        Derivative with respect to the force at the first sample; zero without memory.
+    by_parameter : tuple of ndarray
+        Derivative with respect to each parameter of the element, in the order of its `parameters`.
+    """
+
+    value: FloatArray
+    by_state: FloatArray
+    by_parameter: tuple[FloatArray, ...]
+
+
+class Mechanics(NamedTuple):
+    """An element's part in an equation of motion: numbers, arrays or casadi symbols.
+
+    Attributes
+    ----------
+    inertia
+        What multiplies the acceleration, kg.
+    force
+        The rest of the force, N.
+    rates
+        Changes over time of the element's states, one each.
+    """
+
+    inertia: Any
+    force: Any
+    rates: Sequence[Any] = ()
+
+
+@dataclass(frozen=True)
+class Asymptote:
+    """A limit of an element in which some parameters run away and fewer numbers remain.
+
+    Parameters
+    ----------
+    name : str
+        Such as "gross_slip".
+    meaning : str
+        What the element is in this limit, a few words.
+    pinned : mapping of str to float
+        Values, by label, so far out that the element is its limit.
+    follows : (str, str, float) or None
+        ``label = factor * other``: a parameter that stays at a fixed ratio to another one.
+    runs_away : mapping of str to float
+        The parameters that the data no longer determine and where they go, 0 or inf.
+    kept : tuple of (str, mapping of str to float)
+        Combinations that stay determined: expression, and the power of each label in it.
+    adds_to_spring : str or None
+        A label whose value shows only in the sum with the stiffness of a free spring in parallel;
+        the limit exists only with such a spring.
+    """
+
+    name: str
+    meaning: str
+    pinned: Mapping[str, float]
+    follows: tuple[str, str, float] | None
+    runs_away: Mapping[str, float]
+    kept: tuple[tuple[str, Mapping[str, float]], ...] = ()
+    adds_to_spring: str | None = None
+
+
+class Combination(NamedTuple):
+    """A product of powers of parameters that data may determine where single ones are lost."""
+
+    expression: str
+    powers: Mapping[str, float]
+    meaning: str
+
+
+class UniversalCurve(NamedTuple):
+    """N over a stiffness as a function of beta alone, whatever the scale parameters.
+
+    Parameters
+    ----------
+    stiffness : float
+        What N is divided by, N/m.
+    response : callable
+        h(beta), for an array of beta.
+    """
+
+    stiffness: float
+    response: Callable[[FloatArray], ComplexArray]
+
+
+class Alternative(NamedTuple):
+    """Elements in place of one.
+
+    Attributes
+    ----------
+    elements : tuple of Element
+        In parallel.
+    shows : {"shape", "asymmetry", "speed", "masing"}
+        What of the data speaks for them: how force depends on amplitude and the odd harmonics;
+        the mean force and the even harmonics; a force that falls with the speed; or parallel
+        Jenkins elements that would leave much less.
+    """
+
+    elements: tuple[Element, ...]
+    shows: str = "shape"
+
+
+def central_differences(
+    function: Callable[..., NDArray[Scalar]],
+    arguments: Sequence[FloatArray],
+    index: int,
+    shape: tuple[int, ...],
+) -> NDArray[Scalar]:
+    """Return the derivative of a function of arrays by one of them, to fourth order."""
+    size = np.asarray(arguments[index], dtype=np.float64)
+    step = STEP * np.where(size == 0.0, 1.0, np.abs(size))
+    places = [place for place, _ in STENCIL]
+    ndim = len(shape)
+    stacked = size.reshape((1,) * (ndim - size.ndim) + size.shape)
+    by = np.asarray(places).reshape((-1,) + (1,) * ndim) * step.reshape(stacked.shape)
+    moved = [*arguments[:index], stacked + by, *arguments[index + 1 :]]
+    values = np.broadcast_to(function(*moved), (len(places), *shape))
+    weights = np.asarray([weight for _, weight in STENCIL])
+    return np.asarray(np.tensordot(weights, values, axes=1) / step)
