@@ -27,9 +27,11 @@ def assert_found(case: Case) -> None:
             assert u < 0.3 * abs(value), (parameter.name, found.value, u)
 
 
-@pytest.mark.parametrize(("sigma", "samples"), [(300.0, 512), (30000.0, 320)])
-def test_friction_faster_than_the_sampling(sigma: float, samples: int) -> None:
-    assert_found(cold.fast(sigma, 0, samples))
+@pytest.mark.parametrize(
+    ("sigma", "seed", "samples"), [(300.0, 0, 512), (30000.0, 0, 320), (30000.0, 3, 768)]
+)
+def test_friction_faster_than_the_sampling(sigma: float, seed: int, samples: int) -> None:
+    assert_found(cold.fast(sigma, seed, samples))
 
 
 @pytest.mark.parametrize(("gap", "seed"), [(0.5, 0), (2.0, 1), (6.0, 2)])

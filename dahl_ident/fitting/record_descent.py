@@ -63,14 +63,16 @@ class Descent:
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
         else:
+            bounds = problem.start_bounds(problem.to_values(begin[0]))
             end = minimise(
                 lambda at, _which: problem.quadratic(at, self.scale, self.rho),
-                begin,
+                np.clip(begin, *bounds),
                 problem.space.relative,
                 problem.n_residuals,
                 tolerance_factor=LOOSE,
                 enough=enough,
                 steps=most,
+                bounds=bounds,
             )
         self.evaluations += int(end.evaluations[0])
         return end

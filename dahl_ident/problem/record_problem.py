@@ -20,7 +20,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
-from dahl_ident.elements import Element, Parameter
+from dahl_ident.elements import Element, Friction, Parameter
 from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
@@ -123,7 +123,7 @@ class RecordProblem(BaseProblem):
         self.free = [p for p in self.model.parameters if p.free]
         if not self.free:
             raise ModelError(f"nothing is free in {self.model!r}; leave a parameter out")
-        self.with_memory = [e for e in self.model.elements if e.has_memory]
+        self.with_memory = [e for e in self.model.elements if isinstance(e, Friction)]
         if len({record.motion for record in self.records}) > 1:
             raise DataError("some records are of translation and some of rotation; fit them apart")
         integrated = self.output == "motion" or not self.model.rate_independent
@@ -445,6 +445,27 @@ class RecordProblem(BaseProblem):
         """Return search coordinates; values that have vanished are as small as numbers can be."""
         array = np.asarray(values, dtype=np.float64)
         return self.space.to_search(np.where(self.space.positive & (array == 0.0), _LEAST, array))
+
+    def start_bounds(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return between which search coordinates friction at the first sample may lie.
+
+        These are the forces of full slip at the values. Beyond them friction falls back within a
+        small part of x_c, so that the motion hardly tells how far beyond it began.
+        """
+        low, high = np.full((2, values.size), np.inf) * [[-1.0], [1.0]]
+        of_model = zip(self.model.parameters, self.full_values(values), strict=True)
+        by_name = {p.name: np.asarray(value) for p, value in of_model}
+        for element in self.with_memory:
+            name, unit, _ = element.start
+            if unit != "N":
+                continue
+            limits = element.force_limits([by_name[p.name] for p in element.parameters])
+            up, down = (float(force) for force in limits)
+            prefix = f"{element.name}_" if element.name else ""
+            for i, known in enumerate(self.names):
+                if known == f"{prefix}{name}" or known.startswith(f"{prefix}{name}_"):
+                    low[i], high[i] = -down, up
+        return low, high
 
     def full_values(self, values: FloatArray) -> list[float]:
         """Return the value of every parameter of the model, fixed ones included."""
