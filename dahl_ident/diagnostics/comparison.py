@@ -336,7 +336,7 @@ def _change(value: float, before: float) -> str:
         ratio = round(float(np.float64(value) / before - 1.0), _PLACES)
     if abs(ratio) > _RUNAWAY:
         return "far more"
-    return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(ratio)}"
+    return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(abs(ratio))}"
 
 
 def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> ModelComparison:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 from scipy.linalg import solve_toeplitz, toeplitz
 
 from dahl_ident.arrays import FloatArray
@@ -195,6 +195,8 @@ def correlated(waves: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return R times waves, (n, k), R the matrix of these autocovariances."""
     if covariance.size == 1:
         return waves * covariance
+    from scipy.signal import oaconvolve  # slow to import, and for records alone
+
     kernel = np.concatenate([covariance[:0:-1], covariance])[:, None]
-    full = signal.oaconvolve(waves, kernel, axes=0)
+    full = oaconvolve(waves, kernel, axes=0)
     return np.asarray(full[covariance.size - 1 : covariance.size - 1 + len(waves)])

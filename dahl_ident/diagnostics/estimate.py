@@ -86,7 +86,9 @@ class Basis:
 
         One that no coordinate changes is infinite in the limit, unless nothing changes it at all.
         """
-        scaled = slopes @ self.slopes * self.size
+        # directions alone count, and slopes may be as large as numbers can be
+        largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=np.finfo(np.float64).tiny)
+        scaled = (slopes / largest) @ self.slopes * self.size
         left = scaled - (scaled @ self.directions) @ self.directions.T
         whole = np.linalg.norm(scaled, axis=-1)
         known = np.linalg.norm(left, axis=-1) <= _OUTSIDE * whole

@@ -372,8 +372,10 @@ class Dahl(Friction):
         gap = min(0.3 * f_max / sigma, smallest)
         behind = self.started(values)
         found["gap"] = Alternative((Backlash(behind).started((*values, gap)),))
-        found["Bouc-Wen"] = Alternative(
-            (BoucWen(name=name).started((sigma, sigma / f_max, sigma / f_max)),)
+        rates = sigma, sigma / f_max, sigma / f_max
+        found["Bouc-Wen"] = Alternative((BoucWen(name=name).started(rates),))
+        found["Bouc-Wen, exponent free"] = Alternative(
+            (BoucWen(exponent=None, name=name).started((*rates, 1.0)),)
         )
         found["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
         found["LuGre"] = Alternative((LuGre(name=name),), "speed")
