@@ -333,7 +333,7 @@ def test_stored_and_read_again(tmp_path: Path) -> None:
         n: str(p) for n, p in fit.params.items()
     }
     assert again.verdict == fit.verdict
-    with pytest.raises(DataError, match="holds no fit"):
+    with pytest.raises(DataError, match="a saved fit"):
         RecordFit.from_json("{}")
     edited = json.loads(fit.to_json())
     edited["optimum"]["values"][0] *= 1.01

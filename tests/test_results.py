@@ -381,7 +381,7 @@ class TestStorage:
 
     def test_is_strict_json_with_a_schema(self, microslip: FitResult) -> None:
         content = json.loads(microslip.to_json(), parse_constant=lambda name: pytest.fail(name))
-        assert (content["schema"], content["schema_version"]) == ("dahl_ident.fit_result", 3)
+        assert (content["schema"], content["schema_version"]) == ("dahl_ident.fit_result", 4)
         assert content["model"][0] == {
             "kind": "dahl",
             "f_max": "free",
@@ -395,8 +395,8 @@ class TestStorage:
             FitResult.from_json("{")
         with pytest.raises(DataError, match="has the schema None"):
             FitResult.from_json("[]")
-        with pytest.raises(DataError, match="schema version 4; this version of dahl_ident reads 3"):
-            FitResult.from_json(json.dumps({**content, "schema_version": 4}))
+        with pytest.raises(DataError, match="schema version 5; this version of dahl_ident reads 4"):
+            FitResult.from_json(json.dumps({**content, "schema_version": 5}))
         del content["optimum"]["theta"]
         facts = {k: v for k, v in content.items() if k != "digest"}
         text = json.dumps(facts, sort_keys=True, separators=(",", ":"))

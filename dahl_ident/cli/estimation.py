@@ -13,7 +13,6 @@ from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD, refuse
 from dahl_ident.cli.files import written
 from dahl_ident.cli.options import Writing, one_of
-from dahl_ident.errors import DataError
 
 if TYPE_CHECKING:
     from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
@@ -65,14 +64,11 @@ def is_saved(file: str) -> bool:
 def saved_fit(file: str) -> FitResult | RecordFit:
     """Return the fit of a table or of records that a file holds."""
     from dahl_ident.results import FitResult, RecordFit
-    from dahl_ident.results.record_fit import SCHEMA
+    from dahl_ident.results.fit_storage import load
 
-    try:
-        return FitResult.load(file)
-    except DataError as exc:
-        if repr(SCHEMA) not in str(exc):
-            raise
-        return RecordFit.load(file)
+    optimum, first_order = load(file)
+    kind = FitResult if optimum.problem.settled else RecordFit
+    return kind(optimum, first_order=first_order)
 
 
 def check_reports(*places: str | None) -> None:

@@ -7,7 +7,8 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError, choices
 from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.results import fit_storage
 from dahl_ident.results.result import Parameters, Result, part
 
 if TYPE_CHECKING:
@@ -40,6 +42,7 @@ class Fit(Result):
     """An optimum, its intervals and its uncertainty budget."""
 
     _called = "a fit"
+    _schema: ClassVar[str | None] = None
 
     def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
         self.optimum = optimum  #: The solver's plain result.
@@ -278,6 +281,41 @@ class Fit(Result):
     @abstractmethod
     def fit_report(self) -> str:
         """Return the report as text, the verdict first."""
+
+    # Storage
+
+    def to_json(self) -> str:
+        """Return the fit as JSON: table or records, model, noise, sensors and optimum."""
+        return fit_storage.to_json(self.optimum, self.first_order)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Return the fit that :meth:`to_json` wrote.
+
+        Raises
+        ------
+        DataError
+            If the text holds no such fit, one of another version's schema, or was changed.
+        ModelError
+            If a law of the model is not known here.
+        """
+        optimum, first_order = fit_storage.from_json(text, cls._schema)
+        return cls(optimum, first_order=first_order)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Return the fit that :meth:`save` wrote.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read, holds no such fit, one of another version's schema, or was
+            changed.
+        ModelError
+            If a law of the model is not known here.
+        """
+        optimum, first_order = fit_storage.load(path, cls._schema)
+        return cls(optimum, first_order=first_order)
 
     def __str__(self) -> str:
         return self.fit_report()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -40,8 +39,9 @@ from dahl_ident.errors import DahlIdentError, FitError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum, propagated
 from dahl_ident.problem import Problem
-from dahl_ident.results import fit_report, fit_storage
+from dahl_ident.results import fit_report
 from dahl_ident.results.fit_base import Fit
+from dahl_ident.results.fit_storage import TABLE
 from dahl_ident.results.result import Parameters, part
 from dahl_ident.units import Quantity
 
@@ -64,6 +64,7 @@ class FitResult(Fit):
     (True, 0.1)
     """
 
+    _schema = TABLE
     problem: Problem = part("optimum.problem", "Data, model, noise, sensors as fitted.")
     data: FrequencyResponse = part("problem.data", "The data that were fitted.")
     noise: str = part("problem.noise", "The noise model.")
@@ -433,37 +434,6 @@ class FitResult(Fit):
         from dahl_ident.results.fit_plots import draw_residuals
 
         return draw_residuals(self, against, ax)
-
-    # Storage
-
-    def to_json(self) -> str:
-        """Return the fit as JSON: data, model, noise, sensors and optimum."""
-        return fit_storage.to_json(self.optimum, self.first_order)
-
-    @classmethod
-    def from_json(cls, text: str) -> FitResult:
-        """Return the fit that :meth:`to_json` wrote.
-
-        Raises
-        ------
-        DataError
-            If the text holds no fit, one of another version's schema, or was changed.
-        """
-        optimum, first_order = fit_storage.from_json(text)
-        return cls(optimum, first_order=first_order)
-
-    @classmethod
-    def load(cls, path: str | Path) -> FitResult:
-        """Return the fit that :meth:`save` wrote.
-
-        Raises
-        ------
-        DataError
-            If the file cannot be read, holds no fit, one of another version's schema, or was
-            changed.
-        """
-        optimum, first_order = fit_storage.load(path)
-        return cls(optimum, first_order=first_order)
 
     def __repr__(self) -> str:
         estimates = ", ".join(str(self.params[name]) for name in self.var_names)

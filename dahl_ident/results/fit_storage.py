@@ -1,7 +1,7 @@
 """Fits as JSON: data, model, noise, sensors and optimum, so that all of it can be judged again.
 
 The file says its schema and version. What is stored are facts that do not change with the
-package: the table, the model as plain data, the estimate with its covariance. Residuals,
+package: table or records, the model as plain data, the estimate with its covariance. Residuals,
 intervals and verdicts are computed when asked for, by whatever version loads the file.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import digest, plain_data, read_text
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
@@ -24,11 +24,12 @@ from dahl_ident.errors import DataError
 from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import BaseProblem, Problem
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
-SCHEMA = "dahl_ident.fit_result"
-VERSION = 3  # of the layout; others are refused
+TABLE, RECORDS = "dahl_ident.fit_result", "dahl_ident.record_fit"
+VERSION = 4  # of the layout; others are refused
 _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
 _COLUMNS = (
@@ -40,38 +41,45 @@ _ERRORS = (
     "covariance", "dof", "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance",
 )  # fmt: skip
 _SENSORS = ("force_gain", "displacement_gain", "delay")
+_CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
+_OF_RECORD = ("drive_unit", "drive_factor", "drive_factor_uncertainty", "motion", "provenance")
 
 
-def to_dict(optimum: Optimum, first_order: bool) -> dict[str, Any]:
-    """Return a fit as plain data, numbers that JSON does not know as text, such as "inf"."""
+def to_json(optimum: Optimum, first_order: bool) -> str:
+    """Return a fit as JSON text, numbers that JSON does not know as text, such as "inf"."""
     problem = optimum.problem
     facts = {
-        "schema": SCHEMA,
+        "schema": TABLE if problem.settled else RECORDS,
         "schema_version": VERSION,
         "dahl_ident_version": __version__,
-        "data": _describe_data(problem.data),
         "model": describe_model(problem.model),
         "laws": describe_laws(problem.model.elements),
-        "noise": problem.noise,
-        "steady": problem.steady,
-        "sensors": {name: _describe_channel(getattr(problem.sensors, name)) for name in _SENSORS},
+        **(_describe_table if problem.settled else _describe_records)(problem),
         "optimum": describe_optimum(optimum) | {"first_order": first_order},
     }
-    return sealed(plain_data(facts, not_finite=str))
+    content = plain_data(facts, not_finite=str)
+    # samples of records would stand on a line each
+    indent = 1 if problem.settled else None
+    return json.dumps({**content, "digest": digest(content)}, allow_nan=False, indent=indent)
 
 
-def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[Optimum, bool]:
-    """Return the fit that :func:`to_dict` described, and whether only first order holds."""
-    check_schema(content, source)
-    check_digest(content, source)
-    laws = content.get("laws", ())
-    require_laws(laws, source)
+def from_json(
+    text: str, schema: str | None = None, source: str = "the text"
+) -> tuple[Optimum, bool]:
+    """Return the fit that JSON text holds, and whether it is of first order alone."""
     try:
-        optimum, first_order = _optimum(content), content["optimum"]["first_order"]
+        content = json.loads(text)
+    except json.JSONDecodeError as exc:
+        raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
+    _check(content, schema, source)
+    problem_of = _table_problem if content["schema"] == TABLE else _record_problem
+    try:
+        optimum = optimum_from(problem_of(content), content["optimum"])
+        first_order, laws = content["optimum"]["first_order"], content["laws"]
     except (KeyError, TypeError) as exc:
         raise DataError(
-            f"{source} says {SCHEMA}, version {content['schema_version']}, but lacks or garbles "
-            f"{exc}; it may have been edited or cut short"
+            f"{source} says {content['schema']}, version {VERSION}, but lacks or garbles {exc}; it "
+            "may have been edited or cut short"
         ) from exc
     if laws and not first_order and not _agrees(optimum):
         raise DataError(
@@ -81,51 +89,29 @@ def from_dict(content: Mapping[str, Any], source: str = "the content") -> tuple[
     return optimum, first_order
 
 
-def to_json(optimum: Optimum, first_order: bool) -> str:
-    """Return a fit as JSON text."""
-    return json.dumps(to_dict(optimum, first_order), allow_nan=False, indent=1)
-
-
-def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
-    """Return the fit that JSON text holds."""
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as exc:
-        raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
-    return from_dict(content, source)
-
-
-def load(path: str | Path) -> tuple[Optimum, bool]:
+def load(path: str | Path, schema: str | None = None) -> tuple[Optimum, bool]:
     """Return the fit that a file holds."""
-    return from_json(read_text(path), str(path))
+    return from_json(read_text(path), schema, str(path))
 
 
-def check_schema(content: Any, source: str, schema: str = SCHEMA, version: int = VERSION) -> None:
-    """Refuse what says to be something else than a fit of the version that is known."""
-    name = content.get("schema") if isinstance(content, Mapping) else None
-    if name != schema:
-        raise DataError(f"{source} has the schema {name!r}; expected {schema!r}, a saved fit")
-    stated = content.get("schema_version")
-    if type(stated) is not int or stated != version:
+def _check(content: Any, schema: str | None, source: str) -> None:
+    """Refuse what is not a fit of the version that is known, as it was written."""
+    stated = content.get("schema") if isinstance(content, Mapping) else None
+    if stated not in ((TABLE, RECORDS) if schema is None else (schema,)):
+        expected = repr(schema) if schema else f"{TABLE!r} or {RECORDS!r}"
+        raise DataError(f"{source} has the schema {stated!r}; expected {expected}, a saved fit")
+    version = content.get("schema_version")
+    if type(version) is not int or version != VERSION:
         raise DataError(
-            f"{source} has schema version {stated!r}; this version of dahl_ident reads {version}: "
+            f"{source} has schema version {version!r}; this version of dahl_ident reads {VERSION}: "
             "load it with the version that wrote it, or repeat the fit"
         )
-
-
-def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return plain data with their digest."""
-    return {**content, "digest": digest(content)}
-
-
-def check_digest(content: Mapping[str, Any], source: str) -> None:
-    """Refuse content that is not as it was written: nobody can answer for such numbers."""
-    facts = {key: value for key, value in content.items() if key != "digest"}
-    if content.get("digest") != digest(facts):
-        raise DataError(
+    if content.get("digest") != digest({k: v for k, v in content.items() if k != "digest"}):
+        raise DataError(  # nobody can answer for such numbers
             f"{source} was changed after the fit was saved: its data, model and estimate do not "
             "agree with each other; take the file as it was written, or repeat the fit"
         )
+    require_laws(content.get("laws", ()), source)
 
 
 def _agrees(optimum: Optimum) -> bool:
@@ -143,17 +129,53 @@ def _agrees(optimum: Optimum) -> bool:
     return bool(same and np.isclose(cost, optimum.cost, rtol=_SAME, atol=least))
 
 
-def _optimum(content: Mapping[str, Any]) -> Optimum:
-    sensors = {name: _channel(content["sensors"][name]) for name in _SENSORS}
-    known = Sensors(**sensors)
-    problem = Problem(
+def _describe_table(problem: Problem) -> dict[str, Any]:
+    return {
+        "data": _describe_data(problem.data),
+        "noise": problem.noise,
+        "steady": problem.steady,
+        "sensors": {name: _describe_channel(getattr(problem.sensors, name)) for name in _SENSORS},
+    }
+
+
+def _table_problem(content: Mapping[str, Any]) -> Problem:
+    known = Sensors(**{name: _channel(content["sensors"][name]) for name in _SENSORS})
+    return Problem(
         _data(content["data"]),
         model_from_description(content["model"]),
         noise=content["noise"],
         sensors=EXACT if known.are_exact else known,
         steady=content["steady"],
     )
-    return optimum_from(problem, content["optimum"])
+
+
+def _describe_records(problem: RecordProblem) -> dict[str, Any]:
+    names = ("runs", "output", "excitation", "calibration", "whitening", "delay")
+    return {
+        "records": [
+            {
+                "time": record.time,
+                **{c: x for c in _CHANNELS if (x := getattr(record, c)) is not None},
+                **{name: getattr(record, name) for name in _OF_RECORD},
+            }
+            for record in problem.records
+        ],
+        **{name: getattr(problem, name) for name in names},
+        "displacement_noise": problem.displacement_noise,
+    }
+
+
+def _record_problem(content: Mapping[str, Any]) -> RecordProblem:
+    problem = RecordProblem(
+        [Record(**record) for record in content["records"]],
+        model_from_description(content["model"]),
+        output=content["output"],
+        excitation=content["excitation"],
+        calibration=content["calibration"],
+    )
+    problem.runs = tuple(content["runs"])
+    problem = problem.weighted(_floats(content["whitening"]))
+    return problem.delayed(content["delay"]).without_noise(content["displacement_noise"])
 
 
 def describe_optimum(optimum: Optimum) -> dict[str, Any]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +14,6 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
 from dahl_ident.data.record import cut
-from dahl_ident.data.storage import plain_data, read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, checked_levels, percent
@@ -41,33 +38,20 @@ from dahl_ident.diagnostics.record_errors import (
 )
 from dahl_ident.diagnostics.verdicts import Verdict
 from dahl_ident.elements import Model
-from dahl_ident.elements.description import describe_model, model_from_description
-from dahl_ident.elements.law_files import describe_laws, require_laws
-from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
+from dahl_ident.errors import FitError, FitInterrupted, ValidationError
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.record_search import Tell, hold_model, solve_records
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_base import Fit
-from dahl_ident.results.fit_storage import (
-    check_digest,
-    check_schema,
-    describe_optimum,
-    optimum_from,
-    sealed,
-)
+from dahl_ident.results.fit_storage import RECORDS
 from dahl_ident.results.hold_out import HeldOutPart, HoldOut
 from dahl_ident.results.progress import fit_progress
 from dahl_ident.results.result import Parameters
 from dahl_ident.units import shown_unit
-from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     from dahl_ident.plots import Axes
-
-SCHEMA = "dahl_ident.record_fit"
-_SCHEMA_VERSION = 3  # of the layout; others are refused
-_CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 
 
 @dataclass(frozen=True)
@@ -127,6 +111,8 @@ class RecordFit(Fit):
     >>> fit.trusted, round(fit.params["f_max"].value, 2)
     (True, 0.1)
     """
+
+    _schema = RECORDS
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).from_json, (self.to_json(),)  # the plant's functions cannot be copied
@@ -383,8 +369,9 @@ class RecordFit(Fit):
         for k, (number, piece) in enumerate(pieces):
             rest = [other for i, (_, other) in enumerate(pieces) if i != k]
             remaining = RecordProblem(
-                rest, problem.model, output=problem.output, excitation=problem.excitation
-            )
+                rest, problem.model, output=problem.output, excitation=problem.excitation,
+                calibration=problem.calibration,
+            )  # fmt: skip
             fit = RecordFit(solve_records(remaining, loss=self.optimum.loss, start=start))
             band = fit.predict(piece)
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
@@ -456,81 +443,6 @@ class RecordFit(Fit):
         from dahl_ident.plots.waveforms import draw_record_fit
 
         return draw_record_fit(self, kind or "time", record, ax)
-
-    # Storage
-
-    def to_json(self) -> str:
-        """Return the fit as JSON: records, model and estimate."""
-        problem = self.problem
-        records = [
-            {
-                "time": r.time.tolist(),
-                **{c: getattr(r, c).tolist() for c in _CHANNELS if getattr(r, c) is not None},
-                "drive_unit": r.drive_unit,
-                "drive_factor": r.drive_factor,
-                "drive_factor_uncertainty": r.drive_factor_uncertainty,
-                "motion": r.motion,
-                "provenance": None if r.provenance is None else dict(r.provenance),
-            }
-            for r in self.records
-        ]
-        return json.dumps(
-            sealed(
-                {
-                    "schema": SCHEMA,
-                    "schema_version": _SCHEMA_VERSION,
-                    "dahl_ident_version": __version__,
-                    "records": records,
-                    "model": describe_model(problem.model),
-                    "laws": describe_laws(problem.model.elements),
-                    "runs": list(problem.runs),
-                    "output": problem.output,
-                    "excitation": problem.excitation,
-                    "calibration": problem.calibration,
-                    "whitening": problem.whitening.tolist(),
-                    "delay": problem.delay,
-                    "displacement_noise": problem.displacement_noise,
-                    "optimum": plain_data(describe_optimum(self.optimum), not_finite=str),
-                    "first_order": self.first_order,
-                }
-            )
-        )
-
-    @classmethod
-    def from_json(cls, text: str) -> RecordFit:
-        """Return the fit that :meth:`to_json` wrote.
-
-        Raises
-        ------
-        DataError
-            If the text holds no such fit, or was changed since.
-        ModelError
-            If a law of the model is not known here.
-        """
-        try:
-            held = json.loads(text)
-            check_schema(held, "the text", SCHEMA, _SCHEMA_VERSION)
-            check_digest(held, "the text")
-            require_laws(held["laws"], "the text")
-            records = [Record(r.pop("time"), **r) for r in held["records"]]
-            problem = RecordProblem(
-                records, model_from_description(held["model"]), output=held["output"],
-                excitation=held["excitation"], calibration=held["calibration"],
-            )  # fmt: skip
-            problem.runs = tuple(held["runs"])
-            problem = problem.weighted(np.asarray(held["whitening"], dtype=np.float64))
-            problem = problem.delayed(held["delay"]).without_noise(held["displacement_noise"])
-            optimum = optimum_from(problem, held["optimum"])
-            return cls(optimum, first_order=held["first_order"])
-        except ModelError:
-            raise
-        except (KeyError, TypeError, ValueError) as exc:
-            raise DataError(f"the text holds no fit of records: {exc!r}") from exc
-
-    @classmethod
-    def load(cls, path: str | Path) -> RecordFit:
-        """Return the fit that ``save`` wrote."""
-        return cls.from_json(read_text(path))
 
 
 def _level(problem: RecordProblem) -> float:
