@@ -128,6 +128,18 @@ class PopulationParameter:
         Control charts, a row a fit: individuals (`value`, `centre`, `limit`) and, where an order in
         time is stated, EWMA (`ewma`, `ewma_limit`). Where devices have several fits, a value is the
         deviation from the others of its device, and NaN for a device with one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> from dahl_ident.campaigns.population import population
+    >>> f_max = 0.1 * np.exp(0.05 * np.array([-1.2, -0.3, 0.1, 0.4, 1.0]))
+    >>> table = pd.DataFrame({"device": list("abcde"), "status": "trusted",
+    ...     "f_max": f_max, "u_f_max": 0.001})
+    >>> statistics = population(table)["f_max"]
+    >>> statistics.outlying, statistics.out_of_control
+    ((), ())
     """
 
     name: str
@@ -197,6 +209,17 @@ class Population:
         Fits that were used.
     left_out : mapping of str to int
         Fits that were not used, by status.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> from dahl_ident.campaigns.population import population
+    >>> f_max = 0.1 * np.exp(0.05 * np.array([-1.2, -0.3, 0.1, 0.4, 1.0]))
+    >>> table = pd.DataFrame({"device": list("abcde"), "status": "trusted",
+    ...     "f_max": f_max, "u_f_max": 0.001})
+    >>> population(table).summary().index.tolist()
+    ['f_max']
     """
 
     parameters: Mapping[str, PopulationParameter]

@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.estimate import tests_of
 from dahl_ident.diagnostics.mixed_model import MixedModel, State
+from dahl_ident.diagnostics.residual_space import orthonormal
 from dahl_ident.fitting import Optimum
 
 _EXACT = 1e-5  # relative errors that count as none
+_ROUNDING = 1e-12  # variance of residuals that are none, in units of what is stated or left
 _RANK = 1e-7  # singular value of the derivatives, over the largest, that counts as none
 _LEAST_LEFT = 1e-9  # of a row's weight, that the others do not determine
 _HEAVY = 4.0  # degrees of freedom of the density with a robust loss
@@ -88,7 +90,9 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     y = _parts(missed)
     J = problem.prediction_jacobian(optimum.theta) / size[:, None]
     known = np.isfinite(J).all(axis=0) & (np.abs(J) > 0.0).any(axis=0)
-    X = _orthonormal(np.array([_parts(column) for column in J[:, known].T]).reshape(-1, y.size).T)
+    X = orthonormal(
+        np.array([_parts(column) for column in J[:, known].T]).reshape(-1, y.size).T, _RANK
+    )
     scatter: list[FloatArray] = []
     if run.max() > 0:
         relative, own = predicted / size, run == np.arange(run.max() + 1)[:, None]
@@ -104,7 +108,7 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     unit = np.sqrt(stated + beyond[group] + _EXACT**2)
     Z = [one[keep] / unit[:, None] for one in scatter]
     model = MixedModel(
-        y / unit, X[keep] / unit[:, None], Z, group, np.zeros(groups), groups,
+        y / unit, X[keep] / unit[:, None], Z, group, np.full(groups, _ROUNDING), groups,
         np.full(len(Z), np.inf),
     )  # fmt: skip
     state = model.reml(np.ones(len(Z)))
@@ -151,11 +155,3 @@ def _densities(
         volume = np.log(values).sum() - len(rows) * np.log(2.0 * np.pi)
         found[number] = 0.5 * float(volume - loss) - float(np.log(unit[rows]).sum())
     return found
-
-
-def _orthonormal(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what the columns (m, k) span."""
-    if columns.shape[1] == 0:
-        return columns
-    U, size, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
-    return np.asarray(U[:, size > _RANK * size[0]])

@@ -178,7 +178,7 @@ class RelativeSpace(_Space):
             y = np.log(problem.data.response / predicted)[self._rows]
             J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]
         J = J[:, [name not in problem.ranges for name in problem.names]]  # assumed ones stay
-        self.basis = _orthonormal(np.concatenate([J.real, J.imag]))
+        self.basis = orthonormal(np.concatenate([J.real, J.imag]))
         r = np.concatenate([y.real, y.imag])
         self.residuals = r - self.basis @ (self.basis.T @ r)
 
@@ -225,12 +225,12 @@ class ResidualSpace(_Space):
             y, J = self._estimate.weighted(y), self._estimate.weighted(J)
             own = self._estimate.weighted(own) if runs is not None else own
         if runs is not None:
-            self.dof -= _orthonormal(np.hstack([J[:m], own])).shape[1]
-            self.dof += _orthonormal(J[:m]).shape[1]
+            self.dof -= orthonormal(np.hstack([J[:m], own])).shape[1]
+            self.dof += orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
         every = np.vstack([np.hstack([J[:m], own]), np.pad(J[m:], ((0, 0), (0, own.shape[1])))])
         every[:m] *= self._column_weight[:, None]
-        self.basis = _orthonormal(every)[:m]
+        self.basis = orthonormal(every)[:m]
         r = residual_weight * y[:m] * (not optimum.is_exact)
         self.residuals = r - self.basis @ (self.basis.T @ r)
 
@@ -260,7 +260,7 @@ class ResidualSpace(_Space):
 
     def p_value(self, changes: ComplexArray) -> float:
         """Return how likely noise alone gives as much departure along `changes`, (k, n)."""
-        basis = _orthonormal(self.columns(changes).T)
+        basis = orthonormal(self.columns(changes).T)
         k = basis.shape[1]
         if k == 0:
             return np.nan
@@ -297,11 +297,12 @@ def _columns_of_runs(
     return np.hstack(columns)
 
 
-def _orthonormal(columns: FloatArray) -> FloatArray:
+def orthonormal(columns: FloatArray, least: float = _RANK) -> FloatArray:
     """Return an orthonormal basis of the column space, shape (m, rank)."""
-    size = np.linalg.norm(columns, axis=0)
-    used = columns[:, (size > _NOTHING) & np.isfinite(size)]
-    if used.shape[1] == 0:
+    size = np.abs(columns).max(axis=0, initial=0.0)
+    some = (size > _NOTHING) & np.isfinite(size)
+    if not some.any():
         return np.zeros((len(columns), 0))
+    used = columns[:, some] / size[some]  # squares of the smallest numbers would vanish
     U, singular, _ = np.linalg.svd(used / np.linalg.norm(used, axis=0), full_matrices=False)
-    return np.asarray(U[:, singular > _RANK * singular[0]])
+    return np.asarray(U[:, singular > least * singular[0]])

@@ -225,10 +225,11 @@ def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
         changes = own.astype(np.complex128)
         p = space.p_value(changes)
         if not np.isnan(p):
-            gain = np.exp(RelativeSpace(optimum).fitted(changes).real)
-            low, high = (
-                (str(labels[row]), float(gain[row])) for row in (gain.argmin(), gain.argmax())
-            )
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = np.log(np.abs(data.response / optimum.problem.predict(optimum.theta)))
+            ratio[(data.harmonic != 1) | ~np.isfinite(ratio)] = np.nan
+            gain = [float(np.exp(np.nanmedian(ratio[rows]))) for rows in own]
+            low, high = ((str(names[i]), gain[i]) for i in (np.argmin(gain), np.argmax(gain)))
             found.append(GroupsDiffer(name, low, high, p))
     return found
 
