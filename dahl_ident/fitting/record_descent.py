@@ -40,7 +40,8 @@ class Descent:
         noise = 2.0 * float(end.cost[0]) / problem.n_residuals
         for _ in range(0, steps, ROUGH):
             before = float(end.cost[0])
-            end = self.minimise(problem, end.theta, WORTHLESS * noise, ROUGH)
+            bounds = problem.start_bounds(problem.to_values(end.theta[0]))
+            end = self.minimise(problem, end.theta, WORTHLESS * noise, ROUGH, bounds)
             if bool(end.converged[0]):
                 return end
             if problem.output == "motion" and end.cost[0] > (1.0 - _STAGNANT) * before:
@@ -57,16 +58,20 @@ class Descent:
         return replace(end, converged=np.array([bool(left < SETTLED**2 * noise)]))
 
     def minimise(
-        self, problem: RecordProblem, begin: FloatArray, enough: float, most: int
+        self,
+        problem: RecordProblem,
+        begin: FloatArray,
+        enough: float,
+        most: int,
+        bounds: tuple[FloatArray, FloatArray] | None = None,
     ) -> Minima:
         """Return the minimum near a start, shape (1, P), after so many steps at most."""
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
         else:
-            bounds = problem.start_bounds(problem.to_values(begin[0]))
             end = minimise(
                 lambda at, _which: problem.quadratic(at, self.scale, self.rho),
-                np.clip(begin, *bounds),
+                begin if bounds is None else np.clip(begin, *bounds),
                 problem.space.relative,
                 problem.n_residuals,
                 tolerance_factor=LOOSE,
