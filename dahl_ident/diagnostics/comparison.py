@@ -425,7 +425,8 @@ def _candidates(
     for e in model.elements:
         own = [values[p.name] for p in e.parameters]
         known = np.all(np.isfinite(own)) and all(own[:2])
-        offers.append((e, e.alternatives(own, smallest) if known else {}))
+        stays = e.started(own) if np.all(np.isfinite(own)) else e
+        offers.append((stays, e.alternatives(own, smallest) if known else {}))
     shown = {
         "shape": misfit,
         "asymmetry": _even(optimum),
