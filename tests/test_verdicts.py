@@ -71,7 +71,7 @@ class TestStiffening:
 
 def test_microslip_with_a_free_exponent_determines_the_loss_alone() -> None:
     """Where exponent and limit grow together, their ratio stays, and with it the loss."""
-    data = table(model=FRICTION + Spring(20.0), beta=(3e-3, 3e-2), noise=1e-3)
+    data = table(model=FRICTION + Spring(20.0), beta=(3e-3, 3e-2), n=12, noise=1e-3)
     found = fit(data, Dahl(alpha=1.0) + Spring(), free=["alpha"], throw=False).identifiability
     assert found.determined == ("alpha sigma^2/f_max", "sigma + stiffness")
     assert found.combinations[0].value == pytest.approx(

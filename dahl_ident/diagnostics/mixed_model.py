@@ -230,9 +230,11 @@ class State:
             return self.variances
         units, s = 1.0 / size[part], self.variances.copy()
         scaled = units[:, None] * F[np.ix_(part, part)] * units
-        R = np.linalg.cholesky(scaled + _ALIKE * np.eye(len(part))).T
+        values, vectors = np.linalg.eigh(scaled)
+        root = np.sqrt(np.maximum(values, _ALIKE))  # rounding may leave some below zero
+        R = root[:, None] * vectors.T
         rise = units * (self.gradient - price)[part]
-        aim = R @ (s[part] / units) + linalg.solve_triangular(R, rise, trans=1)
+        aim = R @ (s[part] / units) + (vectors.T @ rise) / root
         s[part] = units * nnls(R, aim)[0]
         return s
 
