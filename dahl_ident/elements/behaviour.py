@@ -206,7 +206,7 @@ class Behaviour(ABC):
         return any(p.is_mass for p in self.parameters)
 
     def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
-        """Return the states at the first sample, in plain arithmetic, from :attr:`start` there.
+        """Return the states at the first sample, in plain arithmetic, from the unknown there.
 
         The states of an element without memory are unknowns themselves.
         """
