@@ -106,7 +106,7 @@ class Behaviour(ABC):
     def stiffness_gradient(
         self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: int = 1
     ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives by amplitude and by each parameter, unchecked."""
+        """Return F_k/X_1 with its derivatives, over amplitude and each parameter, unchecked."""
         return self.settled(values, Sine(amplitude, omega, harmonic), 2)
 
     def answers(self, harmonic: int) -> bool:

@@ -202,8 +202,8 @@ class Dahl(Friction):
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 at `values` (f_max, sigma, alpha), unchecked.
 
-        The derivative by alpha costs a quadrature; while alpha is fixed it is left at zero, which
-        no estimate looks at.
+        The derivative with respect to alpha costs a quadrature; while alpha is fixed it is left at
+        zero, which no estimate uses.
         """
         f_max, sigma, alpha = values
         beta, k = sigma * sine.amplitude / f_max, sine.harmonic

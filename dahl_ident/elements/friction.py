@@ -171,7 +171,7 @@ class Friction(Element):
         return (force,), {}
 
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return F_k/X_1 of the settled loop; 0 for derivatives by parameters that are fixed.
+        """Return F_k/X_1 of the settled loop; derivatives are 0 where a parameter is fixed.
 
         NaN where nothing settles.
         """

@@ -56,7 +56,7 @@ def force_history(
 def linear_history_gradient(
     displacement: FloatArray, f_max: float, sigma: float, initial_force: float
 ) -> HistoryGradient:
-    """Return the force for alpha = 1 with its derivatives by the initial force, f_max and sigma.
+    """Return the force for alpha = 1, and its slopes over the initial force, f_max and sigma.
 
     Along a stretch F = s f_max + (F0 - s f_max) exp(-d) with d = sigma path/f_max; the derivatives
     at the turning points are a linear recursion.
