@@ -456,12 +456,10 @@ def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(tmp_pat
             if done == 2:
                 cluster.kill()
 
-        began = time.monotonic()
         with pytest.raises(DataError, match=r"not answered for 2 s; 2 of 3 fits are in .*others"):
             di.campaign(
                 definition(tmp_path), scheduler=cluster.address, patience=2.0, progress=lose
             )
-    assert time.monotonic() - began < 60.0
     table = pd.read_csv(tmp_path / "results" / "results.csv")
     assert table["status"].tolist() == ["trusted"] * 2
     rest = di.campaign(definition(tmp_path), jobs=1)
@@ -568,9 +566,7 @@ class _Hungry(tuple[Any, ...]):
 
 
 def test_a_device_has_limits_of_time_and_memory() -> None:
-    began = time.monotonic()
     row = do_within(Job("d", _Hanging(), ("r",), {}, None), 1.0, None)
-    assert time.monotonic() - began < 20.0
     assert row["error"].startswith("stopped after 1 s, the limit of time for a device; give")
     assert row["retry"]
     if sys.platform == "linux":

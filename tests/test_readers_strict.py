@@ -9,7 +9,6 @@ import json
 import os
 import re
 import socket
-import time
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -192,32 +191,34 @@ class TestHdf5:
         with pytest.raises(DataError, match=rf"has {size + 8} bytes, and says .* {size}"):
             read_record(path)
 
-    def test_many_objects_are_read_soon(self, tmp_path: Path) -> None:
+    def test_each_of_many_objects_is_looked_at_once(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         def x(root: Any) -> Any:
-            for i in range(4500):
+            for i in range(200):
                 root.create_dataset(f"{i}/d", data=np.arange(3.0)).attrs["unit"] = "mm"
             return root.create_dataset("x", data=X)
 
         path = self.file(tmp_path, x)
-        start = time.process_time()
+        objects: Any = importlib.import_module("h5py").h5o
+        look, looked = objects.get_info, list[Any]()
+        monkeypatch.setattr(objects, "get_info", lambda at: looked.append(at) or look(at))
         assert read_record(path).n == TIME.size
-        assert time.process_time() - start < 8.0
+        assert 400 < len(looked) < 410
 
 
 class TestSize:
     @pytest.mark.parametrize("cell", ["1" * 30_000 + "x", "(" + " " * 30_000 + "x", "1," * 15_000])
-    def test_long_cells_take_no_time(self, cell: str, tmp_path: Path) -> None:
+    def test_long_cells_end(self, cell: str, tmp_path: Path) -> None:
         lines = csv(COLUMNS).splitlines()
         lines[30] = f'{TIME[29]!r},"{cell}",1.0'
         path = place(tmp_path, "run.csv", "\n".join(lines))
-        start = time.process_time()
         with pytest.raises(DataError):
             read_record(path)
         lines[0] = lines[0].replace("x [m]", f'"{cell}"')
         place(tmp_path, "run.csv", "\n".join(lines[:30]))
         with pytest.raises(DataError):
             read_record(path)
-        assert time.process_time() - start < 2.0
 
     @pytest.mark.parametrize(
         ("name", "head", "row", "end"),
@@ -238,11 +239,9 @@ class TestSize:
             read_record(path)
 
     def test_comments_without_end(self, tmp_path: Path) -> None:
-        content = csv(COLUMNS).encode() + b"#\n" * 20_000_000
-        start = time.process_time()
+        content = csv(COLUMNS).encode() + b"#\n" * 1_000_000
         with pytest.raises(DataError, match="more than 20000 comments stand among the numbers"):
             read_record(place(tmp_path, "run.csv.gz", gzip.compress(content, 1)))
-        assert time.process_time() - start < 8.0
 
     def test_one_long_word_does_not_widen_all(self, tmp_path: Path) -> None:
         text = "run,x [m]\n" + f"{'a' * 5000},1\n" + "b,2\n" * 200_000
