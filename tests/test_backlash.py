@@ -10,7 +10,6 @@ import pytest
 
 from dahl_ident import (
     Backlash,
-    BoucWen,
     Dahl,
     Element,
     FrequencyResponse,
@@ -20,9 +19,9 @@ from dahl_ident import (
     Spring,
     fit,
 )
-from dahl_ident.cli.model import elements
 from dahl_ident.elements import describe_model, model_from_description
 from dahl_ident.errors import ModelError
+from tests.command_line import Runner
 from tests.test_generic_friction import Jenkins
 
 AT_REST = np.zeros(())
@@ -194,19 +193,17 @@ def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None
         np.testing.assert_allclose(found.by_state, (ends[0] - ends[1]) / 2e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("backlash", Backlash(Dahl())),
-        ("backlash(gap=0.1)", Backlash(Dahl(), 0.1)),
-        ("backlash(dahl(f_max=2, asymmetry=free), 0.1)", Backlash(Dahl(2.0, asymmetry=None), 0.1)),
-        ("backlash(bouc_wen, gap=free)", Backlash(BoucWen())),
-    ],
-)
-def test_the_element_behind_a_gap_is_written_on_the_command_line(
-    text: str, expected: Backlash
-) -> None:
-    assert elements([text]).describe() == expected.describe()
+def test_the_element_behind_a_gap_is_written_on_the_command_line(run: Runner) -> None:
+    for text, missing in (
+        ("backlash", "f_max, sigma, gap"),
+        ("backlash(gap=0.1)", "f_max, sigma"),
+        ("backlash(bouc_wen, gap=free)", "sigma, q, p, gap"),
+    ):
+        assert f"has no value for {missing};" in run("simulate", "--element", text).err
+    text = "backlash(dahl(f_max=2, sigma=3, asymmetry=0.1), 0.1)"
+    told = json.loads(run("simulate", "--element", text, "--json").out)
+    expected = Backlash(Dahl(2.0, 3.0, asymmetry=0.1), 0.1)
+    assert told["plant"] == describe_model(expected)
 
 
 def test_amplitudes_within_the_gap_are_no_misfit() -> None:

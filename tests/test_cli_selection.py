@@ -11,10 +11,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli.model import elements
-from dahl_ident.cli.row_selection import selected
-from dahl_ident.elements import KINDS
-from dahl_ident.errors import DahlIdentError, ValidationError
+from dahl_ident.elements import KINDS, describe_model
 from tests.command_line import Runner
 
 
@@ -32,6 +29,14 @@ def table(**columns: Any) -> di.FrequencyResponse:
     )
 
 
+def kept(run: Runner, *options: str) -> di.FrequencyResponse:
+    """Return the rows that a fit used."""
+    table().save("t.csv", overwrite=True)
+    fit = ("fit", "t.csv", "--noise", "absolute", "--save", "f.json", "--overwrite")
+    assert run(*fit, *options).status in (0, 3)
+    return di.FitResult.load("f.json").data
+
+
 @pytest.mark.parametrize(
     ("where", "rows"),
     [
@@ -44,21 +49,19 @@ def table(**columns: Any) -> di.FrequencyResponse:
         ("phase_deg > -1", [0, 1, 2, 3, 4, 5]),
     ],
 )
-def test_where_keeps_what_meets_the_condition(where: str, rows: list[int]) -> None:
-    data = table()
-    assert data.amplitude is not None
-    found = selected(data, where, None, None)
-    np.testing.assert_array_equal(found.amplitude, data.amplitude[rows])
+def test_where_keeps_what_meets_the_condition(run: Runner, where: str, rows: list[int]) -> None:
+    amplitude = table().amplitude
+    assert amplitude is not None
+    assert kept(run, "--where", where).amplitude == pytest.approx(amplitude[rows], rel=1e-12)
 
 
-def test_levels_and_runs_are_named() -> None:
-    assert selected(table(), None, "1, 10", None).n == 3
-    assert selected(table(), None, None, "b").n == 3
-    assert selected(table(), "harmonic == 1", "2,3", "a").n == 1
-    with pytest.raises(ValidationError, match="--levels names 7; the data have 1, 2, 3, 10"):
-        selected(table(), None, "7,1", None)
-    with pytest.raises(ValidationError, match="--runs names c; the data have a, b"):
-        selected(table(), None, None, "c")
+def test_levels_and_runs_are_named(run: Runner) -> None:
+    assert kept(run, "--levels", "1, 10").n == 3
+    assert kept(run, "--runs", "b").n == 3
+    assert kept(run, "--where", "harmonic == 1", "--levels", "2,3", "--runs", "a").n == 1
+    for option, says in (("--levels", "names 7; the data have 1, 2, 3, 10"),
+                         ("--runs", "names 7; the data have a, b")):  # fmt: skip
+        assert f"{option} {says}" in run("fit", "t.csv", option, "7").err
 
 
 @pytest.mark.parametrize(
@@ -74,22 +77,26 @@ def test_levels_and_runs_are_named() -> None:
         ("level > 100", "selects none of 6 rows"),
     ],
 )
-def test_conditions_that_cannot_be_met_are_refused(where: str, message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
-        selected(table(), where, None, None)
+def test_conditions_that_cannot_be_met_are_refused(run: Runner, where: str, message: str) -> None:
+    table().save("t.csv")
+    outcome = run("fit", "t.csv", "--where", where)
+    assert outcome.status == 1
+    assert re.search(message, outcome.err)
 
 
-def test_elements_are_written_by_their_kind() -> None:
-    model = elements(["dahl(100 mN, alpha=free, name=pivot)", "mass(300g)", "spring"])
-    known = {p.name: p.value for p in model.parameters if not p.free}
-    assert known == {"pivot_f_max": 0.1, "mass": 0.3}
-    free = [p.name for p in model.parameters if p.free]
-    assert free == ["pivot_sigma", "pivot_alpha", "stiffness"]
+def test_elements_are_written_by_their_kind(run: Runner) -> None:
+    known = ("dahl(100 mN, alpha=free, name=pivot)", "mass(300g)", "spring")
+    told = run("simulate", *(word for text in known for word in ("--element", text)))
+    assert "no value for pivot_sigma, pivot_alpha" in told.err
+    known = ("dahl(100 mN, 30, name=pivot)", "mass(300g)", "spring(stiffness=1)")
+    told = run("simulate", *(word for text in known for word in ("--element", text)), "--json")
+    plant = di.Dahl(0.1, 30.0, name="pivot") + di.Mass(0.3) + di.Spring(1.0)
+    assert json.loads(told.out)["plant"] == describe_model(plant)
 
 
 @pytest.mark.parametrize("kind", [kind for kind, one in KINDS.items() if one.parameters])
-def test_every_kind_can_be_typed(kind: str) -> None:
-    assert elements([kind]).parameters
+def test_every_kind_can_be_typed(run: Runner, kind: str) -> None:
+    assert " has no value for " in run("simulate", "--element", kind, "--levels", "1").err
 
 
 @pytest.mark.parametrize(
@@ -107,9 +114,10 @@ def test_every_kind_can_be_typed(kind: str) -> None:
         ("mass(0.3", "expected a kind and its values"),
     ],
 )
-def test_elements_that_do_not_exist_are_refused(text: str, message: str) -> None:
-    with pytest.raises(DahlIdentError, match=re.escape(message)):
-        elements([text])
+def test_elements_that_do_not_exist_are_refused(run: Runner, text: str, message: str) -> None:
+    outcome = run("simulate", "--element", text)
+    assert outcome.status == 1
+    assert message in outcome.err
 
 
 def test_a_law_that_a_user_wrote_is_simulated_and_fitted(run: Runner) -> None:

@@ -16,7 +16,6 @@ import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Cell, Document, Section, Table
-from dahl_ident.reporting.html import html
 from dahl_ident.reporting.pdf import pdf
 from dahl_ident.results import Posterior
 from tests.browser import CHROMIUM, Page, chromium
@@ -351,7 +350,7 @@ def test_titles_that_no_page_has_room_for(
     found = json.loads(place.read_text(encoding="utf-8"))["title"]
     assert found.startswith(printed)
     whole = Document(title=found, status="trusted", verdict=("Holds.",), sections=())
-    assert printed in html(whole).decode()
+    assert printed in report(fit, tmp_path / "r.html", title=title).read_text(encoding="utf-8")
     page = pypdf.PdfReader(io.BytesIO(pdf(whole))).pages[0].extract_text()
     assert page.replace("\n", "").startswith(printed)
     assert page.endswith("Page 1 of 1")

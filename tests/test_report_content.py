@@ -9,6 +9,7 @@ import math
 import re
 from importlib.resources import files
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,7 @@ from scipy.integrate import trapezoid
 
 import dahl_ident as di
 from dahl_ident import report
-from dahl_ident.data.laboratory import metadata_of
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.reporting.markdown import markdown
-from dahl_ident.reporting.sections import document
-from dahl_ident.results.changes import changes
 from tests.browser import CHROMIUM, Page, chromium
 from tests.command_line import Runner
 
@@ -51,9 +48,16 @@ def measured(
 
 
 def text_of(*results: di.FitResult, metadata: Any = None) -> str:
-    """Return a report as text, without the pictures and without escapes."""
-    whole = document(results, metadata=metadata_of(metadata)).numbered()
-    return markdown(whole, "pictures").decode().replace("\\", "")
+    """Return a report as text without escapes."""
+    with TemporaryDirectory() as folder:
+        place = report(list(results), Path(folder) / "r.md", metadata=metadata)
+        return place.read_text("utf-8").replace("\\", "")
+
+
+def change_of(name: str, fits: list[di.FitResult], place: Path) -> dict[str, Any]:
+    """Return what a report says of the change of one parameter."""
+    facts = json.loads(report(fits, place, overwrite=True).read_text("utf-8"))
+    return next(change for change in facts["changes"] if change["parameter"] == name)
 
 
 @pytest.fixture(scope="module")
@@ -228,15 +232,17 @@ def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path: Path) -> No
     assert (tmp_path / "r_pictures" / "overlay.png").exists()
 
 
-def test_scatter_between_runs_counts_in_the_change_of_a_single_run(fit: di.FitResult) -> None:
+def test_scatter_between_runs_counts_in_the_change_of_a_single_run(
+    fit: di.FitResult, tmp_path: Path
+) -> None:
     """A single day compared with four: its own scatter is that of the four."""
     several = runs(0.103, 3, 0.02, 4)
-    change = next(c for c in changes({"a": fit, "b": several}) if c.parameter == "f_max")
-    assert change.runs_known
-    assert change.u > 0.02 * 0.1, "one day of a device that scatters by 2 % between days"
-    assert not change.significant
-    single = next(c for c in changes({"a": fit, "b": fit}) if c.parameter == "f_max")
-    assert not single.runs_known
+    change = change_of("f_max", [fit, several], tmp_path / "r.json")
+    assert change["runs_known"]
+    assert change["u"] > 0.02 * 0.1, "one day of a device that scatters by 2 % between days"
+    assert not change["significant"]
+    later = di.fit(measured(0.1, 2), di.Dahl())
+    assert not change_of("f_max", [fit, later], tmp_path / "r.json")["runs_known"]
 
 
 def test_two_single_runs_leave_open_whether_the_device_changed(
@@ -273,13 +279,13 @@ def test_two_saved_fits_say_what_changed(run: Runner, fit: di.FitResult) -> None
     assert {c["parameter"] for c in as_json} == {"f_max", "sigma"}
 
 
-def test_equal_devices_seldom_change_significantly() -> None:
+def test_equal_devices_seldom_change_significantly(tmp_path: Path) -> None:
     """At 5 %, 2 parameters of 30 pairs: more than 9 significant ones have probability 0.1 %."""
     fits = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(60)]
     found = [
-        change.p < 0.05
+        change_of(name, [a, b], tmp_path / "r.json")["p"] < 0.05
         for a, b in zip(fits[::2], fits[1::2], strict=True)
-        for change in changes({"a": a, "b": b})
+        for name in ("f_max", "sigma")
     ]
     assert len(found) == 60
     assert stats.binom.sf(sum(found) - 1, 60, 0.05) > 1e-3

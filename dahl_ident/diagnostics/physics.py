@@ -199,9 +199,9 @@ def beyond_friction_limit(
     error = np.hypot(error, scatter * bound)
     force[aside] = np.nan
     excess = np.nan_to_num((force - bound) / error, nan=-np.inf)
-    row = int(np.argmax(excess))
+    row, judged = int(np.argmax(excess)), max(np.isfinite(excess).sum(), 1)
     dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
-    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / np.isfinite(excess).sum()):
+    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / judged):
         shown = {"force": with_unit(force[row], error[row], unit), "limit": f"{bound:.3g} {unit}"}
         yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_slip", {"row": names([row])[0], **shown})
     if problem.data.drive is None:
