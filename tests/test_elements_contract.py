@@ -103,6 +103,22 @@ def test_batches_of_parameters_are_each_alone(element: Element, harmonic: int) -
             np.testing.assert_allclose(np.broadcast_to(batch, (5, 3))[s], single, rtol=1e-10)
 
 
+@every_element
+def test_rows_of_several_harmonics_are_each_that_of_one(element: Element) -> None:
+    model = all_free(element)
+    values = list(model.known_values())
+    A, omega, orders = AMPLITUDE.ravel(), OMEGA[:3], np.array([3, 1, 2])
+    together = model.stiffness_gradient(values, A, omega, orders)
+    value = model.stiffness(values, A, omega, orders)
+    for i, k in enumerate(orders.tolist()):
+        alone = model.stiffness_gradient(values, A, omega, k)
+        size = np.abs(model.stiffness(values, A, omega)).max()
+        assert value[i] == pytest.approx(np.broadcast_to(alone.value, 3)[i], abs=1e-9 * size)
+        for several, one in zip(together.by_parameter, alone.by_parameter, strict=True):
+            expected = np.broadcast_to(one, 3)[i]
+            assert np.broadcast_to(several, 3)[i] == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
 # values and derivatives
 
 

@@ -130,9 +130,11 @@ class Backlash(Friction):
         end = 0.5 * float(np.sign(force))
         return (force, end * float(values[-1])), {len(values) - 1: (1, end)}
 
-    def _loops(self, at: FloatArray, harmonic: int = 1, chosen: Sequence[int] = ()) -> Loops:
-        """Return settled loops at rows of amplitude, frequency and values."""
-        return loops_of(self._element, at, harmonic, chosen, gap=True)
+    def _loops(
+        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+    ) -> Loops:
+        """Return settled loops at rows of amplitude, frequency and values, with their harmonics."""
+        return loops_of(self._element, at, orders, chosen, gap=True)
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool

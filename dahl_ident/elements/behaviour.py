@@ -21,6 +21,7 @@ from dahl_ident.elements.facts import (
     Combination,
     HistoryGradient,
     Mechanics,
+    Orders,
     Path,
     Sine,
     StiffnessGradient,
@@ -98,13 +99,13 @@ class Behaviour(ABC):
         """
 
     def stiffness(
-        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: int = 1
+        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
     ) -> ComplexArray:
         """Return F_k/X_1, unchecked; `harmonic` 0 is the mean force over the amplitude."""
         return self.settled(values, Sine(amplitude, omega, harmonic), 0).value
 
     def stiffness_gradient(
-        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: int = 1
+        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
     ) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, over amplitude and each parameter, unchecked."""
         return self.settled(values, Sine(amplitude, omega, harmonic), 2)

@@ -79,7 +79,7 @@ class BoucWen(Friction):
         Parameter("q", "1/m", "rate of softening while loading (beta + gamma)"),
         Parameter("p", "1/m", "rate of stiffening while unloading (beta - gamma)"),
     )
-    linear_parameters = scale_parameters = ("sigma",)
+    scale_parameters = ("sigma",)
 
     def __init__(
         self,

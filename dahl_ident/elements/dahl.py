@@ -37,6 +37,7 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     UniversalCurve,
     Values,
+    each_harmonic,
 )
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.iwan import Iwan
@@ -199,6 +200,7 @@ class Dahl(Friction):
         every = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
         return {name: every[name][()] for name in chosen}
 
+    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 at `values` (f_max, sigma, alpha), unchecked.
 
@@ -206,7 +208,7 @@ class Dahl(Friction):
         zero, which no estimate uses.
         """
         f_max, sigma, alpha = values
-        beta, k = sigma * sine.amplitude / f_max, sine.harmonic
+        beta, k = sigma * sine.amplitude / f_max, int(sine.harmonic)
         linear = bool(np.equal(alpha, 1.0).all())
         if not derivatives:
             if linear and k == 1:
@@ -458,6 +460,7 @@ class TabulatedDahl(Dahl):
     def __init__(self, element: Dahl) -> None:
         self._name, self.parameters = element.name, element.parameters
 
+    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 at `values`; what the tables do not have by quadrature."""
         if sine.harmonic != 1 or derivatives > 1:

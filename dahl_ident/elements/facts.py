@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -17,7 +18,13 @@ if TYPE_CHECKING:
 Values = Sequence[FloatArray]
 """Of an element's parameters, in their order."""
 
+Orders = int | NDArray[np.int64]
+"""One harmonic, or that of each row along the last axis."""
+
 Scalar = TypeVar("Scalar", bound=np.generic)
+
+Settled = Callable[[Any, Values, "Sine", int], "StiffnessGradient"]
+"""A law's method that gives the stiffness of settled loops."""
 
 STEP = 1e-3  # relative: truncation, its fourth power, and rounding are then both below 1e-12
 STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
@@ -40,13 +47,14 @@ class Sine(NamedTuple):
         A, m.
     omega : ndarray
         rad/s; 0 for a law that does not depend on the rate.
-    harmonic : int
-        1: the fundamental; 0: the mean force over the amplitude.
+    harmonic : int or ndarray of int, shape (n,)
+        1: the fundamental; 0: the mean force over the amplitude. An array: that of each row, along
+        the last axis.
     """
 
     amplitude: FloatArray
     omega: FloatArray
-    harmonic: int = 1
+    harmonic: Orders = 1
 
 
 class Path(NamedTuple):
@@ -74,6 +82,30 @@ class StiffnessGradient(NamedTuple):
     value: ComplexArray
     by_amplitude: ComplexArray
     by_parameter: tuple[ComplexArray, ...]
+
+
+def each_harmonic(settled: Settled) -> Settled:
+    """Return the `settled` of a law for rows of several harmonics from that for one."""
+
+    @wraps(settled)
+    def of_rows(law: Any, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        orders = sine.harmonic
+        if isinstance(orders, int):
+            return settled(law, values, sine, derivatives)
+        arguments = [np.asarray(v) for v in (*values, sine.amplitude, sine.omega)]
+        shape = np.broadcast_shapes(orders.shape, *(v.shape for v in arguments))
+        count = 1 + min(derivatives, 1) + len(values) * (derivatives > 1)
+        whole = [np.empty(shape, dtype=np.complex128) for _ in range(count)]
+        for k in np.unique(orders).tolist():
+            rows = np.flatnonzero(orders == k)
+            own = [v[..., rows] if v.shape[-1:] == orders.shape else v for v in arguments]
+            part = settled(law, own[:-2], Sine(own[-2], own[-1], k), derivatives)
+            pieces = (part.value, part.by_amplitude, *part.by_parameter)
+            for target, piece in zip(whole, pieces, strict=False):
+                target[..., rows] = piece
+        return StiffnessGradient(whole[0], whole[min(derivatives, 1)], tuple(whole[2:]))
+
+    return of_rows
 
 
 class HistoryGradient(NamedTuple):

@@ -177,21 +177,27 @@ class Friction(Element):
         """
         chosen = [i for i, p in enumerate(self.parameters) if p.free and derivatives > 1]
         at, rows = self._rows(values, sine.amplitude, sine.omega)
-        loops = self._loops(at, sine.harmonic, chosen)
-        A = at[:, 0]
-        value = loops.coefficients[:, 0] / A
-        rests = A <= _SMALLEST
+        orders, place = np.unique(sine.harmonic, return_inverse=True)
+        place = place.reshape(np.shape(sine.harmonic))
+        loops = self._loops(at, orders.tolist(), chosen)
+        A = at[:, :1]
+        value = loops.coefficients / A
+        rests = A[:, 0] <= _SMALLEST
         if self.rate_independent and rests.any():
             own = [np.asarray(v) for v in at[rests, 2:].T]
-            value[rests] = self.rest_stiffness(own) if sine.harmonic == 1 else 0.0
-        by = np.zeros((len(values) if derivatives > 1 else 0, A.size), dtype=np.complex128)
-        by[chosen] = loops.by_parameter[:, 0].T / A
-        by_amplitude = (loops.by_amplitude[:, 0] - value) / A
-        return StiffnessGradient(value[rows], by_amplitude[rows], tuple(d[rows] for d in by))
+            value[rests] = self.rest_stiffness(own)[:, None] * (orders == 1)
+        by = np.zeros((len(values) if derivatives > 1 else 0, *value.shape), dtype=np.complex128)
+        by[chosen] = np.moveaxis(loops.by_parameter, 2, 0) / A
+        by_amplitude = (loops.by_amplitude - value) / A
+        return StiffnessGradient(
+            value[rows, place], by_amplitude[rows, place], tuple(d[rows, place] for d in by)
+        )
 
-    def _loops(self, at: FloatArray, harmonic: int = 1, chosen: Sequence[int] = ()) -> Loops:
-        """Return settled loops at rows of amplitude, frequency and values."""
-        return loops_of(self, at, harmonic, chosen)
+    def _loops(
+        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+    ) -> Loops:
+        """Return settled loops at rows of amplitude, frequency and values, with their harmonics."""
+        return loops_of(self, at, orders, chosen)
 
     def _rows(
         self, values: Values, amplitude: FloatArray, omega: FloatArray

@@ -56,7 +56,7 @@ def _form(law: Element) -> Hashable:
 
 
 def loops_of(
-    law: Element, at: FloatArray, harmonic: int, chosen: Sequence[int], *, gap: bool = False
+    law: Element, at: FloatArray, orders: Sequence[int], chosen: Sequence[int], *, gap: bool = False
 ) -> Loops:
     """Return the settled loops of a law at rows of amplitude, frequency and values.
 
@@ -66,9 +66,7 @@ def loops_of(
 
     n = len(law.parameters)
     system = system_of(law, list(at[:, 2 : 2 + n].T), [i for i in chosen if i < n])
-    return loops(
-        system, at[:, 0], at[:, 1], at[:, 2:], chosen=chosen, harmonics=(harmonic,), gap=gap
-    )
+    return loops(system, at[:, 0], at[:, 1], at[:, 2:], chosen=chosen, harmonics=orders, gap=gap)
 
 
 def force_along(

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.facts import SOFTENED, Sine, StiffnessGradient, Values
+from dahl_ident.elements.facts import SOFTENED, Sine, StiffnessGradient, Values, each_harmonic
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
@@ -142,13 +142,15 @@ class Iwan(Masing):
         lost = (x / d) ** (chi + 1.0) / ((1.0 + ratio) * (chi + 2.0))
         return np.asarray(np.where(displacement < d, sigma * x * (1.0 - lost), f_max))
 
+    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, exactly; one-sided at the onset of macroslip."""
         f_max, sigma, chi, ratio = (np.asarray(v, dtype=np.float64) for v in values)
         A = np.maximum(np.asarray(sine.amplitude, dtype=np.float64), _REST) + 0.0 * sine.omega
         g, m = chi + 1.0, _onset(values) / A
-        stick, by_m = jenkins(m, sine.harmonic)
-        lost, lost_by_g = _lost(m, g, sine.harmonic, derivative=derivatives > 1)
+        k = int(sine.harmonic)
+        stick, by_m = jenkins(m, k)
+        lost, lost_by_g = _lost(m, g, k, derivative=derivatives > 1)
         G = stick - lost / (1.0 + ratio)
         # by ln A at constant parameters: the ends of both integrals move alike
         by_lnA = -(m * by_m * ratio + g * lost) / (1.0 + ratio)

@@ -32,9 +32,7 @@ class Lumped(Element):
 
         A pure sine of displacement moves a linear element at its own frequency alone.
         """
-        unit: ComplexArray = np.zeros(np.shape(sine.omega), dtype=np.complex128)
-        if sine.harmonic == 1:
-            unit = power_of_s(sine.omega, self.order)
+        unit: ComplexArray = power_of_s(sine.omega, self.order) * np.equal(sine.harmonic, 1)
         value = np.asarray(values[0] * unit + 0.0 * sine.amplitude)
         if not derivatives:
             return StiffnessGradient(value, unit, ())

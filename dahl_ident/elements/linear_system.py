@@ -29,6 +29,7 @@ from dahl_ident.elements.facts import (
     Sine,
     StiffnessGradient,
     Values,
+    each_harmonic,
 )
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.rational import Rational, typical_rate
@@ -132,6 +133,7 @@ class LinearSystem(Element):
         """What the system's response is."""
         return self._quantity
 
+    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return Z(omega) with its derivatives; a sine answers no harmonic."""
         rows = 1 + len(self._labels) if derivatives > 1 else 1

@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_array, whole_number
 from dahl_ident.elements.element import Element, prefixed
-from dahl_ident.elements.facts import Sine, StiffnessGradient, Values
+from dahl_ident.elements.facts import Sine, StiffnessGradient, Values, each_harmonic
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
@@ -104,6 +104,7 @@ class MaxwellSlip(Masing):
         forces = [k * np.minimum(displacement, d) for k, d in zip(stiffnesses, slips, strict=True)]
         return np.asarray(sum(forces))
 
+    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives in closed form."""
         A = np.asarray(sine.amplitude, dtype=np.float64)
@@ -112,7 +113,7 @@ class MaxwellSlip(Masing):
         by_A, by_k, by_d = np.zeros_like(N), [], []
         for k, d in zip(*self.sliders(values), strict=True):
             with np.errstate(divide="ignore", over="ignore"):
-                unit, by_ratio = jenkins(np.asarray(d) / A, sine.harmonic)
+                unit, by_ratio = jenkins(np.asarray(d) / A, int(sine.harmonic))
             N += k * unit
             if derivatives:
                 safe = np.where(A > 0.0, A, 1.0)

@@ -29,6 +29,7 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     Values,
     central_differences,
+    each_harmonic,
 )
 from dahl_ident.elements.parameter import Parameter
 
@@ -96,6 +97,7 @@ class PowerDamper(Element):
         given = {"coefficient": coefficient, "exponent": exponent}
         self._bind({**given, "reference_speed": reference_speed}, name)
 
+    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, unchecked; infinite at rest for exponents below 1.
 
@@ -104,19 +106,20 @@ class PowerDamper(Element):
         c, p, speed = (np.asarray(v, dtype=np.float64) for v in values)
         A, omega = (np.asarray(v, dtype=np.float64) for v in sine[:2])
         shape = np.broadcast_shapes(*(v.shape for v in (c, p, speed, A, omega)))
-        share = _share(p, sine.harmonic)
+        k = int(sine.harmonic)
+        share = _share(p, k)
         with np.errstate(all="ignore"):
             # A^(p - 1) alone, so that p = 1 needs no amplitude
             size = np.where(omega > 0.0, (omega / speed) ** p * A ** (p - 1.0), 0.0)
-            unit = np.broadcast_to(1j * size * share if sine.harmonic % 2 else 0j, shape).copy()
+            unit = np.broadcast_to(1j * size * share if k % 2 else 0j, shape).copy()
             N = c * unit
             by_amplitude = np.where(A > 0.0, (p - 1.0) * N / A, 0.0)
             if derivatives < 2:
                 return StiffnessGradient(N, by_amplitude, ())
             logarithm = np.log(A * omega / speed)
             by_p = np.where(np.isfinite(logarithm), logarithm * N, 0.0)
-        if sine.harmonic % 2:
-            by_share = central_differences(lambda q: _share(q, sine.harmonic), [p], 0, p.shape)
+        if k % 2:
+            by_share = central_differences(lambda q: _share(q, k), [p], 0, p.shape)
             by_p = by_p + 1j * np.where(np.isfinite(size), c * size * by_share, 0.0)
         return StiffnessGradient(N, by_amplitude, (unit, by_p, -p / speed * N))
 

@@ -97,21 +97,21 @@ class Directions:
         return bool(self.scale) and all(p.free for p in self.scale)
 
     @cached_property
-    def length(self) -> Direction | None:
-        """The one direction with a unit, where it is a length and so scales the curve."""
-        with_unit = [d for d in self.nonlinear if not d.is_number]
-        if len(with_unit) != 1 or not self.element.rate_independent or not self.is_free:
-            return None
-        (one,) = with_unit
-        force, displacement, time = one.dimension
+    def lengths(self) -> tuple[Direction, ...]:
+        """The directions with a unit, where all are powers of a length and so scale the curve.
+
+        N over the reference then depends on the amplitude over one of these lengths, their ratios,
+        and numbers.
+        """
+        with_unit = tuple(d for d in self.nonlinear if not d.is_number)
         fixed = [
             p
             for p in self.element.parameters
             if not p.free and p not in self.scale and any(p.dimension)
         ]
-        is_length = not force and not time and abs(displacement) == 1
-        plain = is_positive(one.parameter) and not fixed and not self.linear
-        return one if is_length and plain else None
+        scales = self.element.rate_independent and self.is_free and not fixed and not self.linear
+        of_length = all(not d.dimension[0] and not d.dimension[2] for d in with_unit)
+        return with_unit if scales and of_length else ()
 
 
 @lru_cache(maxsize=256)

@@ -17,8 +17,8 @@ its own limit to well below any noise; whether the optimum lies out there, at in
 :mod:`dahl_ident.fitting.asymptotes` to decide. A pure number takes the values that its law
 declares. All nodes are combined while they are few; else points of a quasi-random sequence are.
 
-Where one length scales the curve of a rate-independent law, the curve is read from a table over
-ln(A/length) whose steps divide those of the grid.
+Where lengths scale the curve of a rate-independent law, the curve is read from tables over
+ln(A/length) whose steps divide those of the grid; several lengths are one and its multiples.
 """
 
 from __future__ import annotations
@@ -51,6 +51,9 @@ _AROUND_KNEE = 1e3  # how far a table is computed beyond the knee; power laws be
 _NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
 _LARGEST = 1e150  # weighted columns, whose squares are numbers still
 _DEPENDENT = 1e-12  # of a column's length that others leave
+_MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # of the shortest of several lengths
+_MOST_TABLES = 64  # 6 MB a harmonic in all, and some seconds
+_LEAST = 4  # amplitudes of a table
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
 _MOST_STARTS = 4  # searches a table: a limit on their cost
@@ -377,8 +380,8 @@ def _columns(
 
 def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
     """Return an element at its own grid, of at most about `most` nodes."""
-    if d.length is not None:
-        return _tabulated_curves(d, d.length, view, most)
+    if d.lengths:
+        return _tabulated_curves(d, view, most)
     most = min(most, _MOST_OF_ONE)
     lengths = [x for x in d.nonlinear if not x.is_number]
     numbers = [_numbers(x) for x in d.nonlinear if x.is_number]
@@ -468,70 +471,84 @@ def _offsets(span: int, most: float) -> IntArray:
     return np.concatenate([below, inner, above])
 
 
-def _tabulated_curves(
-    d: Directions, length: Direction, view: StiffnessData, most: float
-) -> _Curves:
-    """Return an element whose curve one length scales: from tables over ln(A/length)."""
-    numbers = [x for x in d.nonlinear if x is not length]
-    axes = [_numbers(x) for x in numbers]
+def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
+    """Return an element whose curve lengths scale: from tables over ln(A/length).
+
+    The length is the shortest; the others are multiples of it.
+    """
+    numbers = [x for x in d.nonlinear if x.is_number]
+    ordered = [*d.lengths, *numbers]
+    multiples = np.array(_MULTIPLES if len(d.lengths) > 1 else (1.0,))
+    axes = [_powers(x, multiples) for x in d.lengths] + [_numbers(x) for x in numbers]
     counts = [a.size for a in axes]
-    index = np.indices(counts).reshape(len(counts), -1) if counts else np.zeros((0, 1), np.intp)
-    if index.shape[1] > most / 6.0:
-        index = _quasi_random(tuple(counts), max(2, int(most / 6.0)))
-    chosen = [a[i] for a, i in zip(axes, index, strict=True)]
-    combinations = np.array(chosen).reshape(len(axes), index.shape[1]).T
+    index = np.indices(counts).reshape(len(counts), -1)
+    shortest = [index[i] % multiples.size == 0 for i in range(len(d.lengths))]
+    index = index[:, np.any(shortest, axis=0)]
+    index = index[:, _possible(d, ordered, axes, index)]
+    allowed = max(2, int(min(_MOST_TABLES, most / 6.0)))
+    if index.shape[1] > allowed:
+        chosen = np.random.default_rng(1).choice(index.shape[1], allowed, replace=False)
+        index = index[:, np.sort(chosen)]
+    combinations = np.array([a[i] for a, i in zip(axes, index, strict=True)]).T
     position = np.rint(np.log(view.amplitude) / _STEP).astype(np.intp)
     low = position.min(axis=-1)
     span = int((position.max(axis=-1) - low).max())
     offsets = _offsets(span, max(6.0, most / len(combinations)))
     ln_length = low[..., None] + offsets
     at = position[..., None, :] - (ln_length[..., None] + _LOWEST)
-    power = length.dimension[1]
-    curves = [_curve(d, length, tuple(c.tolist()), view, at) for c in combinations]
-    curve = curves[0] if len(curves) == 1 else np.concatenate(curves, axis=-2)
+    at = np.clip(at, 0, _NODES)
+    order = np.searchsorted(view.orders, view.harmonic)
+    curve = np.concatenate(
+        [_table(d, ordered, tuple(c.tolist()), view.orders)[order, at] for c in combinations],
+        axis=-2,
+    )
     K = len(combinations)
     ln_lengths = np.concatenate([ln_length] * K, axis=-1) * _STEP
-    values = {length.parameter.name: np.exp(ln_lengths * power)}
-    for column, direction in enumerate(numbers):
-        values[direction.parameter.name] = np.repeat(combinations[:, column], offsets.size)
+    values = {}
+    for column, direction in enumerate(ordered):
+        unit = np.repeat(combinations[:, column], offsets.size)
+        power = direction.dimension[1]
+        values[direction.parameter.name] = unit * np.exp(ln_lengths * power) if power else unit
     assert d.reference is not None
     values[d.reference.name] = np.ones(K * offsets.size)
     node = np.arange(K * offsets.size) % offsets.size
     edges = [node == 0, node == offsets.size - 1]
+    if len(d.lengths) > 1:
+        longest = index[: len(d.lengths)] % multiples.size == multiples.size - 1
+        edges += [np.repeat(far, offsets.size) for far in longest]
     # the curve at unit length is that of unit reference, whatever the reference's own dimension
     shift = d.reference.dimension[1] + 1
     if shift:
         curve = curve / np.exp(ln_lengths[..., None] * shift)
-    return _Curves(values, [_Column(d.scale, curve)], None, edges)
+    return _Curves(values, [_Column(d.scale, curve)], None, [e for e in edges if e.any()])
 
 
-def _curve(
-    d: Directions, length: Direction, numbers: tuple[float, ...], view: StiffnessData, at: IntArray
-) -> ComplexArray:
-    """Return F_k/X_1 at unit scale and places `at` of the table, row by row's harmonic."""
-    if len(view.orders) == 1:
-        return _table(d, length, numbers, view.orders[0]).take(at, mode="clip")
-    curve = np.empty(at.shape, dtype=np.complex128)
-    for k in view.orders:
-        rows = view.harmonic == k
-        curve[..., rows] = _table(d, length, numbers, k).take(at[..., rows], mode="clip")
-    return curve
+def _powers(direction: Direction, multiples: FloatArray) -> FloatArray:
+    """Return the values of a power of a length at multiples of unit length, of both signs."""
+    values = multiples ** direction.dimension[1]
+    return values if is_positive(direction.parameter) else np.concatenate([values, -values])
 
 
 _TABLES: dict[Hashable, ComplexArray] = {}
-_MOST_TABLES = 64  # 6 MB in all
 
 
 def _table(
-    d: Directions, length: Direction, numbers: tuple[float, ...], harmonic: int
+    d: Directions, ordered: list[Direction], at: tuple[float, ...], orders: tuple[int, ...]
 ) -> ComplexArray:
-    """Return F_k/X_1 over unit scale at ln(A/length) = -32, -31.99, ..., 32."""
+    """Return F_k/X_1 over unit scale at ln(A/length) = -32, -31.99, ..., 32, (orders, n).
+
+    `at` are the values of the directions at unit length.
+    """
     element = d.element
-    values = _unit_values(d, length, numbers)
+    given = dict(zip((x.parameter.name for x in ordered), at, strict=True))
+    values = [
+        np.asarray(given.get(p.name, 1.0 if p.free or p.value is None else p.value), np.float64)
+        for p in element.parameters
+    ]
     plain = set(vars(element)) <= {"_name", "parameters", "scale_parameters"}
-    key = (type(element), element.labels, tuple(float(v) for v in values), harmonic)
+    key = (type(element), element.labels, tuple(float(v) for v in values), orders)
     if not plain or key not in _TABLES:
-        table = _computed_table(element, values, harmonic)
+        table = _computed_table(element, values, np.array(orders))
         if not plain:
             return table
         if len(_TABLES) >= _MOST_TABLES:
@@ -540,19 +557,13 @@ def _table(
     return _TABLES[key]
 
 
-def _unit_values(d: Directions, length: Direction, numbers: tuple[float, ...]) -> list[FloatArray]:
-    """Return the element's values at unit scale and length."""
-    of_numbers = [x.parameter for x in d.nonlinear if x is not length]
-    given = dict(zip((p.name for p in of_numbers), numbers, strict=True))
-    values = []
-    for p in d.element.parameters:
-        value = given.get(p.name, 1.0 if p.free or p.value is None else p.value)
-        values.append(np.asarray(value, dtype=np.float64))
-    return values
+def _computed_table(
+    element: Element, values: list[FloatArray], orders: NDArray[np.int64]
+) -> ComplexArray:
+    """Return the table from amplitudes around the knee; power laws beyond.
 
-
-def _computed_table(element: Element, values: list[FloatArray], harmonic: int) -> ComplexArray:
-    """Return the table from amplitudes around the knee; power laws beyond."""
+    Beyond the last amplitude at which the law has a loop there is none.
+    """
     from scipy.interpolate import CubicSpline
 
     low, high = (float(np.asarray(v)) for v in element.knee(values))
@@ -562,19 +573,26 @@ def _computed_table(element: Element, values: list[FloatArray], harmonic: int) -
     last = int(np.log(high * _AROUND_KNEE) / _STEP)
     coarse = np.arange(max(first, _LOWEST), min(last, _LOWEST + _NODES) + 1, _COMPUTED)
     x = coarse * _STEP
-    Z = element.stiffness(values, np.exp(x), np.ones(()), harmonic)
+    with np.errstate(all="ignore"):
+        Z = element.stiffness(
+            values, np.tile(np.exp(x), orders.size), np.ones(()), np.repeat(orders, x.size)
+        ).reshape(orders.size, -1)
     fine = np.arange(_LOWEST, _LOWEST + _NODES + 1) * _STEP
-    parts = []
-    for y in (Z.real, Z.imag):
-        inside = CubicSpline(x, y)(np.clip(fine, x[0], x[-1]))
-        for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
+    usable = (np.abs(Z) < _LARGEST).all(axis=0)
+    count = x.size if usable.all() else int(usable.argmin())
+    if count < _LEAST:
+        return np.full((orders.size, fine.size), np.nan, dtype=np.complex128)
+    x, Z, ends = x[:count], Z[:, :count], count < x.size
+    table = np.asarray(CubicSpline(x, Z, axis=1)(np.clip(fine, x[0], x[-1])))
+    for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
+        for whole, Y in ((table.real, Z.real), (table.imag, Z.imag)):
             with np.errstate(divide="ignore", invalid="ignore"):
-                slope = np.log(y[end] / y[near]) / (x[end] - x[near])
-            if not np.isfinite(slope):
-                slope = 0.0
-            inside[side] = y[end] * np.exp(np.clip(slope, -3.0, 3.0) * (fine[side] - x[end]))
-        parts.append(inside)
-    return np.asarray(parts[0] + 1j * parts[1])
+                slope = np.log(Y[:, end] / Y[:, near]) / (x[end] - x[near])
+            slope = np.clip(np.where(np.isfinite(slope), slope, 0.0), -3.0, 3.0)[:, None]
+            whole[:, side] = Y[:, [end]] * np.exp(slope * (fine[side] - x[end]))
+    if ends:
+        table[:, fine > x[-1]] = np.nan
+    return table
 
 
 def _solve_one(

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -108,10 +109,7 @@ class Nearby:
 
 @dataclass(frozen=True)
 class _Group:
-    """Rows that are computed together; `operator` is (j omega)^p.
-
-    Harmonics of the force are apart, those of the displacement are not.
-    """
+    """Rows that are computed together, with all their harmonics; `operator` is (j omega)^p."""
 
     rows: slice | NDArray[np.intp]
     harmonic: NDArray[np.int64]
@@ -122,6 +120,12 @@ class _Group:
     drive: FloatArray | None
     steady: SteadyRows | None
     """Of rows that are predicted by the exact steady motion."""
+
+    @cached_property
+    def orders(self) -> int | NDArray[np.int64]:
+        """The harmonic of each row, or that of all."""
+        first = int(self.harmonic[0])
+        return first if (self.harmonic == first).all() else self.harmonic
 
 
 class Predictor:
@@ -200,10 +204,11 @@ class Predictor:
         with np.errstate(divide="ignore", invalid="ignore"):
             measured = rows.drive * (ratio if self._exponent == -1 else 1.0 / ratio)
         drive, omega = np.broadcast_arrays(rows.drive, rows.omega)
-        first = np.where(rows.of_displacement, rows.fundamental, np.arange(rows.n))
+        every = np.arange(rows.n)
+        first = np.atleast_2d(np.where(rows.of_displacement, rows.fundamental, every))[0]
         return SteadyRows(
             self._model, self._shooting, drive[..., part], omega[..., part], measured[..., part],
-            rows.harmonic[part], np.atleast_2d(first)[0][part], self._orbits,
+            rows.harmonic[part], np.searchsorted(every[part], first[part]), self._orbits,
         )  # fmt: skip
 
     def as_stiffness(
@@ -229,8 +234,7 @@ class Predictor:
             amplitude = amplitude / starts[1]
         if rows.quantity != "dynamic_stiffness":
             weights = weights * np.abs(response / Z)
-        orders = tuple(np.unique(harmonic).tolist())
-        return StiffnessData(Z, amplitude, rows.omega, harmonic, orders, weights)
+        return StiffnessData(Z, amplitude, rows.omega, harmonic, weights)
 
     def __call__(
         self,
@@ -299,7 +303,7 @@ class Predictor:
         """Return the response by the describing function; it has no harmonics of the motion."""
         own, sensed = values[:-3], values[-3:]
         amplitude, found = self._amplitude(group, own, sensed, amplitude_error)
-        harmonic = 1 if group.forced else int(group.harmonic[0])
+        harmonic = 1 if group.forced else group.orders
         factor = group.operator * (group.harmonic == harmonic)
         if not self._neutral:
             sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
@@ -445,10 +449,9 @@ def _fundamental(rows: Rows, response: ComplexArray) -> ComplexArray:
 
 def _parts(rows: Rows) -> Iterator[tuple[slice | NDArray[np.intp], bool]]:
     """Yield rows, and whether force-controlled, for each kind of row."""
-    kind = np.where(rows.forced, -1, rows.harmonic)
-    kinds = np.unique(kind).tolist()
-    for k in kinds:
-        yield slice(None) if len(kinds) == 1 else np.flatnonzero(kind == k), k < 0
+    kinds = np.unique(rows.forced).tolist()
+    for forced in kinds:
+        yield slice(None) if len(kinds) == 1 else np.flatnonzero(rows.forced == forced), forced
 
 
 def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:

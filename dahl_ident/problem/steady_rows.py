@@ -39,7 +39,7 @@ class RowMotion(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Of some rows: X_k with its derivatives, the orbits, the fundamentals X_1, multipliers."""
+    """Of some points: X_k with derivatives, (points, K, ...), orbits, X_1, multipliers."""
 
     X: ComplexArray
     orbits: FloatArray
@@ -60,7 +60,7 @@ class SteadyRows:
     measured : ndarray of complex, shape (n,) or (S, n)
         Fundamental of the displacement, which chooses among several motions.
     harmonic, fundamental : ndarray of int, shape (n,)
-        Harmonic k that each row holds, and the row that holds its fundamental.
+        Harmonic k that each row holds, and the row, of these, that holds its fundamental.
     orbits : dict of int to ndarray
         The orbits last found, (n, order), by their order; kept up to date.
     """
@@ -77,48 +77,54 @@ class SteadyRows:
         orbits: dict[int, FloatArray],
     ) -> None:
         self._model, self._shooting = model, shooting
-        self._omega, self._measured = omega, measured
+        self._drive, self._omega, self._measured = drive, omega, measured
         self._unique_laws = all(e.is_linear or e.unique_response for e in model.elements)
         self._harmonics = (1, *sorted(set(harmonic.tolist()) - {1}))
         self._place = np.array([self._harmonics.index(k) for k in harmonic.tolist()])
-        sweep = np.argsort(fundamental, kind="stable")
-        self._order = [sweep[rows] for rows in levels(np.atleast_2d(drive)[0][sweep])]
+        self._sweep = np.argsort(fundamental, kind="stable")
+        self._fundamental = fundamental
         self._orbits = orbits
 
     def at(self, values: Sequence[FloatArray], drive: FloatArray, chosen: list[int]) -> RowMotion:
         """Return the motions at values of all parameters, each (1,) or (S, 1).
 
-        `chosen` are the parameters whose derivatives are wanted, by index.
+        `chosen` are the parameters whose derivatives are wanted, by index. Harmonics of one motion
+        are solved for together where their rows have the same drive.
         """
         shape = np.broadcast_shapes(
             self._omega.shape, np.shape(drive), *(np.shape(v) for v in values)
         )
-        n = shape[-1]
+        u, w = (np.broadcast_to(v, shape) for v in (drive, self._omega))
+        points, point = np.unique(self._fundamental, return_inverse=True)
+        if not (u == u[..., points[point]]).all():
+            points = point = np.arange(shape[-1])
+        m = points.size
         values = self._within_reach(values)
-        p = np.stack([np.broadcast_to(v, shape).ravel() for v in values], axis=-1)
-        u, w = (np.broadcast_to(v, shape).ravel() for v in (drive, self._omega))
-        several = ~self._is_unique(values, shape).reshape(-1, n).all(axis=1)
-        X = np.full((u.size, 2 + len(chosen)), np.nan, dtype=np.complex128)
+        p = np.stack([np.broadcast_to(v, (*shape[:-1], m)).ravel() for v in values], axis=-1)
+        u, w = (v[..., points].ravel() for v in (u, w))
+        measured = np.broadcast_to(self._measured, shape)[..., points].ravel()
+        several = ~self._is_unique(values, shape).reshape(-1, shape[-1]).all(axis=1)
+        X = np.full((u.size, len(self._harmonics), 2 + len(chosen)), np.nan, dtype=np.complex128)
         stable = np.ones(u.size, dtype=np.bool_)
-        alone = np.flatnonzero(np.repeat(~several, n))
+        alone = np.flatnonzero(np.repeat(~several, m))
         if alone.size:
-            last = self._orbits.get(self._shooting.system.order)
-            starts = None if last is None else last[alone % n]
-            found = self._solve(
-                alone % n, p[alone], w[alone], u[alone], chosen, starts, stable=False
-            )
-            X[alone], first = found.X, found.orbits[:n]
-            if last is not None:
-                first = np.where(np.isfinite(first), first, last)
-            self._orbits[self._shooting.system.order] = first
-        measured = np.broadcast_to(self._measured, shape).ravel()
+            order = self._shooting.system.order
+            last = self._orbits.get(order)
+            starts = None if last is None else last[points][alone % m]
+            found = self._solve(p[alone], w[alone], u[alone], chosen, starts, stable=False)
+            X[alone] = found.X
+            if last is None:
+                last = self._orbits[order] = np.full((shape[-1], order), np.nan)
+            orbits = found.orbits[:m][point]
+            last[:] = np.where(np.isfinite(orbits), orbits, last)
         for table in np.flatnonzero(several):
-            rows = slice(table * n, (table + 1) * n)
-            X[rows], stable[rows] = self._followed(
-                p[rows], w[rows], u[rows], measured[rows], chosen
+            own = slice(table * m, (table + 1) * m)
+            X[own], stable[own] = self._followed(
+                points, p[own], w[own], u[own], measured[own], chosen
             )
-        X = X.reshape(*shape, -1)
-        return RowMotion(X[..., 0], X[..., 1], X[..., 2:], stable.reshape(shape))
+        X = X.reshape(*shape[:-1], m, *X.shape[1:])[..., point, self._place, :]
+        stable = stable.reshape(*shape[:-1], m)[..., point]
+        return RowMotion(X[..., 0], X[..., 1], X[..., 2:], stable)
 
     def is_linear(self, values: Sequence[FloatArray]) -> NDArray[np.bool_]:
         """Return whether friction is hardly more than a spring at every row, () or (S,).
@@ -162,7 +168,6 @@ class SteadyRows:
 
     def _solve(
         self,
-        rows: NDArray[np.intp],
         values: FloatArray,
         omega: FloatArray,
         drive: FloatArray,
@@ -172,39 +177,47 @@ class SteadyRows:
         again: bool = True,
         stable: bool = True,
     ) -> _Solution:
-        """Return the motions of rows of one or more tables."""
+        """Return the motions of some points of one or more tables."""
         found = self._shooting(
             values, omega, drive, chosen=chosen, harmonics=self._harmonics, starts=starts,
             again=again, stable=stable,
         )  # fmt: skip
-        own = np.arange(rows.size), self._place[rows]
-        X = [found.harmonics[own][:, None], found.by_drive[own][:, None], found.by_parameter[own]]
+        X = [found.harmonics[..., None], found.by_drive[..., None], found.by_parameter]
         return _Solution(
-            np.concatenate(X, axis=1), found.starts, found.harmonics[:, 0], found.multiplier
+            np.concatenate(X, axis=-1), found.starts, found.harmonics[:, 0], found.multiplier
         )
 
     def _followed(
         self,
+        points: NDArray[np.intp],
         values: FloatArray,
         omega: FloatArray,
         drive: FloatArray,
         measured: ComplexArray,
         chosen: list[int],
     ) -> tuple[ComplexArray, NDArray[np.bool_]]:
-        """Return the motions of one table, and which are stable.
+        """Return the motions of one table's points, and which are stable.
 
         Each level is followed in the order of its rows; with derivatives as far as there are
         motions: a search needs all rows, or none.
         """
+        place_of = np.full(self._sweep.size, -1)
+        place_of[points] = np.arange(points.size)
+        sweep = place_of[self._sweep]
+        sweep = sweep[sweep >= 0]
+        order_of_levels = [
+            sweep[own] for own in levels(np.atleast_2d(self._drive)[0][points[sweep]])
+        ]
+        shape = (drive.size, len(self._harmonics), 2 + len(chosen))
         stable = np.ones(drive.size, dtype=np.bool_)
-        result = np.full((drive.size, 2 + len(chosen)), np.nan, dtype=np.complex128)
+        result = np.full(shape, np.nan, dtype=np.complex128)
         order = self._shooting.system.order
-        orbits = np.full((len(self._order), order), np.nan)
-        for place in range(max(map(len, self._order))):
-            sweeps = [i for i, sweep in enumerate(self._order) if place < len(sweep)]
-            rows = np.array([self._order[i][place] for i in sweeps])
+        orbits = np.full((len(order_of_levels), order), np.nan)
+        for place in range(max(map(len, order_of_levels))):
+            sweeps = [i for i, own in enumerate(order_of_levels) if place < len(own)]
+            rows = np.array([order_of_levels[i][place] for i in sweeps])
             X, own, first, _ = self._solve(
-                rows, values[rows], omega[rows], drive[rows], chosen, orbits[sweeps]
+                values[rows], omega[rows], drive[rows], chosen, orbits[sweeps]
             )
             apart = np.abs(first - measured[rows])
             far = np.flatnonzero(~(apart < _ELSEWHERE * np.abs(measured[rows])))
@@ -214,15 +227,15 @@ class SteadyRows:
                 begin[:, 0], begin[:, 1] = at.real, -omega[rows[far]] * at.imag
                 there = rows[far]
                 other, orbit, first, _ = self._solve(
-                    there, values[there], omega[there], drive[there], chosen, begin, again=False
+                    values[there], omega[there], drive[there], chosen, begin, again=False
                 )
                 nearer = ~(apart[far] <= np.abs(first - at)) & np.isfinite(first)
                 X[far[nearer]], own[far[nearer]] = other[nearer], orbit[nearer]
-            lost = np.flatnonzero(np.isnan(X[:, 0]))
+            lost = np.flatnonzero(np.isnan(X[:, 0, 0]))
             if lost.size:
                 there = rows[lost]
                 X[lost], own[lost], _, multiplier = self._solve(
-                    there, values[there], omega[there], drive[there], chosen, orbits[sweeps][lost],
+                    values[there], omega[there], drive[there], chosen, orbits[sweeps][lost],
                     stable=False,
                 )  # fmt: skip
                 stable[there] = ~(multiplier > 1.0 + NEUTRAL)

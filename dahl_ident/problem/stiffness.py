@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,8 +26,6 @@ class StiffnessData:
     amplitude, omega : ndarray, shape (n,) or (S, n)
         True amplitude and angular frequency.
     harmonic : ndarray of int, shape (n,)
-    orders : tuple of int
-        The harmonics that occur.
     weights : ndarray, shape (n,) or (S, n)
         One over the standard deviation of Z that the noise model has at the data, up to the
         unknown scale and the ellipse's shape.
@@ -37,7 +35,6 @@ class StiffnessData:
     amplitude: FloatArray
     omega: FloatArray
     harmonic: NDArray[np.int64]
-    orders: tuple[int, ...]
     weights: FloatArray
 
     @property
@@ -54,32 +51,27 @@ class StiffnessData:
         (..., K, n). Meant for starts: over many rows a law that does not depend on the rate is
         interpolated, to two thousandths of its largest value, a hundredth at a kink.
         """
-        A, omega, shape = self.amplitude, self.omega, self.stiffness.shape
+        A, omega = self.amplitude, self.omega
+        harmonic = self.harmonic if len(self.orders) > 1 else self.orders[0]
         if not at_nodes:
-            result = np.empty(shape, dtype=np.complex128)
-            for k, rows in self._by_order():
-                result[..., rows] = element.stiffness(values, A[..., rows], omega[..., rows], k)
-            return result
+            return np.asarray(element.stiffness(values, A, omega, harmonic))
         values = [v[..., None] for v in values]
-        nodes = np.broadcast_shapes(*(v.shape for v in values))
-        result = np.empty(np.broadcast_shapes((*shape[:-1], 1, shape[-1]), nodes), np.complex128)
         x, cell, share = self._places
-        few = element.rate_independent and A.ndim == 1 and x.size < A.size
-        for k, rows in self._by_order():
-            if few:
-                curve = element.stiffness(values, np.exp(x), np.ones(()), k)
-                left, right = curve[..., cell[rows]], curve[..., cell[rows] + 1]
-                right -= left
-                right *= share[rows]
-                result[..., rows] = left + right
-            else:
-                own = A[..., None, rows], omega[..., None, rows]
-                result[..., rows] = element.stiffness(values, *own, k)
-        return result
+        if not element.rate_independent or A.ndim > 1 or x.size * len(self.orders) >= A.size:
+            return element.stiffness(values, A[..., None, :], omega[..., None, :], harmonic)
+        orders = np.array(self.orders)
+        at = np.tile(np.exp(x), orders.size)
+        curves = element.stiffness(values, at, np.ones(()), np.repeat(orders, x.size))
+        cell = cell + x.size * np.searchsorted(orders, self.harmonic)
+        left, right = curves[..., cell], curves[..., cell + 1]
+        right -= left
+        right *= share
+        return np.asarray(left + right)
 
-    def _by_order(self) -> Iterator[tuple[int, slice | NDArray[np.bool_]]]:
-        for k in self.orders:
-            yield k, slice(None) if len(self.orders) == 1 else self.harmonic == k
+    @cached_property
+    def orders(self) -> tuple[int, ...]:
+        """The harmonics that occur."""
+        return tuple(np.unique(self.harmonic).tolist())
 
     @cached_property
     def _places(self) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
