@@ -204,10 +204,8 @@ def test_an_exponent_is_estimated_and_handed_on() -> None:
         fit.export("c")
 
 
-@pytest.mark.parametrize("exponent", [1.0, None])
-def test_a_table_with_harmonics_takes_seconds(exponent: float | None) -> None:
-    plant = BoucWen(30.0, 200.0, 150.0, exponent=exponent or 1.7)
-    true = plant + di.Mass(0.02) + di.Damper(0.1)
+def test_a_table_with_harmonics_takes_seconds() -> None:
+    true = BoucWen(30.0, 200.0, 150.0) + di.Mass(0.02) + di.Damper(0.1)
     orders = np.tile([1, 3, 5], 15)
     A, f = np.repeat(np.geomspace(1e-4, 0.1, 15), 3), np.repeat(np.resize([0.5, 1.0, 2.0], 15), 3)
     Z = np.array(
@@ -221,8 +219,8 @@ def test_a_table_with_harmonics_takes_seconds(exponent: float | None) -> None:
     Z = Z + size * (noise[0] + 1j * noise[1])
     data = di.FrequencyResponse(f, Z, A, harmonic=orders, controlled="displacement")
     begin = time.process_time()
-    fit = di.fit(data, BoucWen(exponent=exponent) + di.Mass() + di.Damper())
-    assert time.process_time() - begin < 20.0  # one; a loop for each node, row and harmonic: 60
+    fit = di.fit(data, BoucWen() + di.Mass() + di.Damper())
+    assert time.process_time() - begin < 10.0  # one; a loop for each node, row and harmonic: 60
     for p in true.parameters:
         found = fit.params[p.name]
         assert abs(found.value - (p.value or 0.0)) < 3.5 * (found.stderr or 0.0), p.name

@@ -53,7 +53,8 @@ _LARGEST = 1e150  # weighted columns, whose squares are numbers still
 _DEPENDENT = 1e-12  # of a column's length that others leave
 _MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # of the shortest of several lengths
 _MOST_TABLES = 64  # 6 MB a harmonic in all, and some seconds
-_LEAST = 4  # amplitudes of a table
+_LEAST, _TOGETHER = 4, 20  # amplitudes of a table; those that are computed together
+_HIGHEST = 3  # harmonic that takes part in a start; higher ones cost more and tell little more
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
 _MOST_STARTS = 4  # searches a table: a limit on their cost
@@ -297,6 +298,9 @@ def _scaled(values: dict[str, FloatArray], column: _Column, coefficient: FloatAr
 
 
 def _grid(problem: Problem, view: StiffnessData) -> _Grid:
+    low = np.flatnonzero(view.harmonic <= _HIGHEST)
+    if 0 < low.size < view.harmonic.size:
+        view = view.of_rows(low)
     every = [directions(e) for e in problem.model.elements]
     searched = [d for d in every if d.nonlinear]
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
@@ -573,13 +577,21 @@ def _computed_table(
     last = int(np.log(high * _AROUND_KNEE) / _STEP)
     coarse = np.arange(max(first, _LOWEST), min(last, _LOWEST + _NODES) + 1, _COMPUTED)
     x = coarse * _STEP
-    with np.errstate(all="ignore"):
-        Z = element.stiffness(
-            values, np.tile(np.exp(x), orders.size), np.ones(()), np.repeat(orders, x.size)
-        ).reshape(orders.size, -1)
+    parts = []
+    for some in np.array_split(x, max(1, x.size // _TOGETHER)):
+        with np.errstate(all="ignore"):
+            parts.append(
+                element.stiffness(
+                    values, np.tile(np.exp(some), orders.size), np.ones(()),
+                    np.repeat(orders, some.size),
+                ).reshape(orders.size, -1)
+            )  # fmt: skip
+        if not (np.abs(parts[-1]) < _LARGEST).all():
+            break
+    Z = np.concatenate(parts, axis=1)
     fine = np.arange(_LOWEST, _LOWEST + _NODES + 1) * _STEP
     usable = (np.abs(Z) < _LARGEST).all(axis=0)
-    count = x.size if usable.all() else int(usable.argmin())
+    count = usable.size if usable.all() else int(usable.argmin())
     if count < _LEAST:
         return np.full((orders.size, fine.size), np.nan, dtype=np.complex128)
     x, Z, ends = x[:count], Z[:, :count], count < x.size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -41,6 +41,10 @@ class StiffnessData:
     def typical_stiffness(self) -> FloatArray:
         """Median of |Z|, shape () or (S,); above zero also where most responses are zero."""
         return np.asarray(np.maximum(np.median(np.abs(self.stiffness), axis=-1), SMALLEST))
+
+    def of_rows(self, rows: NDArray[np.intp]) -> StiffnessData:
+        """Return some of the rows."""
+        return StiffnessData(*(getattr(self, one.name)[..., rows] for one in fields(self)))
 
     def of(
         self, element: Element, values: Sequence[FloatArray], *, at_nodes: bool = False
