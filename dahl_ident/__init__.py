@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from dahl_ident.extraction import extract
     from dahl_ident.planning import plan
     from dahl_ident.reporting import report
-    from dahl_ident.results import FitResult, RecordFit, fit, fit_many, posterior
+    from dahl_ident.results import FitResult, fit, fit_many, posterior
     from dahl_ident.sensors import Sensors
     from dahl_ident.steady_state import response
     from dahl_ident.synthetic import Experiment, load_dataset, simulate
@@ -55,7 +55,7 @@ _ROOMS = {
     "extraction": "extract",
     "planning": "plan",
     "reporting": "report",
-    "results": "FitResult RecordFit fit fit_many posterior",
+    "results": "FitResult fit fit_many posterior",
     "sensors": "Sensors",
     "steady_state": "response",
     "synthetic": "Experiment load_dataset simulate",
@@ -82,7 +82,6 @@ __all__ = [
     "Parameter",
     "PowerDamper",
     "Record",
-    "RecordFit",
     "Sensors",
     "Spring",
     "campaign",

@@ -187,7 +187,7 @@ class FitInterrupted(KeyboardInterrupt):
     ----------
     message : str
         What happened.
-    result : RecordFit
+    result : FitResult
         The best values so far, with status "not described", because no minimum was reached.
 
     Examples

@@ -135,7 +135,7 @@ def test_models_of_records_are_not_compared_as_tables(
     assert "compares models of tables alone" in why
     fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
     with pytest.raises(di.errors.ValidationError, match="takes a fit of a table"):
-        di.compare_models(fit)  # type: ignore[arg-type]
+        di.compare_models(fit)
 
 
 def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:

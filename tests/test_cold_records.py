@@ -80,7 +80,7 @@ def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers() -> No
         if found.vary:
             u = float(found.stderr or 0.0)
             assert abs(found.value - float(parameter.value or 0.0)) < 3.0 * u
-    again = di.RecordFit.from_json(fit.to_json())
+    again = di.FitResult.from_json(fit.to_json())
     assert again.verdict == fit.verdict
 
 

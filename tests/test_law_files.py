@@ -175,10 +175,10 @@ def test_a_saved_fit_of_records_says_it_too(file: Path, monkeypatch: pytest.Monk
     force = law(30.0, 0.1).force(x) + noise  # type: ignore[call-arg]
     fit = di.fit(di.Record(t, displacement=x, force=force), law())
     text = fit.to_json()
-    assert di.RecordFit.from_json(text).params["k"].value == fit.params["k"].value
+    assert di.FitResult.from_json(text).params["k"].value == fit.params["k"].value
     monkeypatch.delitem(KINDS, kind_of(file))
     with pytest.raises(ModelError, match=f"the class Jenkins of {file}"):
-        di.RecordFit.from_json(text)
+        di.FitResult.from_json(text)
 
 
 def test_a_campaign_takes_it_to_its_workers(file: Path, run: Runner) -> None:

@@ -39,7 +39,6 @@ PUBLIC_NAMES = [
     "Parameter",
     "PowerDamper",
     "Record",
-    "RecordFit",
     "Sensors",
     "Spring",
     "campaign",

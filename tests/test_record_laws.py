@@ -61,7 +61,7 @@ def drive(kind: str, samples: int) -> FloatArray:
     return np.asarray(0.03 * np.sum([np.sin(2 * np.pi * (f * t + p)) for f, p in lines], axis=0))
 
 
-def assert_recovered(fit: di.RecordFit, truth: Element) -> None:
+def assert_recovered(fit: di.FitResult, truth: Element) -> None:
     """Check every free parameter against its uncertainty, which must say something."""
     assert fit.trusted, fit.verdict
     for parameter in truth.parameters:

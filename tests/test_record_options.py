@@ -22,12 +22,12 @@ def record(force: np.ndarray) -> di.Record:
 
 
 @pytest.fixture(scope="module")
-def fit() -> di.RecordFit:
+def fit() -> di.FitResult:
     return di.fit(record(TRUE + NOISE), MODEL)
 
 
 @pytest.mark.parametrize("method", ["scipy", "ipopt"])
-def test_every_method_finds_the_same_optimum(method: str, fit: di.RecordFit) -> None:
+def test_every_method_finds_the_same_optimum(method: str, fit: di.FitResult) -> None:
     other = di.fit(record(TRUE + NOISE), MODEL, method=method)
     assert other.method == method
     np.testing.assert_allclose(other.optimum.values[:2], fit.optimum.values[:2], rtol=1e-5)
@@ -35,7 +35,7 @@ def test_every_method_finds_the_same_optimum(method: str, fit: di.RecordFit) -> 
 
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
 @pytest.mark.parametrize("method", ["lm", "scipy"])
-def test_robust_losses_ignore_outliers(loss: str, method: str, fit: di.RecordFit) -> None:
+def test_robust_losses_ignore_outliers(loss: str, method: str, fit: di.FitResult) -> None:
     hit = TRUE + NOISE
     hit[::50] += 0.2
     robust = di.fit(record(hit), MODEL, loss=loss, method=method)
@@ -44,13 +44,13 @@ def test_robust_losses_ignore_outliers(loss: str, method: str, fit: di.RecordFit
     assert abs(robust.params["f_max"].value - 0.1) < 3.0 * u
     assert abs(plain.params["f_max"].value - 0.1) > 5.0 * u
     assert 0.8 * u < robust.stderr_noise["f_max"] < 1.5 * u
-    again = di.RecordFit.from_json(robust.to_json())
+    again = di.FitResult.from_json(robust.to_json())
     assert again.stderr_noise["f_max"] == pytest.approx(robust.stderr_noise["f_max"])
 
 
 @pytest.mark.parametrize("method", ["profile", "bootstrap"])
 def test_intervals_by_noise_agree_where_the_problem_is_linear(
-    method: Literal["profile", "bootstrap"], fit: di.RecordFit
+    method: Literal["profile", "bootstrap"], fit: di.FitResult
 ) -> None:
     comparison = fit.compare_intervals(("wald", method), levels=0.9545)
     for ours, theirs in zip(
@@ -90,7 +90,7 @@ def test_a_posterior_by_points_has_the_covariance_of_the_fit() -> None:
 def test_constraints() -> None:
     measured = record(TRUE + NOISE)
 
-    def tied(ratio: float) -> di.RecordFit:
+    def tied(ratio: float) -> di.FitResult:
         def constraints(p: Any) -> list[Any]:
             return [p["sigma"] == ratio * p["f_max"]]
 
@@ -101,7 +101,7 @@ def test_constraints() -> None:
         sigma, f_max = fit.params["sigma"], fit.params["f_max"]
         assert sigma.value == pytest.approx(ratio * f_max.value)
         assert sigma.stderr == pytest.approx(ratio * (f_max.stderr or 0.0))
-        again = di.RecordFit.from_json(fit.to_json())
+        again = di.FitResult.from_json(fit.to_json())
         assert again.params["sigma"].stderr == pytest.approx(sigma.stderr)
         assert str(again.status) == str(fit.status)
     assert right.trusted
@@ -119,6 +119,6 @@ def test_constraints() -> None:
         (di.load_dataset("noisy"), {"excitation": "base"}),
     ],
 )
-def test_options_of_the_other_kind_are_refused(data: object, option: dict[str, object]) -> None:
+def test_options_of_the_other_kind_are_refused(data: Any, option: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=r"given with a fit of (records|tables), which has"):
-        di.fit(data, MODEL, **option)  # type: ignore[call-overload]
+        di.fit(data, MODEL, **option)

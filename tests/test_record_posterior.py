@@ -35,7 +35,7 @@ def test_as_wide_as_the_error_bars_of_the_fit_where_residuals_are_correlated() -
         assert abs(found.params[name].value - fit.params[name].value) < 0.3 * other
 
 
-def _counted_as_independent(fit: di.RecordFit, name: str) -> float:
+def _counted_as_independent(fit: di.FitResult, name: str) -> float:
     """Return the standard error if every sample counted."""
     number = fit.var_names.index(name)
     J = fit.problem.predict(fit.optimum.values, 0).by

@@ -17,7 +17,7 @@ from dahl_ident.synthetic import Acquisition, Experiment, FrequencySweep, simula
 from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
 
 
-def sources(fit: di.RecordFit, name: str) -> dict[str, float]:
+def sources(fit: di.FitResult, name: str) -> dict[str, float]:
     return {row.source: row.u for row in fit.budget()[name].rows}
 
 
@@ -97,7 +97,7 @@ def test_calibrations_count_as_they_move_the_estimate(
         row = sources(fit, name)[source]
         assert row == pytest.approx(shift, rel=0.3)  # to first order
     assert source not in fit.budget().exact
-    assert sources(di.RecordFit.from_json(fit.to_json()), "f_max")[source] == pytest.approx(
+    assert sources(di.FitResult.from_json(fit.to_json()), "f_max")[source] == pytest.approx(
         sources(fit, "f_max")[source], rel=1e-6
     )
 
@@ -230,7 +230,7 @@ def test_a_delay_that_nobody_stated_is_estimated(delay: float) -> None:
     assert "delay between the channels" in sources(fit, "sigma")
     if abs(delay) == 0.5:
         assert "The motion lags the force by" in fit.verdict
-    again = di.RecordFit.from_json(fit.to_json())
+    again = di.FitResult.from_json(fit.to_json())
     assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
 
 

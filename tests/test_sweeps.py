@@ -23,7 +23,7 @@ def sweep(level: float, seed: int) -> di.Record:
     return data
 
 
-def assert_true(fit: di.FitResult | di.RecordFit) -> None:
+def assert_true(fit: di.FitResult | di.FitResult) -> None:
     truth = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 0.24, "stiffness": 0.3}
     assert fit.trusted, fit.verdict
     for name, value in truth.items():

@@ -109,6 +109,11 @@ class Density(LogDensity):
     likelihood: str = "gaussian"
     errors: RowErrors | None = None
 
+    @property
+    def counted(self) -> tuple[str, ...]:
+        """The sources of error that the likelihood counts."""
+        return ("noise",) if self.errors is None else tuple(self.errors.counted)
+
     def __post_init__(self) -> None:
         problem = self.problem
         one_of(self.likelihood, "likelihood", LIKELIHOODS)

@@ -41,6 +41,8 @@ class RecordDensity(LogDensity):
         Of the model's parameters, every source of error included.
     dof : float
         Effective degrees of freedom of the residuals.
+    counted : tuple of str
+        The sources of error in the covariance.
     prior : JointPrior
     """
 
@@ -48,6 +50,7 @@ class RecordDensity(LogDensity):
     values: FloatArray
     covariance: FloatArray
     dof: float
+    counted: tuple[str, ...]
     prior: JointPrior
     likelihood = "gaussian"
     normalised = False
@@ -71,6 +74,10 @@ class RecordDensity(LogDensity):
                 "the records do not determine every parameter, so that their likelihood has no "
                 "curvature to begin with; fix what the fit's verdict names"
             ) from exc
+
+    def around(self) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate's coordinates and their covariance."""
+        return self.centre, self.root @ self.root.T
 
     @cached_property
     def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.fitting import Optimum, solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 from dahl_ident.sensors import Sensors
 
 _WIDER = 2.0  # times the posterior's spread: R-hat needs starts wider than the posterior
@@ -27,15 +28,17 @@ _POSITIONS = 5  # of the offending parameter, each of which takes a fit of the o
 _EXACT = 1e-13  # relative noise below which a fit is exact to rounding
 
 
-def optimum_of(problem: Problem) -> Optimum | None:
-    """Return the least-squares optimum; None if there are too few data."""
+def optimum_of(problem: BaseProblem) -> Optimum | None:
+    """Return the least-squares optimum; None if a table has too few data."""
     try:
         return solve(_with_normal_priors(problem))
     except FitError:
-        return None
+        if problem.settled:
+            return None
+        raise
 
 
-def _with_normal_priors(problem: Problem) -> Problem:
+def _with_normal_priors(problem: Any) -> Any:
     """Return the problem with priors of the sensors replaced by normal ones, for least squares."""
     given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
     from scipy import stats

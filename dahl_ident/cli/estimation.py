@@ -15,10 +15,10 @@ from dahl_ident.cli.files import written
 from dahl_ident.cli.options import Writing, one_of
 
 if TYPE_CHECKING:
-    from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
+    from dahl_ident.results import FitResult, Posterior
     from dahl_ident.results.result import Result
 
-    Reported = FitResult | Posterior | RecordFit | RecordPosterior
+    Reported = FitResult | Posterior
 
 ReportPlace = Annotated[
     str | None,
@@ -61,14 +61,11 @@ def is_saved(file: str) -> bool:
     return file.endswith(".json") and '"schema": "dahl_ident.' in read_text(Path(file))
 
 
-def saved_fit(file: str) -> FitResult | RecordFit:
+def saved_fit(file: str) -> FitResult:
     """Return the fit of a table or of records that a file holds."""
-    from dahl_ident.results import FitResult, RecordFit
-    from dahl_ident.results.fit_storage import load
+    from dahl_ident.results import FitResult
 
-    optimum, first_order = load(file)
-    kind = FitResult if optimum.problem.settled else RecordFit
-    return kind(optimum, first_order=first_order)
+    return FitResult.load(file)
 
 
 def check_reports(*places: str | None) -> None:
@@ -105,10 +102,9 @@ def report_also(
         console.note(f"report: {written_to}")
 
 
-def as_json(result: FitResult | RecordFit) -> dict[str, Any]:
+def as_json(result: FitResult) -> dict[str, Any]:
     """Return a fit as plain data."""
     from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
-    from dahl_ident.results import RecordFit
 
     facts: dict[str, Any] = {
         "status": str(result.status),
@@ -119,8 +115,8 @@ def as_json(result: FitResult | RecordFit) -> dict[str, Any]:
         "findings": [finding.to_dict() for finding in result.findings],
     }
     limits = result.conf_interval().at(CONFIDENCE)
-    first = int(isinstance(result, RecordFit))  # intervals of tables begin with their level
-    if isinstance(result, RecordFit):
+    first = int(not result.problem.settled)  # intervals of tables begin with their level
+    if not result.problem.settled:
         facts |= {
             "effective_samples": result.effective_samples,
             "share_left": result.goodness.share_left,

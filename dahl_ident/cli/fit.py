@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from dahl_ident.cli.estimation import Reported
     from dahl_ident.data import FrequencyResponse, Record
-    from dahl_ident.results import FitResult, RecordFit
+    from dahl_ident.results import FitResult
 
 _ESTIMATING = "Estimating"
 _estimating = in_panel(_ESTIMATING)
@@ -255,7 +255,6 @@ def report(
     Example: dahl-ident datasets noisy -o - | dahl-ident report - -o report.html
     """
     from dahl_ident.data import read_record
-    from dahl_ident.results import RecordFit
 
     laws.run()
     writing.check(output, files, json=general.json)
@@ -274,15 +273,13 @@ def report(
     if len(files) > 1 and saved and (posterior or waveforms is not None):
         raise ValidationError("--posterior and --waveforms go with one fit; give one file")
     record = None if waveforms is None else read_record(waveforms, columns=waveforms_columns)
-    fits: Sequence[FitResult | RecordFit] = (
+    fits: Sequence[FitResult] = (
         [saved_fit(file) for file in files]
         if saved
         else [fitted(reading.read(files), model, estimating)]
     )
     results: list[Reported] = [*fits]
     for fit in fits if bootstrap else ():
-        if isinstance(fit, RecordFit):
-            raise ValidationError("--bootstrap is given with a fit of records; leave it out")
         fit.conf_interval("bootstrap", seed=seed)
     if posterior:
         from dahl_ident.results import posterior as estimate_posterior

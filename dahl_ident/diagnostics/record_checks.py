@@ -72,6 +72,10 @@ class RecordGoodness:
     correlation: float
     n_records: int
     share_in_band: float
+    warnings: tuple[str, ...] = ()
+    acceptable: bool = True
+    objections: tuple[str, ...] = ()
+    cause: str = ""
 
     @property
     def worst_text(self) -> str:

@@ -390,7 +390,7 @@ def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     endless = np.isinf(covariance.diagonal())
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    found = np.einsum("ij,jk,ik->i", slopes, finite, slopes)
+    found = np.maximum(np.einsum("ij,jk,ik->i", slopes, finite, slopes), 0.0)
     return np.where((slopes[:, endless] != 0.0).any(axis=1), np.inf, found)
 
 

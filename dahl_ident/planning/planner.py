@@ -58,7 +58,7 @@ def plan(
 
     Parameters
     ----------
-    source : Element, FitResult, RecordFit or posterior
+    source : Element, FitResult or Posterior
         What is known: a model with `ranges` before any data, or the result of earlier ones,
         whose information is added.
     limits : mapping

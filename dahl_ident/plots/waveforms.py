@@ -129,13 +129,17 @@ def plot_cycles(
     return top, bottom
 
 
+KINDS = ("time", "loop", "residuals", "residuals_displacement")
+
+
 @style.house_style()
 def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) -> Axes:
     """Draw one record of a fit.
 
     Parameters
     ----------
-    fit : RecordFit
+    fit : FitResult
+        Of records.
     kind : {"time", "loop", "residuals", "residuals_displacement"}
     number : int
         Which record.
@@ -149,7 +153,7 @@ def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) ->
     Raises
     ------
     ValidationError
-        If the kind is unknown, or displacement is wanted that the record does not have.
+        If displacement is wanted that the record does not have.
     """
     record, residual = fit.records[number], fit.residuals[number]
     measured = fit.problem.measured[number]
@@ -170,10 +174,6 @@ def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) ->
             fitted=fitted,
             displacement_label=labels["displacement"],
             force_label=labels.get("force", "force"),
-        )
-    if kind not in ("residuals", "residuals_displacement"):
-        raise ValidationError(
-            f"kind is {kind!r}; expected time, loop, residuals or residuals_displacement"
         )
     over, label = record.time, "time [s]"
     if kind != "residuals":

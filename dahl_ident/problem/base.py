@@ -86,6 +86,17 @@ class BaseProblem(ABC):
         return len(self.names)
 
     @property
+    def of_device(self) -> tuple[str, ...]:
+        """Names of the parameters of model and sensors, fixed ones included."""
+        added = self.names[self.n_reported :]
+        return tuple(p.name for p in self.every_parameter if p.name not in added)
+
+    @property
+    @abstractmethod
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the data come from: one for a table, or one for each record."""
+
+    @property
     def n_priors(self) -> int:
         """The number of priors, those of assumed parameters included."""
         return len(self.priors) + len(self.ranges)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -189,6 +189,11 @@ class Problem(BaseProblem):
     def extent(self) -> str:
         """How much was measured, in words."""
         return f"{self.data.n} rows"
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the table comes from."""
+        return (self.data.provenance,)
 
     @property
     def is_exact(self) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -200,15 +200,20 @@ class RecordProblem(BaseProblem):
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
             parts.append(cut(thin, slice(start, start + n)))
-        other = RecordProblem(
-            parts,
-            self.model,
-            output=self.output,
-            excitation=self.excitation,
-            calibration=self.calibration,
-        )
+        other = self.remade(parts)
         other.watch = self.watch
         return other
+
+    def remade(self, records: Sequence[Record]) -> RecordProblem:
+        """Return the problem of other records, as they were measured."""
+        return RecordProblem(
+            records, self.model, output=self.output, excitation=self.excitation,
+            calibration=self.calibration,
+        )  # fmt: skip
+
+    def of(self, records: Sequence[Record]) -> RecordProblem:
+        """Return the problem of other records, freed of this one's delay and noise."""
+        return self.remade(records).delayed(self.delay).without_noise(self.displacement_noise)
 
     def weighted(self, whitening: FloatArray) -> RecordProblem:
         """Return the same problem with filtered residuals."""
@@ -333,6 +338,18 @@ class RecordProblem(BaseProblem):
         """How much was measured, in words."""
         n = len(self.records)
         return f"{n} record{'s' if n > 1 else ''}, {self.n_samples} samples"
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where each record comes from."""
+        return tuple(record.provenance for record in self.records)
+
+    @property
+    def level(self) -> float:
+        """Size of the input of all records: of the displacement, or of the drive."""
+        force = self.output == "force"
+        waves = [np.asarray(r.displacement if force else r.force_samples) for r in self.records]
+        return float(np.sqrt(np.mean(np.concatenate([w - w.mean() for w in waves]) ** 2)))
 
     @property
     def n_samples(self) -> int:

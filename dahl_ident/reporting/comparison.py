@@ -14,9 +14,8 @@ import numpy as np
 from dahl_ident.diagnostics.formatting import rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting.document import Cell, Paragraph, Section, Table
-from dahl_ident.results import FitResult, RecordFit
+from dahl_ident.results import FitResult
 from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline
-from dahl_ident.results.fit_base import Fit
 
 _HOW_BOTH = (
     "The same parameters, estimated from the table and sample by sample from the waveforms. The "
@@ -44,18 +43,18 @@ class Compared:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
-def comparison_of(fits: Sequence[Fit]) -> Compared:
+def comparison_of(fits: Sequence[FitResult]) -> Compared:
     """Return what changed between fits of records, or between a table and its waveforms."""
     if len({fit.problem.settled for fit in fits}) > 1:
         return _of_both(fits)
-    changed = _between_records([fit for fit in fits if isinstance(fit, RecordFit)])
+    changed = _between_records([fit for fit in fits if not fit.problem.settled])
     if not changed:
         return Compared()
     facts = {"changes": [change.to_dict() for change in changed]}
     return Compared((), tuple(headline(changed)), (changes_section(changed),), facts)
 
 
-def _between_records(fits: Sequence[RecordFit]) -> list[Change]:
+def _between_records(fits: Sequence[FitResult]) -> list[Change]:
     """Return the changes between fits to different records; none between models of the same."""
     firsts = [fit.records[0] for fit in fits]
     channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
@@ -71,7 +70,7 @@ def numbered(names: Sequence[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(names, 1)]
 
 
-def _of_both(fits: Sequence[Fit]) -> Compared:
+def _of_both(fits: Sequence[FitResult]) -> Compared:
     differences = list(_differences(fits))
     disagree = [c.parameter for c, *_ in differences if _disagree(c, differences)]
     # one model, with its uncertainties, then does not describe both
@@ -84,13 +83,13 @@ def _of_both(fits: Sequence[Fit]) -> Compared:
     )
 
 
-_Difference = tuple[Change, FitResult, RecordFit]
+_Difference = tuple[Change, FitResult, FitResult]
 
 
-def _differences(results: Sequence[object]) -> Iterator[_Difference]:
+def _differences(results: Sequence[FitResult]) -> Iterator[_Difference]:
     """Yield the differences of the parameters that a table and waveforms both determine."""
-    tables = [one for one in results if isinstance(one, FitResult)]
-    records = [one for one in results if isinstance(one, RecordFit)]
+    tables = [one for one in results if one.problem.settled]
+    records = [one for one in results if not one.problem.settled]
     for fit, other in product(tables, records):
         for change in changes({"table": fit, "waveforms": other}):
             yield change, fit, other
@@ -100,7 +99,7 @@ def _disagree(change: Change, differences: Sequence[_Difference]) -> bool:
     return change.p * sum(math.isfinite(c.p) for c, _, _ in differences) < SIGNIFICANT
 
 
-def disagreements(results: Sequence[object]) -> list[str]:
+def disagreements(results: Sequence[FitResult]) -> list[str]:
     """Return a sentence for each parameter that a table and waveforms give differently."""
     return _disagreements(list(_differences(results)))
 

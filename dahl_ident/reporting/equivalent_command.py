@@ -16,7 +16,6 @@ from dahl_ident.results import FitResult, Posterior
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.elements import Element, Parameter
-    from dahl_ident.results.fit_base import Fit
 
 _USUAL = {
     "f_max": None, "sigma": None, "alpha": 1.0,
@@ -27,13 +26,9 @@ _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 """Parameters with an option of their own; other elements are written with --element."""
 
 
-def equivalent_command(results: Sequence[Fit | Posterior]) -> str | None:
+def equivalent_command(results: Sequence[FitResult | Posterior]) -> str | None:
     """Return the commands, one per line; None if no options describe data or model."""
-    of_tables = [
-        result
-        for result in results
-        if isinstance(result, FitResult | Posterior) and isinstance(result.problem, Problem)
-    ]
+    of_tables = [result for result in results if result.problem.settled]
     if len(of_tables) < len(results):
         return None
     source = _source(of_tables[0].data)

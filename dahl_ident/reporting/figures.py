@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dahl_ident.diagnostics.budget import Budget
-    from dahl_ident.results import FitResult, RecordFit
+    from dahl_ident.results import FitResult
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
@@ -37,7 +37,12 @@ _WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / a
 _LOOP_POINTS = 73  # of a measured loop, every 5 degrees; one in six of the model's
 
 
-def of_table(fit: FitResult) -> Iterator[Picture]:
+def pictures_of(fit: FitResult) -> Iterator[Picture]:
+    """Yield the pictures of a fit."""
+    return (_of_table if fit.problem.settled else _of_records)(fit)
+
+
+def _of_table(fit: FitResult) -> Iterator[Picture]:
     """Yield the figures of a fit of a table."""
     yield _response(fit)
     if fit.success and _is_plant_over_amplitude(fit):
@@ -57,7 +62,7 @@ def of_table(fit: FitResult) -> Iterator[Picture]:
     yield _information(fit)
 
 
-def of_records(fit: RecordFit) -> Iterator[Picture]:
+def _of_records(fit: FitResult) -> Iterator[Picture]:
     """Yield the figures of the record that a fit describes worst."""
     worst = fit.goodness.worst_record - 1
     of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
@@ -78,7 +83,7 @@ def of_records(fit: RecordFit) -> Iterator[Picture]:
         )
 
 
-def _of_record(fit: RecordFit, kind: str, record: int) -> Figure:
+def _of_record(fit: FitResult, kind: str, record: int) -> Figure:
     return figure_of(fit.plot(kind, record=record))
 
 

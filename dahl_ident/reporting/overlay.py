@@ -27,14 +27,13 @@ from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.sections import RANK, fit_facts, header, origin_facts, signed
 from dahl_ident.results import FitResult, Posterior
 from dahl_ident.results.changes import changes, headline, is_usable
-from dahl_ident.results.fit_base import Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def overlay(
-    results: Sequence[Fit | Posterior],
+    results: Sequence[FitResult | Posterior],
     *,
     title: str | None = None,
     command: str | None = None,

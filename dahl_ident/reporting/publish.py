@@ -23,8 +23,7 @@ from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.sections import Result, document
-from dahl_ident.results import Posterior
-from dahl_ident.results.fit_base import Fit
+from dahl_ident.results import FitResult, Posterior
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +53,7 @@ def report(
 
     Parameters
     ----------
-    results : FitResult, Posterior, RecordFit, RecordPosterior, or sequence of them
+    results : FitResult, Posterior, or sequence of them
         The results to report. Results on different data have to be fits.
     path : path
         Ending in ``.html`` (one file, no network), ``.pdf``, ``.md`` (pictures in a folder
@@ -162,10 +161,9 @@ def _check(results: Sequence[object]) -> None:
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):
-        if not isinstance(result, Fit | Posterior):
+        if not isinstance(result, FitResult | Posterior):
             raise ValidationError(
-                f"result {i} is a {type(result).__name__}; expected a FitResult, a RecordFit or a "
-                "Posterior"
+                f"result {i} is a {type(result).__name__}; expected a FitResult or a Posterior"
             )
 
 

@@ -30,13 +30,12 @@ from dahl_ident.reporting.document import (
     words,
 )
 from dahl_ident.reporting.equivalent_command import equivalent_command
-from dahl_ident.reporting.figures import budget_picture, of_records, of_table
+from dahl_ident.reporting.figures import budget_picture, pictures_of
 from dahl_ident.reporting.settling import settling
-from dahl_ident.results import FitResult, Posterior, RecordFit, RecordPosterior
-from dahl_ident.results.fit_base import Fit
+from dahl_ident.results import FitResult, Posterior
 from dahl_ident.version import __version__
 
-Result = Fit | Posterior
+Result = FitResult | Posterior
 
 NOISE = {
     "measured": "The covariance of every point is known from the measurement; residuals are in "
@@ -69,8 +68,8 @@ def document(
 ) -> Document:
     """Return the report on fits and posteriors of one table, of records, or of both."""
     drawn = [result for result in results if isinstance(result, Posterior)]
-    around = [one.fit for one in drawn if isinstance(one, RecordPosterior)]
-    fits = list(dict.fromkeys([*(r for r in results if isinstance(r, Fit)), *around]))
+    around = [one.fit for one in drawn if one.fit is not None and not one.problem.settled]
+    fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
     tables_first = sorted(results, key=lambda result: not result.problem.settled)
     first, given = tables_first[0], metadata or Metadata()
     repeated = command or equivalent_command(results)
@@ -125,7 +124,7 @@ def document(
     )
 
 
-def _of(fit: Fit, fits: Sequence[Fit]) -> str:
+def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
     """Return what distinguishes a fit from the others of a report, for headings."""
     alike = [other for other in fits if other.problem.settled == fit.problem.settled]
     parts = [repr(fit.problem.model)] if len(alike) > 1 else []
@@ -220,7 +219,7 @@ def in_words(model: Element) -> Iterator[str]:
             yield f"{name}: {element.equation}"
 
 
-def _verdict(fit: Fit, fits: Sequence[Fit]) -> Iterator[str]:
+def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
     """Yield a fit's statements; where there are several fits, model and status come first."""
     kinds = {other.problem.settled for other in fits}
     before = "" if len(kinds) < 2 else "Table: " if fit.problem.settled else "Waveforms: "
@@ -230,13 +229,12 @@ def _verdict(fit: Fit, fits: Sequence[Fit]) -> Iterator[str]:
         lines = [f"{fit.problem.model!r}: {first}", *others]
     else:
         lines = [*map(str, fit.judgement.told)]
-    warned = fit.goodness.warnings if isinstance(fit, FitResult) else ()
-    warnings = (f"Warning: {text}" for text in warned)
+    warnings = (f"Warning: {text}" for text in fit.goodness.warnings)
     yield from (f"{before}{line}" for line in (*lines, *warnings))
 
 
-def _answer(fit: Fit, of: str) -> Iterator[Section]:
-    combinations = fit.identifiability.combinations if isinstance(fit, FitResult) else ()
+def _answer(fit: FitResult, of: str) -> Iterator[Section]:
+    combinations = fit.identifiability.combinations
     yield Section(
         f"Result{of}",
         (
@@ -247,36 +245,35 @@ def _answer(fit: Fit, of: str) -> Iterator[Section]:
     )
 
 
-def _stated(fit: Fit) -> Budget | None:
+def _stated(fit: FitResult) -> Budget | None:
     """Return the uncertainty budget; None where no uncertainty can be stated."""
     lost = fit.status is VerdictStatus.NOT_DESCRIBED
     return None if lost else fit.stated_budget
 
 
-def _budget(fit: Fit) -> Iterator[Block]:
+def _budget(fit: FitResult) -> Iterator[Block]:
     """Yield the combined uncertainties; nothing if none can be stated."""
     if (stated := _stated(fit)) is not None:
         yield tables.uncertainty(stated)
         yield Paragraph(COVERAGE)
 
 
-def _assumed(fit: Fit) -> Iterator[str]:
+def _assumed(fit: FitResult) -> Iterator[str]:
     """Yield the assumptions of the result that these data do not test."""
     sensors = [p.name for p in fit.problem.sensors.parameters]
     held = [p for p in fit.params.values() if not p.vary and p.name not in (*fit.assumed, *sensors)]
     fixed = [f"{p.name} = {p.value:g} {p.unit}".rstrip() for p in held]
-    if isinstance(fit, RecordFit):
+    if not fit.problem.settled:
         yield _OUTPUTS[fit.problem.output]
     if fixed:
         yield f"Held fixed: {listed(fixed)}."
-    if isinstance(fit, RecordFit):
+    if not fit.problem.settled:
         for one in fit.errors.assumed:
             yield f"Not given: {one}; its range counts in the uncertainty."
         yield f"Taken as exact: {listed(fit.errors.exact)}."
         if fit.weighted:
             yield "Residuals are weighted by their spectrum, because slow noise dominates them."
         return
-    assert isinstance(fit, FitResult)
     for p in (fit.params[name] for name in fit.assumed):
         here = with_unit(p.value, p.stderr, p.unit)
         yield f"Not given, so that the uncertainty counts it: {p.name}, here {here}."
@@ -289,33 +286,30 @@ def _assumed(fit: Fit) -> Iterator[str]:
     yield f"Search: {fit.method}, loss {fit.optimum.loss}."
 
 
-def _details(fit: Fit, drawn: Sequence[Posterior], of: str) -> Iterator[Section]:
+def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Section]:
     """Yield what follows the signature."""
 
     def section(title: str, *blocks: Block) -> Section:
         return Section(f"{title}{of}", blocks, details=True)
 
-    pictures = [
-        *(of_table(fit) if isinstance(fit, FitResult) else ()),
-        *(of_records(fit) if isinstance(fit, RecordFit) else ()),
-    ]
+    pictures = list(pictures_of(fit))
     yield section("Pictures", *(p for p in pictures if p.name.startswith(_FRONT)))
     if (stated := _stated(fit)) is not None:
         yield section("Sources of uncertainty", tables.budget(stated), budget_picture(stated))
     yield section("Parameters", *_parameters(fit, drawn))
-    if isinstance(fit, FitResult):
+    if fit.problem.settled:
         known = fit.identifiability
         texts = Bullets(tuple(p.text for p in known.parameters.values()))
         yield section("What the data determine", Paragraph(known.headline), texts)
     yield section("Noise and goodness of fit", *_goodness(fit))
-    if isinstance(fit, FitResult):
+    if fit.problem.settled:
         linearization = tables.linearization(fit)
         blocks = [] if linearization is None else [linearization]
         yield section("Stiffness and damping over amplitude", *blocks)
     yield section("More pictures", *(p for p in pictures if not p.name.startswith(_FRONT)))
 
 
-def _parameters(fit: Fit, drawn: Sequence[Posterior]) -> Iterator[Block]:
+def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     fit.conf_interval("wald")
     if fit.problem.settled and not fit.first_order:  # profiles of records take minutes
         fit.conf_interval("profile")
@@ -330,9 +324,9 @@ def _parameters(fit: Fit, drawn: Sequence[Posterior]) -> Iterator[Block]:
     yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in derived)))
 
 
-def _goodness(fit: Fit) -> Iterator[Block]:
+def _goodness(fit: FitResult) -> Iterator[Block]:
     yield Bullets(tuple(fit.goodness.details))
-    if not isinstance(fit, FitResult):
+    if not fit.problem.settled:
         return
     yield tables.goodness(fit)
     if not fit.goodness.acceptable:
@@ -392,7 +386,7 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
     yield Listing(command)
 
 
-def fit_facts(fit: Fit) -> dict[str, Any]:
+def fit_facts(fit: FitResult) -> dict[str, Any]:
     """Return a fit for machines."""
     intervals = fit.conf_interval().at(CONFIDENCE)
     facts = {
@@ -415,13 +409,12 @@ def fit_facts(fit: Fit) -> dict[str, Any]:
         },
         "budget": None if fit.stated_budget is None else fit.stated_budget.to_dict(),
     }
-    if isinstance(fit, RecordFit):
+    if not fit.problem.settled:
         return facts | {
             "records": len(fit.records),
             "samples": fit.problem.n_samples,
             "share_of_variance_left": fit.goodness.share_left,
         }
-    assert isinstance(fit, FitResult)
     return facts | {
         "search": fit.optimum.status.name.lower().replace("_", " "),
         "noise": fit.noise,

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult, Posterior
-    from dahl_ident.results.fit_base import Fit
 
 _LARGEST = 3  # sources of uncertainty on the first page
 _ASSUMED = "assumed; u counts it"
@@ -30,7 +29,7 @@ _NO_PART = 1e-6  # share of the variance that the details leave out: a thousandt
 _LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
 
 
-def answer(fit: Fit) -> Table:
+def answer(fit: FitResult) -> Table:
     """Return every free parameter with its interval; unusable numbers are struck."""
     limits = fit.conf_interval().at(CONFIDENCE)
     described = fit.status is not VerdictStatus.NOT_DESCRIBED
@@ -168,7 +167,7 @@ def prior_text(given: Any) -> str:
 
 
 def parameters(
-    fit: Fit, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
+    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
 ) -> Table:
     """Return every parameter with its intervals, one column a method."""
     at = [one.at(CONFIDENCE) for one in intervals]

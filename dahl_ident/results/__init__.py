@@ -4,8 +4,6 @@ from dahl_ident.results.estimate import fit, fit_many, posterior
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
-from dahl_ident.results.record_fit import RecordFit
-from dahl_ident.results.record_posterior import RecordPosterior
 from dahl_ident.results.result import Estimate
 
 __all__ = [
@@ -13,8 +11,6 @@ __all__ = [
     "FitBatch",
     "FitResult",
     "Posterior",
-    "RecordFit",
-    "RecordPosterior",
     "fit",
     "fit_many",
     "posterior",

@@ -14,7 +14,7 @@ from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.errors import FitError, ValidationError
-from dahl_ident.results.fit_base import Fit
+from dahl_ident.results.fit_result import FitResult
 
 SIGNIFICANT = 0.05  # two-sided probability below which a change is called significant
 
@@ -86,7 +86,7 @@ class Change:
         )
 
 
-def changes(fits: Mapping[str, Fit]) -> list[Change]:
+def changes(fits: Mapping[str, FitResult]) -> list[Change]:
     """Return the changes of every parameter that a fit and the one before it estimate."""
     return [
         _change(name, *earlier, *later)
@@ -109,12 +109,12 @@ def headline(changed: list[Change]) -> list[str]:
     return told
 
 
-def is_usable(fit: Fit, name: str) -> bool:
+def is_usable(fit: FitResult, name: str) -> bool:
     """Return whether the uncertainty of a parameter is valid."""
     return fit.verdict_on(name)[0].known and fit.status is not VerdictStatus.NOT_DESCRIBED
 
 
-def _change(name: str, a: str, fit: Fit, b: str, later: Fit) -> Change:
+def _change(name: str, a: str, fit: FitResult, b: str, later: FitResult) -> Change:
     one, other = fit.params[name], later.params[name]
     if one.unit != other.unit:
         raise ValidationError(f"{name} is in {one.unit} of {a} and in {other.unit} of {b}")
@@ -131,7 +131,7 @@ def _change(name: str, a: str, fit: Fit, b: str, later: Fit) -> Change:
     return Change(name, one.unit, a, b, change, relative, u, len(missing) < len(known), p)
 
 
-def _scatter(fit: Fit, name: str) -> float | None:
+def _scatter(fit: FitResult, name: str) -> float | None:
     """Return the relative scatter of a parameter between runs; None where there is one run."""
     runs = len(set(fit.problem.runs))
     if runs < 2:

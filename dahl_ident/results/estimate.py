@@ -8,11 +8,12 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.chain import ChainSettings, Pool
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import PriorLike, joint_prior
@@ -27,11 +28,12 @@ from dahl_ident.bayes.walker_start import (
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import row_names
+from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.estimate import EXPONENT, with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import FitError, ModelError, ValidationError
+from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.fitting.record_search import Tell
 from dahl_ident.problem import BaseProblem, Problem, ProblemBatch
@@ -39,9 +41,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
-from dahl_ident.results.progress import progress_bar
-from dahl_ident.results.record_fit import RecordFit, solved
-from dahl_ident.results.record_posterior import RecordPosterior
+from dahl_ident.results.progress import fit_progress, progress_bar
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 
@@ -56,41 +56,6 @@ METHODS = ("mcmc", "grid")
 UNCERTAINTIES = ("combined", "noise")
 
 
-@overload
-def fit(
-    data: FrequencyResponse | pd.DataFrame,
-    model: Element,
-    *,
-    method: str = ...,
-    free: Iterable[str] = ...,
-    fixed: Mapping[str, float] | None = ...,
-    noise: str | None = ...,
-    sensors: Sensors | None = ...,
-    loss: str = ...,
-    start: Mapping[str, float] | None = ...,
-    constraints: Constraints | None = ...,
-    drive_std: ArrayLike | None = ...,
-    drive_covariance: ArrayLike | None = ...,
-    steady: Steady = ...,
-    throw: bool = ...,
-) -> FitResult: ...
-@overload
-def fit(
-    data: Record | Sequence[Record],
-    model: Element,
-    *,
-    method: str = ...,
-    free: Iterable[str] = ...,
-    fixed: Mapping[str, float] | None = ...,
-    sensors: Sensors | None = ...,
-    loss: str = ...,
-    constraints: Constraints | None = ...,
-    start: Mapping[str, float] | None = ...,
-    output: Output | None = ...,
-    excitation: Excitation = ...,
-    throw: bool = ...,
-    progress: bool = ...,
-) -> RecordFit: ...
 def fit(
     data: FrequencyResponse | pd.DataFrame | Record | Sequence[Record],
     model: Element,
@@ -110,7 +75,7 @@ def fit(
     excitation: Excitation = "force",
     throw: bool = True,
     progress: bool = False,
-) -> FitResult | RecordFit:
+) -> FitResult:
     """Estimate a model's free parameters by least squares; no initial values are needed.
 
     Parameters
@@ -202,7 +167,7 @@ def fit(
     if given and method != "ipopt":
         raise ValidationError(f"{' and '.join(given)} given; only method='ipopt' takes that")
 
-    def optimum_of(problem: BaseProblem, tell: Tell | None = None) -> Optimum:
+    def optimum_of(problem: BaseProblem, tell: Tell | None) -> Optimum:
         if method != "ipopt":
             return solve(problem, method=method, loss=loss, start=start, tell=tell)
         from dahl_ident.fitting.ipopt import solve_ipopt
@@ -212,29 +177,46 @@ def fit(
             drive_std=drive_std, drive_covariance=drive_covariance,
         )  # fmt: skip
 
+    problem = _problem(data, model, free, fixed, sensors, noise, steady, output, excitation)
     first_order = constraints is not None
-    if not isinstance(data, FrequencyResponse):
-        records = RecordProblem(
-            [data] if isinstance(data, Record) else list(data),
-            as_model(model).with_free(free).with_fixed(fixed or {}),
-            output=output,
-            excitation=excitation,
-            calibration=(sensors or Sensors()).stated_uncertainties(),
-        )
-        return solved(
-            partial(optimum_of, records), first_order=first_order, throw=throw,
-            progress=progress,
-        )  # fmt: skip
-    optimum = optimum_of(
-        Problem(data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady)
-    )
-    if not np.isfinite(optimum.residuals).all():
-        raise FitError(_no_prediction(optimum))
-    result = FitResult(optimum, first_order=first_order)
+    try:
+        with fit_progress() if progress else nullcontext() as tell:
+            result = FitResult(optimum_of(problem, tell), first_order=first_order)
+    except FitInterrupted as stop:
+        raise FitInterrupted(
+            f"{stop}; this exception's `result` holds the best values so far",
+            FitResult(stop.result),
+        ) from stop
+    if problem.settled and not np.isfinite(result.optimum.residuals).all():
+        raise FitError(_no_prediction(result.optimum))
     if throw and not result.success:
-        cause = result.goodness.cause
-        raise FitError(f"{cause} {result.message}" if cause else result.message, result)
+        raise FitError(" ".join([*filter(None, [result.goodness.cause]), result.message]), result)
     return result
+
+
+def _problem(
+    data: FrequencyResponse | Record | Sequence[Record],
+    model: Element,
+    free: Iterable[str],
+    fixed: Mapping[str, float] | None,
+    sensors: Sensors | None,
+    noise: str | None = None,
+    steady: Steady = "exact",
+    output: Output | None = None,
+    excitation: Excitation = "force",
+) -> Any:
+    """Return the problem of a table or of records."""
+    if isinstance(data, FrequencyResponse):
+        return Problem(
+            data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
+        )
+    return RecordProblem(
+        [data] if isinstance(data, Record) else list(data),
+        as_model(model).with_free(free).with_fixed(fixed or {}),
+        output=output,
+        excitation=excitation,
+        calibration=(sensors or Sensors()).stated_uncertainties(),
+    )
 
 
 def _no_prediction(optimum: Optimum) -> str:
@@ -304,7 +286,7 @@ def fit_many(
 
 
 def posterior(
-    data: FrequencyResponse | FitResult | Record | Sequence[Record] | RecordFit,
+    data: FrequencyResponse | FitResult | Record | Sequence[Record],
     model: Element | None = None,
     *,
     method: str = "mcmc",
@@ -331,7 +313,7 @@ def posterior(
 
     Parameters
     ----------
-    data : FrequencyResponse, Record, sequence of Record, FitResult or RecordFit
+    data : FrequencyResponse, Record, sequence of Record or FitResult
         What was measured; or a fit, whose data, model, noise and sensors are taken over. Records
         are fitted first; where `output`, `excitation` or `start` is needed, give their fit.
     model : Element, optional
@@ -384,7 +366,7 @@ def posterior(
     Returns
     -------
     Posterior
-        Of records, a ``RecordPosterior``. Its first line says where it has not converged.
+        Its first line says where it has not converged.
 
     Raises
     ------
@@ -416,14 +398,15 @@ def posterior(
     """
     options = {**locals()}
     one_of(method, "method", METHODS)
-    of_records = not isinstance(data, FrequencyResponse | FitResult)
-    if of_records:
-        _refuse_options(posterior, "a posterior of records", options)
+    given = data if isinstance(data, FitResult) else None
+    settled = isinstance(data, FrequencyResponse) if given is None else given.problem.settled
+    _refuse_options(posterior, "a posterior of tables" if settled else _OF_RECORDS, options)
     _refuse_options(posterior, f"method={method!r}", options)
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
-    _refuse_with_a_fit(data, options)
+    if given is not None:
+        _refuse_with_a_fit(given, options)
 
     def chain(density: Density | RecordDensity, start: Start) -> ChainSample:
         settings = ChainSettings.of(
@@ -436,50 +419,42 @@ def posterior(
                 density, start, settings, seed=seed, resume=resume, pool=pool, listeners=listeners
             )
 
-    if not isinstance(data, FrequencyResponse | FitResult):
-        recorded = (
-            data
-            if isinstance(data, RecordFit)
-            else fit(data, _checked(model), free=free, fixed=fixed, throw=False)
-        )
-        of_motion = _record_density(recorded, priors)
-        if method == "grid":
-            around = of_motion.centre, of_motion.root @ of_motion.root.T
-            points = sample_points(of_motion, lambda: around, recorded.problem.names, tolerance)
-            return RecordPosterior(recorded, of_motion, points)
-        start = partial(scattered, of_motion, of_motion.centre, of_motion.root)
-        result: Posterior = RecordPosterior(recorded, of_motion, chain(of_motion, start))
-        result.chain.check(result.names, result)
-        return result
-    fitted = data if isinstance(data, FitResult) else None
-    if isinstance(data, FrequencyResponse):
-        problem = Problem(
-            data, _checked(model), noise=noise, sensors=sensors, free=free, fixed=fixed,
-            steady=steady or "exact",
-        )  # fmt: skip
+    fitted = given
+    if not isinstance(data, FitResult):
+        problem = _problem(data, _checked(model), free, fixed, sensors, noise, steady or "exact")
         optimum = optimum_of(problem)
         fitted = None if optimum is None else FitResult(optimum)
     else:
         problem = data.problem
     if fitted is None or likelihood != "gaussian":
         uncertainty = "noise"
-    density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
-    if method == "grid":
+    density: Density | RecordDensity
+    begin: Callable[[], tuple[FloatArray, FloatArray]]
+    start: Start
+    if fitted is not None and not settled:
+        density = of_motion = _record_density(fitted, priors, uncertainty)
+        begin = of_motion.around
+        start = partial(scattered, of_motion, of_motion.centre, of_motion.root)
+    else:
+        density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
         begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
+        start = partial(starting_points, density, optimum)
+    if method == "grid":
         points = sample_points(density, begin, problem.names, tolerance)
         return Posterior(density, points, fitted, uncertainty)
-    drawn = chain(density, partial(starting_points, density, optimum))
+    drawn = chain(density, start)
     result = Posterior(density, drawn, fitted, uncertainty)
     drawn.check(result.names, result)
     return result
 
 
 _CHAIN_ONLY = ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool")
-_TABLES_ONLY = ("noise", "sensors", "steady", "likelihood", "uncertainty")
+_OF_RECORDS = "a posterior of records"
 _REFUSED = {
     "a fit of tables": ("output", "excitation"),
     "a fit of records": ("noise", "drive_std", "drive_covariance", "steady"),
-    "a posterior of records": (*_TABLES_ONLY, "pool"),
+    "a posterior of tables": (),
+    _OF_RECORDS: ("noise", "steady", "likelihood", "pool"),
     "method='mcmc'": ("tolerance",),
     "method='grid'": _CHAIN_ONLY,
 }
@@ -495,23 +470,21 @@ def _refuse_options(of: Callable[..., Any], kind: str, options: Mapping[str, Any
         )
 
 
-def _refuse_with_a_fit(data: object, options: Mapping[str, Any]) -> None:
+def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
     """Refuse what a fit has already."""
-    if not isinstance(data, FitResult | RecordFit):
-        return
     names = ("model", "noise", "sensors", "fixed", "steady")
     given = [name for name in names if options[name] is not None]
     given += ["free"] if tuple(options["free"]) else []
     if given:
         raise ValidationError(
-            f"{', '.join(given)} is given together with a {type(data).__name__}, which has its "
-            "own; pass the data instead"
+            f"{', '.join(given)} is given together with a FitResult, which has its own; pass the "
+            "data instead"
         )
-    if data.first_order:
+    if fit.first_order:
         raise ValidationError(
             "the fit had constraints, which a posterior does not take; pass the data instead"
         )
-    if isinstance(data, RecordFit) and data.optimum.loss != "linear":
+    if not fit.problem.settled and fit.optimum.loss != "linear":
         raise ValidationError(
             "the fit of records had a robust loss, which a posterior does not take; pass the "
             "records instead"
@@ -524,11 +497,16 @@ def _checked(model: Element | None) -> Element:
     return model
 
 
-def _record_density(fit: RecordFit, priors: Mapping[str, PriorLike] | None) -> RecordDensity:
-    values, count = fit.optimum.values, len(fit.problem.free)
+def _record_density(
+    fit: FitResult, priors: Mapping[str, PriorLike] | None, uncertainty: str
+) -> RecordDensity:
+    values, count, errors = fit.optimum.values, fit.problem.n_reported, fit.errors
     prior = joint_prior(fit.problem, priors, values)
-    covariance = fit.covar[:count, :count]
-    return RecordDensity(fit.problem, values, covariance, fit.errors.dof, prior)
+    sources = tuple(name for name, part in errors.contributions.items() if part.any())
+    covariance, dof = fit.covar, errors.dof
+    if uncertainty == "noise":
+        sources, covariance, dof = (NOISE,), errors.contributions[NOISE], errors.dof_of(NOISE)
+    return RecordDensity(fit.problem, values, covariance[:count, :count], dof, sources, prior)
 
 
 def _density(

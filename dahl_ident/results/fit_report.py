@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import percent
-from dahl_ident.diagnostics.formatting import interval, rounded, table, with_unit
+from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 
 if TYPE_CHECKING:
@@ -18,11 +18,6 @@ if TYPE_CHECKING:
 
 _CORRELATED = 0.1  # smaller correlations change an uncertainty by less than 0.5 %
 _BRIEF = 15  # lines that a reader takes in at a glance
-_NOISE = {
-    "measured": "measured: the data's covariance, scale known",
-    "relative": "relative: constant variance of (ln gain, phase)",
-    "absolute": "absolute: constant variance of (real, imaginary part)",
-}
 
 
 @dataclass(frozen=True)
@@ -38,7 +33,8 @@ def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool 
     sections = _all(fit, intervals)
     if details:
         return "\n".join(_lines(sections))
-    verdict, parameters = next(sections), next(sections)
+    verdict, shown = next(sections), fit.problem.of_device
+    parameters = ReportPart("Parameters", _parameters(fit, intervals, shown))
     numbers = list(_lines([parameters]))[: _BRIEF - 2]
     room = _BRIEF - 1 - len(numbers)
     if len(verdict.lines) > room:
@@ -68,75 +64,56 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[ReportPart]
     first, *others = fit.statements
     warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
     yield ReportPart("Verdict", [first, *warnings, *others])
-    yield ReportPart("Parameters", _parameters(fit, intervals))
-    combined = [str(c) for c in fit.identifiability.combinations]
-    if combined:
-        yield ReportPart("Determined combinations", combined)
-    derived = [str(q) for q in fit.derived()]
-    if derived:
-        yield ReportPart("Derived", derived)
-    if fit.stated_budget is not None:
-        yield ReportPart("Uncertainty budget", str(fit.stated_budget).splitlines())
-    correlations = _correlations(fit)
-    if correlations:
-        yield ReportPart("Correlations", correlations)
-    yield ReportPart("Noise", _noise(fit))
+    yield ReportPart("Parameters", _parameters(fit, intervals, fit.params))
+    further = {
+        "Determined combinations": list(map(str, fit.identifiability.combinations)),
+        "Derived": list(map(str, fit.derived())),
+        "Uncertainty budget": str(fit.stated_budget or "").splitlines(),
+        "Correlations": _correlations(fit),
+    }
+    yield from (ReportPart(title, lines) for title, lines in further.items() if lines)
+    loss = fit.optimum.loss
+    robust = [] if loss == "linear" else [f"robust loss: {loss}"]
+    yield ReportPart("Noise", [*fit.assessment.noise_in_words, *robust])
     yield ReportPart("Goodness of fit", fit.goodness.details or ["no test applies"])
     if not fit.goodness.acceptable:
         yield ReportPart("Other models, for comparison", str(compare_models(fit)).splitlines())
     yield ReportPart("Solver", _solver(fit))
 
 
-def _parameters(fit: FitResult, intervals: ConfidenceIntervals) -> list[str]:
+def _parameters(fit: FitResult, intervals: ConfidenceIntervals, names: Iterable[str]) -> list[str]:
     level = float(intervals.levels[-1])
     rows = [["", "value", "stderr", "unit", f"{percent(level)} ({intervals.method})", ""]]
-    for name, p in fit.params.items():
-        if fit.errors is not None and name in fit.errors.assumed:
-            value, error = rounded(fit.errors.values[name], fit.errors.stderr[name])
-            rows.append([name, value, error, p.unit, "", "assumed"])
-            continue
+    for name in names:
+        p = fit.params[name]
         if not p.vary:
-            rows.append([name, f"{p.value:g}", "", p.unit, "", "fixed"])
+            assumed = name in fit.assumed
+            shown = rounded(p.value, p.stderr) if p.stderr is not None else (f"{p.value:g}", "")
+            rows.append([name, *shown, p.unit, "", "assumed" if assumed else "fixed"])
             continue
         value, error = rounded(p.value, p.stderr)
         if math.isfinite(p.value) and p.stderr == math.inf and fit.nfree > 0:
             value = "?"  # any other would do as well
-        limits = intervals[name][-1]
-        positive = p.min == 0.0
-        lower = -math.inf if positive and limits.lower == 0.0 else limits.lower
-        within = interval(lower, limits.upper, "")
+        within = ""
+        if name in intervals:
+            limits = intervals[name][-1]
+            open_below = p.min == 0.0 and limits.lower == 0.0
+            within = interval(-math.inf if open_below else limits.lower, limits.upper, "")
         word = fit.identifiability.parameters[name].verdict.value
         rows.append([name, value, error, p.unit, within, word])
     return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
 
 
 def _correlations(fit: FitResult) -> list[str]:
+    names = fit.var_names[: fit.problem.n_reported]
     pairs = [
         (a, b, c)
-        for i, a in enumerate(fit.var_names)
+        for i, a in enumerate(names)
         for b, c in fit.correl[a].items()
-        if b in fit.var_names[i + 1 :] and abs(c) >= _CORRELATED
+        if b in names[i + 1 :] and abs(c) >= _CORRELATED
     ]
     pairs.sort(key=lambda pair: -abs(pair[2]))
     return [f"{a}, {b}: {c:+.3f}" for a, b, c in pairs]
-
-
-def _noise(fit: FitResult) -> list[str]:
-    lines = [_NOISE[fit.noise]]
-    if not fit.scale_known:
-        error = fit.scale / math.sqrt(2.0 * fit.nfree) if fit.nfree > 0 else None
-        unit = fit.data.unit if fit.noise == "absolute" else ""
-        size = with_unit(fit.scale, error, unit)
-        made = "the limit of rounding; the residuals are smaller"
-        if not fit.optimum.is_exact:
-            made = f"estimated with {fit.nfree} degrees of freedom"
-        lines.append(f"scale {size}, {made}")
-    loss = fit.optimum.loss
-    if loss != "linear":
-        lines.append(f"robust loss: {loss}")
-    for name, prior in fit.problem.priors.items():
-        lines.append(f"prior of {name}: {float(prior.mean()):g} ± {float(prior.std()):g}")
-    return lines
 
 
 def _counted(fit: FitResult) -> str:
@@ -147,8 +124,9 @@ def _counted(fit: FitResult) -> str:
 
 
 def _solver(fit: FitResult) -> list[str]:
+    criteria = f"; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}" if fit.problem.settled else ""
     return [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
-        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",
+        f"{fit.optimum.status.outcome}{criteria}",
         f"sum of squares{_counted(fit)} {fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}",
     ]

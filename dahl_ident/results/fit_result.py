@@ -1,60 +1,52 @@
-"""The result of a least-squares fit to a frequency response, under lmfit's names."""
+"""The result of a least-squares fit, of tables and of records alike, under lmfit's names."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.bands import (
-    DerivedQuantity,
-    ResponseBand,
-    derived,
-    describing_function_band,
-    predicted_backbone,
-    response_band,
-)
-from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
-from dahl_ident.diagnostics.checks import judgement
+from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.diagnostics.bands import DerivedQuantity, ResponseBand
+from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.confidence_levels import LEVELS
-from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import NOISE
-from dahl_ident.diagnostics.goodness import Goodness, goodness
-from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation
 from dahl_ident.diagnostics.intervals import (
     ConfidenceIntervals,
+    IntervalComparison,
     Method,
-    combined_intervals,
+    compare,
 )
 from dahl_ident.diagnostics.judgement import Judgement
-from dahl_ident.diagnostics.verdicts import Identifiability, Verdict, judged
+from dahl_ident.diagnostics.verdicts import Identifiability, Verdict
 from dahl_ident.elements import Model
-from dahl_ident.errors import DahlIdentError, FitError, ValidationError
-from dahl_ident.fitting import solve
-from dahl_ident.fitting.optimum import DeterminedCombination, Optimum, propagated
-from dahl_ident.problem import Problem
-from dahl_ident.results import fit_report
-from dahl_ident.results.fit_base import Fit
-from dahl_ident.results.fit_storage import TABLE
-from dahl_ident.results.result import Parameters, part
+from dahl_ident.errors import FitError, ValidationError, choices
+from dahl_ident.fitting.optimum import DeterminedCombination, Optimum
+from dahl_ident.results import fit_report, fit_storage
+from dahl_ident.results.record_assessment import RecordAssessment
+from dahl_ident.results.result import Parameters, Result, part
+from dahl_ident.results.table_assessment import TableAssessment
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from dahl_ident.plots import Axes
 
 
-class FitResult(Fit):
+class FitResult(Result):
     """The result of a fit: estimates, their errors, and whether to trust them.
 
-    Made by :func:`dahl_ident.fit`. Names follow lmfit's ``ModelResult`` where both have the same
-    thing; the covariance is never rescaled silently: `scale` is 1 where the noise is known, else
-    estimated and reported.
+    Made by :func:`dahl_ident.fit`, from a table or from records. Names follow lmfit's
+    ``ModelResult`` where both have the same thing; the covariance is never rescaled silently:
+    `scale` is 1 where the noise is known, else estimated and reported. Of records, parameters of
+    each record follow those of the model: states at its first sample, offset and drift.
 
     Examples
     --------
@@ -62,175 +54,242 @@ class FitResult(Fit):
     >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl())
     >>> fit.trusted, round(fit.params["f_max"].value, 3)
     (True, 0.1)
+    >>> x = 1e-3 * np.cumsum(np.random.default_rng(0).standard_normal(500))
+    >>> force = di.Dahl(0.1, 30.0).force(x) + 1e-3 * np.random.default_rng(1).standard_normal(500)
+    >>> fit = di.fit(di.Record(np.arange(500) / 100.0, displacement=x, force=force), di.Dahl())
+    >>> fit.trusted, round(fit.params["f_max"].value, 2)
+    (True, 0.1)
     """
 
-    _schema = TABLE
-    problem: Problem = part("optimum.problem", "Data, model, noise, sensors as fitted.")
-    data: FrequencyResponse = part("problem.data", "The data that were fitted.")
-    noise: str = part("problem.noise", "The noise model.")
+    _called = "a fit"
+
+    def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
+        self.optimum = optimum  #: The solver's plain result.
+        #: Whether errors are of first order alone: with constraints.
+        self.first_order = first_order
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_json, (self.to_json(),)  # a plant's functions cannot be copied
+
+    @cached_property
+    def assessment(self) -> TableAssessment | RecordAssessment:
+        """What the data tell of the estimate."""
+        kind = TableAssessment if self.problem.settled else RecordAssessment
+        return kind(self.optimum, first_order=self.first_order)
+
+    problem: Any = part("optimum.problem", "Data, model, noise, sensors as fitted.")
+    method: str = part("optimum.method", "The solver.")
+    message: str = part("optimum.message", "How the search ended, in words.")
+    scale_known: bool = part("optimum.scale_known", "Whether the noise's scale was known.")
+    ndata: int = part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
+    nfree: int = part("optimum.dof", "Degrees of freedom.")
+    nfev: int = part("optimum.nfev", "Evaluations of the residuals.")
+    provenances: tuple[Mapping[str, Any] | None, ...] = part(
+        "problem.provenances", "Where the table comes from, or each record."
+    )
     combinations: tuple[DeterminedCombination, ...] = part(
         "optimum.combinations", "What the data determine where single parameters run away."
     )
     log_likelihood: float = part(
         "optimum.log_likelihood",
         "Log-density of the data at the optimum, at the likeliest scale where unknown; with a "
-        "robust loss rho, that of the density proportional to exp(-rho/2).",
+        "robust loss rho, that of the density proportional to exp(-rho/2). Of tables.",
     )
     aic: float = part(
         "optimum.aic",
         "Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale, and no parameter "
-        "whose optimum lies at infinity.",
+        "whose optimum lies at infinity. Of tables.",
     )
-    bic: float = part("optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`.")
+    bic: float = part(
+        "optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`. Of tables."
+    )
 
-    @cached_property
-    def errors(self) -> ErrorModel | None:
-        """The sources of error; None where there is nothing to estimate them from."""
-        return None if self.first_order else error_model(self.optimum)
+    # What was fitted
 
-    @cached_property
-    def errors_of_combinations(self) -> ErrorModel | None:
-        """The same; also where only combinations of parameters are determined, for these alone."""
-        if self.first_order:
-            return None
-        return self.errors or error_model(self.optimum, of_combinations=True)
+    data: FrequencyResponse = part("problem.data", "The table that was fitted.")
+    noise: str = part("problem.noise", "The noise model of a table.")
+    records: tuple[Record, ...] = part("problem.records", "The records that were fitted.")
+
+    # What the data tell
+
+    success: bool = part(
+        "assessment.success", "Whether the search found a finite optimum; of records, any."
+    )
+    errors: Any = part(
+        "assessment.errors", "The sources of error; None where a table leaves nothing to judge by."
+    )
+    errors_of_combinations: Any = part(
+        "assessment.errors_of_combinations",
+        "Of tables: also where only combinations of parameters are determined, for these alone.",
+    )
+    goodness: Any = part("assessment.goodness", "Statistics and tests of the residuals.")
+    cross_validation: Any = part(
+        "assessment.cross_validation", "Of tables: held-out tests against their bands, or None."
+    )
+    identifiability: Identifiability = part(
+        "assessment.identifiability",
+        "Which parameters, or which combinations of them, the data determine.",
+    )
+    judgement: Judgement = part(
+        "assessment.judgement", "Every finding, and the status that follows from them."
+    )
+    assumed: tuple[str, ...] = part(
+        "assessment.assumed",
+        "Names of parameters that were not given; the uncertainty counts their ranges.",
+    )
+    model: Model = part(
+        "assessment.model", "The model with the estimates put in; free parameters stay free."
+    )
+    covar: FloatArray = part(
+        "assessment.covar", "Covariance of the free values, by every source of error, first order."
+    )
+    stderr_noise: Mapping[str, float] = part(
+        "assessment.stderr_noise", "Standard errors of the estimate from noise alone, by name."
+    )
+    residuals: tuple[FloatArray, ...] = part(
+        "assessment.residuals", "Of records: measured minus predicted, record by record."
+    )
+    effective_samples: float = part(
+        "errors.effective", "Of records: white samples that would tell as much as the residuals."
+    )
 
     @cached_property
     def params(self) -> Parameters:
-        """Every parameter of model and sensors, by name, with combined uncertainties.
+        """Every parameter by name, with combined uncertainties.
 
-        Assumed exponents have their estimates, so that all of them together are a model.
+        Assumed exponents of tables have their estimates, so that all of them are a model.
         """
-        values = dict(zip(self.var_names, self.optimum.values.tolist(), strict=True))
-        stderr = dict(self.optimum.stderr)
-        errors = self.errors_of_combinations
-        if errors is not None:
-            known = [name for name in (*values, *errors.assumed) if errors.holds(name)]
-            values |= {name: errors.values[name] for name in known}
-            stderr |= {name: errors.stderr[name] for name in known}
-        return Parameters.of(self.problem, values, stderr)
-
-    @cached_property
-    def stderr_noise(self) -> Mapping[str, float]:
-        """Standard errors of the estimate from noise alone, by name."""
-        stderr = dict(self.optimum.stderr)
-        errors = self.errors_of_combinations
-        if errors is not None:
-            size = np.abs(errors.problem.value_slopes(errors.theta))
-            noise = size * np.sqrt(np.maximum(np.diagonal(errors.contributions[NOISE]), 0.0))
-            by_name = dict(zip(errors.names, noise.tolist(), strict=True))
-            stderr |= {name: by_name[name] for name in stderr if errors.holds(name)}
-        return stderr
-
-    @cached_property
-    def covar(self) -> FloatArray:
-        """Combined covariance of the free values, by every source of error, first order."""
-        errors = self.errors
-        if errors is None:
-            return self.optimum.values_covariance
-        free = [errors.names.index(name) for name in self.var_names]
-        slopes = errors.problem.value_slopes(errors.theta)
-        whole = propagated(errors.covariance, slopes)
-        return np.asarray(whole[np.ix_(free, free)])
-
-    @cached_property
-    def _estimate(self) -> Optimum:
-        """The estimate, as an optimum; the search's where nothing else is estimated."""
-        errors = self.errors_of_combinations
-        return self.optimum if errors is None else errors.at_estimate
-
-    @cached_property
-    def best_fit(self) -> ComplexArray:
-        """Predicted response at the estimate, shape (n,)."""
-        predicted: ComplexArray = self._estimate.problem.predict(self._estimate.theta)
-        return predicted
-
-    @cached_property
-    def model(self) -> Model:
-        """The model with the estimates put in; parameters stay free or fixed as they were."""
-        model = self.problem.model
-        names = {p.name for p in model.parameters}
-        values = self.problem.to_values(self.optimum.theta).tolist()
-        estimates = dict(zip(self.var_names, values, strict=True))
-        if self.errors is not None:
-            estimates = dict(self.errors.values)
-        return model.with_values({name: v for name, v in estimates.items() if name in names})
-
-    # Judging
-
-    def _combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
-        errors = self.errors_of_combinations
-        if errors is None:
-            return replace(self.conf_interval("profile", levels), method="combined")
-        return combined_intervals(
-            self.optimum, errors, levels, lambda: self.conf_interval("profile", levels)
-        )
-
-    @cached_property
-    def identifiability(self) -> Identifiability:
-        """Which parameters, or which combinations of them, the data determine."""
-        profile = None if self.first_order else lambda: self.conf_interval("profile")
-        verdicts = judged(self.optimum, profile, self.errors, self.conf_interval())
-        sources: Mapping[str, ParameterBudget] = self.stated_budget or {}
-        combinations = tuple(
-            replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
-            if c.expression in sources
-            else c
-            for c in verdicts.combinations
-        )
-        return replace(verdicts, combinations=combinations)
+        return Parameters.of(self.problem, *self.assessment.known)
 
     @property
-    def assumed(self) -> tuple[str, ...]:
-        """Names of parameters that were not given; the uncertainty counts their ranges."""
-        return () if self.errors is None else tuple(self.errors.assumed)
+    def weighted(self) -> bool:
+        """Whether residuals of records were weighted by their spectrum: slow noise prevails."""
+        return bool(self.problem.whitening.size > 1)
 
     def verdict_on(self, name: str) -> tuple[Verdict, str]:
         """Return whether the data determine a parameter, and what they say of it."""
         known = self.identifiability.parameters[name]
         return known.verdict, known.reason
 
+    @cached_property
+    def best_fit(self) -> ComplexArray:
+        """Predicted response of a table at the estimate, shape (n,)."""
+        estimate = self.assessment.estimate
+        predicted: ComplexArray = estimate.problem.predict(estimate.theta)
+        return predicted
+
     @property
-    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        """Where the table comes from."""
-        return (self.data.provenance,)
+    def var_names(self) -> list[str]:
+        """Names of the free parameters."""
+        return list(self.optimum.problem.names)
 
     @cached_property
-    def goodness(self) -> Goodness:
-        """Whether the residuals are noise, and the estimates physically possible."""
-        return goodness(self.optimum, self.errors_of_combinations)
+    def correl(self) -> Mapping[str, Mapping[str, float]]:
+        """Correlation of each pair of free parameters, by both names."""
+        std = np.sqrt(np.diagonal(self.covar))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            matrix = self.covar / np.outer(std, std)
+        names = self.var_names
+        return {
+            a: {b: float(matrix[i, j]) for j, b in enumerate(names) if j != i}
+            for i, a in enumerate(names)
+        }
 
-    @cached_property
-    def cross_validation(self) -> CrossValidation | None:
-        """Held-out tests against their bands; None without tests to hold out."""
-        errors = self.errors_of_combinations
-        return None if errors is None else cross_validation(errors.left_out)
+    @property
+    def residual(self) -> FloatArray:
+        """Whitened residuals at the estimate."""
+        return self.assessment.estimate.residuals
 
-    @cached_property
-    def fundamentals(self) -> FitResult | None:
-        """The same fit to the fundamentals alone; None where there are no other harmonics."""
-        first = self.data.harmonic == 1
-        if first.all() or not first.any() or self.first_order:
-            return None
-        try:
-            problem = self.problem.like(data=self.data.select(rows=first))
-            return FitResult(solve(problem, loss=self.optimum.loss))
-        except DahlIdentError:
-            return None
+    @property
+    def chisqr(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.residual @ self.residual)
 
-    @cached_property
-    def judgement(self) -> Judgement:
-        """Every finding about the fit, and the status that follows from them."""
-        return judgement(self)
+    @property
+    def redchi(self) -> float:
+        """`chisqr` over `nfree`; the squared scale where that was estimated."""
+        return self.chisqr / self.nfree if self.nfree > 0 else math.nan
 
-    @cached_property
-    def _budget(self) -> Budget:
-        if self.first_order:
-            raise FitError(
-                "no uncertainty budget: the fit had constraints, which its sources do not keep; "
-                "its standard errors are from noise alone"
-            )
-        return budget(self.optimum, self.errors_of_combinations)
+    @property
+    def scale(self) -> float:
+        """Standard deviation of the residuals: 1 where known beforehand."""
+        return self.assessment.estimate.scale
+
+    @property
+    def nvarys(self) -> int:
+        """Number of free parameters."""
+        return len(self.optimum.names)
+
+    # Intervals
+
+    def conf_interval(
+        self,
+        method: Method = "combined",
+        levels: Sequence[float] | float = LEVELS,
+        *,
+        replicates: int | None = None,
+        seed: int = 0,
+    ) -> ConfidenceIntervals:
+        """Return confidence intervals of every free parameter.
+
+        Parameters
+        ----------
+        method : {"combined", "profile", "wald", "bootstrap"}, default "combined"
+            "combined" counts every source of the budget, the others noise alone; see
+            :mod:`dahl_ident.diagnostics.intervals`, which says what to use when.
+        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
+            Confidence levels.
+        replicates, seed : int
+            Of the bootstrap; fewer replicates of records, each of which is a search.
+
+        Returns
+        -------
+        ConfidenceIntervals
+            A mapping from the parameter's name to its intervals; a side on which the data set no
+            limit is open. Profiles never raise, however badly a parameter is determined. Where
+            the fit had constraints, "combined" gives Wald's, and says so.
+
+        Raises
+        ------
+        ValidationError
+            If `method` is unknown, a level is not between 0 and 1, or repetitions of a fit with
+            a robust loss, or profiles or repetitions of one with constraints, are wanted.
+        FitError
+            If there is no optimum to repeat.
+        """
+        return self.assessment.intervals(method, levels, replicates, seed)
+
+    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
+        """Return the intervals at a level of every method that has been asked for until now."""
+        return self.assessment.intervals_run(level)
+
+    def compare_intervals(
+        self,
+        methods: Sequence[Method] = ("wald", "bootstrap", "profile"),
+        levels: Sequence[float] | float = LEVELS,
+    ) -> IntervalComparison:
+        """Return the intervals of several methods side by side, and where they disagree.
+
+        Parameters
+        ----------
+        methods : sequence of str, default ("wald", "bootstrap", "profile")
+            The last is the most trusted; each of the others is compared with it.
+        levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
+            Confidence levels.
+
+        Returns
+        -------
+        IntervalComparison
+            Printed, a table with the disagreements.
+
+        Raises
+        ------
+        ValidationError
+            If there are fewer than two methods, one is unknown, or a level is impossible.
+        """
+        return compare(
+            self.assessment.by_noise, [self.conf_interval(method, levels) for method in methods]
+        )
 
     def budget(self) -> Budget:
         """Return the uncertainty budget: each parameter's sources, combined and expanded.
@@ -241,27 +300,57 @@ class FitResult(Fit):
             Printed, a table: source, type A or B, standard uncertainty, degrees of freedom and
             share; then the combined and the expanded uncertainty.
         """
-        return self._budget
+        return self.assessment.budget()
+
+    @cached_property
+    def stated_budget(self) -> Budget | None:
+        """The uncertainty budget; None where there is nothing to state."""
+        try:
+            return self.budget()
+        except FitError:
+            return None
+
+    def summary(self) -> pd.DataFrame:
+        """Return a table, one row a parameter, with its combined 95.45 % interval.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``value, stderr, lower, upper, unit, vary, description, init_value, min, max``.
+        """
+        import pandas as pd
+
+        limits = self.conf_interval().at(LEVELS[1])
+        rows = {}
+        for name, p in self.params.items():
+            known = {"lower": limits[name].lower, "upper": limits[name].upper} if p.vary else {}
+            rows[name] = {**asdict(p), **known}
+        frame = pd.DataFrame.from_dict(rows, orient="index").rename_axis("parameter")
+        columns = ["value", "stderr", "lower", "upper", "unit", "vary", "description"]
+        return frame.reindex(columns=[*columns, "init_value", "min", "max"])
 
     # What follows from the estimate
 
     def predict(
         self,
-        frequency_hz: ArrayLike,
+        at: Any,
+        /,
         *,
         amplitude: ArrayLike | None = None,
         drive: ArrayLike | None = None,
         quantity: Quantity | None = None,
         noise: bool = True,
-    ) -> ResponseBand:
-        """Return the response that the estimate predicts, with its bands.
+        initial: Literal["fitted", "rest"] = "fitted",
+    ) -> Any:
+        """Return what another measurement of the device should show, with its bands.
 
         Bands count every source of the budget, and what the device departs from the model.
 
         Parameters
         ----------
-        frequency_hz : array_like, shape (n,)
-            Hz.
+        at : array_like, shape (n,), or Record
+            Of a fit of a table: frequencies, Hz. Of a fit of records: another record, with the
+            same channels.
         amplitude : array_like, shape (n,), optional
             Displacement amplitude, m or rad, where that is controlled.
         drive : array_like, shape (n,), optional
@@ -271,22 +360,57 @@ class FitResult(Fit):
         noise : bool, default True
             The band holds what one more test would measure, its noise and scatter included;
             False: the device's response itself.
+        initial : {"fitted", "rest"}, default "fitted"
+            Whether the state at a record's first sample and its offset are fitted, the model's
+            parameters held, or taken as zero.
 
         Returns
         -------
-        ResponseBand
+        ResponseBand or RecordBand
             Sensors included: what would be measured. NaN where a drive has no steady amplitude.
 
         Raises
         ------
+        DataError
+            If the record lacks a channel.
+        FitError
+            If the motion grows beyond all bounds.
         ValidationError
-            If both or neither of amplitude and drive are given, a value is not above zero, or
-            the shapes do not go together.
+            If the fit is of the other kind of data, both or neither of amplitude and drive are
+            given, a value is not above zero, or the shapes do not go together.
         """
-        errors = self.errors_of_combinations
-        return response_band(
-            self.optimum, frequency_hz, amplitude, drive, quantity, errors, of_a_test=noise
-        )
+        if isinstance(at, Record):
+            return self.assessment.predict_record(at, initial)
+        return self.assessment.predict_response(at, amplitude, drive, quantity, noise=noise)
+
+    def simulate(self, record: Record) -> FloatArray:
+        """Return the output for a record's input, from rest; its measured output is not used."""
+        output: FloatArray = self.predict(record, initial="rest").output
+        return output
+
+    def hold_out(self, parts: int | None = None) -> Any:
+        """Return how well parts of the data are predicted by fits to the others.
+
+        Parameters
+        ----------
+        parts : int, optional
+            In how many parts each record is cut. Left out: several records are left out as a
+            whole, one at a time, and a single one is cut in four. Tests of tables are left out
+            one at a time.
+
+        Returns
+        -------
+        HoldOut or CrossValidation
+            Each part left out in turn; printed, a table or a sentence.
+
+        Raises
+        ------
+        DataError
+            If a part is too short to be fitted.
+        FitError
+            If nothing is left to fit.
+        """
+        return self.assessment.hold_out(parts)
 
     def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
         """Return natural frequency and damping ratio of the estimate against amplitude.
@@ -306,7 +430,7 @@ class FitResult(Fit):
         ModelError
             If the model has no mass, or no natural frequency at an amplitude.
         """
-        return predicted_backbone(self.optimum, self.model, amplitude, self.errors)
+        return self.assessment.backbone(amplitude)
 
     def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
         """Return N(A) of the friction alone, with bands that hold the device's.
@@ -325,7 +449,7 @@ class FitResult(Fit):
         ModelError
             If the model has no friction law.
         """
-        return describing_function_band(self.optimum, amplitude, self.errors)
+        return self.assessment.describing_function(amplitude)
 
     def derived(
         self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
@@ -343,10 +467,10 @@ class FitResult(Fit):
         -------
         tuple of DerivedQuantity
         """
-        return tuple(derived(self.optimum, amplitudes, frequency_hz, self.errors))
+        return self.assessment.derived(amplitudes, frequency_hz)
 
     def fit_report(
-        self, method: Method = "combined", level: float = 0.9545, *, details: bool = True
+        self, method: Method = "combined", level: float = LEVELS[1], *, details: bool = True
     ) -> str:
         """Return the report as text, the verdict first.
 
@@ -357,7 +481,7 @@ class FitResult(Fit):
         level : float, default 0.9545
             Their confidence level.
         details : bool, default True
-            False: verdict and parameters alone, on at most 15 lines.
+            False: verdict and the device's parameters alone, on at most 15 lines.
 
         Returns
         -------
@@ -368,32 +492,49 @@ class FitResult(Fit):
     def _repr_html_(self) -> str:
         return fit_report.as_html(self, self._reported("combined", LEVELS[1]))
 
-    def plot(self, kind: str | None = None, ax: Any = None) -> Any:
+    def _reported(self, method: Method, level: float) -> ConfidenceIntervals:
+        if level in LEVELS:
+            return self.conf_interval(method).only(level)
+        return self.conf_interval(method, (level,))
+
+    def plot(self, kind: str | None = None, ax: Any = None, *, record: int = 0) -> Any:
         """Draw the fit.
 
         Parameters
         ----------
-        kind : {"fit", "residuals", "budget"}, optional
-            "fit" (the default): data and fit, see :meth:`plot_fit`. "residuals": see
-            :meth:`plot_residuals`. "budget": shares of the uncertainty as bars.
+        kind : str, optional
+            "budget": shares of the uncertainty as bars. Of a table: "fit" (the default), see
+            :meth:`plot_fit`, or "residuals", see :meth:`plot_residuals`. Of records: "time" (the
+            default), "loop", "residuals" over time, or "residuals_displacement".
         ax : matplotlib Axes, or two of them for "fit", optional
             New ones where left out.
+        record : int, default 0
+            Which record.
 
         Returns
         -------
         Axes, or a tuple of Axes
         """
-        if kind in (None, "fit"):
-            return self.plot_fit(ax)
-        if kind == "residuals":
-            return self.plot_residuals(ax)
-        if kind == "budget":
-            from dahl_ident.plots import plot_budget
+        kinds: dict[str, Callable[[], Any]] = {"budget": lambda: self._plot_budget(ax)}
+        if self.problem.settled:
+            kinds = {
+                "fit": lambda: self.plot_fit(ax), "residuals": lambda: self.plot_residuals(ax)
+            } | kinds  # fmt: skip
+        else:
+            from dahl_ident.plots.waveforms import KINDS, draw_record_fit
 
-            table = self.budget()
-            shares = [(name, row.source, row.share) for name in table for row in table[name].rows]
-            return plot_budget(shares, ax=ax)
-        raise ValidationError(f"kind is {kind!r}; expected fit, residuals or budget")
+            of_record = {k: partial(draw_record_fit, self, k, record, ax) for k in KINDS}
+            kinds = of_record | kinds
+        if kind is not None and kind not in kinds:
+            raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
+        return kinds[kind or next(iter(kinds))]()
+
+    def _plot_budget(self, ax: Any) -> Axes:
+        from dahl_ident.plots import plot_budget
+
+        table = self.budget()
+        shares = [(name, row.source, row.share) for name in table for row in table[name].rows]
+        return plot_budget(shares, ax=ax)
 
     def plot_fit(self, ax: Sequence[Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw data and fit, gain above phase, over amplitude or frequency.
@@ -435,6 +576,45 @@ class FitResult(Fit):
 
         return draw_residuals(self, against, ax)
 
+    # Storage
+
+    def to_json(self) -> str:
+        """Return the fit as JSON: table or records, model, noise, sensors and optimum."""
+        return fit_storage.to_json(self.optimum, self.first_order)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Return the fit that :meth:`to_json` wrote.
+
+        Raises
+        ------
+        DataError
+            If the text holds no such fit, one of another version's schema, or was changed.
+        ModelError
+            If a law of the model is not known here.
+        """
+        optimum, first_order = fit_storage.from_json(text)
+        return cls(optimum, first_order=first_order)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Return the fit that :meth:`save` wrote.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read, holds no such fit, one of another version's schema, or was
+            changed.
+        ModelError
+            If a law of the model is not known here.
+        """
+        optimum, first_order = fit_storage.load(path)
+        return cls(optimum, first_order=first_order)
+
+    def __str__(self) -> str:
+        return self.fit_report()
+
     def __repr__(self) -> str:
-        estimates = ", ".join(str(self.params[name]) for name in self.var_names)
+        names = self.var_names[: self.problem.n_reported]
+        estimates = ", ".join(str(self.params[name]) for name in names)
         return f"<FitResult: {estimates}; {self.optimum.status.name.lower()}>"

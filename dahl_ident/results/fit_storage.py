@@ -63,15 +63,13 @@ def to_json(optimum: Optimum, first_order: bool) -> str:
     return json.dumps({**content, "digest": digest(content)}, allow_nan=False, indent=indent)
 
 
-def from_json(
-    text: str, schema: str | None = None, source: str = "the text"
-) -> tuple[Optimum, bool]:
+def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
     """Return the fit that JSON text holds, and whether it is of first order alone."""
     try:
         content = json.loads(text)
     except json.JSONDecodeError as exc:
         raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
-    _check(content, schema, source)
+    _check(content, source)
     problem_of = _table_problem if content["schema"] == TABLE else _record_problem
     try:
         optimum = optimum_from(problem_of(content), content["optimum"])
@@ -89,16 +87,16 @@ def from_json(
     return optimum, first_order
 
 
-def load(path: str | Path, schema: str | None = None) -> tuple[Optimum, bool]:
+def load(path: str | Path) -> tuple[Optimum, bool]:
     """Return the fit that a file holds."""
-    return from_json(read_text(path), schema, str(path))
+    return from_json(read_text(path), str(path))
 
 
-def _check(content: Any, schema: str | None, source: str) -> None:
+def _check(content: Any, source: str) -> None:
     """Refuse what is not a fit of the version that is known, as it was written."""
     stated = content.get("schema") if isinstance(content, Mapping) else None
-    if stated not in ((TABLE, RECORDS) if schema is None else (schema,)):
-        expected = repr(schema) if schema else f"{TABLE!r} or {RECORDS!r}"
+    if stated not in (TABLE, RECORDS):
+        expected = f"{TABLE!r} or {RECORDS!r}"
         raise DataError(f"{source} has the schema {stated!r}; expected {expected}, a saved fit")
     version = content.get("schema_version")
     if type(version) is not int or version != VERSION:

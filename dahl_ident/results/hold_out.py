@@ -36,7 +36,7 @@ class HeldOutPart:
 
 @dataclass(frozen=True)
 class HoldOut:
-    """The hold-out check of a fit; made by :meth:`dahl_ident.RecordFit.hold_out`.
+    """The hold-out check of a fit; made by :meth:`dahl_ident.FitResult.hold_out`.
 
     Attributes
     ----------

@@ -5,7 +5,7 @@ Everything is computed at draws from the posterior; no linearization is involved
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.diagnostics.bands import ENERGY, DerivedQuantity
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.elements import Element
-from dahl_ident.problem import Problem
+from dahl_ident.problem import BaseProblem
 from dahl_ident.units import shown_unit
 
 
@@ -70,24 +70,26 @@ def _central(values: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
 
 
 def derived_at_draws(
-    problem: Problem,
-    theta: FloatArray,
+    problem: BaseProblem,
+    by_name: Mapping[str, FloatArray],
     amplitudes: Sequence[float],
     frequency_hz: float | None,
 ) -> Iterator[DerivedQuantity]:
-    """Yield the knee of each law, and at each amplitude stiffness, loss and damping of friction."""
-    by_name = dict(zip(problem.names, problem.to_values(theta).T, strict=True))
-    motion = problem.data.motion
+    """Yield the knee of each law, and at each amplitude stiffness, loss and damping of friction.
+
+    `by_name` are draws of the free parameters.
+    """
+    motion, size = problem.motion, len(next(iter(by_name.values())))
     friction = [e for e in problem.model.elements if e.has_memory]
     values = [_own_values(e, by_name) for e in friction]
     for element, p in zip(friction, values, strict=True):
-        low, high = (np.broadcast_to(k, len(theta)) for k in element.knee(p))
+        low, high = (np.broadcast_to(k, size) for k in element.knee(p))
         if np.array_equal(low, high):
             label = "x_c" if element.name is None else f"{element.name}_x_c"
             yield _quantity(label, shown_unit("m", motion), None, low)
     omega = 2.0 * np.pi * float(positive_array(1.0 if frequency_hz is None else frequency_hz, "f"))
     for A in positive_array(amplitudes, "amplitudes").ravel().tolist():
-        at = np.full(len(theta), A), np.full(len(theta), omega)
+        at = np.full(size, A), np.full(size, omega)
         N = np.sum(
             [e.stiffness(p, *at) for e, p in zip(friction, values, strict=True)],
             axis=0,
@@ -98,7 +100,7 @@ def derived_at_draws(
             yield _quantity("equivalent damping", shown_unit("N s/m", motion), A, N.imag / omega)
 
 
-def _own_values(element: Element, by_name: dict[str, FloatArray]) -> list[FloatArray]:
+def _own_values(element: Element, by_name: Mapping[str, FloatArray]) -> list[FloatArray]:
     return [by_name.get(p.name, np.asarray(p.value)) for p in element.parameters]
 
 

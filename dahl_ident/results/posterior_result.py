@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,18 +21,18 @@ from dahl_ident.arrays import (
     whole_number,
 )
 from dahl_ident.bayes.convergence import Convergence
-from dahl_ident.bayes.density import SCALE, Density, LogDensity
+from dahl_ident.bayes.density import SCALE, Density
 from dahl_ident.bayes.priors import PriorLike
+from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.bayes.sample import ChainSample, PointSample, Sample
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import plain_data
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.checks import assumptions, doubted
+from dahl_ident.diagnostics.checks import doubted
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem import Problem
 from dahl_ident.results.arviz_export import to_arviz
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_checks import (
@@ -83,18 +83,23 @@ class Posterior(Result):
 
     def __init__(
         self,
-        density: Density,
+        density: Density | RecordDensity,
         sample: Sample,
         fit: FitResult | None = None,
         uncertainty: str = "noise",
     ) -> None:
-        self._density: LogDensity = density
+        self._density = density
         self.sample = sample  #: The weighted draws, search coordinates.
-        self._fit = fit
+        #: The least-squares fit from which the search started; None with too few data.
+        self.fit = fit
         #: What is counted: every source of the fit's budget, "combined", or "noise" alone.
         self.uncertainty = uncertainty
 
-    problem: Problem = part("_density.problem", "Data, model, noise and sensors.")
+    problem: Any = part("_density.problem", "Data, model, noise and sensors.")
+    data: FrequencyResponse = part("problem.data", "The table.")
+    provenances: tuple[Mapping[str, Any] | None, ...] = part(
+        "problem.provenances", "Where the table comes from, or each record."
+    )
     names: tuple[str, ...] = part(
         "_density.names", "Names of the parameters, the model's first, an unknown noise scale last."
     )
@@ -113,25 +118,19 @@ class Posterior(Result):
         return list(self.names)
 
     @property
-    def asked(self) -> Problem:
+    def asked(self) -> Any:
         """The problem as it was given, before exponents that were not given became parameters."""
-        return self.problem if self._fit is None else self._fit.problem
-
-    @property
-    def data(self) -> FrequencyResponse:
-        """The data."""
-        return self.problem.data
+        return (self.fit or self).problem
 
     @property
     def optimum(self) -> Optimum | None:
         """The least-squares optimum from which the search started; None with too few data."""
-        return None if self._fit is None else self._fit.optimum
+        return None if self.fit is None else self.fit.optimum
 
     @property
     def units(self) -> tuple[str, ...]:
         """SI units of the parameters."""
-        known = [p.unit for p in self.problem.parameters]
-        return (*known, *([""] * (len(self.names) - len(known))))
+        return tuple(self.params[name].unit for name in self.names)
 
     @property
     def given_priors(self) -> Mapping[str, PriorLike]:
@@ -146,7 +145,8 @@ class Posterior(Result):
         """Every parameter by name, posterior mean and standard deviation; fixed ones included."""
         values = dict(zip(self.names, self.mean().tolist(), strict=True))
         stderr = dict(zip(self.names, self.std().tolist(), strict=True))
-        shown = dict(Parameters.of(self.problem, values, stderr))
+        every = Parameters.of(self.problem, values, stderr)
+        shown = {name: every[name] for name in self.problem.of_device}
         if SCALE in values:
             at = values[SCALE], stderr[SCALE]
             shown[SCALE] = Estimate(SCALE, "", "noise scale", *at, None, 0.0, math.inf, True)
@@ -429,51 +429,48 @@ class Posterior(Result):
             yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
 
     @property
-    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        """Where the data come from."""
-        return (self.data.provenance,)
-
-    @property
     def _counted_fit(self) -> FitResult | None:
         """The fit whose sources of error are counted; None where noise alone is."""
-        return self._fit if self.uncertainty == "combined" else None
+        return self.fit if self.uncertainty == "combined" else None
 
     @property
     def _misfits(self) -> tuple[Finding, ...]:
         """Where the data contradict the model; with the fit's errors, what its status rests on."""
-        fit = self._counted_fit
-        if fit is None:
+        fit = self.fit
+        if fit is None or (self._counted_fit is None and self.problem.settled):
             lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
             failed = (check for check in self.checks if not check.passed)
             return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)
         if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
             return tuple(fit.goodness.findings())
-        return doubts_of(fit)
+        if fit.status is not VerdictStatus.NOT_DESCRIBED:
+            return ()
+        return tuple(f for f in fit.findings if f.severity is not VerdictStatus.TRUSTED)
 
     @property
     def _notes(self) -> tuple[Finding, ...]:
         """What the numbers count and assume, and the evidence."""
         note = Question.ASSUMED, VerdictStatus.TRUSTED
         notes: tuple[Finding, ...] = ()
-        if isinstance(self.sample, PointSample):
+        if isinstance(self.sample, PointSample) and self._density.normalised:
             values = {"ln": self.log_evidence}
             notes = (Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", values),)
-        fit = self._fit
+        fit = self.fit
         if fit is None or self.likelihood == "none":
             return notes
+        assumed = fit.assessment.assumptions(counted=self._counted_fit is not None)
         if self._counted_fit is not None:
-            shared = getattr(self._density, "errors", None)
-            names = ["noise"] if shared is None else list(shared.counted)
-            free = [n for n in self.problem.names if n not in fit.problem.names]
+            free = [n for n in self.names if n not in (*fit.problem.names, SCALE)]
             ranges = (f"{name} as a parameter, which was not given" for name in free)
-            counted = Finding(*note, "counted", {"sources": (*names, *ranges)})
-            return (counted, *assumptions(fit.optimum, fit.errors), *notes)
+            counted = Finding(*note, "counted", {"sources": (*self._density.counted, *ranges)})
+            return (counted, *assumed, *notes)
         if fit.errors is None:
-            return (*assumptions(fit.optimum, None), *notes)
+            return (*assumed, *notes)
         std = dict(zip(self.names, self.std().tolist(), strict=True))
-        u = [f"{fit.params[n].stderr:.2g} instead of {std[n]:.2g} for {n}" for n in fit.var_names]
+        free = [n for n in fit.var_names if n in std]
+        u = [f"{fit.params[n].stderr:.2g} instead of {std[n]:.2g} for {n}" for n in free]
         compared = Finding(*note, "noise_alone", {"compared": tuple(u)})
-        return (compared, *assumptions(fit.optimum, None), *notes)
+        return (compared, *assumed, *notes)
 
     # What follows
 
@@ -485,36 +482,46 @@ class Posterior(Result):
         FitError
             If there are too few data for one.
         """
-        if self._fit is None:
+        if self.fit is None:
             raise FitError("there are too few data for a least-squares fit, so there is no budget")
-        return self._fit.budget()
+        return self.fit.budget()
 
     def predict(
         self,
-        frequency_hz: Any,
+        at: Any,
         /,
         *,
         amplitude: ArrayLike | None = None,
         drive: ArrayLike | None = None,
         quantity: Quantity | None = None,
-        size: int = 1000,
+        initial: Literal["fitted", "rest"] = "fitted",
+        size: int | None = None,
         seed: int = 0,
     ) -> Any:
-        """Return the response at draws from the posterior, with its bands.
+        """Return what another measurement should show, at draws from the posterior.
 
         Parameters
         ----------
-        frequency_hz, amplitude, drive, quantity
+        at, amplitude, drive, quantity, initial
             As for :meth:`dahl_ident.FitResult.predict`.
-        size, seed : int, default 1000 and 0
+        size : int, optional
+            How many draws: 1000, or 100 of records.
+        seed : int, default 0
             Of the draws.
 
         Returns
         -------
-        PredictiveBand
+        PredictiveBand or RecordBand
         """
-        there = problem_at(self.problem, frequency_hz, amplitude, drive, quantity)
-        return PredictiveBand(there.predict(self._drawn(size, seed)[:, : len(there.names)]))
+        if self.problem.settled:
+            there = problem_at(self.problem, at, amplitude, drive, quantity)
+            theta = self._drawn(1000 if size is None else size, seed)
+            return PredictiveBand(there.predict(theta[:, : len(there.names)]))
+        assert self.fit is not None
+        if not isinstance(at, Record):
+            return self.fit.predict(at)  # says what can be predicted
+        draws = self.draws(100 if size is None else whole_number(size, "size", 2), seed)
+        return self.fit.assessment.record_at_draws(at, initial, draws)
 
     def derived(
         self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
@@ -530,8 +537,8 @@ class Posterior(Result):
         -------
         tuple of DerivedQuantity
         """
-        theta = self._drawn(RULE_DRAWS, 0)[:, : len(self.problem.names)]
-        return tuple(derived_at_draws(self.problem, theta, amplitudes, frequency_hz))
+        by_name = dict(zip(self.names, self.draws(RULE_DRAWS).T, strict=True))
+        return tuple(derived_at_draws(self.problem, by_name, amplitudes, frequency_hz))
 
     def plot(self, kind: str | None = None, ax: Any = None) -> Any:
         """Draw the posterior.
@@ -609,13 +616,6 @@ class Posterior(Result):
 
 
 _LEVELS = np.array(list(QUANTILES.values()))
-
-
-def doubts_of(fit: Result) -> tuple[Finding, ...]:
-    """Return what the status of a fit rests on, where the fit does not describe the data."""
-    if fit.status is not VerdictStatus.NOT_DESCRIBED:
-        return ()
-    return tuple(f for f in fit.findings if f.severity is not VerdictStatus.TRUSTED)
 
 
 def _thinned(array: FloatArray, discard: int, thin: int, flat: bool) -> FloatArray:

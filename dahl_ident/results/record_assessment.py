@@ -1,0 +1,310 @@
+"""What a fit of records of any motion states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray, whole_number
+from dahl_ident.data import Record
+from dahl_ident.data.record import cut
+from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.budget import Budget, coverage_factor
+from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
+from dahl_ident.diagnostics.judgement import Finding, Judgement
+from dahl_ident.diagnostics.record_checks import (
+    RecordGoodness,
+    misses,
+    record_goodness,
+    record_judgement,
+    undetermined,
+)
+from dahl_ident.diagnostics.record_errors import (
+    NOISE,
+    RecordErrors,
+    errors_on_constraints,
+    record_assumptions,
+    record_budget,
+    record_derived,
+    record_errors,
+    variances,
+)
+from dahl_ident.diagnostics.verdicts import Identifiability, ParameterVerdict, Verdict
+from dahl_ident.elements import Model
+from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.fitting import solve
+from dahl_ident.fitting.losses import loss_named
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.record_search import hold_model
+from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.results.assessment import Assessment
+from dahl_ident.results.hold_out import HeldOutPart, HoldOut
+from dahl_ident.units import shown_unit
+
+
+@dataclass(frozen=True)
+class RecordBand:
+    """Predicted samples of a record with their uncertainty.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        s.
+    output : ndarray, shape (n,)
+        Predicted force or motion.
+    stderr : ndarray, shape (n,)
+        Standard uncertainty from the parameters.
+    lower, upper : ndarray, shape (n,)
+        95.45 % band of what would be measured, the residuals' scatter included.
+    measured : ndarray, shape (n,)
+        What the record holds.
+    """
+
+    time: FloatArray
+    output: FloatArray
+    stderr: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    measured: FloatArray
+
+    @property
+    def rms_error(self) -> float:
+        """Root mean square of measured minus predicted."""
+        return float(np.sqrt(np.mean((self.measured - self.output) ** 2)))
+
+    @property
+    def rms_share(self) -> float:
+        """The same over the measured samples' standard deviation."""
+        return self.rms_error / float(np.std(self.measured))
+
+
+class RecordAssessment(Assessment):
+    """A fit of records, with its errors source by source."""
+
+    problem: RecordProblem
+    kind = "records"
+    instead = (
+        "it predicts a Record; for settled sines ask its model, such as "
+        "fit.model.dynamic_stiffness(amplitude, frequency_hz)"
+    )
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, object] | None, ...]:
+        """Where each record comes from."""
+        return self.problem.provenances
+
+    @property
+    def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
+        """Estimates and combined standard uncertainties by name."""
+        names, u = self.optimum.names, np.sqrt(np.diagonal(self.covar)).tolist()
+        values = self.optimum.values.tolist()
+        return dict(zip(names, values, strict=True)), dict(zip(names, u, strict=True))
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Names of parameters that were not given; the uncertainty counts their ranges."""
+        return tuple(one.name for one in self.errors.assumed)
+
+    @property
+    def success(self) -> bool:
+        """Whether the search converged, also where the records leave a parameter undetermined."""
+        return self.optimum.converged
+
+    @cached_property
+    def model(self) -> Model:
+        """The model with the estimates put in, fixed."""
+        values = dict(zip(self.optimum.names, self.optimum.values.tolist(), strict=True))
+        return self.problem.model.with_fixed({p.name: values[p.name] for p in self.problem.free})
+
+    @cached_property
+    def _evaluated(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        places = range(len(self.problem.records))
+        predictions = [self.problem.predict(self.optimum.values, i) for i in places]
+        residuals = [y - p.output for y, p in zip(self.problem.measured, predictions, strict=True)]
+        return [p.by for p in predictions], residuals
+
+    @property
+    def residuals(self) -> tuple[FloatArray, ...]:
+        """Measured minus predicted, record by record."""
+        return tuple(self._evaluated[1])
+
+    @cached_property
+    def errors(self) -> RecordErrors:
+        """The estimate's uncertainty, source by source."""
+        jacobians, residuals = self._evaluated
+        loss = loss_named(self.optimum.loss, self.problem.parts)
+        if loss is not None:  # to first order, least squares of these residuals
+            units = [size * self.optimum.scale for size in self.problem.sizes]
+            z = [(e / unit) ** 2 for e, unit in zip(residuals, units, strict=True)]
+            mean = loss.mean_slope(np.concatenate(z))
+            residuals = [e * loss.slope(each) / mean for e, each in zip(residuals, z, strict=True)]
+        if self.first_order:
+            return errors_on_constraints(self.optimum, jacobians, residuals)
+        return record_errors(self.problem, self.optimum.values, jacobians, residuals)
+
+    @property
+    def covar(self) -> FloatArray:
+        """Covariance of the free values, every source together."""
+        return self.errors.covariance
+
+    @property
+    def stderr_noise(self) -> Mapping[str, float]:
+        """Standard error of every free value from the residuals' noise alone."""
+        sizes = np.sqrt(self.errors.contributions[NOISE].diagonal()).tolist()
+        return dict(zip(self.optimum.names, sizes, strict=True))
+
+    @property
+    def estimate(self) -> Optimum:
+        """The estimate: the optimum."""
+        return self.optimum
+
+    @cached_property
+    def by_noise(self) -> Optimum:
+        """The optimum with the covariance of correlated noise."""
+        slopes = self.problem.value_slopes(self.optimum.theta)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            covariance = self.errors.contributions[NOISE] / np.outer(slopes, slopes)
+        return replace(
+            self.optimum,
+            covariance=np.where(np.isnan(covariance), np.inf, covariance),
+            dof=int(self.errors.dof_of(NOISE)),
+        )
+
+    def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
+        """Return intervals that count every source of error."""
+        array, values = checked_levels(levels), self.optimum.values
+        dof = [self.errors.dof_for(place) for place in range(values.size)]
+        k = np.array([[coverage_factor(nu, level) for nu in dof] for level in array.tolist()])
+        u = np.sqrt(np.diagonal(self.covar))
+        lower, upper = around(self.problem.space, values, u, k)
+        note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
+        names, units = self.problem.names, tuple(p.unit for p in self.problem.parameters)
+        return ConfidenceIntervals("combined", array, names, units, values, lower, upper, note)
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which parameters the records determine."""
+        lost = {finding.values["name"]: str(finding) for finding in undetermined(self)}
+        limits = self.intervals("combined", LEVELS, None, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.sqrt(np.diagonal(self.covar)) / np.abs(self.optimum.values)
+        verdicts: dict[str, ParameterVerdict] = {}
+        for name, u in zip(limits, relative.tolist(), strict=True):
+            verdict = Verdict.NOT_IDENTIFIED if name in lost else Verdict.IDENTIFIED
+            reason, unit = lost.get(name, verdict.value), limits.units[len(verdicts)]
+            verdicts[name] = ParameterVerdict(name, unit, verdict, u, u, limits[name][1], reason)
+        return Identifiability(verdicts, (), len(verdicts) - len(lost), {}, {})
+
+    @cached_property
+    def goodness(self) -> RecordGoodness:
+        """Statistics of the residuals."""
+        return record_goodness(self.problem, self.residuals)
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Every finding about the fit, and the status that follows from them."""
+        return record_judgement(self)
+
+    def assumptions(self, *, counted: bool = True) -> tuple[Finding, ...]:
+        """Return what the result depends on."""
+        return (record_assumptions(self.problem, self.errors),)
+
+    @property
+    def noise_in_words(self) -> list[str]:
+        """How residuals were weighted."""
+        spectrum = self.problem.whitening.size > 1
+        weighted = "weighted by their spectrum" if spectrum else "of constant variance"
+        return [
+            f"residuals {weighted}; worth {self.errors.effective:.3g} independent samples of "
+            f"{self.problem.n_samples}"
+        ]
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget."""
+        stated = record_budget(self.problem, self.optimum.values, self.errors)
+        parameters = tuple(replace(p, unit=self._shown(p.unit)) for p in stated.parameters)
+        return replace(stated, parameters=parameters)
+
+    def _shown(self, unit: str) -> str:
+        """Return a unit as it is written for the records' motion."""
+        return shown_unit(unit, self.problem.motion)
+
+    def derived(
+        self, amplitudes: Sequence[float], frequency_hz: float | None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping."""
+        values = self.optimum.values
+        quantities = record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
+        return tuple(replace(quantity, unit=self._shown(quantity.unit)) for quantity in quantities)
+
+    def predict_record(self, record: Record, initial: str) -> RecordBand:
+        """Return what another record should show."""
+        count = self.problem.n_reported
+        problem, full = self.started(record, self.optimum.values[:count], initial)
+        predicted = problem.predict(full, 0)
+        variance = variances(predicted.by[:, :count], self.covar[:count, :count])
+        return self.band(problem, predicted.output, variance)
+
+    def record_at_draws(self, record: Record, initial: str, draws: FloatArray) -> RecordBand:
+        """Return what another record should show, at draws of the model's parameters."""
+        outputs = []
+        for values in draws:
+            problem, full = self.started(record, values, initial)
+            outputs.append(problem.predict(full, 0, derivatives=False).output)
+        return self.band(problem, np.mean(outputs, axis=0), np.var(outputs, axis=0, ddof=1))
+
+    def started(
+        self, record: Record, values: FloatArray, initial: str
+    ) -> tuple[RecordProblem, FloatArray]:
+        """Return the problem of another record, and all its values; the model's are given."""
+        problem = self.problem.of([record])
+        if initial == "fitted":
+            return problem, hold_model(problem, values)
+        if initial != "rest":
+            raise ValidationError(f"initial is {initial!r}; expected fitted or rest")
+        full = np.zeros(len(problem.parameters))
+        full[: values.size] = values
+        return problem, full
+
+    def band(self, problem: RecordProblem, output: FloatArray, variance: FloatArray) -> RecordBand:
+        """Return a predicted record with its bands, from the variance of what is predicted.
+
+        What a model misses is a share of the output: its scatter grows with the record's level.
+        """
+        scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
+        if misses(self):
+            scatter *= max(1.0, problem.level / self.problem.level) ** 2
+        half = coverage_factor(self.errors.dof) * np.sqrt(variance + scatter)
+        return RecordBand(
+            problem.records[0].time, output, np.sqrt(variance), output - half, output + half,
+            problem.measured[0],
+        )  # fmt: skip
+
+    def hold_out(self, parts: int | None) -> HoldOut:
+        """Return how well parts of the records are predicted by fits to the others."""
+        problem, several = self.problem, len(self.problem.records) > 1
+        if parts is None:
+            parts = 1 if several else 4
+        if whole_number(parts, "parts", 1) == 1 and not several:
+            raise FitError("with the only record left out, nothing is left to fit; give parts=2")
+        pieces = [
+            (number, cut(record, slice(int(rows[0]), int(rows[-1]) + 1)))
+            for number, record in enumerate(problem.records, 1)
+            for rows in np.array_split(np.arange(len(record)), parts)
+        ]
+        start = dict(zip(problem.names[: problem.n_reported], self.optimum.values, strict=False))
+        left_out = []
+        for k, (number, piece) in enumerate(pieces):
+            others = problem.remade([other for i, (_, other) in enumerate(pieces) if i != k])
+            fit = RecordAssessment(solve(others, loss=self.optimum.loss, start=start))
+            band = fit.predict_record(piece, "fitted")
+            inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
+            first, last = float(piece.time[0]), float(piece.time[-1])
+            left_out.append(
+                HeldOutPart(number, first, last, len(piece), band.rms_share, float(inside))
+            )
+        return HoldOut(tuple(left_out))

@@ -1,0 +1,265 @@
+"""What a fit of a table states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.bands import (
+    DerivedQuantity,
+    ResponseBand,
+    derived,
+    describing_function_band,
+    predicted_backbone,
+    response_band,
+)
+from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
+from dahl_ident.diagnostics.checks import assumptions, judgement
+from dahl_ident.diagnostics.confidence_levels import LEVELS
+from dahl_ident.diagnostics.error_model import ErrorModel, error_model
+from dahl_ident.diagnostics.error_sources import NOISE
+from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.goodness import Goodness, goodness
+from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation
+from dahl_ident.diagnostics.intervals import ConfidenceIntervals, combined_intervals
+from dahl_ident.diagnostics.judgement import Finding, Judgement
+from dahl_ident.diagnostics.verdicts import Identifiability, judged
+from dahl_ident.elements import Model
+from dahl_ident.errors import DahlIdentError, FitError, ValidationError
+from dahl_ident.fitting import solve
+from dahl_ident.fitting.optimum import Optimum, propagated
+from dahl_ident.problem import Problem
+from dahl_ident.results.assessment import Assessment
+
+_NOISE = {
+    "measured": "measured: the data's covariance, scale known",
+    "relative": "relative: constant variance of (ln gain, phase)",
+    "absolute": "absolute: constant variance of (real, imaginary part)",
+}
+
+
+class TableAssessment(Assessment):
+    """A fit of a table, with its error model."""
+
+    problem: Problem
+    kind = "tables"
+    instead = "extract the table from the waveforms, or fit the record itself"
+
+    @cached_property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error; None where there is nothing to estimate them from."""
+        return None if self.first_order else error_model(self.optimum)
+
+    @cached_property
+    def errors_of_combinations(self) -> ErrorModel | None:
+        """The same; also where only combinations of parameters are determined, for these alone."""
+        if self.first_order:
+            return None
+        return self.errors or error_model(self.optimum, of_combinations=True)
+
+    @property
+    def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
+        """Estimates and combined standard uncertainties by name, assumed parameters included."""
+        optimum, errors = self.optimum, self.errors_of_combinations
+        values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+        stderr = dict(optimum.stderr)
+        if errors is not None:
+            held = [name for name in (*values, *errors.assumed) if errors.holds(name)]
+            values |= {name: errors.values[name] for name in held}
+            stderr |= {name: errors.stderr[name] for name in held}
+        return values, stderr
+
+    @cached_property
+    def stderr_noise(self) -> Mapping[str, float]:
+        """Standard errors of the estimate from noise alone, by name."""
+        stderr = dict(self.optimum.stderr)
+        errors = self.errors_of_combinations
+        if errors is not None:
+            size = np.abs(errors.problem.value_slopes(errors.theta))
+            noise = size * np.sqrt(np.maximum(np.diagonal(errors.contributions[NOISE]), 0.0))
+            by_name = dict(zip(errors.names, noise.tolist(), strict=True))
+            stderr |= {name: by_name[name] for name in stderr if errors.holds(name)}
+        return stderr
+
+    @cached_property
+    def covar(self) -> FloatArray:
+        """Combined covariance of the free values, first order."""
+        errors = self.errors
+        if errors is None:
+            return self.optimum.values_covariance
+        free = [errors.names.index(name) for name in self.optimum.names]
+        slopes = errors.problem.value_slopes(errors.theta)
+        whole = propagated(errors.covariance, slopes)
+        return np.asarray(whole[np.ix_(free, free)])
+
+    @property
+    def estimate(self) -> Optimum:
+        """The estimate, as an optimum; the search's where nothing else is estimated."""
+        errors = self.errors_of_combinations
+        return self.optimum if errors is None else errors.at_estimate
+
+    @property
+    def by_noise(self) -> Optimum:
+        """The optimum, whose covariance is that of noise alone."""
+        return self.optimum
+
+    @property
+    def success(self) -> bool:
+        """Whether a finite optimum was found."""
+        return self.optimum.success
+
+    @cached_property
+    def model(self) -> Model:
+        """The model with the estimates put in; parameters stay free or fixed as they were."""
+        model = self.problem.model
+        names = {p.name for p in model.parameters}
+        values = self.problem.to_values(self.optimum.theta).tolist()
+        estimates = dict(zip(self.optimum.names, values, strict=True))
+        if self.errors is not None:
+            estimates = dict(self.errors.values)
+        return model.with_values({name: v for name, v in estimates.items() if name in names})
+
+    def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
+        """Return intervals that count every source of error."""
+
+        def profile() -> ConfidenceIntervals:
+            return self.intervals("profile", levels, None, 0)
+
+        errors = self.errors_of_combinations
+        if errors is None:
+            return replace(profile(), method="combined")
+        return combined_intervals(self.optimum, errors, levels, profile)
+
+    @cached_property
+    def identifiability(self) -> Identifiability:
+        """Which parameters, or which combinations of them, the data determine."""
+
+        def profile() -> ConfidenceIntervals:
+            return self.intervals("profile", LEVELS, None, 0)
+
+        stated = self.intervals("combined", LEVELS, None, 0)
+        verdicts = judged(self.optimum, None if self.first_order else profile, self.errors, stated)
+        try:
+            sources: Mapping[str, ParameterBudget] = self.budget()
+        except FitError:
+            sources = {}
+        combinations = tuple(
+            replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
+            if c.expression in sources
+            else c
+            for c in verdicts.combinations
+        )
+        return replace(verdicts, combinations=combinations)
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Names of parameters that were not given; the uncertainty counts their ranges."""
+        return () if self.errors is None else tuple(self.errors.assumed)
+
+    @cached_property
+    def goodness(self) -> Goodness:
+        """Whether the residuals are noise, and the estimates physically possible."""
+        return goodness(self.optimum, self.errors_of_combinations)
+
+    @cached_property
+    def cross_validation(self) -> CrossValidation | None:
+        """Held-out tests against their bands; None without tests to hold out."""
+        errors = self.errors_of_combinations
+        return None if errors is None else cross_validation(errors.left_out)
+
+    def hold_out(self, parts: int | None) -> CrossValidation:
+        """Return held-out tests against their bands."""
+        if parts is not None:
+            raise ValidationError("tests of a table are left out one at a time; leave parts out")
+        check = self.cross_validation
+        if check is None:
+            raise FitError("the table has too few tests to leave one out; measure more levels")
+        return check
+
+    @cached_property
+    def fundamentals(self) -> TableAssessment | None:
+        """The same fit to the fundamentals alone; None where there are no other harmonics."""
+        first = self.problem.data.harmonic == 1
+        if first.all() or not first.any() or self.first_order:
+            return None
+        try:
+            problem = self.problem.like(data=self.problem.data.select(rows=first))
+            return TableAssessment(solve(problem, loss=self.optimum.loss))
+        except DahlIdentError:
+            return None
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Every finding about the fit, and the status that follows from them."""
+        return judgement(self)
+
+    def assumptions(self, *, counted: bool = True) -> Iterator[Finding]:
+        """Return what the result depends on."""
+        return assumptions(self.optimum, self.errors if counted else None)
+
+    @cached_property
+    def _budget(self) -> Budget:
+        if self.first_order:
+            raise FitError(
+                "no uncertainty budget: the fit had constraints, which its sources do not keep; "
+                "its standard errors are from noise alone"
+            )
+        return budget(self.optimum, self.errors_of_combinations)
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget."""
+        return self._budget
+
+    def predict_response(
+        self,
+        frequency_hz: ArrayLike,
+        amplitude: ArrayLike | None,
+        drive: ArrayLike | None,
+        quantity: Any,
+        *,
+        noise: bool,
+    ) -> ResponseBand:
+        """Return the response at other operating points."""
+        errors = self.errors_of_combinations
+        return response_band(
+            self.optimum, frequency_hz, amplitude, drive, quantity, errors, of_a_test=noise
+        )
+
+    def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
+        """Return natural frequency and damping ratio of the estimate against amplitude."""
+        return predicted_backbone(self.optimum, self.model, amplitude, self.errors)
+
+    def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
+        """Return N(A) of the friction alone."""
+        return describing_function_band(self.optimum, amplitude, self.errors)
+
+    def derived(
+        self, amplitudes: Sequence[float], frequency_hz: float | None
+    ) -> tuple[DerivedQuantity, ...]:
+        """Return x_c, energy per cycle, equivalent stiffness and damping."""
+        return tuple(derived(self.optimum, amplitudes, frequency_hz, self.errors))
+
+    @property
+    def noise_in_words(self) -> list[str]:
+        """How residuals were weighted."""
+        optimum, problem, dof = self.optimum, self.problem, self.optimum.dof
+        lines = [_NOISE[problem.noise]]
+        if not optimum.scale_known:
+            scale = self.estimate.scale
+            error = scale / math.sqrt(2.0 * dof) if dof > 0 else None
+            size = with_unit(scale, error, problem.data.unit * (problem.noise == "absolute"))
+            made = "the limit of rounding; the residuals are smaller"
+            if not optimum.is_exact:
+                made = f"estimated with {dof} degrees of freedom"
+            lines.append(f"scale {size}, {made}")
+        for name, prior in problem.priors.items():
+            lines.append(f"prior of {name}: {float(prior.mean()):g} ± {float(prior.std()):g}")
+        return lines
