@@ -26,8 +26,7 @@ import numpy as np
 
 from dahl_ident.bayes.chain import Chain, RandomState
 from dahl_ident.bayes.convergence import Convergence
-from dahl_ident.bayes.density import Density
-from dahl_ident.bayes.record_density import RecordDensity
+from dahl_ident.bayes.density import LogDensity
 from dahl_ident.data.storage import library, locked, plain_data, put_in_place
 from dahl_ident.elements.description import describe_model
 from dahl_ident.errors import ModelError, SamplingError
@@ -48,35 +47,17 @@ class StoredChain:
     seed: int
 
 
-def identity(density: Density | RecordDensity, walkers: int, ensembles: int) -> Identity:
+def identity(density: LogDensity, walkers: int, ensembles: int) -> Identity:
     """Return everything a chain depends on except its seed, part by part."""
     elements = density.problem.model
     try:
         model = json.dumps(describe_model(elements), sort_keys=True, default=str)
     except ModelError:  # a linear system built by a function
         model = repr(elements)
-    if isinstance(density, RecordDensity):
-        samples = [(r.time, r.motion_samples, r.force_samples) for r in density.problem.records]
-        facts = {"data": _digest(*(part for record in samples for part in record))}
-        facts["estimate"] = _digest(density.values)
-    else:
-        problem = density.problem
-        data = [
-            getattr(problem.data, name)
-            for name in (
-                "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
-                "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance",
-                "harmonic", "controlled",
-            )
-        ]  # fmt: skip
-        fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
-        facts = {"data": _digest(*data), "noise": problem.noise, "sensors": repr(fixed)}
-        errors = density.errors
-        facts["errors other than noise"] = (
-            "none"
-            if errors is None
-            else _digest(errors.turn, errors.shared, errors.factors, errors.sizes)
-        )
+    facts = {
+        name: part if isinstance(part, str) else _digest(*part)
+        for name, part in density.facts.items()
+    }
     return {
         **facts,
         "model": model,

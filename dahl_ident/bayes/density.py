@@ -18,8 +18,10 @@ For outliers a row may count as Student's t in two dimensions with nu = 4 instea
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
@@ -37,13 +39,22 @@ LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
 TAIL_DOF = 4.0  # of Student's t: heavy tails for outliers, yet a finite variance
 _FARTHEST = 300.0  # of ln s
+_COLUMNS = (
+    "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
+    "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance", "harmonic",
+    "controlled",
+)  # fmt: skip
+"""Of a table: what its likelihood depends on."""
 
 
 class LogDensity(ABC):
     """A log-posterior over search coordinates; call it with points of shape (S, D)."""
 
+    problem: Any
     prior: JointPrior
     likelihood: str
+    counted: tuple[str, ...]
+    """The sources of error that the likelihood counts."""
     normalised: bool = True
     """Whether the density is that of the data, and not only up to a factor."""
 
@@ -64,6 +75,20 @@ class LogDensity(ABC):
     def decorrelation(self) -> Decorrelation | None:
         """Coordinates in which ridges are straight, where there are some."""
         return None
+
+    @property
+    def around(self) -> tuple[FloatArray, FloatArray] | None:
+        """Centre and covariance of the density, where they are known."""
+        return None
+
+    @property
+    @abstractmethod
+    def facts(self) -> dict[str, str | Sequence[object]]:
+        """What the density depends on in addition to model and priors: texts, or arrays."""
+
+    def in_order(self, points: FloatArray) -> FloatArray:
+        """Return points with interchangeable elements in order."""
+        return points
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -110,9 +135,27 @@ class Density(LogDensity):
     errors: RowErrors | None = None
 
     @property
-    def counted(self) -> tuple[str, ...]:
+    def counted(self) -> tuple[str, ...]:  # type: ignore[override]
         """The sources of error that the likelihood counts."""
         return ("noise",) if self.errors is None else tuple(self.errors.counted)
+
+    @property
+    def facts(self) -> dict[str, str | Sequence[object]]:
+        """Data, noise, sensors and shared errors."""
+        problem, errors = self.problem, self.errors
+        fixed = [(p.name, p.value) for p in problem.sensors.parameters if not p.free]
+        parts = [errors.turn, errors.shared, errors.factors, errors.sizes] if errors else "none"
+        return {
+            "data": [getattr(problem.data, name) for name in _COLUMNS],
+            "noise": problem.noise,
+            "sensors": repr(fixed),
+            "errors other than noise": parts,
+        }
+
+    def in_order(self, points: FloatArray) -> FloatArray:
+        """Return points with interchangeable elements in order."""
+        P = len(self.problem.names)
+        return np.concatenate([self.problem.in_order(points[:, :P]), points[:, P:]], axis=1)
 
     def __post_init__(self) -> None:
         problem = self.problem

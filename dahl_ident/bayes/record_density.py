@@ -16,6 +16,7 @@ and Davison, Statistica Sinica 22 (2012) 813-845).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,9 +76,16 @@ class RecordDensity(LogDensity):
                 "curvature to begin with; fix what the fit's verdict names"
             ) from exc
 
+    @property
     def around(self) -> tuple[FloatArray, FloatArray]:
-        """Return the estimate's coordinates and their covariance."""
+        """The estimate's coordinates and their covariance."""
         return self.centre, self.root @ self.root.T
+
+    @property
+    def facts(self) -> dict[str, str | Sequence[object]]:
+        """Samples and estimate."""
+        samples = [(r.time, r.motion_samples, r.force_samples) for r in self.problem.records]
+        return {"data": [part for one in samples for part in one], "estimate": [self.values]}
 
     @cached_property
     def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:

@@ -22,7 +22,6 @@ from dahl_ident.bayes.checkpoint import identity, open_chain
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.bayes.importance import WeightedDraws, WeightedPoints, in_blocks, integrate
-from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.errors import SamplingError, ValidationError
 
 _MOST_AXES = 3  # the number of points is a power of the number of axes
@@ -168,7 +167,7 @@ class PointSample(Sample):
 
 
 def sample_chain(
-    density: Density | RecordDensity,
+    density: LogDensity,
     start: Start,
     settings: ChainSettings,
     *,

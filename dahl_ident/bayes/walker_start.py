@@ -7,8 +7,6 @@ start as wide as the prior, and walkers draw from Student's t with twice that sp
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,30 +49,18 @@ def _with_normal_priors(problem: Any) -> Any:
 
 
 def starting_points(
-    density: Density, optimum: Optimum | None, walkers: int, random: np.random.Generator
+    density: LogDensity, optimum: Optimum | None, walkers: int, random: np.random.Generator
 ) -> FloatArray:
     """Return `walkers` points of finite density, (walkers, D)."""
     theta, covariance = centre_and_covariance(density, optimum, random)
     centre, root = _with_scale(density, theta, covariance)
-    return scattered(density, centre, root, walkers, random, partial(_in_order, density))
-
-
-def scattered(
-    density: LogDensity,
-    centre: FloatArray,
-    root: FloatArray,
-    walkers: int,
-    random: np.random.Generator,
-    arranged: Callable[[FloatArray], FloatArray] = np.asarray,
-) -> FloatArray:
-    """Return `walkers` points of finite density around a centre, (walkers, D)."""
     spread = np.full(walkers, _WIDER)
     points = np.empty((walkers, len(centre)))
     missing = np.arange(walkers)
     for _ in range(_TRIES):
         shape = (missing.size, len(centre))
         draws = random.standard_normal(shape) @ root.T
-        points[missing] = arranged(centre + spread[missing, None] * draws)
+        points[missing] = density.in_order(centre + spread[missing, None] * draws)
         missing = missing[~np.isfinite(density(points[missing]))]
         if not missing.size:
             return points
@@ -86,15 +72,13 @@ def scattered(
     )
 
 
-def _in_order(density: Density, points: FloatArray) -> FloatArray:
-    P = len(density.problem.names)
-    return np.concatenate([density.problem.in_order(points[:, :P]), points[:, P:]], axis=1)
-
-
 def centre_and_covariance(
-    density: Density, optimum: Optimum | None, random: np.random.Generator
+    density: LogDensity, optimum: Optimum | None, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Return theta near the posterior's centre, and about its covariance."""
+    if density.around is not None:
+        return density.around
+    assert isinstance(density, Density)
     problem, prior = density.problem, density.prior
     theta = _inside(density, optimum, random)
     precision = np.diag((2.0 / prior.widths) ** 2)
@@ -110,7 +94,7 @@ def centre_and_covariance(
 
 
 def _with_scale(
-    density: Density, theta: FloatArray, covariance: FloatArray
+    density: LogDensity, theta: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the centre and a root of the covariance, ln s included where it is sampled."""
     P = len(theta)
@@ -118,6 +102,7 @@ def _with_scale(
     root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
     if not density.has_scale:
         return theta, root
+    assert isinstance(density, Density)
     wider = np.zeros((P + 1, P + 1))
     wider[:P, :P] = root
     wider[P, P] = 1.0 / np.sqrt(2.0 * (density.problem.n_residuals - P))

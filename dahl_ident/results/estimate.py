@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.chain import ChainSettings, Pool
-from dahl_ident.bayes.density import Density
+from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.bayes.priors import PriorLike, joint_prior
 from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.bayes.sample import ChainSample, Start, sample_chain, sample_points
 from dahl_ident.bayes.walker_start import (
     centre_and_covariance,
     optimum_of,
-    scattered,
     starting_points,
 )
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
@@ -408,7 +406,7 @@ def posterior(
     if given is not None:
         _refuse_with_a_fit(given, options)
 
-    def chain(density: Density | RecordDensity, start: Start) -> ChainSample:
+    def chain(density: LogDensity, start: Start) -> ChainSample:
         settings = ChainSettings.of(
             len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
             walkers=walkers, ensembles=ensembles,
@@ -428,21 +426,12 @@ def posterior(
         problem = data.problem
     if fitted is None or likelihood != "gaussian":
         uncertainty = "noise"
-    density: Density | RecordDensity
-    begin: Callable[[], tuple[FloatArray, FloatArray]]
-    start: Start
-    if fitted is not None and not settled:
-        density = of_motion = _record_density(fitted, priors, uncertainty)
-        begin = of_motion.around
-        start = partial(scattered, of_motion, of_motion.centre, of_motion.root)
-    else:
-        density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
-        begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
-        start = partial(starting_points, density, optimum)
+    density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
+    begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
     if method == "grid":
         points = sample_points(density, begin, problem.names, tolerance)
         return Posterior(density, points, fitted, uncertainty)
-    drawn = chain(density, start)
+    drawn = chain(density, partial(starting_points, density, optimum))
     result = Posterior(density, drawn, fitted, uncertainty)
     drawn.check(result.names, result)
     return result
@@ -499,14 +488,15 @@ def _checked(model: Element | None) -> Element:
 
 def _record_density(
     fit: FitResult, priors: Mapping[str, PriorLike] | None, uncertainty: str
-) -> RecordDensity:
-    values, count, errors = fit.optimum.values, fit.problem.n_reported, fit.errors
-    prior = joint_prior(fit.problem, priors, values)
+) -> LogDensity:
+    """Return the density around a fit of records."""
+    problem, values, errors = fit.problem, fit.optimum.values, fit.errors
     sources = tuple(name for name, part in errors.contributions.items() if part.any())
     covariance, dof = fit.covar, errors.dof
     if uncertainty == "noise":
         sources, covariance, dof = (NOISE,), errors.contributions[NOISE], errors.dof_of(NOISE)
-    return RecordDensity(fit.problem, values, covariance[:count, :count], dof, sources, prior)
+    prior, count = joint_prior(problem, priors, values), problem.n_reported
+    return RecordDensity(problem, values, covariance[:count, :count], dof, sources, prior)
 
 
 def _density(
@@ -515,11 +505,13 @@ def _density(
     priors: Mapping[str, PriorLike] | None,
     likelihood: str,
     uncertainty: str,
-) -> tuple[Density, Optimum | None]:
+) -> tuple[LogDensity, Optimum | None]:
     """Return the density with every source of error, or noise alone, and where to start from."""
     from scipy import stats
 
     given, optimum = dict(priors or {}), None if fit is None else fit.optimum
+    if fit is not None and not problem.settled:
+        return _record_density(fit, priors, uncertainty), optimum
     if fit is None or optimum is None or uncertainty == "noise":
         values = None if optimum is None else optimum.values
         return Density(problem, joint_prior(problem, given, values), likelihood), optimum

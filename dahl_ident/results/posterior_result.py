@@ -21,9 +21,8 @@ from dahl_ident.arrays import (
     whole_number,
 )
 from dahl_ident.bayes.convergence import Convergence
-from dahl_ident.bayes.density import SCALE, Density
+from dahl_ident.bayes.density import SCALE, LogDensity
 from dahl_ident.bayes.priors import PriorLike
-from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.bayes.sample import ChainSample, PointSample, Sample
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import plain_data
@@ -83,7 +82,7 @@ class Posterior(Result):
 
     def __init__(
         self,
-        density: Density | RecordDensity,
+        density: LogDensity,
         sample: Sample,
         fit: FitResult | None = None,
         uncertainty: str = "noise",
@@ -378,9 +377,10 @@ class Posterior(Result):
         ValidationError
             If there is no chain, or it is one of records.
         """
-        if not isinstance(self._density, Density):
+        if not self._density.normalised:
             raise ValidationError("a posterior of records has no form for ArviZ")
-        return to_arviz(self._density, self.chain, seed)
+        density: Any = self._density
+        return to_arviz(density, self.chain, seed)
 
     # Judging
 
@@ -406,8 +406,9 @@ class Posterior(Result):
 
         None where the prior was sampled, or where rows share errors; the fit's tests count there.
         """
-        density, counted = self._density, self._counted_fit is not None
-        if self.likelihood == "none" or counted or not isinstance(density, Density):
+        density: Any = self._density
+        counted = self._counted_fit is not None
+        if self.likelihood == "none" or counted or not density.normalised:
             return ()
         return predictive_checks(density, self._drawn(_CHECK_DRAWS, 0), np.random.default_rng(0))
 
