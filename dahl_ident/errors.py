@@ -6,7 +6,10 @@ and nothing else. A message says what was found, what was expected and what to d
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from difflib import get_close_matches
 from typing import Any
 
@@ -239,3 +242,69 @@ def choices(known: Iterable[str], *words: str) -> str:
     names = list(known)
     near = [repr(name) for word in words for name in get_close_matches(word, names, 1)]
     return ", ".join(names) + (f"; did you mean {', '.join(near)}?" if near else "")
+
+
+_OPTIONS: ContextVar[bool] = ContextVar("options", default=False)
+
+
+@contextmanager
+def arguments_as_options() -> Iterator[None]:
+    """Name arguments in messages as options of the command line."""
+    before = _OPTIONS.set(True)
+    try:
+        yield
+    finally:
+        _OPTIONS.reset(before)
+
+
+def spelled(python: str, options: str) -> str:
+    """Return how to say something to Python, or on the command line where that is used.
+
+    Examples
+    --------
+    >>> spelled("fit(record, model)", "dahl-ident fit --record")
+    'fit(record, model)'
+    """
+    return options if _OPTIONS.get() else python
+
+
+class Placeholder(str):
+    """What stands in a message for a value that the user knows."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+LOW, HIGH, ANY = Placeholder("low"), Placeholder("high"), Placeholder("...")
+
+
+def argument(name: str, value: Any = None, *, option: str | None = None) -> str:
+    """Return an argument for a message, ``name=value`` or ``--name value``.
+
+    A mapping becomes one option for each of its names; `option` is that of another name.
+
+    Examples
+    --------
+    >>> argument("frequency"), argument("mode", "sweep"), argument("ranges", {"f_max": (LOW, HIGH)})
+    ('frequency=', "mode='sweep'", "ranges={'f_max': (low, high)}")
+    >>> with arguments_as_options():
+    ...     argument("frequency"), argument("ranges", {"mass": (LOW, HIGH)})
+    ('--frequency', '--ranges mass=low:high')
+    """
+    typed = f"--{(option or name).replace('_', '-')}"
+    if isinstance(value, Mapping):
+        return spelled(
+            f"{name}={dict(value)!r}",
+            " ".join(f"{typed} {n}={_typed(v)}" for n, v in value.items()),
+        )
+    if value is None or value is True:
+        return spelled(f"{name}=" + ("True" if value else ""), typed)
+    return spelled(f"{name}={value!r}", f"{typed} {_typed(value)}")
+
+
+def _typed(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ":".join(map(str, value))
+    return str(value) if isinstance(value, Placeholder) else shlex.quote(str(value))

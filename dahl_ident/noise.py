@@ -55,7 +55,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import Rows
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, argument
 
 Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 """A loss: z -> rho(z), rho'(z), rho''(z)."""
@@ -399,7 +399,8 @@ def _relative(rows: Rows) -> Relative:
     if not size.all():
         raise DataError(
             f"response{_first(size == 0.0)} is 0, which has no logarithm; relative noise needs a "
-            "response other than 0 in every row: take noise='absolute', or leave the row out"
+            f"response other than 0 in every row: take {argument('noise', 'absolute')}, or leave "
+            "the row out"
         )
     return Relative(rows.response, fundamental, -2.0 * np.log(size).sum(axis=-1))
 
@@ -412,7 +413,7 @@ def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
         raise DataError(
             f"row {_first(lost)} is a harmonic, but no row holds the fundamental of the same "
             "frequency and amplitude, to which relative noise refers; add it, or use "
-            "noise='absolute'"
+            f"{argument('noise', 'absolute')}"
         )
     return np.where(harmonic, rows.of_fundamental(size), 0.0)
 
@@ -420,8 +421,8 @@ def _fundamental(rows: Rows, size: FloatArray) -> FloatArray:
 def _measured(rows: Rows) -> Measured:
     if rows.covariance is None:
         raise DataError(
-            "noise='measured' needs a covariance, and the data have none; "
-            "give it, or take noise='relative'"
+            f"{argument('noise', 'measured')} needs a covariance, and the data have none; "
+            f"give it, or take {argument('noise', 'relative')}"
         )
     C = rows.covariance
     covariance = Covariance(C[..., 0, 0], C[..., 0, 1], C[..., 1, 1])
@@ -434,7 +435,7 @@ def _measured(rows: Rows) -> Measured:
         raise DataError(
             f"covariance{_first(singular)} is singular, {C[singular][0].tolist()}: some "
             "combination of real and imaginary part would be free of error; give every row a "
-            "regular covariance, or take noise='relative'"
+            f"regular covariance, or take {argument('noise', 'relative')}"
         )
     dof = rows.dof if rows.dof is not None and np.isfinite(rows.dof).any() else None
     if dof is not None:
@@ -450,7 +451,8 @@ def _check_dof(dof: FloatArray) -> None:
     if few.any():
         raise DataError(
             f"dof{_first(few)} is {dof[few][0]:g}; a covariance of two parts needs more than 2 "
-            "degrees of freedom to weigh a row: measure more cycles, or take noise='relative'"
+            "degrees of freedom to weigh a row: measure more cycles, or take "
+            f"{argument('noise', 'relative')}"
         )
 
 

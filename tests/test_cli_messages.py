@@ -3,54 +3,62 @@
 from __future__ import annotations
 
 import io
+import shlex
 import sys
 import time
+from pathlib import Path
 
+import pandas as pd
 import pytest
 
+from dahl_ident import read_frequency_response
 from dahl_ident.cli import console
-from dahl_ident.cli.console import in_options
+from dahl_ident.errors import DataError
+from tests.command_line import Runner
+
+TABLE = "drive [N],gain [m/N],phase_deg\n0.1,1e-3,-20\n0.2,2e-3,-30\n"
+WAVES = "time [s],x [mm],pull [N]\n" + "".join(f"{i},{i % 5},{i % 3}\n" for i in range(30))
+DRIVEN = "frequency_hz,drive [N],gain [m/N],phase_deg\n" + "".join(
+    f"{1 + i},{0.1 * i + 0.1},{1e-3 * i + 1e-3},-{20 + i}\n" for i in range(9)
+)
 
 
 @pytest.mark.parametrize(
-    ("message", "shown"),
+    ("command", "said"),
     [
         (
-            "record longer, give frequency=, or mode='sweep'",
-            "record longer, give --frequency, or --mode 'sweep'",
+            "fit table.csv --mass 0.1",
+            'name it with --columns columns.toml, a file with the line: frequency = "...", or say '
+            "what was swept, such as --sweep '1:100Hz log'",
         ),
-        ("or lower min_share= if it is noise", "or lower --min-share if it is noise"),
-        ("give frequency=1.25, or leave it out", "give --frequency 1.25, or leave it out"),
-        ("it: di.fit(record, model)", "it: dahl-ident fit --record"),
-        ("a = b, x=", "a = b, --x"),
+        ("extract moved.csv", "Name it, such as --displacement x"),
+        ("extract waves.csv --displacement x", "Name it with --force ... (inspect"),
         (
-            "Name it with columns={'gain': ...}",
-            'Name it with --columns columns.toml, a file with the line: gain = "..."',
+            "plan --frequency 5Hz --noise 0.01 --target f_max=0.01",
+            "--ranges f_max=low:high --ranges",
         ),
         (
-            "or give columns={'gain': {'column': 'K', 'unit': 'N/m'}}",
-            "or give --columns columns.toml, a file with the line: "
-            'gain = {column = "K", unit = "N/m"}',
+            "plan --displacement 1mm --noise 0.01 --ranges f_max=0.1:0.2 --ranges sigma=20:40 "
+            "--target f_max",
+            "give --time, or --target f_max=0.02",
         ),
+        ("sample driven.csv --alpha free --mass free --method grid", "or use --method mcmc"),
     ],
 )
-def test_arguments_become_options(message: str, shown: str) -> None:
-    assert in_options(message) == shown
+def test_messages_name_options(command: str, said: str, run: Runner) -> None:
+    Path("table.csv").write_text(TABLE)
+    Path("waves.csv").write_text(WAVES)
+    Path("moved.csv").write_text(WAVES.replace("x [mm]", "moved [mm]"))
+    Path("driven.csv").write_text(DRIVEN)
+    ended = run(*shlex.split(command))
+    assert ended.status == 1
+    assert said in ended.err
 
 
-def test_extract_names_its_own_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    message = "Name it with columns={'force': ...}, or columns={'force': 'friction force'}"
-    monkeypatch.setattr(console._session, "typed", ["extract", "run.csv"])
-    assert in_options(message) == "Name it with --force ..., or --force 'friction force'"
-    monkeypatch.setattr(console._session, "typed", ["fit", "run.csv"])
-    assert "--columns columns.toml" in in_options(message)
-
-
-def test_ranges_are_options() -> None:
-    shown = in_options("give ranges={'f_max': (low, high), 'mass': (low, high)} that hold")
-    assert shown == "give --ranges f_max=low:high --ranges mass=low:high that hold"
-    shown = in_options("give limits['frequency_hz'], or target={'f_max': 0.02}")
-    assert shown == "give --frequency, or --target f_max=0.02"
+def test_python_is_told_arguments() -> None:
+    data = pd.read_csv(io.StringIO(TABLE))
+    with pytest.raises(DataError, match=r"columns=\{'frequency': \.\.\.\}.*sweep='1:100Hz log'"):
+        read_frequency_response(data)
 
 
 @pytest.mark.parametrize("quiet", [False, True])

@@ -31,7 +31,7 @@ from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.data.columns import one_of
-from dahl_ident.errors import SamplingError, ValidationError
+from dahl_ident.errors import SamplingError, ValidationError, argument
 from dahl_ident.fitting import solve
 from dahl_ident.problem import Problem
 
@@ -162,9 +162,9 @@ class Density(LogDensity):
         one_of(self.likelihood, "likelihood", LIKELIHOODS)
         if self.likelihood == "student_t" and not problem.gaussian:
             raise ValidationError(
-                "likelihood='student_t' is for Gaussian noise with outliers, but the covariance of "
-                "these data has few degrees of freedom, which gives Student's t by itself; leave "
-                "likelihood out"
+                f"{argument('likelihood', 'student_t')} is for Gaussian noise with outliers, but "
+                "the covariance of these data has few degrees of freedom, which gives Student's t "
+                "by itself; leave likelihood out"
             )
         if self.has_scale and problem.n_residuals <= len(problem.names):
             raise SamplingError(
@@ -206,8 +206,8 @@ class Density(LogDensity):
         """Return the log-density of theta, (S, P), an unknown scale integrated out."""
         if self.likelihood == "student_t" and self.has_scale:
             raise ValidationError(
-                "likelihood='student_t' with an unknown noise scale has no closed integral over "
-                "the scale; give the data a covariance, or use sampling"
+                f"{argument('likelihood', 'student_t')} with an unknown noise scale has no closed "
+                "integral over the scale; give the data a covariance, or use sampling"
             )
         if self.likelihood == "student_t":
             return self(theta)

@@ -29,7 +29,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.elements import Parameter
-from dahl_ident.errors import ModelError, ValidationError, choices
+from dahl_ident.errors import HIGH, LOW, ModelError, ValidationError, argument, choices
 from dahl_ident.problem import BaseProblem
 
 _DECADES = 1e5  # beyond the data's sizes, either way: as data far from the knee leave open
@@ -332,8 +332,9 @@ def _widened(parameter: Parameter, low: float, high: float) -> tuple[float, floa
 def _without_default(parameter: Parameter) -> ValidationError:
     name = parameter.name
     return ValidationError(
-        f"{name} has no default prior, because the data do not show its size; give priors="
-        f'{{"{name}": (low, high)}}, or a frozen distribution of scipy.stats'
+        f"{name} has no default prior, because the data do not show its size; give "
+        f"{argument('priors', {name: (LOW, HIGH)}, option='prior')}, or a frozen distribution of "
+        "scipy.stats"
     )
 
 

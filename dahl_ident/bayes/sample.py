@@ -22,7 +22,7 @@ from dahl_ident.bayes.checkpoint import identity, open_chain
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.bayes.importance import WeightedDraws, WeightedPoints, in_blocks, integrate
-from dahl_ident.errors import SamplingError, ValidationError
+from dahl_ident.errors import SamplingError, ValidationError, argument
 
 _MOST_AXES = 3  # the number of points is a power of the number of axes
 
@@ -147,7 +147,7 @@ class PointSample(Sample):
             return f"Converged: {text}."
         return (
             f"NOT CONVERGED: {text}, expected {self.tolerance:.1g}. The numbers are provisional: "
-            "use method='mcmc', or give narrower priors."
+            f"use {argument('method', 'mcmc')}, or give narrower priors."
         )
 
     @property
@@ -226,7 +226,7 @@ def sample_points(
         instead = f"give {', '.join(assumed)} or " if assumed else ""
         raise SamplingError(
             f"{len(names)} parameters are free ({', '.join(names)}); a grid takes up to "
-            f"{_MOST_AXES}: {instead}fix some, or use method='mcmc'"
+            f"{_MOST_AXES}: {instead}fix some, or use {argument('method', 'mcmc')}"
         )
     positive_number(tolerance, "tolerance")
     centre, covariance = begin()

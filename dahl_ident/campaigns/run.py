@@ -27,7 +27,7 @@ from dahl_ident.campaigns.engine import (
 from dahl_ident.campaigns.journal import Journal, finished, write_tables
 from dahl_ident.campaigns.work import Job, Row, digest_of
 from dahl_ident.data.storage import as_before_inert, locked, read_text, regular, write_whole
-from dahl_ident.errors import DataError, ModelError
+from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
@@ -368,8 +368,7 @@ def _options_agree(definition: Definition, redo: bool) -> bool:
     if changed and not redo:
         raise DataError(
             f"{definition.source}: {'; '.join(changed)}, but {definition.folder} holds results of "
-            "the former; give another folder, or repeat all of them with redo=True (on the "
-            "command line --redo)"
+            f"the former; give another folder, or repeat all of them with {argument('redo', True)}"
         )
     return not changed
 

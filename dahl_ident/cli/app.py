@@ -19,7 +19,7 @@ from dahl_ident.cli.one_step import datasets, export, inspect, template
 from dahl_ident.cli.plan import plan
 from dahl_ident.cli.sample import sample
 from dahl_ident.cli.simulate import simulate
-from dahl_ident.errors import DahlIdentError
+from dahl_ident.errors import DahlIdentError, arguments_as_options
 from dahl_ident.version import __version__
 
 _NAME = "dahl-ident"
@@ -75,13 +75,14 @@ def main(arguments: list[str] | None = None) -> None:
     console.begin(typed)
     try:
         try:
-            status = app(args=typed, prog_name=_NAME, standalone_mode=False)
+            with arguments_as_options():
+                status = app(args=typed, prog_name=_NAME, standalone_mode=False)
         finally:
             sys.stdout.flush()
     except _WrongUse as exc:
         status = _refuse(exc, typed)
     except DahlIdentError as exc:
-        console.write_error(f"error: {console.in_options(' '.join(str(exc).split()))}")
+        console.write_error(f"error: {' '.join(str(exc).split())}")
         status = console.BAD_INPUT
     except MemoryError:
         console.write_error("error: this takes more memory than there is; give smaller files")

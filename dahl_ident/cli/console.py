@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import io
 import json
 import os
@@ -51,7 +50,7 @@ def begin(typed: Sequence[str]) -> None:
     """Store the command, and show warnings as plain lines, without file and code."""
 
     def show(message: Warning | str, *_: Any) -> None:
-        note(f"warning: {in_options(str(message))}")
+        note(f"warning: {message}")
 
     _session.typed, _session.quiet = typed, False
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -93,55 +92,6 @@ def changed(*groups: Any) -> list[str]:
         for name, value in vars(group).items()
         if value != getattr(type(group)(), name)
     ]
-
-
-def in_options(message: str) -> str:
-    """Return a message of the library with its arguments as command-line options.
-
-    ``give frequency=, or mode='sweep'`` becomes ``give --frequency, or --mode 'sweep'``, and
-    ``columns={'gain': 'K'}`` becomes ``--columns columns.toml, a file with the line: gain = "K"``.
-    """
-
-    def argument(match: re.Match[str]) -> str:
-        name, value = match.groups()
-        return f"{option(name)} {value}".rstrip() if value != "True" else option(name)
-
-    def assigned(match: re.Match[str]) -> str:
-        pairs = re.findall(r"'([^']+)': (?:\((\w+), (\w+)\)|([^,}]+))", match[2])
-        return " ".join(f"{match[1]} {n}={value or f'{a}:{b}'}" for n, a, b, value in pairs)
-
-    message = message.replace("select(harmonic=1)", "--where 'harmonic == 1'")
-    message = message.replace(
-        "frequency_hz=(low, high) keeps", "--where 'low <= frequency_hz <= high' keeps"
-    )
-    message = re.sub(r"columns=(\{(?:[^{}]|\{[^{}]*\})*\})", _column_map, message)
-    message = re.sub(r"(?<![\w.(-])([a-z]+(?:_[a-z]+)*)=(True\b|['\"\w]?)", argument, message)
-    message = re.sub(r"(--(?:ranges|target|start|suspects)) ?\{([^}]*)\}", assigned, message)
-    message = re.sub(r"limits\['([a-z]+)(?:_hz)?'\]", r"--\1", message)
-    message = re.sub(r"limits has no ([a-z]+)(?:_hz)?\b", r"--\1 is missing", message)
-    return message.replace("di.fit(record, model)", "dahl-ident fit --record")
-
-
-def _column_map(match: re.Match[str]) -> str:
-    """Return the options, or the line of the file, that correspond to a map in Python.
-
-    ``extract`` has an option for the column of each role.
-    """
-    try:
-        entries = ast.literal_eval(match[1])
-    except (SyntaxError, ValueError):
-        return match[0]
-    if _session.typed[:1] == ["extract"] and not any(isinstance(e, dict) for e in entries.values()):
-        named = (f"--{role} {'...' if e is ... else shlex.quote(e)}" for role, e in entries.items())
-        return " ".join(named)
-    lines = []
-    for role, entry in entries.items():
-        if isinstance(entry, dict):
-            parts = ", ".join(f"{key} = {json.dumps(value)}" for key, value in entry.items())
-            lines.append(f"{role} = {{{parts}}}")
-        else:
-            lines.append(f"{role} = {json.dumps('...' if entry is ... else entry)}")
-    return f"--columns columns.toml, a file with the line: {'; '.join(lines)}"
 
 
 def typed_command() -> str:
@@ -192,10 +142,10 @@ def write(text: str) -> None:
 
 
 def write_wrapped(text: str) -> None:
-    """Print a text with command-line options in its advice; long lines are wrapped and indented."""
+    """Print a text; long lines are wrapped and indented."""
     shown = sys.stdout.isatty() or "COLUMNS" in os.environ
     width = max(_NARROWEST, shutil.get_terminal_size().columns) if shown else None
-    for line in in_options(text).splitlines():
+    for line in text.splitlines():
         indent = " " * (len(line) - len(line.lstrip()) + 4)
         if width is None or len(line) <= width:
             write(line)

@@ -129,7 +129,7 @@ class LoopMargins:
         """
         values: FloatArray = getattr(self, name)
         if values.ndim < 2:
-            raise ValidationError(f"{name} holds no draws; give draws= to loop_margins")
+            raise ValidationError(f"{name} holds no draws; give loop_margins draws")
         tail = 0.5 * (1.0 - float(array_between(probability, "probability", 0.0, 1.0)))
         flat = values.reshape(-1, self.amplitude.size)
         # inverted_cdf returns one of the values, infinite ones included

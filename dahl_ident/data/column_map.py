@@ -21,6 +21,7 @@ one level: ``column = "FRdata.*[*].frequency"``. Indices count from 0.
 
 from __future__ import annotations
 
+import json
 import tomllib
 import warnings
 from collections.abc import Callable, Mapping
@@ -32,11 +33,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, non_negative_number, positive_number
-from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, FileColumn, one_of
+from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, RECORD_COLUMNS, FileColumn, one_of
 from dahl_ident.data.raw_columns import Channel, Source, plain
 from dahl_ident.data.storage import read_text
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError, choices
+from dahl_ident.errors import (
+    ANY,
+    DataError,
+    DataWarning,
+    UnitError,
+    ValidationError,
+    argument,
+    choices,
+    spelled,
+)
 from dahl_ident.units import (
     MECHANICAL_KINDS,
     QUANTITIES,
@@ -106,6 +116,20 @@ class ColumnMap:
     sample_rate: float | None = None
     drive_factor: str | None = None
     drive_factor_uncertainty: float = 0.0
+
+
+def column_map_of(entries: Mapping[str, Any]) -> str:
+    """Return how a column map with these entries is given, for messages."""
+
+    def toml(entry: Any) -> str:
+        if isinstance(entry, Mapping):
+            return f"{{{', '.join(f'{key} = {toml(part)}' for key, part in entry.items())}}}"
+        return json.dumps(entry)
+
+    lines = "; ".join(f"{role} = {toml(entry)}" for role, entry in entries.items())
+    return spelled(
+        f"columns={dict(entries)!r}", f"--columns columns.toml, a file with the line: {lines}"
+    )
 
 
 def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
@@ -186,8 +210,16 @@ class Binding:
             raise DataError(
                 f"{self.source.name}: the table has no header line; expected names and units "
                 "above the numbers, such as 'frequency_hz, amplitude [um], gain [N/m], phase_deg', "
-                "or columns={'force': 'column 2 [N]'} and the like"
+                f"or {self.naming('force', 'column 2 [N]')} and the like"
             )
+
+    def naming(self, role: str, entry: Any = ANY) -> str:
+        """Return how the column of a role is named, for messages."""
+        if self.columns is not RECORD_COLUMNS:
+            return column_map_of({role: entry})
+        typed = f"{entry['column']} [{entry['unit']}]" if isinstance(entry, Mapping) else entry
+        named = {role: entry}
+        return spelled(f"columns={named!r}", argument(role, typed))
 
     def mapped(self, role: str) -> MappedColumn:
         """Return what the column map says of a role."""
@@ -218,7 +250,7 @@ class Binding:
             matches = matches[:1]
         if len(matches) > 1:
             distinct = len({c.name for c in matches}) == len(matches)
-            way = f"say which one with columns={{{role!r}: {matches[0].name!r}}}"
+            way = f"say which one with {self.naming(role, matches[0].name)}"
             raise DataError(
                 f"{self.source.name}: {len(matches)} columns may be the {role}: "
                 f"{listed([c.header for c in matches])}; "
@@ -242,7 +274,7 @@ class Binding:
             raise DataError(
                 f"{self.source.name}: no column holds the {role}; there are "
                 f"{listed([c.header for c in self.source.channels], 20)}. Name it with "
-                f"columns={{{role!r}: ...}} (inspect proposes a column map)"
+                f"{self.naming(role)} (inspect proposes a column map)"
             )
         return channel
 
@@ -262,7 +294,9 @@ class Binding:
             return None
         values, unit = self.numbers(role, channel), self.unit(role, channel)
         if declared.expected and least:
-            self.source.require(values >= declared.least, channel, declared.expected)
+            keep = spelled("frequency_hz=(low, high)", "--where 'low <= frequency_hz <= high'")
+            hint = f"; {keep} keeps a range" if role == "frequency" else ""
+            self.source.require(values >= declared.least, channel, declared.expected + hint)
         if declared.kinds:
             _, factor = self.kind(role, unit)
         else:
@@ -287,7 +321,7 @@ class Binding:
             raise UnitError(
                 f"{self.source.name}: column {channel.name!r} has no unit; write it in the "
                 f"header, such as '{channel.name} [{example}]', or give "
-                f"columns={{{role!r}: {{'column': {channel.name!r}, 'unit': {example!r}}}}}"
+                + self.naming(role, {"column": channel.name, "unit": example})
             )
         try:
             return parse_unit(text)
@@ -311,7 +345,7 @@ class Binding:
         if text is None:
             raise UnitError(
                 f"{self.source.name}: the drive is a {kind}; give the force for one unit of it, "
-                f"such as drive_factor='12.5 N/{si_unit(kind)}'"
+                f"such as {argument('drive_factor', f'12.5 N/{si_unit(kind)}')}"
             )
         value, _, motion = parse_quantity(text, (f"force_per_{kind}",), "drive_factor")
         self.motions["drive_factor"] = motion
@@ -332,7 +366,7 @@ class Binding:
                 why = f"the drive ({channel.name}) is a force already"
             raise DataError(
                 f"{self.source.name}: {what} is given, but {why}; expected a drive in V or A: "
-                "leave the factor out, or name the column with columns={'drive': ...}"
+                f"leave the factor out, or name the column with {self.naming('drive')}"
             )
         if what and self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
             raise DataError(f"{self.source.name}: {what} is given without drive_factor; give both")

@@ -301,7 +301,7 @@ _RESPONSE = (
     FileColumn(
         ("frequency", "freq", "frequency_hz", "freq_hz"), "Hz", _of("frequency_hz"),
         header="frequency_hz", kinds=("frequency", "angular_frequency"), least=SMALLEST,
-        expected="a frequency > 0; frequency_hz=(low, high) keeps a range",
+        expected="a frequency > 0",
     ),
     FileColumn(("level",), saved=_of("level")),
     FileColumn(("run", "test", "file", "day"), saved=_of("run")),

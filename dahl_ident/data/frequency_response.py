@@ -38,11 +38,16 @@ from dahl_ident.data.columns import (
 from dahl_ident.data.quantities import converted, jacobian
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, distinct, extent, listed, noted
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, spelled
 from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+def fundamental_alone() -> str:
+    """Return how the rows of the fundamental are selected, for messages."""
+    return spelled("select(harmonic=1)", "--where 'harmonic == 1'")
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -420,7 +425,7 @@ class FrequencyResponse(Tabular):
         if (self.harmonic != 1).any():
             raise ValidationError(
                 f"rows with harmonics {listed(np.unique(self.harmonic))} cannot become "
-                f"{quantity}; take select(harmonic=1) first"
+                f"{quantity}; take {fundamental_alone()} first"
             )
         response, derivative = converted(self.response, self.omega, self.quantity, quantity)
         J = jacobian(derivative)
@@ -603,7 +608,7 @@ class FrequencyResponse(Tabular):
 
         if (self.harmonic != 1).any():
             raise ValidationError(
-                "a transfer function has no harmonics; use select(harmonic=1) first"
+                f"a transfer function has no harmonics; use {fundamental_alone()} first"
             )
         systems = {}
         for label in self.levels or [None]:

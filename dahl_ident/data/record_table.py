@@ -15,7 +15,7 @@ from dahl_ident.data.plausibility import record_doubts
 from dahl_ident.data.raw_columns import Channel, Source, missing_marks
 from dahl_ident.data.record import DriveUnit, Record, is_even
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.errors import DataError, UnitError, ValidationError, argument
 from dahl_ident.units import MOTION_KINDS, si_unit
 
 _STAMP = re.compile(
@@ -99,8 +99,9 @@ def _channels(bound: Binding) -> dict[str, Channel]:
     if len(motions) != 1:
         raise DataError(
             f"{bound.source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
-            "displacement, velocity and acceleration. Name it, such as displacement='x'; there "
-            f"are {listed([c.header for c in bound.source.channels], 20)}"
+            f"displacement, velocity and acceleration. Name it, such as "
+            f"{argument('displacement', 'x')}; there are "
+            f"{listed([c.header for c in bound.source.channels], 20)}"
         )
     channels = {role: bound.required(role) for role in motions}
     if bound.map.sample_rate is None:

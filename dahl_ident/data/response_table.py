@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_number
-from dahl_ident.data.column_map import Binding, ColumnMap, by_level
+from dahl_ident.data.column_map import Binding, ColumnMap, by_level, column_map_of
 from dahl_ident.data.columns import CONTROLLED, RECORD_COLUMNS, RESPONSE_COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.plausibility import (
@@ -31,7 +31,7 @@ from dahl_ident.data.plausibility import (
 )
 from dahl_ident.data.raw_columns import TRACE, Channel, Source, plain
 from dahl_ident.data.tabular import ASSUMED, listed
-from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.errors import ANY, DataError, UnitError, ValidationError, argument
 from dahl_ident.units import (
     DRIVE_KINDS,
     MOTION_KINDS,
@@ -88,8 +88,13 @@ def response_from(
         if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
             whole.doubt(
                 "the columns of the trace are taken as real and imaginary part, but look like "
-                "magnitude and phase in degrees; if they are, give columns={'gain': {'column': "
-                "'real', 'unit': '...'}, 'phase': {'column': 'imag', 'unit': 'deg'}}"
+                "magnitude and phase in degrees; if they are, give "
+                + column_map_of(
+                    {
+                        "gain": {"column": "real", "unit": ANY},
+                        "phase": {"column": "imag", "unit": "deg"},
+                    }
+                )
             )
     parts = []
     for label, one in by_level(source, columns).items():
@@ -179,8 +184,9 @@ class _Table(Binding):
         if amplitude is None and drive is None:
             raise ValidationError(
                 "neither an amplitude nor a drive is given; friction answers every amplitude "
-                "differently. Name a column with columns={'amplitude': ...} (inspect proposes a "
-                "column map), or give drive='0.2 N' or amplitude='5 um' for the whole file"
+                f"differently. Name a column with {column_map_of({'amplitude': ANY})} (inspect "
+                f"proposes a column map), or give {argument('drive', '0.2 N')} or "
+                f"{argument('amplitude', '5 um')} for the whole file"
             )
         harmonic: Any = 1
         if (channel := self.channel("harmonic")) is not None:
@@ -242,8 +248,8 @@ class _Table(Binding):
             if options.frequency is None and rows and not self.has("amplitude"):
                 raise ValidationError(
                     "no column holds the frequency (inspect proposes a column map); name it with "
-                    "columns={'frequency': ...}, or say what was swept, such as "
-                    "sweep='1:100Hz log'"
+                    f"{column_map_of({'frequency': ANY})}, or say what was swept, such as "
+                    f"{argument('sweep', '1:100Hz log')}"
                 )
             if not rows:
                 self.required("frequency")
@@ -362,7 +368,7 @@ class _Table(Binding):
         if self.map.quantity is None:
             raise ValidationError(
                 "the phase stands without a gain; say which quantity's it is with "
-                "quantity='receptance' or another"
+                f"{argument('quantity', 'receptance')} or another"
             )
         receptance = FrequencyResponse(
             frequency_hz, amplitude / drive, amplitude, quantity="receptance"
@@ -378,7 +384,7 @@ class _Table(Binding):
         if len(complete) > 1:
             raise ValidationError(
                 f"both {' and '.join(complete[0])} and {' and '.join(complete[1])} are there; "
-                "name one of them in columns="
+                f"name one of them in {argument('columns')}"
             )
         return complete[0] if complete else None
 

@@ -24,7 +24,13 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.errors import DahlIdentError, DataError, MissingDependencyError, ValidationError
+from dahl_ident.errors import (
+    DahlIdentError,
+    DataError,
+    MissingDependencyError,
+    ValidationError,
+    argument,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +97,8 @@ def refuse_existing(path: Path) -> None:
         raise DataError(f"{path} is a folder; give the path of a file in it")
     if path.exists():
         raise DataError(
-            f"{path}: the file exists already; give another name, or replace it with overwrite=True"
+            f"{path}: the file exists already; give another name, or replace it with "
+            f"{argument('overwrite', True)}"
         )
 
 

@@ -15,6 +15,7 @@ from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem.steady_rows import levels
@@ -151,7 +152,7 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
         (name,) = row_names(problem.data, [found[0]])
         yield (
             "the describing function, which takes the motion for a sine, is "
-            f"{percent(found[1])} off at {name}: fit with steady='exact'"
+            f"{percent(found[1])} off at {name}: fit with {argument('steady', 'exact')}"
         )
 
 

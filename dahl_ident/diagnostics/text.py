@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
+from dahl_ident.errors import argument
 
 _MOST_DEPARTURES = 3  # in the verdict; the details list all
 _MOST_ROWS = 3  # the same
@@ -196,7 +197,7 @@ def _moved(names: Sequence[str], rows: Sequence[str]) -> str:
     which = "the suspicious rows" if rows else "the rows with the largest residuals"
     return (
         f"A robust fit moves {listed(names)} by more than one standard uncertainty: check {which}, "
-        'or fit with loss="huber".'
+        f"or fit with {argument('loss', 'huber')}."
     )
 
 
@@ -350,8 +351,9 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "records_not_described": lambda: "The model does not describe the records.",
     "no_optimum": lambda message: f"The search found no optimum. {message}",
     "motion_may_be_imposed": lambda: (
-        "If the exciter imposed the motion, fit the force instead (output='force'): what it moves "
-        "hardly depends on the force, and the model cannot follow it."
+        "If the exciter imposed the motion, fit the force instead "
+        f"({argument('output', 'force', option='predicted')}): what it moves hardly depends on the "
+        "force, and the model cannot follow it."
     ),
     "records_misfit": lambda: "The misfit exceeds the noise.",
     "record_parameter": _record_parameter,

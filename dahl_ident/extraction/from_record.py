@@ -29,7 +29,7 @@ from dahl_ident.extraction.plateaus import AMPLITUDE_TOLERANCE, FREQUENCY_TOLERA
 from dahl_ident.extraction.point import Point, measure
 from dahl_ident.extraction.segments import record_cycles, record_spans, segment_of
 from dahl_ident.extraction.sine_fit import Samples
-from dahl_ident.extraction.sine_test import ROUTE, SWEEP_ROUTE, is_sweep, not_a_sine_test
+from dahl_ident.extraction.sine_test import is_sweep, not_a_sine_test, route
 
 _WELL_COVERED = 0.8  # of the moving time: points that cover more of it are none by chance
 _APART = 3.0  # cycles that may be missing between two parts
@@ -112,10 +112,9 @@ def _refuse_other_motion(
         return
     reason = not_a_sine_test(motion, runs, covered=measured / moving if moving else 0.0)
     if reason:
-        route = ROUTE
-        if is_sweep(record_cycles(record.time, record.force_samples, None)):
-            route = SWEEP_ROUTE.format(file=(record.provenance or {}).get("file", "FILE"))
-        raise ExtractionError(f"{reason}; {route}")
+        swept = is_sweep(record_cycles(record.time, record.force_samples, None))
+        file = (record.provenance or {}).get("file", "FILE") if swept else None
+        raise ExtractionError(f"{reason}; {route(file)}")
 
 
 def _summary(refused: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
-from dahl_ident.errors import ExtractionError
+from dahl_ident.errors import ExtractionError, argument
 from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise
 from dahl_ident.extraction.phasors import Phasors, Settings, without
 from dahl_ident.extraction.segment_quality import (
@@ -68,20 +68,20 @@ def measure(
     if settings.of_displacement and settings.integrations and 0 in settings.harmonics:
         raise ExtractionError(
             f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "
-            "out of harmonics="
+            f"out of {argument('harmonics')}"
         )
     available = whole_cycles(segment)
     if available < FEWEST_CYCLES:
         raise ExtractionError(
             f"{available} whole cycles {_where(segment)}; expected at least {FEWEST_CYCLES}: "
-            "record longer, or check frequency="
+            f"record longer, or check {argument('frequency')}"
         )
     cycles = min(available, settings.num_periods or available)
     if not sweep and cycles - (settings.settling_periods or 0) < FEWEST_CYCLES:
         raise ExtractionError(
             f"{cycles} cycles {_where(segment)}, {settings.settling_periods} of them for "
             f"settling; expected {FEWEST_CYCLES} more than for settling: record longer, or lower "
-            "settling_periods="
+            f"{argument('settling_periods')}"
         )
     whole = last_cycles(segment, cycles)
     own = samples.of(whole)
@@ -129,7 +129,8 @@ def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: Flo
             raise ExtractionError(
                 f"{name} {_where(segment)}: the fundamental has {100.0 * share:.3g} % of the "
                 f"power; expected at least {100.0 * settings.min_share:.3g} %, one dominant sine: "
-                "check the channel and frequency=, or lower min_share= if it is noise"
+                f"check the channel and {argument('frequency')}, or lower "
+                f"{argument('min_share')} if it is noise"
             )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.errors import ExtractionError
+from dahl_ident.errors import ExtractionError, Placeholder, argument
 from dahl_ident.extraction.cycles import Cycles, cut_cycles, find_cycles, sine_in_each
 from dahl_ident.extraction.plateaus import Mode, Span, find_spans
 from dahl_ident.extraction.segment_bounds import cycle_edges, highest_by_chance, steady_part
@@ -82,7 +82,8 @@ def record_spans(
     raise ExtractionError(
         f"no segment of constant amplitude and frequency in {time[-1] - time[0]:.6g} s: "
         f"{cycles} cycles{read}, motion from {motion.min():.4g} to {motion.max():.4g}; expected "
-        f"at least {FEWEST_CYCLES} similar cycles: record longer, give frequency=, or mode='sweep'"
+        f"at least {FEWEST_CYCLES} similar cycles: record longer, give "
+        f"{argument('frequency')}, or {argument('mode', 'sweep')}"
     )
 
 
@@ -105,7 +106,8 @@ def segment_of(
     if last - first < 2:
         raise ExtractionError(
             f"{last - first} samples from t = {span.start:.6g} to {span.stop:.6g} s; "
-            "expected at least 3 a cycle and 2 cycles: sample faster, or check frequency="
+            "expected at least 3 a cycle and 2 cycles: sample faster, or check "
+            f"{argument('frequency')}"
         )
     omega = 2.0 * np.pi * (span.frequency_hz if frequency is None else frequency)
     segment = steady_segment(time[first:last], channels[:, first:last], omega, block)
@@ -157,7 +159,8 @@ def _refuse_drift(segment: Segment) -> None:
         raise ExtractionError(
             f"the motion around t = {segment.centre:.6g} s has {shown:.6g} Hz, not the given "
             f"{given:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
-            f"expected less than {_DRIFTED:g} rad: give frequency={shown:.6g}, or leave it out"
+            f"expected less than {_DRIFTED:g} rad: give "
+            f"{argument('frequency', Placeholder(f'{shown:.6g}'))}, or leave it out"
         )
 
 

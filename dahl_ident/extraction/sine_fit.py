@@ -34,7 +34,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
-from dahl_ident.errors import ExtractionError
+from dahl_ident.errors import ExtractionError, argument
 
 FEWEST_CYCLES = 2  # that a fit with offset and drift needs
 HARMONICS = 9  # fitted at least, where the sampling can tell them apart
@@ -108,7 +108,7 @@ class Segment:
             raise ExtractionError(
                 f"{time.size} samples near t = {self.centre:.6g} s for cycles of "
                 f"{2.0 * np.pi / self.omega:.4g} s; expected at least 3 a cycle and 2 cycles: "
-                "sample faster, record longer, or check frequency="
+                f"sample faster, record longer, or check {argument('frequency')}"
             )
         new = Segment(time, channels, self.phase, block)
         inner = Polynomial(
@@ -310,7 +310,7 @@ def estimate_frequency(segment: Segment) -> Segment:
     raise ExtractionError(
         f"no steady frequency near {segment.omega / (2.0 * np.pi):.6g} Hz around t = "
         f"{segment.centre:.6g} s: the fit diverges; expected one sine of constant frequency: "
-        "give frequency=, or mode='sweep'"
+        f"give {argument('frequency')}, or {argument('mode', 'sweep')}"
     )
 
 
@@ -444,6 +444,6 @@ def solvable_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
         raise ExtractionError(
             f"the samples around t = {segment.centre:.6g} s do not separate the harmonics of "
             f"{segment.omega / (2.0 * np.pi):.6g} Hz apart; expected samples spread over whole "
-            "cycles: check frequency= and the sampling"
+            f"cycles: check {argument('frequency')} and the sampling"
         )
     return np.asarray(np.linalg.inv(normal))

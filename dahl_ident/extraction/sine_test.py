@@ -8,22 +8,15 @@ rests does not.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.errors import spelled
 from dahl_ident.extraction.cycles import Cycles
 
-ROUTE = (
-    "expected levels or a sweep of one sine; for any other motion fit the waveform itself: "
-    "di.fit(record, model)"
-)
-SWEEP_ROUTE = (
-    "the force is a sweep of one sine, which the motion is too unsteady to follow in a table; fit "
-    "the waveforms: dahl-ident fit --record {file} --mass free --damping free --stiffness free, or "
-    "di.fit(record, model)"
-)
 _PERIOD_CHANGE = 0.03  # limit from one cycle to the next (median by energy) of a sine measurement
 _AMPLITUDE_CHANGE = 0.1  # the same of the amplitude, which resonances change faster
 _SWEEP_RANGE = 0.2  # of the log period: less may be chance
@@ -34,6 +27,22 @@ _SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils
 _ONE_LINE = 0.8  # of the power, of one level whatever its cycles look like
 _LEAK = 2  # lines on either side that a line leaks into
 _SPECTRUM_OF = 2**20  # samples at most
+
+
+def route(file: str | None = None) -> str:
+    """Return what else can be done with a record; `file` is that of a sweep of the force."""
+    if file is None:
+        how = spelled("di.fit(record, model)", "dahl-ident fit --record")
+        return (
+            "expected levels or a sweep of one sine; for any other motion fit the waveform itself: "
+            f"{how}"
+        )
+    model = "--mass free --damping free --stiffness free"
+    how = spelled("di.fit(record, model)", f"dahl-ident fit --record {shlex.quote(file)} {model}")
+    return (
+        "the force is a sweep of one sine, which the motion is too unsteady to follow in a table; "
+        f"fit the waveforms: {how}"
+    )
 
 
 def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.elements import Element, Parameter
-from dahl_ident.errors import FitError
+from dahl_ident.errors import FitError, argument
 from dahl_ident.fitting.directions import Direction, Directions, directions, is_positive
 from dahl_ident.problem import Problem
 from dahl_ident.problem.stiffness import StiffnessData
@@ -348,7 +348,7 @@ def _columns(
     if missing:
         raise FitError(
             f"{', '.join(missing)} has no value to start from, and {d.element!r} does not say how "
-            "its force depends on it; give it a value and name it in free="
+            f"its force depends on it; give it a value and name it in {argument('free')}"
         )
 
     def at(one: Parameter | None, scale: float) -> ComplexArray:

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
 from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
-from dahl_ident.errors import FitError, ValidationError
+from dahl_ident.errors import FitError, ValidationError, argument
 from dahl_ident.fitting.constraints import Constraints, Relations
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.global_start import starts
@@ -391,7 +391,8 @@ def _with_drive_error(
     if problem.noise != "measured" or loss != "linear":
         raise ValidationError(
             f"drive_std is given with {problem.noise} noise and {loss} loss; how much it weighs "
-            "in addition to the response's error is known only with noise='measured', loss='linear'"
+            "in addition to the response's error is known only with "
+            f"{argument('noise', 'measured')}, {argument('loss', 'linear')}"
         )
     spread = _for_rows(non_negative_array(std, "drive_std"), "drive_std", (data.n,))
     cross = None

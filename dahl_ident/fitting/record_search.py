@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.behaviour import Behaviour
-from dahl_ident.errors import FitError, FitInterrupted, ModelError, choices
+from dahl_ident.errors import FitError, FitInterrupted, ModelError, argument, choices
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.losses import loss_named
@@ -253,9 +253,11 @@ class _Search(Descent):
             elif driven and finite == STARTS:
                 break
         if best is None:
-            imposed = ", or, if the exciter imposes the motion, fit the force: output='force'"
+            predict = argument("output", "force", option="predicted")
+            imposed = f", or, if the exciter imposes the motion, fit the force: {predict}"
             raise FitError(
-                "from no start does the model give a finite motion; give start=, or check the units"
+                "from no start does the model give a finite motion; give "
+                f"{argument('start')}, or check the units"
                 + (imposed if problem.output == "motion" else "")
             )
         if driven and not best.converged[0]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, LinearSystem
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, argument
 from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -149,7 +149,7 @@ class _Scan:
             elif isinstance(element, LinearSystem):
                 raise ModelError(
                     f"{parameter.name} is an argument of a linear system, and has no value to "
-                    "start from: give start=, or a Parameter with a value"
+                    f"start from: give {argument('start')}, or a Parameter with a value"
                 )
             elif parameter.scan:
                 grids.append(list(parameter.scan))

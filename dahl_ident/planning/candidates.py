@@ -18,7 +18,7 @@ from dahl_ident import steady_state
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.question import BenchLimits, Question
+from dahl_ident.planning.question import BenchLimits, Question, limit
 from dahl_ident.planning.trajectories import PlannedMotion
 
 CONTROLLED = ("displacement", "force")
@@ -82,8 +82,8 @@ def grid(question: Question, limits: BenchLimits, count: int) -> tuple[FloatArra
     """Return levels and frequencies of about `count` candidates, before limits are applied."""
     if not np.isfinite(limits.frequency_hz[1]):
         raise ValidationError(
-            "limits has no frequency_hz; give the highest frequency of the exciter, or lowest "
-            "and highest: a cycle's time follows from it"
+            f"{limit('frequency_hz')} is missing; give the highest frequency of the exciter, or "
+            "lowest and highest: a cycle's time follows from it"
         )
     by_force = question.controlled == "force"
     low, high = level_range(question, limits)
@@ -109,7 +109,7 @@ def level_range(question: Question, limits: BenchLimits) -> tuple[float, float]:
     low, high = getattr(limits, question.controlled)
     if question.controlled == "force":
         if not np.isfinite(high):
-            raise ValidationError("limits has no force; give the largest drive, N")
+            raise ValidationError(f"{limit('force')} is missing; give the largest drive, N")
         return low or _SOFTEST * high, high
     knees = np.array(question.knowledge.model.knee(question.knowledge.model_values()))
     known = knees[np.isfinite(knees) & (knees > 0.0)]
@@ -118,7 +118,7 @@ def level_range(question: Question, limits: BenchLimits) -> tuple[float, float]:
         if not np.isfinite(high):
             high = max(_ABOVE * float(np.quantile(known, 0.975)), 2.0 * low)
     if not np.isfinite(high):
-        raise ValidationError("limits has no displacement; give the largest amplitude, m")
+        raise ValidationError(f"{limit('displacement')} is missing; give the largest amplitude, m")
     return low or 1e-3 * high, high
 
 

@@ -19,7 +19,7 @@ from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import NOISE, RUNS
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import ValidationError, choices
+from dahl_ident.errors import HIGH, LOW, ValidationError, argument, choices
 from dahl_ident.problem import Problem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.space import Space
@@ -163,10 +163,10 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
     centre, std = _moments(free, ranges)
     missing = [p.name for p, s in zip(free, std, strict=True) if np.isinf(s)]
     if missing:
-        needed = ", ".join(f"{name!r}: (low, high)" for name in missing)
+        needed = argument("ranges", dict.fromkeys(missing, (LOW, HIGH)))
         raise ValidationError(
-            f"plan: nothing is known about {', '.join(missing)}; give ranges={{{needed}}} that "
-            "contain the values with 95 % probability"
+            f"plan: nothing is known about {', '.join(missing)}; give {needed} that contain the "
+            "values with 95 % probability"
         )
     model, assumed = _with_assumed(model)
     parameters = tuple(p for p in model.parameters if p.free)
@@ -186,8 +186,9 @@ def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> K
         name = problem.names[i]
         if np.isinf(std[i]):
             raise ValidationError(
-                f"plan: the fit does not determine {name}; give ranges={{{name!r}: (low, high)}}, "
-                "or plan from the model with ranges="
+                f"plan: the fit does not determine {name}; give "
+                f"{argument('ranges', {name: (LOW, HIGH)})}, or plan from the model with "
+                f"{argument('ranges')}"
             )
     prior = _leaned_on(problem.parameters, centre, std)
     if fit.errors is not None:
@@ -248,13 +249,14 @@ def _of_records(
     if ranges:
         raise ValidationError(
             "plan: ranges are given with a fit of records, which determines its parameters; leave "
-            "them out, or give the model with ranges="
+            f"them out, or give the model with {argument('ranges')}"
         )
     problem: RecordProblem = fit.optimum.problem
     if problem.output != "force":
         raise ValidationError(
             "plan: the fit predicts the motion of a driven plant; planned are fits of frequency "
-            "responses, and of records whose force was predicted: give the model with ranges="
+            "responses, and of records whose force was predicted: give the model with "
+            f"{argument('ranges')}"
         )
     parameters = tuple(problem.free)
     space, P = Space(parameters), len(parameters)

@@ -20,7 +20,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.planning.bench_time import LEAST_CYCLES
 from dahl_ident.planning.candidates import Candidates, allowed
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.question import BenchLimits, RecordedForce
+from dahl_ident.planning.question import BenchLimits, RecordedForce, limit
 from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -40,14 +40,14 @@ def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> l
     if kind == "multisine":
         if not np.isfinite(high):
             raise ValidationError(
-                "limits has no frequency_hz; give the highest one of the multisine"
+                f"{limit('frequency_hz')} is missing; give the highest one of the multisine"
             )
         tops = [top for i in range(_BANDS) if (top := high / _SLOWER**i) >= low]
         return [Multisine(max(top / _LINES, low), top, size) for size in amplitudes for top in tops]
     for name in ("speed", "acceleration"):
         if not np.isfinite(getattr(limits, name)[1]):
             raise ValidationError(
-                f"limits has no {name}; give the highest one of the exciter: the time of a "
+                f"{limit(name)} is missing; give the highest one of the exciter: the time of a "
                 "trapezoidal trajectory follows from it"
             )
     v, a = limits.speed[1], limits.acceleration[1]

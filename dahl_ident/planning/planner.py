@@ -11,7 +11,7 @@ import numpy as np
 from dahl_ident.arrays import non_negative_array, positive_number, whole_number
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements import Element
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, argument
 from dahl_ident.planning.advice import assumptions_of, options_of, undetermined
 from dahl_ident.planning.candidates import CONTROLLED, evaluate
 from dahl_ident.planning.design import Design
@@ -23,6 +23,7 @@ from dahl_ident.planning.question import (
     BenchLimits,
     Question,
     larger_model,
+    limit,
     motions_among,
     noise_of_cycle,
     recorded_force,
@@ -159,8 +160,8 @@ def plan(
     wanted, has_numbers = target_of(target)
     if not has_numbers and not np.isfinite(bench.time):
         raise ValidationError(
-            "plan: without a wanted uncertainty the time is needed: give limits['time'], or "
-            "target={'f_max': 0.02}"
+            f"plan: without a wanted uncertainty the time is needed: give {limit('time')}, or "
+            f"{argument('target', {'f_max': 0.02})}"
         )
     costs = {
         "change_over": float(non_negative_array(change_over, "change_over")),
@@ -175,7 +176,7 @@ def plan(
             "suspects": bool(suspects),
             "larger": larger is not None,
             "runs": runs not in (None, 1),
-            "controlled='force'": controlled == "force",
+            argument("controlled", "force"): controlled == "force",
         }
         for name in (name for name, there in of_sines.items() if there):
             raise ValidationError(
@@ -190,7 +191,7 @@ def plan(
     if sample_rate is not None:
         raise ValidationError(
             "plan: sample_rate is that of records of motions in time; leave it out for settled "
-            "sines, or give candidates='trapezoid'"
+            f"sines, or give {argument('candidates', 'trapezoid', option='motion')}"
         )
     if controlled == "force" and knowledge.steady == "exact":
         knowledge = knowledge.thinned(SEARCHED)

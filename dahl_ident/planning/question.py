@@ -13,13 +13,18 @@ from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, po
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import ValidationError, choices
+from dahl_ident.errors import ValidationError, argument, choices, spelled
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.trajectories import KINDS, PlannedMotion
 
 RESPONSE = "response"
 _POWER = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\^(?P<power>-?\d+(?:\.\d+)?))?")
 _EXPANDED = re.compile(r"U\((?P<quantity>.+)\)")
+
+
+def limit(name: str) -> str:
+    """Return how a limit of the bench is given, for messages."""
+    return spelled(f"limits[{name!r}]", f"--{name.removesuffix('_hz')}")
 
 
 @dataclass(frozen=True)
@@ -50,14 +55,13 @@ class BenchLimits:
         checked: dict[str, Any] = {}
         for name, value in limits.items():
             if name == "time":
-                checked[name] = positive_number(value, "limits['time']")
+                checked[name] = positive_number(value, limit("time"))
                 continue
-            ends = positive_array(value, f"limits[{name!r}]")
+            ends = positive_array(value, limit(name))
             pair = [0.0, float(ends)] if ends.ndim == 0 else ends.tolist()
             if len(pair) != 2 or not pair[0] <= pair[1]:
                 raise ValidationError(
-                    f"limits[{name!r}] is {value!r}; expected the highest value, or lowest and "
-                    "highest"
+                    f"{limit(name)} is {value!r}; expected the highest value, or lowest and highest"
                 )
             checked[name] = tuple(pair)
         return cls(**checked)
@@ -125,8 +129,9 @@ def noise_of_cycle(noise: float | Mapping[str, float] | None, knowledge: Knowled
     if noise is None:
         if knowledge.row_noise is None:
             raise ValidationError(
-                "plan: the noise is unknown before any data; give noise=0.01 (of ln gain and phase "
-                "in one cycle), or its parts: relative, force in N, displacement in m"
+                f"plan: the noise is unknown before any data; give {argument('noise', 0.01)} (of "
+                "ln gain and phase in one cycle), or its parts: relative, force in N, displacement "
+                "in m"
             )
         return CycleNoise(knowledge.row_noise * float(np.sqrt(knowledge.row_cycles)))
     if not isinstance(noise, Mapping):
@@ -212,8 +217,8 @@ def larger_model(
     unknown = sorted(set(suspects) - names)
     if unknown:
         raise ValidationError(
-            f"suspects names {', '.join(unknown)}, which {model!r} does not have; give larger=, a "
-            "model that has them"
+            f"suspects names {', '.join(unknown)}, which {model!r} does not have; give a model "
+            "that has them, in Python as larger="
         )
     return model.with_free([*suspects, *(names & set(knowledge.names))])
 

@@ -17,7 +17,7 @@ from dahl_ident.planning.design import Coverage, Design, Exchange, Objective, co
 from dahl_ident.planning.forecast import Expected, Forecast, typical
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
-from dahl_ident.planning.question import Question
+from dahl_ident.planning.question import Question, limit
 from dahl_ident.planning.suspects import forecast_of_suspects
 
 _POOL = 80  # candidates: the time of the search grows with their number
@@ -44,7 +44,7 @@ class Search:
         settles = np.isfinite(self.bench.alone)
         if not settles.any():
             raise ValidationError(
-                "plan: no candidate ever settles; widen limits['displacement'] upwards"
+                f"plan: no candidate ever settles; widen {limit('displacement')} upwards"
             )
         if not settles.all():
             candidates = candidates.only(np.flatnonzero(settles))
@@ -64,7 +64,7 @@ class Search:
         if design is None:
             least = float((self.bench.alone + LEAST_CYCLES / self.bench.frequency_hz).min())
             raise ValidationError(
-                f"limits['time'] is {q.limits.time:g} s, and the quickest "
+                f"{limit('time')} is {q.limits.time:g} s, and the quickest "
                 f"{'level' if q.recorded is None else 'motion'} takes {least:.3g} "
                 "s to change over, settle and measure; give more time"
             )

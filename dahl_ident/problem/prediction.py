@@ -33,7 +33,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import DEFINITIONS, power_of_s
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, argument
 from dahl_ident.problem.space import Space
 from dahl_ident.problem.steady_rows import SteadyRows
 from dahl_ident.problem.stiffness import StiffnessData
@@ -428,8 +428,8 @@ def _check(rows: Rows, model: Model) -> None:
         raise DataError(
             f"row {row} is force-controlled and holds harmonic {rows.harmonic[row]} of the force, "
             "which is a sine there: give harmonics of the displacement, X_k/F_1, in a table of "
-            "receptance, leave such rows out, or say controlled='displacement' if the measured "
-            "amplitude is to be used"
+            f"receptance, leave such rows out, or say {argument('controlled', 'displacement')} if "
+            "the measured amplitude is to be used"
         )
     lost = bad & (np.atleast_2d(rows.fundamental) < 0).any(axis=0)
     if lost.any():
@@ -459,7 +459,7 @@ def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:
         other = {"displacement": "force", "force": "displacement"}[controlled]
         raise DataError(
             f"row {int(np.argmax(rows))} is {controlled}-controlled, but the data have no {name}; "
-            f"give it, or say controlled={other!r} if the laboratory held the {other}"
+            f"give it, or say {argument('controlled', other)} if the laboratory held the {other}"
         )
 
 

@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.columns import one_of
+from dahl_ident.data.frequency_response import fundamental_alone
 from dahl_ident.data.rows import Rows
 from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.errors import DataError, ModelError, ValidationError, argument
 from dahl_ident.noise import ROUNDING, Measured, Rho, bend, correct_amplitude, noise_for
 from dahl_ident.problem.base import EXPLICIT, BaseProblem, Quadratic
 from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
@@ -117,7 +118,7 @@ class Problem(BaseProblem):
         if rates and assumes_frequency(table.provenance):
             raise DataError(
                 f"the table says no frequency, on which the force of {', '.join(rates)} depends; "
-                "give it when the table is read: frequency=1.0 (Hz)"
+                f"give it when the table is read: {argument('frequency', 1.0)} (Hz)"
             )
         self.data = as_response(table, self.model)
         self.runs = tuple(self.data.runs or ())
@@ -140,7 +141,9 @@ class Problem(BaseProblem):
         if motion == "rotation":
             parameters = [replace(p, unit=shown_unit(p.unit, motion)) for p in parameters]
         if not parameters:
-            raise ModelError(f"{model!r} has no free parameter; leave one out, or name it in free=")
+            raise ModelError(
+                f"{model!r} has no free parameter; leave one out, or name it in {argument('free')}"
+            )
         self.space = Space(parameters)
         self._orbits = {}
         self._alike = Interchangeable(model, self.names)
@@ -208,7 +211,7 @@ class Problem(BaseProblem):
             raise DataError(
                 "the rows hold harmonics of the displacement, and the describing function takes "
                 f"that for a sine ({self.obstacle_to_exact or 'as asked for'}): leave them out "
-                "with select(harmonic=1)"
+                f"with {fundamental_alone()}"
             )
 
     def unstable_rows(self, theta: ArrayLike) -> list[int]:

@@ -206,7 +206,7 @@ def with_changes(
         return model, sensors
     both = set(free) & set(fixed)
     if both:
-        raise ModelError(f"{', '.join(sorted(both))} is both in free= and in fixed=; choose one")
+        raise ModelError(f"{', '.join(sorted(both))} is both in free and in fixed; choose one")
     sensed = {p.name for p in sensors.parameters}
     model = model.with_free([n for n in free if n not in sensed])
     model = model.with_fixed({n: v for n, v in fixed.items() if n not in sensed})

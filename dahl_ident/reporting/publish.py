@@ -16,7 +16,7 @@ import numpy as np
 from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
-from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.html import html
@@ -111,7 +111,8 @@ def report(
     of_tables = [one for one in given if one.problem.settled]
     if record is not None and not of_tables:
         raise ValidationError(
-            "record= is given, the waveforms of a table, but no result on a table; leave it out"
+            f"{argument('record', option='waveforms')} is given, the waveforms of a table, but no "
+            "result on a table; leave it out"
         )
     if _on_one_table(of_tables):
         whole = document(given, record=record, **how)

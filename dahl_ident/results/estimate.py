@@ -31,7 +31,7 @@ from dahl_ident.diagnostics.estimate import EXPONENT, with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError
+from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.fitting.record_search import Tell
 from dahl_ident.problem import BaseProblem, Problem, ProblemBatch
@@ -154,8 +154,8 @@ def fit(
     """
     if hasattr(data, "iloc"):  # a table in memory, without the import of pandas
         data = read_frequency_response(cast("pd.DataFrame", data))
-    kind = "a fit of tables" if isinstance(data, FrequencyResponse) else "a fit of records"
-    _refuse_options(fit, kind, locals())
+    kind = "tables" if isinstance(data, FrequencyResponse) else "records"
+    _refuse_options(fit, f"a fit of {kind}", locals(), _NOT_OF_FITS[kind])
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
     by_ipopt = {
@@ -163,7 +163,9 @@ def fit(
     }  # fmt: skip
     given = [name for name, value in by_ipopt.items() if value is not None]
     if given and method != "ipopt":
-        raise ValidationError(f"{' and '.join(given)} given; only method='ipopt' takes that")
+        raise ValidationError(
+            f"{' and '.join(given)} given; only {argument('method', 'ipopt')} takes that"
+        )
 
     def optimum_of(problem: BaseProblem, tell: Tell | None) -> Optimum:
         if method != "ipopt":
@@ -398,8 +400,9 @@ def posterior(
     one_of(method, "method", METHODS)
     given = data if isinstance(data, FitResult) else None
     settled = isinstance(data, FrequencyResponse) if given is None else given.problem.settled
-    _refuse_options(posterior, "a posterior of tables" if settled else _OF_RECORDS, options)
-    _refuse_options(posterior, f"method={method!r}", options)
+    if not settled:
+        _refuse_options(posterior, "a posterior of records", options, _NOT_OF_RECORDS)
+    _refuse_options(posterior, argument("method", method), options, _NOT_OF_METHODS[method])
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
@@ -437,22 +440,23 @@ def posterior(
     return result
 
 
-_CHAIN_ONLY = ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool")
-_OF_RECORDS = "a posterior of records"
-_REFUSED = {
-    "a fit of tables": ("output", "excitation"),
-    "a fit of records": ("noise", "drive_std", "drive_covariance", "steady"),
-    "a posterior of tables": (),
-    _OF_RECORDS: ("noise", "steady", "likelihood", "pool"),
-    "method='mcmc'": ("tolerance",),
-    "method='grid'": _CHAIN_ONLY,
+_NOT_OF_RECORDS = ("noise", "steady", "likelihood", "pool")
+_NOT_OF_FITS = {
+    "tables": ("output", "excitation"),
+    "records": ("noise", "drive_std", "drive_covariance", "steady"),
+}
+_NOT_OF_METHODS = {
+    "mcmc": ("tolerance",),
+    "grid": ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool"),
 }
 
 
-def _refuse_options(of: Callable[..., Any], kind: str, options: Mapping[str, Any]) -> None:
+def _refuse_options(
+    of: Callable[..., Any], kind: str, options: Mapping[str, Any], refused: Sequence[str]
+) -> None:
     """Refuse options that a kind of estimate does not have, unless they are left as they are."""
     defaults = signature(of).parameters
-    given = [name for name in _REFUSED[kind] if options[name] != defaults[name].default]
+    given = [name for name in refused if options[name] != defaults[name].default]
     if given:
         raise ValidationError(
             f"{', '.join(given)} given with {kind}, which has no such option; leave it out"

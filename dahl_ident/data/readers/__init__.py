@@ -29,7 +29,7 @@ from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from, record_size
 from dahl_ident.data.response_table import ResponseOptions, response_from
 from dahl_ident.data.storage import plain_data
-from dahl_ident.errors import DahlIdentError, DataError, DataWarning, ValidationError
+from dahl_ident.errors import DahlIdentError, DataError, DataWarning, ValidationError, argument
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
@@ -334,7 +334,9 @@ def open_source(
         return replace(dictionary_source(path), options=options or {})
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
-        raise DataError(f"{file.name}: sheet={sheet!r} is given, but the file is not a workbook")
+        raise DataError(
+            f"{file.name}: {argument('sheet', sheet)} is given, but the file is not a workbook"
+        )
     source = _parsed(file, sheet)
     for doubt in source.doubts:
         warnings.warn(f"{file.name}: {doubt}", DataWarning, stacklevel=3)

@@ -18,7 +18,7 @@ from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, argument
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,7 +44,7 @@ def read_workbook(file: File, sheet: str | None = None) -> Source:
     if len(with_table) > 1:
         raise DataError(
             f"{file.name}: sheets {listed(with_table)} hold tables; name one with "
-            f"sheet={next(iter(with_table))!r}"
+            f"{argument('sheet', next(iter(with_table)))}"
         )
     return next(iter(with_table.values()))
 
