@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -68,13 +69,18 @@ def interrupted(folder: Path, *arguments: str, when: Path | None = None) -> tupl
         # the shell of a job in the background has its children ignore interrupts
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:  # fmt: skip
-        ends = time.monotonic() + 60.0
+        ends = time.monotonic() + 90.0
         while when is not None and not when.exists() and time.monotonic() < ends:
             time.sleep(0.05)
         time.sleep(0.5 if when else 5.0)
         assert process.poll() is None, process.communicate()
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        while process.poll() is None:
+            assert time.monotonic() < ends, "the command cannot be interrupted"
+            process.send_signal(signal.SIGINT)
+            # an interrupt that meets a callback of a compiled library is lost: press again
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=5)
+        out, err = process.communicate()
     assert process.returncode == 130
     return out, err
 

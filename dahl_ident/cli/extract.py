@@ -120,10 +120,10 @@ def _tell_of_sweeps(
     """Say how to fit waveforms that were swept too fast for a table."""
     import numpy as np
 
-    from dahl_ident.extraction.point import TOO_FAST
+    from dahl_ident.diagnostics.formatting import percent
 
     points = _one_row_a_point(data)
-    fast = np.array([TOO_FAST in str(verdict) for verdict in points.quality["verdict"]])
+    fast = ~points.quality["settled"] & (points.quality["more_periods"] == 0)
     if fast.any():
         bias = np.hypot(points.quality["bias_real"], points.quality["bias_imag"]) / points.gain
         named = changed(reading)
@@ -133,8 +133,8 @@ def _tell_of_sweeps(
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
         console.note(
             f"{fast.sum()} of {points.n} points are of a sweep that friction could not follow, and "
-            f"biased by about {100.0 * np.median(bias[fast]):.2g} % (median), at most "
-            f"{100.0 * bias[fast].max():.2g} %. Its waveforms can be fitted at once, without that "
+            f"biased by about {percent(np.median(bias[fast]))} (median), at most "
+            f"{percent(bias[fast].max())}. Its waveforms can be fitted at once, without that "
             f"error: {command}"
         )
 

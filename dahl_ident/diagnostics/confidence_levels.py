@@ -43,6 +43,6 @@ def thresholds(optimum: Optimum, levels: FloatArray) -> FloatArray:
     return np.asarray(special.stdtrit(optimum.dof, upper))
 
 
-def percent(level: float) -> str:
+def level_text(level: float) -> str:
     """Return a level as text: ``"95.45 %"``."""
     return f"{100.0 * level:.4g} %"

@@ -36,7 +36,7 @@ from dahl_ident.diagnostics.confidence_levels import (
     LEVELS,
     MANY,
     checked_levels,
-    percent,
+    level_text,
     thresholds,
 )
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -127,8 +127,8 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         return replace(self, note=note)
 
     def __str__(self) -> str:
-        head = ["", *(f"-{percent(c)}" for c in self.levels[::-1]), "estimate"]
-        head += [percent(c) for c in self.levels]
+        head = ["", *(f"-{level_text(c)}" for c in self.levels[::-1]), "estimate"]
+        head += [level_text(c) for c in self.levels]
         rows = [head]
         for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
             numbers = [*self.lower[::-1, i], self.estimate[i], *self.upper[:, i]]
@@ -260,7 +260,7 @@ class Disagreement(NamedTuple):
     def __str__(self) -> str:
         theirs, ours = (f"{v:.4g}" if np.isfinite(v) and v else "open" for v in self.limits)
         return (
-            f"{self.name}: the {self.side} {percent(self.level)} limit is {theirs} by "
+            f"{self.name}: the {self.side} {level_text(self.level)} limit is {theirs} by "
             f"{self.methods[0]} and {ours} by {self.methods[1]}; trust the latter"
         )
 

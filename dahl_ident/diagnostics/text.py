@@ -166,7 +166,7 @@ def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, wi
     return (
         f"Fitted without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and "
         f"{phases} of {rows} phases of fundamentals are inside their 95 % bands "
-        f"(half width {100.0 * width:.2g} %)."
+        f"(half width {percent(width)})."
     )
 
 
@@ -239,7 +239,7 @@ def _jenkins_bound(least: float, law: bool) -> str:
 def _displacement_noise(noise: float, unit: str, travel: float) -> str:
     return (
         f"The displacement's noise of {noise:.2g} {unit} (standard deviation) is not counted as "
-        f"travel, of which it would add {100.0 * travel:.2g} %; the residuals are smaller without "
+        f"travel, of which it would add {percent(travel)}; the residuals are smaller without "
         "it. A quieter displacement would determine more."
     )
 

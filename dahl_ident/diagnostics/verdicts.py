@@ -29,7 +29,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
 from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
-from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
+from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
@@ -557,7 +557,7 @@ def _reason(
     lost: frozenset[str],
 ) -> str:
     lower = -np.inf if limits.lower == 0.0 else limits.lower
-    within = f"{interval_text(lower, limits.upper, unit)} ({percent(limits.level)})"
+    within = f"{interval_text(lower, limits.upper, unit)} ({level_text(limits.level)})"
     if verdict is not Verdict.NOT_IDENTIFIED:
         return f"{within}, {verdict.value}"
     return f"{within}, not determined, {advice(optimum, name, limits, lost)}"

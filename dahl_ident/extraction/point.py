@@ -33,7 +33,6 @@ from dahl_ident.extraction.transient import (
     estimate_transient,
 )
 
-TOO_FAST = "swept too fast"
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
@@ -189,7 +188,7 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
     shares = np.abs(bias + lag) / np.abs(response).max()
     verdicts = []
     for good, more, share in zip(settled, missing.astype(int), shares, strict=True):
-        too_fast = f"{TOO_FAST} to settle, biased by about {100.0 * share:.2g} %"
+        too_fast = f"swept too fast to settle, biased by about {100.0 * share:.2g} %"
         unsettled = f"not settled, {more} more periods" if more else too_fast
         verdicts.append("; ".join([unsettled][: not good] + shared) or "good")
     return Point(

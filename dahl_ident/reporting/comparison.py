@@ -171,7 +171,7 @@ def changes_section(changed: Sequence[Change]) -> Section:
                 Cell(value, c.change, struck=not usable),
                 Cell(error, c.u if math.isfinite(c.u) else None, struck=not usable),
                 Cell(c.unit or "-"),
-                Cell(c.p_text.removeprefix("p = ").removeprefix("p "), c.p if usable else None),
+                Cell(c.p_number if usable else "-", c.p if usable else None),
                 Cell(c.significance),
             )
         )

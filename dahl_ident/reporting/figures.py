@@ -12,9 +12,8 @@ from dahl_ident import plots
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import curves
 from dahl_ident.diagnostics.bands import ENERGY
-from dahl_ident.diagnostics.confidence_levels import LEVELS, percent, thresholds
-from dahl_ident.diagnostics.formatting import percent as of_size
-from dahl_ident.diagnostics.formatting import with_unit
+from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
+from dahl_ident.diagnostics.formatting import percent, with_unit
 from dahl_ident.diagnostics.information import shares
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
@@ -66,7 +65,7 @@ def _of_records(fit: FitResult) -> Iterator[Picture]:
     """Yield the figures of the record that a fit describes worst."""
     worst = fit.goodness.worst_record - 1
     of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
-    share = of_size(fit.goodness.share_left**0.5)
+    share = percent(fit.goodness.share_left**0.5)
     shown = {
         "time": f"Measured and fitted {fit.problem.output}",
         "residuals": "Residuals over time",
@@ -117,7 +116,7 @@ def _response(fit: FitResult) -> Picture:
         over += ", by level" if over_frequency else ", by frequency"
     caption = (
         f"Data (points, with error bars) and fit (lines) over {over}. Bands are the "
-        f"{percent(LEVELS[1])} confidence bands of the fit."
+        f"{level_text(LEVELS[1])} confidence bands of the fit."
     )
     return Picture("response", caption, alt, lambda: figure_of(fit.plot_fit()))
 
@@ -234,7 +233,7 @@ def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
         np.exp(coordinate) if logarithmic else coordinate,
         profiler.curve(index, coordinate),
         best=float(fit.optimum.values[index]),
-        limits={percent(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
+        limits={level_text(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
         label=_with_unit(name, parameter.unit),
         log=bool(logarithmic and np.ptp(coordinate) > _STRAIGHT),
         ax=axis,
@@ -397,4 +396,4 @@ def _distance(
     for (_, model), (_, force) in zip(drawn, measured, strict=True):
         same = model[:: (model.size - 1) // (force.size - 1)]
         away.append(np.sqrt(np.mean((force - same) ** 2)) / np.abs(force).max())
-    return f"The measured loops are within {100.0 * max(away):.2g} % rms of the model's."
+    return f"The measured loops are within {percent(max(away))} rms of the model's."

@@ -10,7 +10,7 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.budget import Budget, taken_as_exact
 from dahl_ident.diagnostics.comparison import compare_models
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
@@ -48,7 +48,7 @@ NOISE = {
 RELATES = "The results relate only to the item that was measured."
 COVERAGE = (
     "The expanded uncertainty U is the combined standard uncertainty u times the coverage factor "
-    f"k, for a coverage of about {percent(CONFIDENCE)}."
+    f"k, for a coverage of about {level_text(CONFIDENCE)}."
 )
 _MOST_FILES = 4  # lines of them before the signature
 _FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin

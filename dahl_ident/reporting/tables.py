@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, percent
-from dahl_ident.diagnostics.formatting import degrees_text, interval, rounded, with_unit
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
+from dahl_ident.diagnostics.formatting import degrees_text, interval, percent, rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting.document import Cell, Table, number, words
 from dahl_ident.results.changes import is_usable
@@ -65,7 +65,7 @@ def answer(fit: FitResult) -> Table:
             )
         )
     header = (
-        "parameter", "estimate", "standard uncertainty u", f"{percent(CONFIDENCE)} interval",
+        "parameter", "estimate", "standard uncertainty u", f"{level_text(CONFIDENCE)} interval",
         "unit", "description", "what the data say",
     )  # fmt: skip
     crossed = any(cell.struck for row in rows for cell in row)
@@ -90,7 +90,7 @@ def uncertainty(stated: Budget) -> Table:
         "unit", "largest sources, share of the variance",
     )  # fmt: skip
     return Table(
-        f"Expanded uncertainties U; k is for {percent(CONFIDENCE)} coverage", header, tuple(rows)
+        f"Expanded uncertainties U; k is for {level_text(CONFIDENCE)} coverage", header, tuple(rows)
     )
 
 
@@ -125,7 +125,7 @@ def budget(stated: Budget) -> Table:
         "share", "k", "U = k u",
     )  # fmt: skip
     return Table(
-        f"Uncertainty budget; k is for {percent(CONFIDENCE)} coverage", header, tuple(rows)
+        f"Uncertainty budget; k is for {level_text(CONFIDENCE)} coverage", header, tuple(rows)
     )
 
 
@@ -193,7 +193,7 @@ def parameters(
         row += [Cell(credible_interval(posterior, name)) for posterior in drawn]
         rows.append((*row, Cell(estimate.description)))
     methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
-    columns = (f"{method} {percent(CONFIDENCE)}" for method in methods)
+    columns = (f"{method} {level_text(CONFIDENCE)}" for method in methods)
     header = ("parameter", "estimate", "standard error", "unit", *columns, "description")
     return Table("Estimates and intervals, one column a method", header, tuple(rows))
 
@@ -316,7 +316,7 @@ def goodness(fit: FitResult) -> Table:
     rows = [
         words("data (real numbers)", f"{fit.ndata}"),
         words("degrees of freedom", f"{fit.nfree}"),
-        words("rms misfit", f"{100.0 * fit.goodness.rms_misfit:.2g} %"),
+        words("rms misfit", percent(fit.goodness.rms_misfit)),
         (Cell("sum of squares"), number(fit.chisqr)),
         (Cell("sum of squares over degrees of freedom"), number(fit.redchi)),
         words("noise scale", scale),

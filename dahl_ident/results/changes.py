@@ -65,11 +65,16 @@ class Change:
         return "significant" if self.runs_known else "beyond noise; scatter between runs unknown"
 
     @property
+    def p_number(self) -> str:
+        """The probability as a number, or its bound."""
+        return "< 0.0001" if self.p < 1e-4 else f"{self.p:.1g}"
+
+    @property
     def p_text(self) -> str:
         """The probability as text, complete."""
         if not math.isfinite(self.p):
             return "-"
-        return "p < 0.0001" if self.p < 1e-4 else f"p = {self.p:.1g}"
+        return f"p {self.p_number}" if self.p < 1e-4 else f"p = {self.p_number}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return it for machines."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dahl_ident.diagnostics.comparison import compare_models
-from dahl_ident.diagnostics.confidence_levels import percent
+from dahl_ident.diagnostics.confidence_levels import level_text
 from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 
@@ -83,7 +83,7 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[ReportPart]
 
 def _parameters(fit: FitResult, intervals: ConfidenceIntervals, names: Iterable[str]) -> list[str]:
     level = float(intervals.levels[-1])
-    rows = [["", "value", "stderr", "unit", f"{percent(level)} ({intervals.method})", ""]]
+    rows = [["", "value", "stderr", "unit", f"{level_text(level)} ({intervals.method})", ""]]
     for name in names:
         p = fit.params[name]
         if not p.vary:
