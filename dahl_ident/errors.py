@@ -257,6 +257,16 @@ def arguments_as_options() -> Iterator[None]:
         _OPTIONS.reset(before)
 
 
+def names_options() -> bool:
+    """Return whether messages name options of the command line."""
+    return _OPTIONS.get()
+
+
+def name_options(on: bool) -> None:
+    """Name options, or arguments, from now on: for a process that works for another one."""
+    _OPTIONS.set(on)
+
+
 def spelled(python: str, options: str) -> str:
     """Return how to say something to Python, or on the command line where that is used.
 
@@ -265,7 +275,7 @@ def spelled(python: str, options: str) -> str:
     >>> spelled("fit(record, model)", "dahl-ident fit --record")
     'fit(record, model)'
     """
-    return options if _OPTIONS.get() else python
+    return options if names_options() else python
 
 
 class Placeholder(str):

@@ -329,7 +329,7 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
         (("sample", "friction.csv"),
          "friction.csv: it holds waveforms (time [s], displacement [m], friction force [N]), and"),
         (("fit", "levels.csv", "--level", "high"),
-         "levels.csv: --level 'high' is given, but the table has its own levels"),
+         "levels.csv: --level high is given, but the table has its own levels"),
         (("fit", "t.csv", "--level", "high", "--level-from-name", "(t)"),
          "level and level_from_name are both given"),
         (("simulate", "run.toml", "--f-max", "3", "--force-std", "0.1"),

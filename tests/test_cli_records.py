@@ -55,7 +55,7 @@ def test_a_column_map_is_used(
     words = ("fit", odd_columns, "--record")
     code, _, why = told(monkeypatch, capsys, *words)
     assert code == 1
-    assert "--columns" in why
+    assert "Name it with --force ..." in why
     mapped = (*words, "--columns", odd_columns.with_name("columns.toml"))
     code, out, _ = told(monkeypatch, capsys, *mapped)
     assert code == 0
@@ -82,7 +82,7 @@ def test_waveforms_need_no_option(
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text)))
     code, _, why = told(monkeypatch, capsys, "fit", "-")
     assert code == 1
-    assert "on the command line --record" in why
+    assert "fitted as a record: dahl-ident fit --record" in why
 
 
 def test_a_fast_sweep_is_told_how_to_be_fitted(

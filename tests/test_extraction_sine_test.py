@@ -10,7 +10,7 @@ import pytest
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
-from dahl_ident.errors import ExtractionError
+from dahl_ident.errors import ExtractionError, arguments_as_options
 from dahl_ident.extraction import extract
 
 FRICTION = Dahl(f_max=20.0, sigma=2e4)
@@ -74,7 +74,12 @@ def test_a_swept_force_that_friction_cannot_follow_is_named_with_the_command() -
     with pytest.raises(ExtractionError, match=r"^not a sine test: ") as refused:
         extract(swept, controlled="force")
     assert "the force is a sweep of one sine" in str(refused.value)
-    assert "dahl-ident fit --record FILE" in str(refused.value)
+    assert "di.fit(record, model)" in str(refused.value)
+    with (
+        arguments_as_options(),
+        pytest.raises(ExtractionError, match="dahl-ident fit --record FILE"),
+    ):
+        extract(swept, controlled="force")
 
 
 def test_levels_far_apart_sweeps_and_a_sine_in_noise_are_sine_tests() -> None:

@@ -256,8 +256,11 @@ class TestPlan:
             ({"target": "response"}, "'response' is planned with settled sines only"),
             ({"controlled": "force"}, "controlled='force' is planned with settled sines only"),
             ({"suspects": {"alpha": 0.1}}, "suspects is planned with settled sines only"),
-            ({"limits": {"speed": 0.1, "time": 9}}, "limits has no acceleration"),
-            ({"candidates": "multisine", "limits": {"time": 9}}, "limits has no frequency_hz"),
+            ({"limits": {"speed": 0.1, "time": 9}}, r"limits\['acceleration'\] is missing"),
+            (
+                {"candidates": "multisine", "limits": {"time": 9}},
+                r"limits\['frequency_hz'\] is missing",
+            ),
             ({"limits": {**BENCH, "time": 9, "force": 1e-9}}, "force excludes"),
             ({"limits": {**BENCH, "time": 0.5}}, "the quickest motion takes"),
         ],

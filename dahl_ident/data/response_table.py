@@ -31,7 +31,7 @@ from dahl_ident.data.plausibility import (
 )
 from dahl_ident.data.raw_columns import TRACE, Channel, Source, plain
 from dahl_ident.data.tabular import ASSUMED, listed
-from dahl_ident.errors import ANY, DataError, UnitError, ValidationError, argument
+from dahl_ident.errors import ANY, DataError, UnitError, ValidationError, argument, spelled
 from dahl_ident.units import (
     DRIVE_KINDS,
     MOTION_KINDS,
@@ -273,8 +273,8 @@ class _Table(Binding):
         known = self.channel(role)
         if known is not None:
             raise ValidationError(
-                f"{option}={text!r} is given, and column {known.name!r} holds the {role} too; "
-                "leave out one of them"
+                f"{argument(option, text)} is given, and column {known.name!r} holds the {role} "
+                "too; leave out one of them"
             )
         channels = (*self.source.channels, Channel(str(text), values, unit, role))
         self.source = replace(self.source, channels=channels)
@@ -291,7 +291,8 @@ class _Table(Binding):
             raise WaveformsError(
                 f"{self.source.name}: it holds waveforms ({channels}), and a table of responses at "
                 "some frequencies was expected. If they are sine tests, make such a table with "
-                "extract; any other motion is fitted as a record (on the command line --record)"
+                "extract; any other motion is fitted as a record: "
+                f"{spelled('di.fit(di.read_record(file), model)', 'dahl-ident fit --record')}"
             )
 
     def _backbone(

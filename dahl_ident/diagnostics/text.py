@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
-from dahl_ident.errors import argument
+from dahl_ident.errors import argument, spelled
 
 _MOST_DEPARTURES = 3  # in the verdict; the details list all
 _MOST_ROWS = 3  # the same
@@ -360,7 +360,7 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "unphysical": lambda objection: f"Physically doubtful: {objection}.",
     "exponent": lambda name, wanted, held: (
         f"The records ask for {name} = {wanted} instead of the assumed {held:g}: estimate it "
-        f"({name}=None; {name}=free on the command line)."
+        f"({spelled(f'{name}=None', f'{name}=free')})."
     ),
     "stated_exponent": lambda name, wanted, held: (
         f"The records contradict {name} = {held:g}, which was stated: they ask for {wanted}."

@@ -20,7 +20,7 @@ from dahl_ident.arrays import whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.levels import labelled
 from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
-from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.errors import DataError, ValidationError, name_options, names_options
 from dahl_ident.extraction.from_record import record_response
 from dahl_ident.extraction.phasors import Settings
 from dahl_ident.extraction.plateaus import Mode
@@ -200,7 +200,9 @@ def extract_all(
         parts = [_extracted(task, settings) for task in tasks]
     else:
         # a forked copy of a process with threads may hang: the workers start afresh
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        with ProcessPoolExecutor(
+            jobs, get_context("spawn"), initializer=name_options, initargs=(names_options(),)
+        ) as pool:
             parts = []
             for part, messages in pool.map(_extracted_apart, tasks, repeat(settings)):
                 parts.append(part)

@@ -160,8 +160,8 @@ def read_frequency_response(
         for name, label, labels in (("level", level, part.level), ("run", options.run, part.run)):
             if label is not None and labels is not None and any(v != label for v in labels):
                 raise DataError(
-                    f"{one}: {name}={label!r} is given, but the table has its own {name}s; leave "
-                    "it out"
+                    f"{one}: {argument(name, label)} is given, but the table has its own {name}s; "
+                    "leave it out"
                 )
         parts.append(part)
     if len(parts) == 1:
