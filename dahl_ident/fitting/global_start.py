@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
-from dahl_ident.elements import Element, Parameter
+from dahl_ident.elements import Element, Friction, Parameter
 from dahl_ident.errors import FitError, argument
 from dahl_ident.fitting.directions import Direction, Directions, directions, is_positive
 from dahl_ident.problem import Problem
@@ -57,6 +57,7 @@ _LEAST, _TOGETHER = 4, 20  # amplitudes of a table; those that are computed toge
 _HIGHEST = 3  # harmonic that takes part in a start; higher ones cost more and tell little more
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
+_MOST_LOOPS, _MOST_ROWS = 10_000, 40  # of a law that depends on the rate: a second or two
 _MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
 _ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
@@ -298,11 +299,15 @@ def _scaled(values: dict[str, FloatArray], column: _Column, coefficient: FloatAr
 
 
 def _grid(problem: Problem, view: StiffnessData) -> _Grid:
-    low = np.flatnonzero(view.harmonic <= _HIGHEST)
-    if 0 < low.size < view.harmonic.size:
-        view = view.of_rows(low)
     every = [directions(e) for e in problem.model.elements]
     searched = [d for d in every if d.nonlinear]
+    rows = np.flatnonzero(view.harmonic <= _HIGHEST)
+    rows = rows if rows.size else np.arange(view.harmonic.size)
+    if any(_takes_loops(d) for d in searched) and rows.size > _MOST_ROWS:
+        chosen = np.random.default_rng(1).choice(rows.size, _MOST_ROWS, replace=False)
+        rows = rows[np.sort(chosen)]
+    if rows.size < view.harmonic.size:
+        view = view.of_rows(rows)
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
     curves = [_curves(d, view, each) for d in searched]
     counts = [_size(c) for c in curves]
@@ -325,6 +330,12 @@ def _grid(problem: Problem, view: StiffnessData) -> _Grid:
         common,
         any(len(d.nonlinear) > 1 for d in searched),
     )
+
+
+def _takes_loops(d: Directions) -> bool:
+    """Return whether a loop is integrated for every node and row."""
+    law = type(d.element)
+    return not d.lengths and not law.rate_independent and law.settled is Friction.settled
 
 
 def _size(curves: _Curves) -> int:
@@ -387,6 +398,8 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
     if d.lengths:
         return _tabulated_curves(d, view, most)
     most = min(most, _MOST_OF_ONE)
+    if _takes_loops(d):
+        most = min(most, _MOST_LOOPS / view.harmonic.size)
     lengths = [x for x in d.nonlinear if not x.is_number]
     numbers = [_numbers(x) for x in d.nonlinear if x.is_number]
     combined = float(np.prod([n.size for n in numbers])) if numbers else 1.0
