@@ -65,6 +65,14 @@ def test_random_motions_are_those_of_an_independent_integrator(
     assert case.error < (max(limit, sharp) if law in cases.KINKS else limit), case.note
 
 
+@pytest.mark.parametrize("law", list(cases.WAYS))
+def test_loops_of_any_amplitude_are_those_in_closed_form(law: str) -> None:
+    rng = seeded(4, list(cases.LAWS).index(law))
+    for _ in range(3):
+        case = cases.any_amplitude(law, rng)
+        assert case.error < 1e-8, case.note
+
+
 @pytest.mark.parametrize("beta", [1e-8, 0.3, 1e8])
 def test_dahl_loops_are_the_closed_forms(beta: float) -> None:
     law = di.Dahl(2.0, 500.0)

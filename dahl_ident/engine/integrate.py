@@ -39,7 +39,7 @@ _SMALLEST = 1e-14  # of the span: a shorter step cannot advance the time
 _DENSE = 1e-2  # of the tolerance: the same for a polynomial that is read between its ends
 _SHARE = _DENSE ** (1.0 / (STAGES + 1))  # of the step
 _TOGETHER = 1e-8  # of the span: events that are as near to each other may change places
-_NEAREST = 0.005  # rad before a turning point: the last step under a sine
+_NEAREST = 0.005  # before a turning point, rad of a sine, or of an interval: the last step
 _MOST, _PER_SAMPLE = 20_000, 200  # steps: more is not a motion
 _BEYOND_BOUNDS = 1e100  # m/s: far beyond any motion, and its square is still a number
 
@@ -241,6 +241,10 @@ def advance(
             error = error_of(f, states, read, signal, t, h, y, w, at) / tolerance
             if error * tolerance > allowed and h > LOCATED * span:
                 step, last = h * max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
+                continue
+            nearest = _NEAREST * (w[at.interval + 2] - w[at.interval + 1])
+            if which == 0 and at.rated and h > nearest:  # what happens near rest is short
+                step, last = max(0.5 * h, nearest), 0.0
                 continue
             if not there:
                 which = -1
