@@ -69,7 +69,8 @@ def test_measured_damper_from_files_to_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    files = sorted(str(p) for p in MEASURED.glob("*.csv"))
+    tests = ("0.25Hz_0.5in", "0.25Hz_1in", "0.5Hz_0.5in", "0.5Hz_1in", "1Hz_1.5in", "2Hz_0.5in")
+    files = [str(MEASURED / f"band30lb_{test}.csv") for test in tests]
     assert run("inspect", files[0]) == 0
     contents = capsys.readouterr().out
     assert "1024 Hz" in contents

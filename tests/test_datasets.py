@@ -43,8 +43,9 @@ def test_experiment_and_seed_give_the_shipped_values(name: str) -> None:
         ours, theirs = getattr(data, column, None), getattr(made, column, None)
         assert (ours is None) == (theirs is None), column
         if ours is not None and theirs is not None:
+            # what machines round in another way, the steps of the integration add up
             scale = np.max(np.abs(theirs[np.isfinite(theirs)]), initial=0.0)
-            np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-12 * scale, err_msg=column)
+            np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-8 * scale, err_msg=column)
 
 
 @pytest.mark.parametrize("name", DATA_SETS)

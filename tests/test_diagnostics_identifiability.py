@@ -111,7 +111,7 @@ class TestVerdicts:
 
     def test_amplitudes_within_the_gap_do_not_show_it(self) -> None:
         law = Backlash(Dahl(F_MAX, SIGMA), 10.0 * X_C)
-        data = table(model=law + Spring(SIGMA), beta=(1.0, 4.9))
+        data = table(model=law + Spring(SIGMA), beta=(1.0, 4.9), n=14)
         found = fit(data, Backlash(Dahl()) + Spring(), throw=False)
         assert found.verdict.startswith("Not determined.")
         assert {"f_max", "sigma", "gap"} <= set(found.identifiability.named(NOT))

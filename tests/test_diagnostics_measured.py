@@ -82,7 +82,7 @@ class TestDamper:
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
 
     def test_other_models_are_compared_as_well(self, damper: FrequencyResponse) -> None:
-        found = fit(damper, Dahl())
+        found = fit(damper.select(rows=np.arange(damper.n) % 3 == 0), Dahl())
         report = found.fit_report()
         assert "Other models, for comparison" in report
         names = [model.name for model in compare_models(found).models]
@@ -120,7 +120,7 @@ class TestStill:
     def test_laws_are_compared_where_harmonics_are_rows(
         self, tests: list[FrequencyResponse]
     ) -> None:
-        compared = compare_models(self.of(tests, 3))
+        compared = compare_models(self.of(tests[::3], 3))
         assert not compared.failed
         assert {"gap", "Bouc-Wen", "mass added"} <= {model.name for model in compared.models}
 
