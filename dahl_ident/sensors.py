@@ -88,9 +88,9 @@ class Sensors:
 
     def __post_init__(self) -> None:
         for name in ("force_gain", "displacement_gain", "delay"):
-            given = getattr(self, name)
-            if given is not None and not hasattr(given, "logpdf"):
-                object.__setattr__(self, name, finite_number(given, name))
+            stated = getattr(self, name)
+            if stated is not None and not hasattr(stated, "logpdf"):
+                object.__setattr__(self, name, finite_number(stated, name))
         _ = self.parameters  # checks the bounds
 
     def stated_uncertainties(self) -> dict[str, float]:
@@ -107,19 +107,19 @@ class Sensors:
         >>> Sensors(force_gain=stats.norm(1.0, 0.005)).stated_uncertainties()
         {'force_gain': 0.005}
         """
-        found = {}
+        uncertainties = {}
         for name, right in (("force_gain", 1.0), ("displacement_gain", 1.0), ("delay", 0.0)):
-            given = getattr(self, name)
-            if given is not None and not hasattr(given, "logpdf") and given == right:
+            stated = getattr(self, name)
+            if stated is not None and not hasattr(stated, "logpdf") and stated == right:
                 continue
-            if given is None or not hasattr(given, "logpdf") or float(given.mean()) != right:
+            if stated is None or not hasattr(stated, "logpdf") or float(stated.mean()) != right:
                 raise ValidationError(
-                    f"sensors state {name}={given!r}; a fit of records expects a prior about "
+                    f"sensors state {name}={stated!r}; a fit of records expects a prior about "
                     f"{right:g}, such as scipy.stats.norm({right:g}, 0.005), which counts in the "
                     "uncertainty: correct the record for what is known, or fit an extracted table"
                 )
-            found[name] = float(given.std())
-        return found
+            uncertainties[name] = float(stated.std())
+        return uncertainties
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any] | str | Path) -> Sensors:
@@ -173,8 +173,8 @@ class Sensors:
     @cached_property
     def priors(self) -> dict[str, Prior]:
         """The prior of each parameter that has one, by name."""
-        given = {p.name: getattr(self, p.name) for p in self.parameters}
-        return {n: v for n, v in given.items() if not (v is None or isinstance(v, float))}
+        stated = {p.name: getattr(self, p.name) for p in self.parameters}
+        return {n: v for n, v in stated.items() if not (v is None or isinstance(v, float))}
 
     @cached_property
     def are_exact(self) -> bool:
@@ -208,10 +208,10 @@ def measured_stiffness_factor(
 
 
 def _parameter(
-    name: str, unit: str, description: str, given: float | Prior | None, neutral: float
+    name: str, unit: str, description: str, stated: float | Prior | None, neutral: float
 ) -> Parameter:
     positive = neutral > 0.0
-    value = given if given is None or isinstance(given, float) else float(given.mean())
+    value = stated if stated is None or isinstance(stated, float) else float(stated.mean())
     if value is not None and positive and value <= 0.0:
         raise ValidationError(
             f"{name} is {value!r}; expected a number > 0 (change the sign of a channel when "
@@ -222,7 +222,7 @@ def _parameter(
         unit,
         description,
         neutral if value is None else value,
-        free=not isinstance(given, float),
+        free=not isinstance(stated, float),
         lower=0.0 if positive else -np.inf,
         transform="log" if positive else "linear",
     )

@@ -173,22 +173,24 @@ def parse_unit(text: str) -> Unit:
     >>> f"{unit.factor:g}", unit.marker
     ('1e-06', 'rms')
     """
-    rest = text.strip()
-    if len(rest) > 2 * _LONGEST:
-        raise UnitError(f"[{rest[:_LONGEST]}...] is not a unit: it has {len(rest)} characters")
-    decibel = _DECIBEL.match(rest)
+    symbols = text.strip()
+    if len(symbols) > 2 * _LONGEST:
+        raise UnitError(
+            f"[{symbols[:_LONGEST]}...] is not a unit: it has {len(symbols)} characters"
+        )
+    decibel = _DECIBEL.match(symbols)
     if decibel:
-        rest = rest[decibel.end() :]
+        symbols = symbols[decibel.end() :]
     marker: Marker | None = None
-    found = _MARKER.search(rest)
-    if found:
-        marker = next(m for (m, _), g in zip(_MARKERS, found.groups(), strict=True) if g)
-        rest = rest[: found.start()]
-    if decibel and not rest:
+    match = _MARKER.search(symbols)
+    if match:
+        marker = next(m for (m, _), g in zip(_MARKERS, match.groups(), strict=True) if g)
+        symbols = symbols[: match.start()]
+    if decibel and not symbols:
         raise UnitError(
             f"[{text}] does not say what 0 dB is; give the reference, such as [dB re N/m]"
         )
-    factor, dimension = _root(_normalised(rest, text), text)
+    factor, dimension = _root(_normalised(symbols, text), text)
     return Unit(text.strip(), factor, dimension, marker, decibel is not None)
 
 
@@ -295,14 +297,14 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
     >>> parse_quantity("20 um pp", ("displacement",), "amplitude")
     (..., 'displacement', 'translation')
     """
-    found = re.fullmatch(
+    match = re.fullmatch(
         r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.,].*)", text.strip()
     )
-    if not found:
+    if not match:
         raise UnitError(f"{what} is {text!r}; expected a number and its unit, such as '0.2 N'")
-    unit = parse_unit(found[2])
+    unit = parse_unit(match[2])
     kind, motion, factor = kind_of(unit, kinds, what)
-    return float(found[1]) * factor * unit.to_peak, kind, motion
+    return float(match[1]) * factor * unit.to_peak, kind, motion
 
 
 def _normalised(text: str, written: str) -> str:
@@ -330,17 +332,17 @@ def _common(text: str) -> tuple[float, Dimension] | None:
     text = text.strip()
     factor, powers, at = 1.0, dict[str, float](), 0
     while at < len(text):
-        found = _COMMON_PART.match(text, at)
-        if found is None or bool(found[1]) != bool(at):
+        match = _COMMON_PART.match(text, at)
+        if match is None or bool(match[1]) != bool(at):
             return None
-        part = _common(found[2]) if found[2] else _COMMON.get(found[3])
+        part = _common(match[2]) if match[2] else _COMMON.get(match[3])
         if part is None:
             return None
-        power = int(found[4] or 1) * (-1 if "/" in found[1] else 1)
+        power = int(match[4] or 1) * (-1 if "/" in match[1] else 1)
         factor *= part[0] ** power
         for name, exponent in part[1]:
             powers[name] = powers.get(name, 0.0) + power * exponent
-        at = found.end()
+        at = match.end()
     return factor, tuple(sorted((name, p) for name, p in powers.items() if p))
 
 

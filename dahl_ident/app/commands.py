@@ -99,8 +99,8 @@ def _linear(model: Mapping[str, str]) -> Iterator[tuple[str, str]]:
             yield name, "free" if how == "free" else model.get(f"{name}_value", "").strip()
 
 
-def _options(given: Mapping[str, str], names: Sequence[str]) -> list[str]:
-    return [word for name in names for word in _option(name, given.get(name, ""))]
+def _options(form: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    return [word for name in names for word in _option(name, form.get(name, ""))]
 
 
 def _option(name: str, value: str) -> list[str]:
@@ -165,12 +165,12 @@ def columns_toml(form: Mapping[str, str]) -> str:
 
 def report_toml(form: Mapping[str, str]) -> str:
     """Return the metadata of the report that the form states, empty fields left out."""
-    given = {name: text.strip() for name, text in form.items() if text.strip()}
-    texts = {k.removeprefix("meta_"): v for k, v in given.items() if k.startswith("meta_")}
+    entries = {name: text.strip() for name, text in form.items() if text.strip()}
+    texts = {k.removeprefix("meta_"): v for k, v in entries.items() if k.startswith("meta_")}
     lines = [f"{name} = {_text(text)}\n" for name, text in texts.items()]
     for channel in ("force", "displacement", "delay"):
         fields = ("name", "serial", "calibration", "uncertainty", "k")
-        one = {f: given[f"{channel}_{f}"] for f in fields if f"{channel}_{f}" in given}
+        one = {f: entries[f"{channel}_{f}"] for f in fields if f"{channel}_{f}" in entries}
         if set(one) - {"k"}:
             lines.append(f"\n[[instruments]]\nchannel = {_text(channel)}\n")
             one.setdefault("name", f"{channel} channel".capitalize())

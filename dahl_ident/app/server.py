@@ -138,11 +138,11 @@ class App:
             last = child.stderr.decode(errors="replace").strip().splitlines()[-1:]
             error = " ".join(["The files could not be read.", *last])
             return {**NOTHING_FOUND, "error": error}
-        found: dict[str, Any] = json.loads(child.stdout)
+        preview: dict[str, Any] = json.loads(child.stdout)
         for name in ("error", "summary"):
-            found[name] = work.in_users_words(found[name])
-        found["notes"] = [work.in_users_words(note) for note in found["notes"]]
-        return found
+            preview[name] = work.in_users_words(preview[name])
+        preview["notes"] = [work.in_users_words(note) for note in preview["notes"]]
+        return preview
 
     async def save_data(self, request: Request) -> Response:
         """Store what the channels are; go on, or show again what can be read."""

@@ -26,11 +26,11 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
     from dahl_ident.data.storage import read_text
 
     try:
-        given = tomllib.loads(read_text(path))
+        content = tomllib.loads(read_text(path))
     except (DataError, tomllib.TOMLDecodeError) as exc:
         raise DataError(f"{path}: no TOML file of options: {exc}") from exc
-    tables = {k: v for k, v in given.items() if isinstance(v, dict)}
-    shared = _named({k: v for k, v in given.items() if k not in tables})
+    tables = {k: v for k, v in content.items() if isinstance(v, dict)}
+    shared = _named({k: v for k, v in content.items() if k not in tables})
     of_command = _named(tables.get(ctx.info_name or "", {}))
     commands = _options_of_commands(ctx)
     known = commands.get(ctx.info_name or "", set())
@@ -60,8 +60,8 @@ def _options_of_commands(ctx: typer.Context) -> dict[str, set[str]]:
     }
 
 
-def _refuse_unknown(path: Path, what: str, given: Iterable[str], known: Collection[str]) -> None:
-    unknown = sorted(set(given) - set(known))
+def _refuse_unknown(path: Path, what: str, names: Iterable[str], known: Collection[str]) -> None:
+    unknown = sorted(set(names) - set(known))
     if unknown:
         raise DataError(
             f"{path}: {what} {', '.join(unknown)}; there are {choices(sorted(known), *unknown)}"

@@ -58,10 +58,10 @@ def numbers(name: str, text: str, unit: str | None = None, sep: str = ":") -> li
 
 def ends(name: str, text: str, unit: str | None = None) -> float | tuple[float, float]:
     """Return the two ends of ``low:high``, or one number."""
-    given = numbers(name, text, unit)
-    if len(given) > 2:
+    values = numbers(name, text, unit)
+    if len(values) > 2:
         raise ValidationError(f"{name} is {text!r}; expected a number, or low:high")
-    return given[0] if len(given) == 1 else (given[0], given[1])
+    return values[0] if len(values) == 1 else (values[0], values[1])
 
 
 def number_or_free(name: str, text: str | None) -> float | None:
@@ -112,9 +112,9 @@ def distribution(name: str, text: str) -> Any:
         )
     parts = [part.rpartition("=") for part in call[2].split(",")]
     try:
-        given = [float(value) for key, _, value in parts if not key]
+        positional = [float(value) for key, _, value in parts if not key]
         by_name = {key.strip(): float(value) for key, _, value in parts if key}
-        frozen = kind(*given, **by_name)
+        frozen = kind(*positional, **by_name)
     except (TypeError, ValueError) as exc:
         raise ValidationError(
             f"{name} is {text!r}, which are not arguments of {call[1]}: {exc}"

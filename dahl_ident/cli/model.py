@@ -96,21 +96,21 @@ class ModelOptions:
     def _friction(self) -> Element:
         from dahl_ident.elements import Dahl
 
-        given = self._given(*_FRICTION)
+        stated = self._given(*_FRICTION)
         if self.element:
-            refuse_with_elements(given)
+            refuse_with_elements(stated)
             return elements(self.element)
-        values: dict[str, Any] = {name: number_or_free(name, text) for name, text in given.items()}
+        values: dict[str, Any] = {name: number_or_free(name, text) for name, text in stated.items()}
         return Dahl(**{name: value for name, value in values.items() if value is not None})
 
     def _given(self, *names: str) -> dict[str, str]:
         return {name: text for name in names if (text := getattr(self, name)) is not None}
 
 
-def refuse_with_elements(given: Mapping[str, Any]) -> None:
+def refuse_with_elements(options: Mapping[str, Any]) -> None:
     """Refuse parameters of the Dahl element if --element describes the friction."""
     refuse(
-        given,
+        options,
         "together with --element; write such values inside the element, as in --element "
         "'dahl(f_max=0.1)'",
     )

@@ -81,12 +81,12 @@ class Bench:
 
     def limits(self) -> dict[str, Any]:
         """Return the limits that were given."""
-        given: dict[str, Any] = {
+        stated: dict[str, Any] = {
             "frequency_hz" if name == "frequency" else name: ends(name, text, unit)
             for name, unit in _LIMITS.items()
             if (text := getattr(self, name)) is not None
         }
-        return given if self.time is None else {**given, "time": self.time}
+        return stated if self.time is None else {**stated, "time": self.time}
 
     def motions(self, sample_rate: float | None) -> dict[str, Any]:
         """Return the arguments of ``plan`` that motions in time, or settled ones, need."""
@@ -203,10 +203,10 @@ def _known(fit: str | None, options: ModelOptions) -> Any:
                 "a saved fit has its model and sensors; leave out the options that describe them"
             )
         return saved_fit(fit)
-    given = options.keywords()
-    if not given["sensors"].are_exact:
+    keywords = options.keywords()
+    if not keywords["sensors"].are_exact:
         raise ValidationError("a plan before any data takes the sensors as exact; leave them out")
-    return as_model(given["model"]).with_free(given["free"])
+    return as_model(keywords["model"]).with_free(keywords["free"])
 
 
 def _pair(option: str, text: str) -> tuple[str, str]:
@@ -219,5 +219,5 @@ def _pair(option: str, text: str) -> tuple[str, str]:
 def _noise(text: str | None) -> Any:
     if text is None or "=" not in text:
         return None if text is None else number("noise", text, "1")
-    given = [_pair("noise", part) for part in text.split(",")]
-    return {name: number(f"noise {name}", value, _LIMITS.get(name, "1")) for name, value in given}
+    parts = [_pair("noise", part) for part in text.split(",")]
+    return {name: number(f"noise {name}", value, _LIMITS.get(name, "1")) for name, value in parts}

@@ -64,18 +64,18 @@ class Plant:
         from dahl_ident.elements import Dahl
 
         names = ("f_max", "sigma", "alpha")
-        given = {n: value for n in names if (value := getattr(self, n)) is not None}
+        stated = {n: value for n in names if (value := getattr(self, n)) is not None}
         others = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
         if self.element:
-            refuse_with_elements(given)
+            refuse_with_elements(stated)
             return in_parallel(elements(self.element), others)
-        missing = [name for name in ("f_max", "sigma") if name not in given]
+        missing = [name for name in ("f_max", "sigma") if name not in stated]
         if missing:
             raise ValidationError(
                 f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma, "
                 "or --element"
             )
-        return in_parallel(Dahl(**given), others)
+        return in_parallel(Dahl(**stated), others)
 
 
 @dataclass(frozen=True)
@@ -186,14 +186,14 @@ def _experiment(plant: Plant, excitation: Excitation, errors: Errors, motion: Mo
     from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
 
     truth = plant.built()
-    given: dict[str, Any] = dict(vars(excitation))
-    as_record = given.pop("record")
+    settings: dict[str, Any] = dict(vars(excitation))
+    as_record = settings.pop("record")
     controlled = excitation.controlled
-    given["levels"] = _numbers(
+    settings["levels"] = _numbers(
         "levels", excitation.levels or _usual_levels(truth, controlled), _UNITS[controlled]
     )
-    given["frequencies_hz"] = _numbers("frequency", given.pop("frequency"), "Hz")
-    steps = SteppedSine(**given)
+    settings["frequencies_hz"] = _numbers("frequency", settings.pop("frequency"), "Hz")
+    steps = SteppedSine(**settings)
     if not as_record:
         table = Table(errors.of("displacement", "1"), errors.of("force", "1"), **vars(motion))
         return Experiment(truth, steps, table=table)

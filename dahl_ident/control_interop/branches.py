@@ -111,25 +111,26 @@ def response_branches(
     """
     friction, linear = split(plant)
     f = positive_array(frequency_hz, "frequency_hz")
-    found = response(plant, f, drive, all_roots=True, steady=steady)
-    if found.steady == "exact":
+    steady_motion = response(plant, f, drive, all_roots=True, steady=steady)
+    if steady_motion.steady == "exact":
         with np.errstate(divide="ignore", invalid="ignore"):
-            growth = np.log(found.multiplier) * found.frequency_hz
-        neutral = np.abs(found.multiplier - 1.0) < NEUTRAL  # a motion that may lie anywhere
-        return Branches(found, np.where(neutral, 0.0, growth))
-    return Branches(found, _slow_growth(friction, linear, found))
+            growth = np.log(steady_motion.multiplier) * steady_motion.frequency_hz
+        # a motion that may lie anywhere
+        neutral = np.abs(steady_motion.multiplier - 1.0) < NEUTRAL
+        return Branches(steady_motion, np.where(neutral, 0.0, growth))
+    return Branches(steady_motion, _slow_growth(friction, linear, steady_motion))
 
 
 def _slow_growth(friction: Model, linear: Model, steady: SteadyResponse) -> FloatArray:
     """Return the rate at which slow changes of one sine grow, 1/s."""
     omega = 2.0 * np.pi * np.asarray(steady.frequency_hz)
-    found = np.asarray(steady.found)
-    N, slope = friction_and_slope(friction, np.where(found, steady.amplitude, 1.0), omega)
+    exists = np.asarray(steady.found)
+    N, slope = friction_and_slope(friction, np.where(exists, steady.amplitude, 1.0), omega)
     w = omega.ravel()
     Z = stiffness_of(linear, w).reshape(omega.shape) + N
     by_s = -1j * stiffness_slope(linear, w).reshape(omega.shape)
     rate = _largest_rate(Z, slope, by_s)
-    return np.where(found, rate, np.nan)
+    return np.where(exists, rate, np.nan)
 
 
 def _largest_rate(Z: ComplexArray, slope: ComplexArray, by_s: ComplexArray) -> FloatArray:

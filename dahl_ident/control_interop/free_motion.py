@@ -65,17 +65,17 @@ def free_motion(plant: Model, amplitude: float, omega: float) -> FreeMotion | No
     --------
     >>> from dahl_ident import Dahl, Damper, Mass, Spring
     >>> plant = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(-0.3) + Spring(0.3)
-    >>> found = free_motion(plant, 8e-4, 9.94)
-    >>> round(found.amplitude, 5), round(found.omega, 3), found.growth_rate < 0.0
+    >>> orbit = free_motion(plant, 8e-4, 9.94)
+    >>> round(orbit.amplitude, 5), round(orbit.omega, 3), orbit.growth_rate < 0.0
     (0.0008, 9.946, True)
     """
     loop = _Loop(plant)
     y = loop.start(amplitude, omega)
     period = loop.turns * np.pi / omega
     for scale in _STARTS:
-        found = loop.closed(y * scale, period)
-        if found is not None:
-            return loop.described(*found, near=(amplitude, omega))
+        orbit = loop.closed(y * scale, period)
+        if orbit is not None:
+            return loop.described(*orbit, near=(amplitude, omega))
     return None
 
 
@@ -125,14 +125,14 @@ class _Loop:
             return last[0]
 
         begin = np.append((y / size)[~at_rest], 1.0)
-        found = least_squares(
+        solution = least_squares(
             missing, begin, slopes, method="lm",
             xtol=1e-14, ftol=1e-14, max_nfev=_EVALUATIONS,
         )  # fmt: skip
-        if not np.abs(found.fun).max() < _CLOSED or found.x[-1] <= 0.0:
+        if not np.abs(solution.fun).max() < _CLOSED or solution.x[-1] <= 0.0:
             return None
-        missing(found.x)
-        return state(found.x), float(found.x[-1]) * period, last[1]
+        missing(solution.x)
+        return state(solution.x), float(solution.x[-1]) * period, last[1]
 
     def _after(self, y: FloatArray, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return state, map and rates after a period, or after half of one with its sign."""
@@ -168,7 +168,7 @@ class _Loop:
 def _followed(element: Element, amplitude: float, omega: float) -> FloatArray:
     """Return an element's states at the peak of a sine that it has followed."""
     values = np.array([[float(v) for v in element.known_values()]])
-    found = settled(
+    loop = settled(
         translate(law_equations(element)), np.array([amplitude]), np.array([omega]), values
     )
-    return np.asarray(found.starts[0, 2:])
+    return np.asarray(loop.starts[0, 2:])

@@ -181,30 +181,30 @@ def limit_cycles(
     N, _ = friction_and_slope(as_model(friction), A)
     omega = _frequencies(linear, float(abs(N[0])), frequency_range_hz)
     L = stiffness_of(linear, omega)
-    found = []
+    crossings = []
     for i, j in _crossings(-L, N):
         cycle = _refine(linear, as_model(friction), A[j], omega[i])
         if cycle is not None and omega[0] <= cycle.omega <= omega[-1]:
-            found.append(cycle)
+            crossings.append(cycle)
     plant = Model(*linear.elements, *as_model(friction).elements)
     approximate = obstacle(plant) if steady == "exact" else "as asked for"
     if not approximate:
-        motions = (free_motion(plant, c.amplitude, c.omega) for c in _distinct(found))
+        motions = (free_motion(plant, c.amplitude, c.omega) for c in _distinct(crossings))
         exact = [
             LimitCycle(m.amplitude, m.omega / (2.0 * np.pi), m.growth_rate, m.share)
             for m in motions
             if m is not None
         ]
         cycles = LimitCycles(_distinct(exact))
-        if found and not cycles:
-            one = _distinct(found)[0]
+        if crossings and not cycles:
+            one = _distinct(crossings)[0]
             cycles.reason = (
                 f"the describing function has one of {one.amplitude:.3g} m at "
                 f"{one.frequency_hz:.3g} Hz, but no periodic motion is near it"
             )
             return cycles
     else:
-        cycles = LimitCycles(_distinct(found))
+        cycles = LimitCycles(_distinct(crossings))
         cycles.approximate = approximate
     if not cycles:
         ends = " to ".join(f"{w / (2.0 * np.pi):.3g}" for w in (omega[0], omega[-1]))

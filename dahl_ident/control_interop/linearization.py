@@ -129,7 +129,7 @@ class LoopMargins:
         """
         values: FloatArray = getattr(self, name)
         if values.ndim < 2:
-            raise ValidationError(f"{name} holds no draws; give loop_margins draws")
+            raise ValidationError(f"{name} holds no draws; give draws= to loop_margins")
         tail = 0.5 * (1.0 - float(array_between(probability, "probability", 0.0, 1.0)))
         flat = values.reshape(-1, self.amplitude.size)
         # inverted_cdf returns one of the values, infinite ones included
@@ -260,8 +260,8 @@ def _margins(loop: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     no_wrap = np.abs(np.diff(angle)) < np.pi
     room_at_180 = _at_zeros(angle, -size, -np.diff(size), no_wrap)
     angle_at_one = _at_zeros(size, angle, turn, np.ones_like(no_wrap))
-    found = np.isfinite(angle_at_one)
-    angle_at_one[found] = np.angle(np.exp(1j * angle_at_one[found]))
+    crosses = np.isfinite(angle_at_one)
+    angle_at_one[crosses] = np.angle(np.exp(1j * angle_at_one[crosses]))
     gain = np.exp(_nearest_to_zero(room_at_180))
     phase = np.degrees(_nearest_to_zero(angle_at_one))
     return gain, phase, np.min(np.abs(1.0 + loop), axis=-1)

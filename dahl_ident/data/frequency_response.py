@@ -158,14 +158,14 @@ class FrequencyResponse(Tabular):
         quality: Mapping[str, ArrayLike] | None = None,
         provenance: Mapping[str, Any] | None = None,
     ) -> None:
-        given = {name: value for name, value in locals().items() if name in COLUMNS}
-        given["frequency_hz"] = frequency = positive_array(frequency_hz, "frequency_hz")
+        columns = {name: value for name, value in locals().items() if name in COLUMNS}
+        columns["frequency_hz"] = frequency = positive_array(frequency_hz, "frequency_hz")
         if frequency.ndim != 1 or frequency.size == 0:
             raise ValidationError(
                 f"frequency_hz: expected one number for each point, got shape {frequency.shape}"
             )
         n = frequency.size
-        values = {name: one.checked(given[name], name, n) for name, one in COLUMNS.items()} | {
+        values = {name: one.checked(columns[name], name, n) for name, one in COLUMNS.items()} | {
             "quantity": one_of(quantity, "quantity", (*QUANTITIES, "backbone")),
             "motion": one_of(motion, "motion", MOTIONS),
             "drive_factor_uncertainty": non_negative_number(
@@ -289,8 +289,8 @@ class FrequencyResponse(Tabular):
         """
         frequency = positive_array(natural_frequency_hz, "natural_frequency_hz")
         stds = [
-            np.broadcast_to(positive_array(given, name), frequency.shape)
-            for name, given in (
+            np.broadcast_to(positive_array(values, name), frequency.shape)
+            for name, values in (
                 ("frequency_std", frequency_std), ("damping_ratio_std", damping_ratio_std)
             )
         ]  # fmt: skip

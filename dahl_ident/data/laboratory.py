@@ -122,15 +122,15 @@ class Metadata:
         return {name: math.sqrt(square) for name, square in squares.items()}
 
 
-def metadata_of(given: Mapping[str, Any] | str | Path | None) -> Metadata:
+def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
     """Return metadata from a mapping or a TOML file."""
-    if given is None or isinstance(given, Mapping):
-        entries, where = given or {}, ""
+    if source is None or isinstance(source, Mapping):
+        entries, where = source or {}, ""
     else:
         try:
-            entries, where = tomllib.loads(read_text(Path(given))), f"{given}: "
+            entries, where = tomllib.loads(read_text(Path(source))), f"{source}: "
         except tomllib.TOMLDecodeError as exc:
-            raise DataError(f"{given}: is not a TOML file: {exc}") from exc
+            raise DataError(f"{source}: is not a TOML file: {exc}") from exc
     texts = _texts(entries, _TEXTS, _LISTS, f"{where}metadata", where)
     ambient, instruments = entries.get("ambient", ()), entries.get("instruments", ())
     if isinstance(ambient, Mapping):  # such as {temperature = "22 °C"}

@@ -182,14 +182,14 @@ class Source:
         """
         exact = [c for c in self.channels if text in (c.name, c.header)]
         loose = [c for c in self.channels if plain(c.name) == plain(text)]
-        for found in (exact, loose):
-            if len(found) > 1:
+        for matches in (exact, loose):
+            if len(matches) > 1:
                 raise DataError(
-                    f"{self.name}: {len(found)} columns are called {text!r}; expected one. "
+                    f"{self.name}: {len(matches)} columns are called {text!r}; expected one. "
                     "Rename them in the file, or count them: 'column 2'"
                 )
-            if found:
-                return found[0]
+            if matches:
+                return matches[0]
         last = [c for c in self.channels if plain(c.short or "") == plain(text)]
         if len(last) > 1:
             paths = listed([c.name for c in last], 20)

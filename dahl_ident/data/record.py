@@ -106,11 +106,11 @@ class Record(Tabular):
         motion: Motion = "translation",
         provenance: Mapping[str, Any] | None = None,
     ) -> None:
-        given = {name: value for name, value in locals().items() if name in RECORD_COLUMNS}
-        seconds = _time(given.pop("time"))
+        columns = {name: value for name, value in locals().items() if name in RECORD_COLUMNS}
+        seconds = _time(columns.pop("time"))
         values: dict[str, Any] = {
             name: Column(finite_array).checked(value, name, seconds.size)
-            for name, value in given.items()
+            for name, value in columns.items()
         }
         for name, samples in values.items():
             size = 0.0 if samples is None else float(np.abs(samples).max())

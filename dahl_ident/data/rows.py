@@ -62,9 +62,9 @@ class Rows:
         other = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
         point = np.empty(self.response.size, dtype=np.intp)
         point[order] = np.concatenate([[0], np.cumsum(other)])
-        own = np.flatnonzero(np.broadcast_to(self.harmonic == 1, shape))[::-1]
+        fundamentals = np.flatnonzero(np.broadcast_to(self.harmonic == 1, shape))[::-1]
         first = np.full(point.size, -1)
-        first[point[own]] = own
+        first[point[fundamentals]] = fundamentals
         row = np.where(first < 0, -1, first % self.n)[point].reshape(shape)
         first_table = row.reshape(-1, self.n)[0]
         return first_table if (row == first_table).all() else row

@@ -195,9 +195,9 @@ def _both(a: Point, b: Point) -> Point:
         return weights[0] * of_a + weights[1] * of_b
 
     repeating = mean(a.repeating, b.repeating)
-    own = [w**2 * (p.joint - p.repeating) for w, p in zip(weights, (a, b), strict=True)]
+    separate = [w**2 * (p.joint - p.repeating) for w, p in zip(weights, (a, b), strict=True)]
     # the degrees of freedom of a sum of variances, as Welch and Satterthwaite have them
-    traces = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in own]
+    traces = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in separate]
     spread = sum((s / sum(traces)) ** 2 / p.dof for s, p in zip(traces, (a, b), strict=True))
     verdicts = zip(a.quality["verdict"], b.quality["verdict"], strict=True)
     quality = {
@@ -216,7 +216,7 @@ def _both(a: Point, b: Point) -> Point:
         amplitude=mean(a.amplitude, b.amplitude),
         drive=mean(a.drive, b.drive),
         response=mean(a.response, b.response),
-        joint=own[0] + own[1] + repeating,
+        joint=separate[0] + separate[1] + repeating,
         repeating=repeating,
         dof=np.asarray(1.0 / spread),
         quality=quality,

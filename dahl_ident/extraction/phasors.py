@@ -206,10 +206,10 @@ class Phasors:
                 scattered(v, _LOOKED_AT)
                 for v in (self.samples.time, self.samples.motion, self.samples.force)
             )
-            own = segment.with_samples(time, np.stack([motion, force]))
+            samples = segment.with_samples(time, np.stack([motion, force]))
             tau = (time - segment.centre) / segment.half_width
-            sine = fit.coefficients.T @ columns(own.theta, tau, fit.orders, fit.trending)
-            left = without(self.transient, own, self.settings).channels - sine
+            sine = fit.coefficients.T @ columns(samples.theta, tau, fit.orders, fit.trending)
+            left = without(self.transient, samples, self.settings).channels - sine
             residual = np.sqrt(np.mean(left**2, axis=1))
         samples_a_cycle = self.samples.time.size / self.cycles
         return quantisation_errors(np.abs(fit.phasors(1)), self.steps, residual, samples_a_cycle)
@@ -338,8 +338,8 @@ class Phasors:
         part = 0.5 * answer * np.eye(2) if k else np.diag([answer, 0.0])
         covariance = part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
         referred = relative * (1.0 + k**2) * abs(N) ** 2
-        own = answer / max(answer + referred, TINY)
-        dof = 1.0 / (own**2 / noise.dof + (1.0 - own) ** 2 / self.noise[1].dof)
+        share = answer / max(answer + referred, TINY)
+        dof = 1.0 / (share**2 / noise.dof + (1.0 - share) ** 2 / self.noise[1].dof)
         return N, covariance, -along * relative * A, dof
 
     def rows(self, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:

@@ -83,8 +83,10 @@ def measure(
             f"{argument('settling_periods')}"
         )
     whole = last_cycles(segment, cycles)
-    own = samples.of(whole)
-    steps = np.array([sensor_step(channel) for channel in (own.motion, own.force)])
+    recorded_samples = samples.of(whole)
+    steps = np.array(
+        [sensor_step(channel) for channel in (recorded_samples.motion, recorded_samples.force)]
+    )
     first = first_cycles(whole, MOST_CYCLES)
     rough = sine_fit(thinned(first), trend=sweep, most=HARMONICS)
     amplitudes = np.abs(rough.phasors(1))
@@ -107,7 +109,9 @@ def measure(
     elif settings.settling_periods is not None:
         dropped = settings.settling_periods
     else:
-        dropped = _settling_periods(rough.segment, transient, cycles, settings, steps, own)
+        dropped = _settling_periods(
+            rough.segment, transient, cycles, settings, steps, recorded_samples
+        )
     used = last_cycles(whole, cycles - dropped)
     phasors = Phasors.of(
         used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep

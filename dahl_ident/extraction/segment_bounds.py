@@ -104,11 +104,11 @@ class _Inside:
         """Return whether samples of the record depart from the sine by more than by chance."""
         basis = self.columns(time)
         sine = basis[2:4] - basis[2:4].mean(axis=1, keepdims=True)  # the mean may wander
-        own = np.linalg.pinv(sine @ sine.T)
+        inverse = np.linalg.pinv(sine @ sine.T)
         left = sine @ (motion - self.coefficients @ basis)
-        explained = float(left @ own @ left)
+        explained = float(left @ inverse @ left)
         onto = sine @ basis.T
-        fitted = 0.5 * float(np.trace(own @ onto @ self.inverse @ onto.T))
+        fitted = 0.5 * float(np.trace(inverse @ onto @ self.inverse @ onto.T))
         bound = highest_by_chance(_BY_CHANCE, self.dof)
         amplitude = float(np.hypot(*self.coefficients[2:4]))
         least = 0.5 * time.size * (_NEGLIGIBLE * amplitude) ** 2

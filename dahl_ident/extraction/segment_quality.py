@@ -79,9 +79,11 @@ def quantisation_errors(
     that follow a sine far more closely than the step were not rounded to it.
     """
     sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
-    own = 0.04 * step**2 * step / np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
+    of_amplitude = (
+        0.04 * step**2 * step / np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
+    )
     rounded = (residual > _UNROUNDED * step) & (residual <= _DITHERED * step)
-    return np.asarray(np.where(rounded, np.sqrt(sampled + own), 0.0))
+    return np.asarray(np.where(rounded, np.sqrt(sampled + of_amplitude), 0.0))
 
 
 def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:

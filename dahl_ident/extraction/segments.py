@@ -138,27 +138,27 @@ def _refuse_drift(segment: Segment) -> None:
     if dof < 1:
         return
     bounds = np.column_stack([cuts[:-1], cuts[1:]])[cycle].ravel()
-    found, _ = sine_in_each(few.theta, few.channels[0], bounds, counts[cycle])
+    phasor, _ = sine_in_each(few.theta, few.channels[0], bounds, counts[cycle])
     phasors = np.zeros(counts.size, dtype=np.complex128)
-    phasors[cycle] = found
+    phasors[cycle] = phasor
     power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
     peak = int(np.argmax(power))
     turns = float(np.fft.fftfreq(power.size)[peak])
-    phases = np.angle(found * np.exp(-2j * np.pi * turns * cycle))
+    phases = np.angle(phasor * np.exp(-2j * np.pi * turns * cycle))
     evenly = True
     if cycle.size >= 2 * _FEWEST_IN_HALF:
         halves = [float(np.polyfit(*half, 1)[0]) for half in _halves(cycle, phases)]
         evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * turns)
     turns += float(np.polyfit(cycle, phases, 1)[0]) / (2.0 * np.pi)
     drift = 2.0 * np.pi * turns * counts.size
-    left = float(np.sum(np.abs(found) ** 2)) - power[peak]
+    left = float(np.sum(np.abs(phasor) ** 2)) - power[peak]
     clear = (power[peak] - power[0]) * dof > 2.0 * highest_by_chance(_BY_CHANCE, dof) * left
     if clear and evenly and abs(drift) > _DRIFTED:
-        given = segment.omega / (2.0 * np.pi)
-        shown = given * (1.0 + turns)
+        stated = segment.omega / (2.0 * np.pi)
+        shown = stated * (1.0 + turns)
         raise ExtractionError(
             f"the motion around t = {segment.centre:.6g} s has {shown:.6g} Hz, not the given "
-            f"{given:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
+            f"{stated:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
             f"expected less than {_DRIFTED:g} rad: give "
             f"{argument('frequency', Placeholder(f'{shown:.6g}'))}, or leave it out"
         )

@@ -167,8 +167,8 @@ class Samples:
         """Return the variance of both channels that the means of a segment do not show."""
         if segment.block == 1:
             return np.zeros(2)
-        own = self.of(segment)
-        whole = np.array([np.var(own.motion), np.var(own.force)], dtype=np.float64)
+        at_samples = self.of(segment)
+        whole = np.array([np.var(at_samples.motion), np.var(at_samples.force)], dtype=np.float64)
         return np.asarray(whole - np.var(segment.channels, axis=1))
 
 

@@ -144,8 +144,8 @@ def plot_frequency_response(
     pair = top, bottom = style.axes_pair(ax)
     lines, markers = style.level_lines(len(levels)), style.level_markers(len(levels))
     labelled = style.labelled_levels(len(levels))
-    given = [*errors, *[(None, None)] * (len(levels) - len(errors))]
-    points = [Points(x, R, *std) for (_, x, R), std in zip(levels, given, strict=True)]
+    with_errors = [*errors, *[(None, None)] * (len(levels) - len(errors))]
+    points = [Points(x, R, *std) for (_, x, R), std in zip(levels, with_errors, strict=True)]
     for i, (part, (label, x, _)) in enumerate(zip(points, levels, strict=True)):
         joined = not fitted and _is_one_curve(x)
         look = lines[i] | ({"marker": marker} if marker else {}) if joined else markers[i]

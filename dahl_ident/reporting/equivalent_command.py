@@ -85,8 +85,8 @@ def _extraction_of(part: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in made.items() if k != "refused"} | {"harmonics": harmonics}
 
 
-def _words(given: Mapping[str, Any]) -> list[str]:
-    pairs = ((f"--{k.replace('_', '-')}", v) for k, v in given.items() if v is not None)
+def _words(options: Mapping[str, Any]) -> list[str]:
+    pairs = ((f"--{k.replace('_', '-')}", v) for k, v in options.items() if v is not None)
     return [word for name, value in pairs for word in (name, str(value))]
 
 
@@ -100,13 +100,13 @@ def _has_text(element: Element) -> bool:
 def _as_text(element: Element) -> str:
     """Return an element as --element takes it, what is usual left out."""
     usual = {p.name: p for p in type(element).parameters}
-    given = [f"name={element.name}"] if element.name else []
+    values = [f"name={element.name}"] if element.name else []
     for label, parameter in zip(element.labels, element.parameters, strict=True):
         if not parameter.free and not parameter.assumed:
-            given.append(f"{label}={parameter.value!r}")
+            values.append(f"{label}={parameter.value!r}")
         elif parameter.free and not (label in usual and usual[label].free):
-            given.append(f"{label}=free")
-    return f"{element.kind}({', '.join(given)})" if given else element.kind
+            values.append(f"{label}=free")
+    return f"{element.kind}({', '.join(values)})" if values else element.kind
 
 
 def _fit(fit: FitResult) -> list[str]:
@@ -162,6 +162,6 @@ def _parameter(parameter: Parameter, problem: Problem) -> Iterator[str]:
     yield from (f"--{name.replace('_', '-')}", value)
 
 
-def _changed(**given: tuple[str, str]) -> list[str]:
-    changed = {name: value for name, (value, usual) in given.items() if value != usual}
+def _changed(**options: tuple[str, str]) -> list[str]:
+    changed = {name: value for name, (value, usual) in options.items() if value != usual}
     return _words(changed)

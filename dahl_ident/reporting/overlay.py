@@ -50,7 +50,7 @@ def overlay(
     if len(units) > 1:
         raise ValidationError(f"the fits measure in different units: {', '.join(sorted(units))}")
     names = _names(fits)
-    given = metadata or Metadata()
+    known = metadata or Metadata()
     changed = changes(dict(zip(names, fits, strict=True)))
     verdicts = tuple(f"{name}: {fit.verdict}" for name, fit in zip(names, fits, strict=True))
     sections = (
@@ -60,20 +60,20 @@ def overlay(
         Section("Verdicts", (Bullets(verdicts),), details=True),
     )
     return Document(
-        title=title or given.title or f"Comparison of {', '.join(names)}",
+        title=title or known.title or f"Comparison of {', '.join(names)}",
         status=max((str(fit.status) for fit in fits), key=RANK),
         verdict=tuple(headline(changed)),
-        header=_header(fits, names, given),
+        header=_header(fits, names, known),
         sections=sections,
         facts={
             "fits": [{"name": n} | fit_facts(fit) for n, fit in zip(names, fits, strict=True)],
             "posteriors": [],
             "changes": [change.to_dict() for change in changed],
-            "metadata": given.facts(),
+            "metadata": known.facts(),
             **origin_facts(fits),
             "command": command,
         },
-        **signed(given, fits[0]),
+        **signed(known, fits[0]),
     )
 
 
@@ -87,10 +87,10 @@ def _names(fits: Sequence[FitResult]) -> list[str]:
 
 
 def _header(
-    fits: Sequence[FitResult], names: Sequence[str], given: Metadata
+    fits: Sequence[FitResult], names: Sequence[str], metadata: Metadata
 ) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    rows = dict(header(fits[:1], given))
-    headers = [dict(header([fit], given)) for fit in fits]
+    rows = dict(header(fits[:1], metadata))
+    headers = [dict(header([fit], metadata)) for fit in fits]
     rows["Model"] = tuple(dict.fromkeys(line for one in headers for line in one["Model"]))
     rows["Data"] = tuple(
         f"{name}: {'; '.join(one['Data'])}" for name, one in zip(names, headers, strict=True)

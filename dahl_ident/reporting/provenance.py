@@ -48,8 +48,8 @@ def options(provenances: Provenances) -> list[tuple[str, str]]:
         given_keys = {k: v for k, v in part.items() if k not in _LISTED_ELSEWHERE}
         for name in ("options", "extraction"):
             inner = given_keys.pop(name, None)
-            given = inner if isinstance(inner, Mapping) else {"": inner}
-            given_keys |= {f"{name} {key}".strip(): value for key, value in given.items()}
+            entries = inner if isinstance(inner, Mapping) else {"": inner}
+            given_keys |= {f"{name} {key}".strip(): value for key, value in entries.items()}
         for key, value in given_keys.items():
             if not isinstance(value, Mapping) and value not in (None, [], ()):
                 stated.setdefault(key, str(value))

@@ -103,26 +103,26 @@ def report(
     place = place_of(path, "a report", FORMATS)
     if not overwrite:
         refuse_existing(place)
-    given = list(results) if isinstance(results, Sequence) else [results]
+    listed = list(results) if isinstance(results, Sequence) else [results]
     known = metadata_of(metadata)
-    _check(given)
-    _check_calibrations(given, known)
+    _check(listed)
+    _check_calibrations(listed, known)
     how: dict[str, Any] = {"title": title, "command": command, "metadata": known}
-    of_tables = [one for one in given if one.problem.settled]
+    of_tables = [one for one in listed if one.problem.settled]
     if record is not None and not of_tables:
         raise ValidationError(
             f"{argument('record', option='waveforms')} is given, the waveforms of a table, but no "
             "result on a table; leave it out"
         )
     if _on_one_table(of_tables):
-        whole = document(given, record=record, **how)
-    elif len(of_tables) < len(given):
+        whole = document(listed, record=record, **how)
+    elif len(of_tables) < len(listed):
         raise ValidationError(
             "fits of several tables are reported together with no fit of records; give those of "
             "one table, or write a report for each"
         )
     else:
-        whole = overlay(given, **how)
+        whole = overlay(listed, **how)
     whole = replace(whole.numbered(), title=_one_line(whole.title))
     if progress is not None:
         whole = _counted(whole, progress)

@@ -71,7 +71,7 @@ def document(
     around = [one.fit for one in drawn if one.fit is not None and not one.problem.settled]
     fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
     tables_first = sorted(results, key=lambda result: not result.problem.settled)
-    first, given = tables_first[0], metadata or Metadata()
+    first, known = tables_first[0], metadata or Metadata()
     repeated = command or equivalent_command(results)
     compared = comparison_of(fits)
     front: list[Section] = []
@@ -88,7 +88,7 @@ def document(
         details += posterior_sections.sections(one)
     data = first.problem.data if isinstance(first.problem, Problem) else None
     return Document(
-        title=title or given.title or title_of(first),
+        title=title or known.title or title_of(first),
         status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=RANK),
         verdict=tuple(
             dict.fromkeys(
@@ -99,7 +99,7 @@ def document(
                 ]
             )
         ),
-        header=header(tables_first, given),
+        header=header(tables_first, known),
         sections=(
             *compared.sections,
             *(section for section in front if section.blocks),
@@ -115,12 +115,12 @@ def document(
             "fits": [fit_facts(fit) for fit in fits if fit.problem.settled],
             "record_fits": [fit_facts(fit) for fit in fits if not fit.problem.settled],
             "posteriors": [one.to_dict() for one in drawn],
-            "metadata": given.facts(),
+            "metadata": known.facts(),
             **compared.facts,
             **origin_facts(tables_first),
             "command": repeated,
         },
-        **signed(given, first),
+        **signed(known, first),
     )
 
 
@@ -133,14 +133,14 @@ def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
     return f": {', '.join(parts)}" if parts else ""
 
 
-def signed(given: Metadata, result: Result) -> dict[str, Any]:
+def signed(metadata: Metadata, result: Result) -> dict[str, Any]:
     """Return what identifies the report on every page, and who signs it."""
     files = [s for s in provenance.sources(result.provenances) if s.read and s.sha256]
-    parts = [f"Report {given.number}"] if given.number else []
+    parts = [f"Report {metadata.number}"] if metadata.number else []
     if files:
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         parts.append(f"{Path(files[0].file).name}, SHA-256 {_short(files[0].sha256)}{more}")
-    return {"identity": " \u00b7 ".join(parts), "signatory": given.signatory}
+    return {"identity": " \u00b7 ".join(parts), "signatory": metadata.signatory}
 
 
 def _short(sha256: str) -> str:
@@ -177,9 +177,11 @@ RANK = list(MARKS).index
 """The place of a status in the order from good to bad."""
 
 
-def header(results: Sequence[Result], given: Metadata) -> tuple[tuple[str, tuple[str, ...]], ...]:
+def header(
+    results: Sequence[Result], metadata: Metadata
+) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Return specimen, model, data, instruments, operator, dates and software."""
-    of_laboratory = given.lines
+    of_laboratory = metadata.lines
     specimen = {"Specimen": of_laboratory.pop("Specimen")}
     first = {
         name: of_laboratory.pop(name)
@@ -279,7 +281,7 @@ def _assumed(fit: FitResult) -> Iterator[str]:
         yield f"Not given, so that the uncertainty counts it: {p.name}, here {here}."
     if exact := taken_as_exact(fit.optimum):
         yield f"Taken as exact: {listed(exact)}."
-    yield from (f"Prior of {name}: {given}." for name, given in tables.priors_in_words(fit))
+    yield from (f"Prior of {name}: {text}." for name, text in tables.priors_in_words(fit))
     yield NOISE[fit.noise]
     for note in provenance.notes(fit.provenances):
         yield f"{note[0].upper()}{note[1:]}."

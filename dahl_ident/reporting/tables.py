@@ -140,30 +140,30 @@ def _dof(dof: float) -> Cell:
 
 def priors(fit: FitResult) -> dict[str, str]:
     """Return the prior of each parameter that has one, as it is typed."""
-    return {name: prior_text(given) for name, given in fit.problem.priors.items()}
+    return {name: prior_text(prior) for name, prior in fit.problem.priors.items()}
 
 
 def priors_in_words(fit: FitResult) -> Iterator[tuple[str, str]]:
     """Yield each parameter with a prior, and the prior as a reader of a certificate knows it."""
     known: Mapping[str, Any] = fit.problem.priors
-    for name, given in known.items():
+    for name, prior in known.items():
         unit = fit.params[name].unit
-        if isinstance(given, tuple):
-            lower, upper = given
+        if isinstance(prior, tuple):
+            lower, upper = prior
             yield name, interval(lower, upper, unit)
-        elif given.dist.name == "norm":
-            mean, std = (float(value) for value in (given.mean(), given.std()))
+        elif prior.dist.name == "norm":
+            mean, std = (float(value) for value in (prior.mean(), prior.std()))
             yield name, f"normal, {with_unit(mean, std, unit)}"
         else:
-            yield name, prior_text(given)
+            yield name, prior_text(prior)
 
 
-def prior_text(given: Any) -> str:
+def prior_text(prior: Any) -> str:
     """Return bounds or a frozen distribution as they are typed."""
-    if isinstance(given, tuple):
-        return ":".join(map(repr, given))
-    arguments = [*map(repr, given.args), *(f"{k}={v!r}" for k, v in given.kwds.items())]
-    return f"{given.dist.name}({', '.join(arguments)})"
+    if isinstance(prior, tuple):
+        return ":".join(map(repr, prior))
+    arguments = [*map(repr, prior.args), *(f"{k}={v!r}" for k, v in prior.kwds.items())]
+    return f"{prior.dist.name}({', '.join(arguments)})"
 
 
 def parameters(

@@ -200,9 +200,9 @@ class AmplitudeRamp:
         return run.finish()
 
 
-def _numbers(given: Sequence[float], name: str) -> tuple[float, ...]:
+def _numbers(numbers: Sequence[float], name: str) -> tuple[float, ...]:
     """Return one or more positive numbers as a tuple."""
-    values = positive_array(given, name)
+    values = positive_array(numbers, name)
     if values.ndim != 1 or values.size == 0:
         raise ValidationError(f"{name}: expected some numbers, got shape {values.shape}")
     return tuple(values.tolist())

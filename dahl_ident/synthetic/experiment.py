@@ -225,23 +225,23 @@ def _parsed(loads: Callable[[str], Any], text: str, form: str) -> Any:
         raise DataError(f"the experiment is not {form}: {exc}") from exc
 
 
-def _built(cls: type[_T], given: Mapping[str, Any], where: str) -> _T:
+def _built(cls: type[_T], entries: Mapping[str, Any], where: str) -> _T:
     """Return the dataclass that plain data describe."""
-    return cls(**_checked(given, cls, where))
+    return cls(**_checked(entries, cls, where))
 
 
-def _checked(given: Any, cls: type[Any], where: str) -> dict[str, Any]:
+def _checked(entries: Any, cls: type[Any], where: str) -> dict[str, Any]:
     """Return plain data as arguments of a dataclass, or name the keys that do not fit."""
-    if not isinstance(given, Mapping):
-        raise DataError(f"{where} is {given!r}; expected a table of named values")
+    if not isinstance(entries, Mapping):
+        raise DataError(f"{where} is {entries!r}; expected a table of named values")
     known = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
-    unknown = [key for key in given if key not in known]
-    missing = [key for key, required in known.items() if required and key not in given]
+    unknown = [key for key in entries if key not in known]
+    missing = [key for key, required in known.items() if required and key not in entries]
     if unknown or missing:
         faults = [f"the unknown {', '.join(unknown)}"] if unknown else []
         faults += [f"no {', '.join(missing)}"] if missing else []
         raise DataError(f"{where} has {' and '.join(faults)}; expected {', '.join(known)}")
-    return dict(given)
+    return dict(entries)
 
 
 def _plain(value: Any) -> Any:

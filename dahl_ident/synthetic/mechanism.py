@@ -72,8 +72,8 @@ class Mechanism:
                 "friction alone slides without bound under a force above f_max; give the plant a "
                 "mass, a damper or a spring, or control its displacement"
             )
-        polynomial, rest = self.linear.split()
-        if np.any(rest.numerator) or any(
+        polynomial, proper = self.linear.split()
+        if np.any(proper.numerator) or any(
             law.branch(_values(law), 0.0, np.zeros(1)) is None for law in self.laws
         ):
             raise ModelError(
@@ -87,7 +87,7 @@ class Mechanism:
 
     def force_under(self, displacement: Waveform, progress: Progress | None = None) -> Signal:
         """Return the force F(t) for a displacement x(t), from rest."""
-        polynomial, rest = self.linear.split()
+        polynomial, proper = self.linear.split()
         if polynomial.size > 3:
             raise ModelError(
                 f"the linear part's dynamic stiffness grows as s^{polynomial.size - 1}; under a "
@@ -95,10 +95,10 @@ class Mechanism:
             )
         q0, q1, q2 = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
         parts: list[Signal] = [_law_force(law, displacement) for law in self.laws]
-        if np.any(rest.numerator):
+        if np.any(proper.numerator):
             import control
 
-            system = control.tf(rest.numerator, rest.denominator)
+            system = control.tf(proper.numerator, proper.denominator)
             element = LinearSystem(system, quantity="dynamic_stiffness")
             parts.append(EngineMotion(law_equations(element), (), displacement, progress))
 

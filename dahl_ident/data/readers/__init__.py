@@ -155,8 +155,8 @@ def read_frequency_response(
             frequency_hz=frequency_hz,
             passive=passive,
         )
-        given = _given(columns=columns, **entries, sheet=sheet, **vars(options))
-        part = response_from(open_source(one, sheet, given), mapped, options)
+        stated = _given(columns=columns, **entries, sheet=sheet, **vars(options))
+        part = response_from(open_source(one, sheet, stated), mapped, options)
         for name, label, labels in (("level", level, part.level), ("run", options.run, part.run)):
             if label is not None and labels is not None and any(v != label for v in labels):
                 raise DataError(

@@ -218,9 +218,9 @@ def _recognised(file: File) -> File:
 
 
 def _format(file: File, head: bytes, suffix: str) -> str:
-    for magic, found in _MAGIC:
+    for magic, kind in _MAGIC:
         if head.startswith(magic):
-            return _archive(file, suffix) if found == "zip" else found
+            return _archive(file, suffix) if kind == "zip" else kind
     # HDF5 may begin behind a block of the user's own: of 512 bytes, 1024, 2048, ...
     if suffix in (".h5", ".hdf5") and any(file.data.startswith(_HDF5, 512 << k) for k in range(12)):
         return "hdf5"

@@ -172,10 +172,10 @@ def _bare(cell: str) -> str | None:
 def are_units(cells: Sequence[str]) -> bool:
     """Return whether each cell is empty or a unit, and some is one."""
     try:
-        found = [parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None]
+        units = [parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None]
     except UnitError:
         return False
-    return bool(found)
+    return bool(units)
 
 
 def named_channels(

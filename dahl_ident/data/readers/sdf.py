@@ -109,7 +109,7 @@ class _Sdf:
                 f"its results take {sum(expected)} bytes, and {len(numbers)} are there (results "
                 "of several scans are not read)"
             )
-        found: list[Channel] = []
+        read: list[Channel] = []
         doubts: list[str] = []
         notes: list[str] = []
         at = 0
@@ -130,12 +130,12 @@ class _Sdf:
                     factor, unit = 1.0, result.unit
                 is_response = result.kind == _RESPONSE
                 name = result.title + (f" {k + 1}" if result.vectors[1] > 1 else "")
-                found.append(axis)
+                read.append(axis)
                 role = "response" if is_response else None
-                found.append(Channel(name, factor * values, unit if is_response else None, role))
-        found += self.deviations(results, found, notes)
+                read.append(Channel(name, factor * values, unit if is_response else None, role))
+        read += self.deviations(results, read, notes)
         return self.file.source(
-            "SDF", merged_axes(found), row_name=lambda i: f"sample {i}",
+            "SDF", merged_axes(read), row_name=lambda i: f"sample {i}",
             notes=tuple(notes), doubts=tuple(doubts),
         )  # fmt: skip
 
@@ -211,12 +211,14 @@ class _Sdf:
         return factor, f"({units[0]})/({units[1]})" if all(units) else units[0] or None
 
     def deviations(
-        self, results: list[_Result], found: list[Channel], notes: list[str]
+        self, results: list[_Result], channels: list[Channel], notes: list[str]
     ) -> Iterator[Channel]:
         """Yield the standard deviation that the coherence of averages gives a response."""
-        responses = [c for c in found if c.role == "response"]
+        responses = [c for c in channels if c.role == "response"]
         kinds = [r.kind for r in results for _ in range(r.vectors[1])]
-        coherences = [c for c, kind in zip(found[1::2], kinds, strict=True) if kind == _COHERENCE]
+        coherences = [
+            c for c, kind in zip(channels[1::2], kinds, strict=True) if kind == _COHERENCE
+        ]
         if len(responses) != 1 or len(coherences) != 1 or self.averages < 2:
             return
         coherence = np.asarray(coherences[0].values, dtype=np.float64)
