@@ -8,14 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dahl_ident.data.storage import write_whole
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.results.export import c_header, numbers, simulators
-
-if TYPE_CHECKING:
-    from dahl_ident.results.result import Result
 
 FORMATS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "mujoco": ("joint with LuGre friction, MJCF", simulators.mujoco),
@@ -33,7 +30,7 @@ DRAWS = "draws"
 
 
 def export(
-    result: Result,
+    result: Any,
     to: str,
     path: str | Path | None = None,
     *,
