@@ -23,7 +23,7 @@ def test_the_damper_shows_its_misfit() -> None:
     data = di.FrequencyResponse.concatenate(
         [di.extract(measured(name), harmonics=(1,)) for name in FILES]
     )
-    posterior = di.posterior(data, di.Dahl(), seed=1, ess=500.0, uncertainty="noise")
+    posterior = di.posterior(data, di.Dahl(), seed=1, ess=300.0, uncertainty="noise")
     assert posterior.converged
     size = next(check for check in posterior.checks if check.statistic == "size")
     assert not size.passed

@@ -281,7 +281,7 @@ def test_sample_tells_the_posterior(run: Runner) -> None:
 
 def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    options = ("sample", "-", "--prior", "f_max=0.01:1")
+    options = ("sample", "-", "--prior", "f_max=0.01:1", "--alpha", "1")
     told = json.loads(run(*options, "--method", "grid", "--json", stdin=table).out)
     assert told["converged"]
     assert told["error"] < 1e-3

@@ -20,7 +20,7 @@ from benchmarks.coverage import (
 def test_intervals_cover_and_verdicts_are_right(index: int) -> None:
     count, bootstrapped, replicates = SMALL
     if index in (2, 5):  # long profiles of a hidden spring; five parameters of a plant
-        count, bootstrapped = count // 4, 0
+        count, bootstrapped = count // 8, 0
     table = run(count, bootstrapped, replicates, [index], processes=1)
     assert not [text for row in table for text in row.failures]
 

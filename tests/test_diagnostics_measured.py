@@ -132,7 +132,7 @@ class TestBeam:
     def fitted(beam: FrequencyResponse, controlled: str) -> FitResult:
         data = beam.select(level=[label for label in beam.levels if controlled in label])
         if controlled == "Force":  # exact motions, row by row
-            data = data.select(rows=np.arange(data.n) % 8 == 0)
+            data = data.select(rows=np.arange(data.n) % 24 == 0)
         return fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
 
     @pytest.mark.parametrize(

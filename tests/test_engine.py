@@ -279,7 +279,7 @@ def test_derivatives_along_a_history_jump_at_kinks() -> None:
 
 def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
     """Several Jenkins elements, by parameters and by the first state."""
-    n, interval = 80, 0.01
+    n, interval = 40, 0.01
     times: FloatArray = interval * np.arange(n, dtype=float)
     omega = 2.0 * np.pi * np.array([3.0, 5.0, 8.0]) / (n * interval)
 

@@ -197,11 +197,11 @@ def test_a_level_across_the_cuts_is_one_point(
 
 
 def test_errors_of_joined_parts_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scatter of 40 records over the stated variance; chi-square bounds of 1 in 1000."""
+    """Scatter of 20 records over the stated variance; chi-square bounds of 1 in 1000."""
     exact = FRICTION.describing_function(2e-3)
     errors, stated, dof = [], [], []
     monkeypatch.setattr(sources, "_PIECE", 3000)
-    for seed in range(40):
+    for seed in range(20):
         path = tmp_path / f"{seed}.h5"
         stored(path, record(2e-3, n=9000, seed=seed))
         data = extract(path, frequency=FREQUENCY, harmonics=[1])
@@ -211,7 +211,7 @@ def test_errors_of_joined_parts_hold(tmp_path: Path, monkeypatch: pytest.MonkeyP
         errors.append(data.response[0] - exact)
         stated.append(np.trace(data.covariance[0]))
         dof.append(data.dof[0])
-    assert 0.57 < np.mean(np.abs(errors) ** 2) / np.mean(stated) < 1.66
+    assert 0.44 < np.mean(np.abs(errors) ** 2) / np.mean(stated) < 1.84
     assert np.mean(dof) > 60.0  # three parts of about 40 each, were they alike
 
 

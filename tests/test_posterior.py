@@ -47,7 +47,7 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
 @pytest.mark.parametrize("name", scenarios())
 def test_sampling_agrees_with_integration(name: str) -> None:
     data, model, options = scenarios()[name]
-    drawn = di.posterior(data, model, seed=3, ess=400.0, **options, uncertainty="noise")
+    drawn = di.posterior(data, model, seed=3, ess=200.0, **options, uncertainty="noise")
     grid = di.posterior(data, model, **options, method="grid", uncertainty="noise")
     assert drawn.converged
     ess = drawn.convergence.ess

@@ -37,7 +37,7 @@ def fit() -> di.FitResult:
 
 @pytest.fixture(scope="module")
 def posterior(fit: di.FitResult) -> Posterior:
-    return di.posterior(fit, seed=3)
+    return di.posterior(fit, seed=3, ess=500.0, uncertainty="noise")
 
 
 @pytest.fixture(scope="module")
