@@ -35,6 +35,7 @@ from dahl_ident.engine.radau import (
 )
 
 _NEWTON, _SOLVED = 15, 1e-7  # iterations of the stages; the change whose square is rounding
+_SIDED = 0.1  # change of a switching function over itself, whose sign is then known
 _SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
 _LOCATED = 1e-14  # rad: shorter steps are none
 _MOST = 4000  # steps of a half cycle
@@ -118,7 +119,7 @@ def _choose_sides(f, cosine, sine, F, at):
 @compiled
 def _solve(f, psi, h, F, at):
     """Solve for the changes of the force at the stages from a guess; False if not found."""
-    w, o, omega = at.w, at.o, at.numbers[1]
+    w, o, omega, found = at.w, at.o, at.numbers[1], False
     for i in range(STAGES):
         at.cosines[i], at.sines[i] = np.cos(psi + NODES[i] * h), np.sin(psi + NODES[i] * h)
     for _ in range(_NEWTON):
@@ -139,19 +140,23 @@ def _solve(f, psi, h, F, at):
             at.columns[i, 0] = value
         if not eliminate(at.matrix, at.columns, STAGES, 1):
             return False
-        largest, size, total = 0.0, abs(F), 0.0
+        largest, size, total, sided = 0.0, abs(F), 0.0, True
         for i in range(STAGES):
             at.stages[i] += at.columns[i, 0]
             total += abs(at.columns[i, 0])
             for e in range(at.k):
-                at.functions[i, e] += at.turns[i, e] * at.columns[i, 0]
+                change = at.turns[i, e] * at.columns[i, 0]
+                at.functions[i, e] += change
+                value = max(abs(at.functions[i, e]), NEAR * at.scale[e])
+                sided = sided and abs(change) <= _SIDED * value
             largest = max(largest, abs(at.columns[i, 0]))
             size = max(size, abs(F + at.stages[i]))
         if not total < np.inf:  # nor not a number
             return False
-        if largest <= _SOLVED * max(size, _FLOOR * at.numbers[3]):
-            return True
-    return False
+        found = largest <= _SOLVED * max(size, _FLOOR * at.numbers[3])
+        if found and sided:
+            break
+    return found
 
 
 @compiled
