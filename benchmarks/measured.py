@@ -18,7 +18,6 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.fitting import solve
-from dahl_ident.fitting.record_search import solve_records
 from dahl_ident.problem import Problem
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -104,7 +103,7 @@ def damper() -> None:
     for name, records in names.items():
         model = di.Backlash(di.Dahl(asymmetry=None)) + di.Mass() + di.Damper()
         problem = RecordProblem(records, model, output="force")
-        first = solve_records(problem).values
+        first = solve(problem).values
         cells = []
         for dropped in ((), ("drift",), ("drift", "offset")):
             values = without(problem, first, dropped) if dropped else first

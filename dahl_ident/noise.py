@@ -475,3 +475,24 @@ def _amplitude_error(rows: Rows) -> AmplitudeError | None:
 def _first(bad: NDArray[np.bool_]) -> str:
     """Return the index of the first bad row, of the first bad table where several are stacked."""
     return str([int(i) for i in np.argwhere(bad)[0]])
+
+
+def squares_of(residuals: FloatArray) -> FloatArray:
+    """Return the sum of squares of the two residuals of each row, (..., 2 n) -> (..., n)."""
+    return np.asarray(residuals[..., 0::2] ** 2 + residuals[..., 1::2] ** 2)
+
+
+def weighted(rows: FloatArray, m: int, size: FloatArray, along: FloatArray) -> FloatArray:
+    """Return residuals times `size`, derivatives d of each pair y as size d + along y (y' d).
+
+    `rows` are residuals and, below them, their derivatives, (..., 1 + P, k); what stands after
+    the first `m` residuals, those of priors, stays.
+    """
+    first, second = rows[..., :1, 0:m:2], rows[..., :1, 1:m:2]
+    by_first, by_second = rows[..., 1:, 0:m:2], rows[..., 1:, 1:m:2]
+    lever = along[..., None, :] * (first * by_first + second * by_second)
+    result = rows.copy()
+    result[..., :m] *= np.repeat(size, 2, axis=-1)[..., None, :]
+    result[..., 1:, 0:m:2] += first * lever
+    result[..., 1:, 1:m:2] += second * lever
+    return result

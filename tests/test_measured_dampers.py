@@ -20,7 +20,7 @@ from dahl_ident import (
     Spring,
     read_record,
 )
-from dahl_ident.fitting.record_search import solve_records
+from dahl_ident.fitting import solve
 from dahl_ident.problem import RecordProblem
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(
 def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], float]:
     """Return the estimates, and the share of the force's rms that is left."""
     problem = RecordProblem(records, model, output="force")
-    found = solve_records(problem)
+    found = solve(problem)
     left = np.concatenate(found.problem.split_residuals(found.values))
     share = np.sqrt(np.mean(left**2) / np.mean(np.concatenate(problem.measured) ** 2))
     return dict(zip(problem.names, found.values.tolist(), strict=True)), float(share)

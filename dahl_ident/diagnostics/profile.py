@@ -304,7 +304,7 @@ class Profiler:
             self._logarithmic,
             self._problem.n_residuals,
             tolerance_factor=_TOLERANCE_FACTOR,
-            enough=_ENOUGH,
+            enough=lambda _: _ENOUGH,
             steps=_SEARCH_STEPS,
             accuracy=self._problem.accuracy,
         ).theta

@@ -39,7 +39,6 @@ from dahl_ident.fitting.optimum import (
     estimated_scale,
     information_of,
     inverse,
-    scale_ratio,
 )
 from dahl_ident.fitting.record_search import Tell
 from dahl_ident.fitting.record_start import record_starts
@@ -149,14 +148,13 @@ def solve_ipopt(
     dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
     if adapts and relations.texts:
 
-        def excess(scale: float) -> float:
+        def again(scale: float) -> tuple[FloatArray, int]:
             nonlocal target, found
             target = replace(target, scale=scale)
             found = _descend(target, found.theta, relations, found.evaluations)
-            rho = loss_named(loss, problem.parts)
-            return float(np.log(scale_ratio(problem, found.theta, scale, rho, dof)))
+            return found.theta, dof
 
-        agreed_scale(excess, target.scale)
+        agreed_scale(problem, loss_named(loss, problem.parts), again, target.scale)
     return _ended(target, found, relations, begin)
 
 

@@ -27,6 +27,10 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
 """(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
+Bounds = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""theta (S, P) -> between which coordinates the next ones may lie."""
+Fall = Callable[[FloatArray], FloatArray | float]
+"""Costs (S,) -> their falls that are not worth a step."""
 
 _EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
 _FIRST_DAMPING = 1e-9  # almost nothing: the first step is that of Gauss and Newton
@@ -126,10 +130,10 @@ def minimise(
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None = None,
     owner: IntArray | None = None,
     tolerance_factor: float = 1.0,
-    enough: float = 0.0,
+    enough: Fall | None = None,
     steps: int = 80,
     accuracy: float = EXPLICIT,
-    bounds: tuple[FloatArray, FloatArray] | None = None,
+    bounds: Bounds | None = None,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
@@ -137,8 +141,8 @@ def minimise(
     Searches that leave the region `inside`, which is called like `evaluate`, end there, not
     converged; so do those that are still higher after twice the steps in which another one of the
     same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
-    search has converged; `enough` is a fall of the cost that is not worth a step, however long.
-    `accuracy` is that of predictions, relative to the data. No step leads beyond `bounds` of
+    search has converged; `enough` gives the fall of a cost that is not worth a step, however long.
+    `accuracy` is that of predictions, relative to the data. No step leads beyond the `bounds` at
     theta; a coordinate at its bound that would go on stays there.
     """
     owner = np.arange(len(theta)) if owner is None else owner
@@ -202,10 +206,10 @@ def _minimise(
     inside: Callable[[FloatArray, IntArray | None], BoolArray] | None,
     owner: IntArray,
     tolerance_factor: float,
-    enough: float,
+    enough: Fall | None,
     steps: int,
     accuracy: float,
-    bounds: tuple[FloatArray, FloatArray] | None,
+    bounds: Bounds | None,
 ) -> Minima:
     S, P = theta.shape
     unseen_change = _UNSEEN if accuracy <= EXPLICIT else _OF_ACCURACY * accuracy
@@ -222,7 +226,7 @@ def _minimise(
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
-        settled |= predicted < enough
+        settled |= enough is not None and predicted < enough(at.cost)
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         which = None if active.size == S else active
@@ -299,7 +303,7 @@ def _step(
     at: _State,
     damping: FloatArray,
     logarithmic: BoolArray,
-    bounds: tuple[FloatArray, FloatArray] | None,
+    bounds: Bounds | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the next step, its squared length, the fall of cost predicted, the longest log step.
 
@@ -311,7 +315,7 @@ def _step(
     H = at.hessian / (size[:, :, None] * size[:, None, :])
     g = at.gradient / size
     if bounds is not None:
-        low, high = bounds
+        low, high = bounds(at.theta)
         held = ((at.theta <= low) & (g > 0.0)) | ((at.theta >= high) & (g < 0.0))
         g = np.where(held, 0.0, g)
         H = np.where(held[:, :, None] | held[:, None, :], np.eye(P), H)

@@ -344,7 +344,7 @@ def estimated_scale(
     return np.maximum(np.sqrt(variance), problem.rounding)
 
 
-def scale_ratio(
+def _scale_ratio(
     problem: BaseProblem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
 ) -> float:
     """Return the scale that the residuals at `theta` have, over the `scale` that was assumed.
@@ -358,14 +358,20 @@ def scale_ratio(
     return max(float(np.sqrt(variance)), float(problem.rounding) / scale)
 
 
-def agreed_scale(excess: Callable[[float], float], scale: float) -> float:
+def agreed_scale(
+    problem: BaseProblem,
+    loss: Loss | None,
+    search: Callable[[float], tuple[FloatArray, int]],
+    scale: float,
+) -> float:
     """Return the noise's scale on which a search and its residuals agree.
 
-    `excess` searches with a scale and returns ln of the scale of what is left over it.
+    `search` takes a scale and returns where it ends with it, and the degrees of freedom there.
     """
     step, last = 0.0, 0.0
     for _ in range(_RESCALINGS):
-        now = excess(scale)
+        theta, dof = search(scale)
+        now = float(np.log(_scale_ratio(problem, theta, scale, loss, dof)))
         if abs(now) < _SAME_SCALE or not np.isfinite(now):
             break
         # the secant's step where it goes the same way, else the plain one

@@ -18,10 +18,10 @@ EXACT = 1e-12  # share of variance left that is rounding
 LOOSE = 1e4  # of the step at which a search of a long record has converged
 ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
 _STAGNANT = 0.01  # relative fall of the cost in as many steps, below which more lead nowhere
-WORTHLESS = 1e-5  # fall of the cost, in units of the noise's variance
+WORTHLESS = 1e-5  # fall of the cost, over the residuals' variance
 SETTLED = 0.03  # step in standard errors that no longer matters
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is not chance
-STEPS = 60  # at most; a search without convergence is not an estimate
+STEPS = 75  # at most; a search without convergence is not an estimate
 
 
 class Descent:
@@ -34,18 +34,15 @@ class Descent:
 
     def descend(self, problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
         """Return the minimum near a start; first roughly, then to a small part of the noise."""
-        end = self.minimise(problem, theta[None], 0.0, ROUGH)
-        if bool(end.converged[0]) or not np.isfinite(end.cost[0]) or steps == ROUGH:
-            return end
-        noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+        begin, before = theta[None], np.inf
         for _ in range(0, steps, ROUGH):
-            before = float(end.cost[0])
-            bounds = problem.start_bounds(problem.to_values(end.theta[0]))
-            end = self.minimise(problem, end.theta, WORTHLESS * noise, ROUGH, bounds)
-            if bool(end.converged[0]):
+            end = self.minimise(problem, begin, ROUGH, bounded=before < np.inf)
+            if bool(end.converged[0]) or not np.isfinite(end.cost[0]) or steps == ROUGH:
                 return end
             if problem.output == "motion" and end.cost[0] > (1.0 - _STAGNANT) * before:
                 break
+            begin, before = end.theta, float(end.cost[0])
+        noise = 2.0 * float(end.cost[0]) / problem.n_residuals
         # where a motion comes to rest, errors of its integration hide the last falls of the cost
         with np.errstate(all="ignore"):
             at = problem.quadratic(end.theta[0], self.scale, self.rho)
@@ -58,26 +55,28 @@ class Descent:
         return replace(end, converged=np.array([bool(left < SETTLED**2 * noise)]))
 
     def minimise(
-        self,
-        problem: RecordProblem,
-        begin: FloatArray,
-        enough: float,
-        most: int,
-        bounds: tuple[FloatArray, FloatArray] | None = None,
+        self, problem: RecordProblem, begin: FloatArray, most: int, *, bounded: bool = False
     ) -> Minima:
-        """Return the minimum near a start, shape (1, P), after so many steps at most."""
+        """Return the minimum near a start, shape (1, P), after so many steps at most.
+
+        With first states `bounded`, which a search from far off must not be: it would end there.
+        """
+
+        def within(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+            return problem.start_bounds(problem.to_values(at[0]))
+
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
         else:
             end = minimise(
                 lambda at, _which: problem.quadratic(at, self.scale, self.rho),
-                begin if bounds is None else np.clip(begin, *bounds),
+                begin,
                 problem.space.relative,
                 problem.n_residuals,
                 tolerance_factor=LOOSE,
-                enough=enough,
+                enough=lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals,
                 steps=most,
-                bounds=bounds,
+                bounds=within if bounded else None,
             )
         self.evaluations += int(end.evaluations[0])
         return end

@@ -11,7 +11,6 @@ from dahl_ident.fitting.record_descent import (
     SETTLED,
     SLOW,
     STEPS,
-    WORTHLESS,
     Descent,
     by_chance,
     correlation,
@@ -113,7 +112,7 @@ def weighted(
     for _ in range(_REPEATS):
         white = white.weighted(prediction_error_filter(residuals))
         theta = end.theta
-        end = search.minimise(white, theta, WORTHLESS * share, STEPS)
+        end = search.minimise(white, theta, STEPS)
         if not end.converged[0]:
             return problem, plain
         change = end.theta[0] - theta[0]

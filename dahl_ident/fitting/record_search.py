@@ -9,11 +9,11 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.behaviour import Behaviour
-from dahl_ident.errors import FitError, FitInterrupted, ModelError, argument, choices
+from dahl_ident.errors import FitError, FitInterrupted, argument
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.losses import loss_named
-from dahl_ident.fitting.optimum import Optimum, agreed_scale, scale_ratio
+from dahl_ident.fitting.optimum import Optimum, agreed_scale
 from dahl_ident.fitting.record_descent import EXACT, LOOSE, ROUGH, SLOW, STEPS, Descent, correlation
 from dahl_ident.fitting.record_refinement import aligned, weighted, without_noise
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
@@ -60,47 +60,15 @@ class _Trace:
 
 def solve_records(
     problem: RecordProblem,
-    *,
-    method: str = "lm",
-    loss: str = "linear",
-    start: Mapping[str, float] | None = None,
-    tell: Tell | None = None,
+    method: str,
+    loss: str,
+    start: Mapping[str, float],
+    tell: Tell | None,
 ) -> Optimum:
-    """Return the least-squares estimate.
+    """Return the least-squares estimate; see :func:`~dahl_ident.fitting.search.solve`.
 
-    Parameters
-    ----------
-    problem : RecordProblem
-        What to solve.
-    method, loss : str
-        As for :func:`~dahl_ident.fitting.search.solve`.
-    start : mapping of str to float, optional
-        Values that the search begins with; it then looks at no other start.
-    tell : callable, optional
-        Called after each evaluation with their number and the share of variance left.
-
-    Returns
-    -------
-    Optimum
-
-    Raises
-    ------
-    FitInterrupted
-        If stopped from the keyboard; its `result` is the best Optimum so far.
-    FitError
-        If there are fewer samples than parameters, or no start gives a finite motion.
-    ModelError
-        If `start` names a parameter that is not free.
+    Where all parameters of the model are started, no other start is looked at.
     """
-    if problem.n_residuals <= len(problem.parameters):
-        raise FitError(
-            f"{problem.n_residuals} samples are fewer than the {len(problem.parameters)} unknowns"
-        )
-    unknown = [name for name in start or () if name not in problem.names]
-    if unknown:
-        raise ModelError(
-            f"start names {', '.join(unknown)}; the unknowns are {choices(problem.names, *unknown)}"
-        )
     problem.watch = trace = _Trace(tell)
     try:
         found = _Search(method, loss).solved(problem, start)
@@ -170,10 +138,10 @@ def _optimum(problem: RecordProblem, end: Minima, scale: float, method: str, los
 class _Search(Descent):
     """One search, from starts to the estimate with what is taken out of the records."""
 
-    def solved(self, problem: RecordProblem, start: Mapping[str, float] | None) -> Optimum:
+    def solved(self, problem: RecordProblem, start: Mapping[str, float]) -> Optimum:
         """Return the optimum of a problem."""
         steps, begin = STEPS, None
-        if start is not None and all(p.name in start for p in problem.free):
+        if all(p.name in start for p in problem.free):
             begin = [start[p.name] for p in problem.free]
         elif problem.n_residuals > 2 * _SHORT[problem.output]:
             part = problem.shortened(_SHORT[problem.output])
@@ -201,17 +169,17 @@ class _Search(Descent):
         self.rho, end = loss_named(self.loss, problem.parts), plain
         dof = problem.n_residuals - plain.theta.shape[1]
 
-        def excess(scale: float) -> float:
+        def again(scale: float) -> tuple[FloatArray, int]:
             nonlocal end
             self.scale = scale
             end = self.descend(problem, end.theta[0], STEPS)
-            return float(np.log(scale_ratio(problem, end.theta[0], scale, self.rho, dof)))
+            return end.theta[0], dof
 
         typical = float(np.median(problem.squares(plain.theta[0]))) ** 0.5 / _MEDIAN
-        agreed_scale(excess, max(typical, float(problem.rounding)))
+        agreed_scale(problem, self.rho, again, max(typical, float(problem.rounding)))
         return end
 
-    def searched(self, problem: RecordProblem, start: Mapping[str, float] | None) -> Minima:
+    def searched(self, problem: RecordProblem, start: Mapping[str, float]) -> Minima:
         """Return the best end of searches from automatic starts, some of their values given."""
         try:
             best = self.best(problem, _changed(record_starts(problem, 2 * STARTS), problem, start))
@@ -237,7 +205,7 @@ class _Search(Descent):
         driven = problem.output == "motion" and len(starts) > 1
         for one in starts:
             theta = problem.to_search(one)
-            end = self.minimise(problem, theta[None], 0.0, _COMPARED) if driven else None
+            end = self.minimise(problem, theta[None], _COMPARED) if driven else None
             if end is None or 2.0 * end.cost[0] < _GOOD * problem.n_residuals:
                 end = self.descend(problem, theta if end is None else end.theta[0], steps)
             finite += bool(np.isfinite(end.cost[0]))
@@ -308,11 +276,9 @@ def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
     return full
 
 
-def _changed(
-    starts: FloatArray, problem: RecordProblem, start: Mapping[str, float] | None
-) -> FloatArray:
+def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, float]) -> FloatArray:
     """Return starts with some of their values given."""
-    for name, value in (start or {}).items():
+    for name, value in start.items():
         if name in problem.names:
             starts[:, problem.names.index(name)] = value
     return starts

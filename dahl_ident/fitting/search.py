@@ -42,7 +42,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
     minimise,
 )
 from dahl_ident.fitting.losses import Loss, loss_named
-from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale, scale_ratio
+from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
 from dahl_ident.fitting.record_search import Tell, solve_records
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import BaseProblem, Problem, ProblemBatch, Quadratic
@@ -118,16 +118,18 @@ def solve(
     """
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
+    _check(problem, start or {})
     if isinstance(problem, RecordProblem):
-        return solve_records(problem, method=method, loss=loss, start=start, tell=tell)
+        return solve_records(problem, method, loss, start or {}, tell)
     assert isinstance(problem, Problem)
     search = _Search(problem, loss_named(loss, problem.parts), method=method, limits=limits)
     own = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(own) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
     found = own_starts(problem, resistant=loss != "linear")
-    if start is not None:
-        given = _completed(problem, start, found.theta[0])
+    if start:
+        values = zip(problem.names, problem.to_values(found.theta[0]), strict=True)
+        given = problem.to_search([start.get(name, value) for name, value in values])
         found = Starts(np.zeros(len(found.theta) + 1, dtype=np.intp), np.vstack([given, found[1]]))
     optimum = search.run(found)[0]
     if limits and problem.is_exact and not problem.takes_energy(optimum.theta):
@@ -174,6 +176,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     >>> solve_many(ProblemBatch(tables, Dahl())).values.round(6).tolist()
     [[0.1, 30.0], [0.2, 30.0]]
     """
+    _check(batch, {})
     S, P = batch.n_tables, len(batch.parameters)
     begin = None
     if start is not None:
@@ -201,9 +204,9 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     return OptimumBatch.joined(batch, parts)
 
 
-def _completed(problem: Problem, start: Mapping[str, float], theta: FloatArray) -> FloatArray:
-    """Return search coordinates of the values given, completed from `theta`."""
-    names = problem.names
+def _check(problem: BaseProblem, start: Mapping[str, float]) -> None:
+    """Refuse starts of parameters that are not free, and more of these than numbers."""
+    names, m = problem.names, problem.n_residuals + len(problem.priors)
     if not isinstance(start, Mapping):
         raise ValidationError(f"start is {start!r}; expected a mapping of names to numbers")
     unknown = [name for name in start if name not in names]
@@ -211,8 +214,11 @@ def _completed(problem: Problem, start: Mapping[str, float], theta: FloatArray) 
         raise ModelError(
             f"start names {', '.join(unknown)}; the free parameters are {choices(names, *unknown)}"
         )
-    values = problem.to_values(theta)
-    return problem.to_search([start.get(n, v) for n, v in zip(names, values, strict=True)])
+    if m < len(names):
+        raise FitError(
+            f"{problem.extent} give {m} numbers, fewer than the {len(names)} free parameters "
+            f"({', '.join(names)}); measure more points, or fix some"
+        )
 
 
 class _Search:
@@ -230,12 +236,6 @@ class _Search:
         self.limits = limits
         self.problem, self.loss, self.method, self.tolerance = problem, loss, method, tolerance
         self.m = problem.n_residuals + len(problem.priors)
-        P = len(problem.parameters)
-        if self.m < P:
-            raise FitError(
-                f"{problem.n_residuals // 2} rows give {self.m} numbers, fewer than the {P} free "
-                f"parameters ({', '.join(problem.names)}); measure more points, or fix some"
-            )
         self.logarithmic = problem.space.positive
         self.friction = problem.friction_columns
         self.low, self.high = problem.bounds()
@@ -262,18 +262,18 @@ class _Search:
         ends: list[Ends] = []
         evaluations = np.zeros(self.problem.n_tables, dtype=np.intp)
 
-        def excess(scale: float) -> float:
+        def search(scale: float) -> tuple[FloatArray, int]:
             nonlocal starts, evaluations
             ends.append(self._search(starts, scale))
             end = ends[-1].minima
             evaluations = evaluations + end.evaluations
-            if not self.rescales:
-                return 0.0
             starts = Starts(np.zeros(1, np.intp), end.theta)
-            dof, one = self.m - ends[-1].determined(0), self.problem.table(0)
-            return float(np.log(scale_ratio(one, end.theta[0], scale, self.loss, dof)))
+            return end.theta[0], self.m - ends[-1].determined(0)
 
-        scale = agreed_scale(excess, scale)
+        if self.rescales:
+            scale = agreed_scale(self.problem.table(0), self.loss, search, scale)
+        else:
+            search(scale)
         return optima(self.problem, ends[-1], scale, self.loss, self.method, evaluations)
 
     def _search(self, begin: Starts, scale: float) -> Ends:
@@ -364,7 +364,7 @@ class _Search:
             tolerance_factor=_AT_LIMIT if limit else self.tolerance,
             steps=steps,
             accuracy=problem.accuracy,
-            bounds=(self.low, self.high) if self.bounded and chart is None else None,
+            bounds=(lambda _: problem.bounds()) if self.bounded and chart is None else None,
         )
         if self.bounded:
             theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)

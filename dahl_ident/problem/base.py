@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from copy import copy
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Model, Parameter
+from dahl_ident.errors import ValidationError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.space import Space
 from dahl_ident.sensors import EXACT, Prior, Sensors
@@ -183,7 +185,32 @@ class BaseProblem(ABC):
         """Return theta with interchangeable elements in order, where there are some."""
         return self.space.checked(theta)
 
+    def altered(self, *stale: str, **changes: Any) -> Self:
+        """Return this problem with other attributes, without the `stale` ones that it computed."""
+        other = copy(self)
+        for name in stale:
+            other.__dict__.pop(name, None)
+        other.__dict__.update(changes)
+        return other
+
     # Residuals
+
+    def with_priors(self, rows: FloatArray, theta: FloatArray) -> FloatArray:
+        """Return residuals and their derivatives, (..., 1 or 1 + P, m), with those of priors."""
+        if not self.n_priors:
+            return rows
+        more = np.zeros((*rows.shape[:-1], self.n_priors))
+        values = self.space.to_values(theta)
+        slopes = self.space.slopes(values)
+        priors, one = self.priors.items(), np.ones_like(theta)
+        known = [(name, *_normal_moments(name, prior), values, slopes) for name, prior in priors]
+        known += [(name, *moments, theta, one) for name, moments in self.ranges.items()]
+        for place, (name, mean, std, at, slope) in enumerate(known):
+            index = self.names.index(name)
+            more[..., 0, place] = (at[..., index] - mean) / std
+            if rows.shape[-2] > 1:
+                more[..., 1 + index, place] = slope[..., index] / std
+        return np.concatenate([rows, more], axis=-1)
 
     @property
     @abstractmethod
@@ -231,3 +258,14 @@ class BaseProblem(ABC):
     ) -> FloatArray:
         """Return the Fisher information of theta, shape (P, P) or (S, P, P), priors included."""
         return self.quadratic(self.space.checked(theta), scale, chart=chart).hessian
+
+
+def _normal_moments(name: str, prior: Prior) -> tuple[float, float]:
+    """Return mean and standard deviation of a normal prior, the only kind least squares takes."""
+    kind = getattr(getattr(prior, "dist", None), "name", type(prior).__name__)
+    if kind != "norm":
+        raise ValidationError(
+            f"the prior of {name} is {kind}; least squares takes normal priors "
+            "(scipy.stats.norm), any other needs sampling"
+        )
+    return float(prior.mean()), float(prior.std())

@@ -12,7 +12,8 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
 from dahl_ident.errors import DataError
-from dahl_ident.problem.problem import Problem, as_response, checked_table
+from dahl_ident.problem.problem import Problem
+from dahl_ident.problem.stiffness import as_response, checked_table
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 

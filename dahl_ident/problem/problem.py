@@ -17,14 +17,23 @@ from dahl_ident.data.columns import one_of
 from dahl_ident.data.frequency_response import fundamental_alone
 from dahl_ident.data.rows import Rows
 from dahl_ident.data.tabular import assumes_frequency
-from dahl_ident.elements import Element, Model
+from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ModelError, ValidationError, argument
-from dahl_ident.noise import ROUNDING, Measured, Rho, bend, correct_amplitude, noise_for
+from dahl_ident.noise import (
+    ROUNDING,
+    Measured,
+    Rho,
+    bend,
+    correct_amplitude,
+    noise_for,
+    squares_of,
+    weighted,
+)
 from dahl_ident.problem.base import EXPLICIT, BaseProblem, Quadratic
 from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
-from dahl_ident.problem.stiffness import StiffnessData
+from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.steady_state import ACCURACY, STEADY, Shooting, Steady, obstacle
 from dahl_ident.units import Motion, shown_unit
@@ -68,11 +77,6 @@ class Problem(BaseProblem):
         and the model an equation of motion.
     noise : str
         The name of the noise model.
-    parameters : tuple of Parameter
-        The free ones, the model's first, then the sensors', in units of the data's motion. P is
-        their number.
-    n_numbers : int
-        Residuals that can differ from zero: one in a row of the mean force, which is real.
 
     Raises
     ------
@@ -191,7 +195,7 @@ class Problem(BaseProblem):
     @property
     def extent(self) -> str:
         """How much was measured, in words."""
-        return f"{self.data.n} rows"
+        return f"{self._rows.n} rows"
 
     @property
     def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
@@ -223,10 +227,7 @@ class Problem(BaseProblem):
 
     def with_steady(self, steady: Steady) -> Self:
         """Return the same problem, or batch, with another way to predict driven rows."""
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        other.__dict__.pop("stiffness_data", None)
-        other.steady = steady
+        other = self.altered("stiffness_data", steady=steady)
         other._set_rows(self._rows, self.noise)
         return other
 
@@ -235,11 +236,7 @@ class Problem(BaseProblem):
         model = self.model.coarser() if self.is_exact else self.model
         if model is self.model:
             return self
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        for stale in ("stiffness_data", "obstacle_to_exact", "_shooting"):
-            other.__dict__.pop(stale, None)
-        other.model = model
+        other = self.altered("stiffness_data", "obstacle_to_exact", "_shooting", model=model)
         other._set_rows(self._rows, self.noise)
         return other
 
@@ -272,26 +269,10 @@ class Problem(BaseProblem):
         shooting = self._shooting if exact else None
         return Predictor(self.model, self.sensors, self.space, self._rows, shooting, self._orbits)
 
-    def like(
-        self,
-        *,
-        data: FrequencyResponse | None = None,
-        model: Element | None = None,
-        noise: str | None = None,
-        sensors: Sensors | None = None,
-        free: Iterable[str] = (),
-        fixed: Mapping[str, float] | None = None,
-    ) -> Problem:
-        """Return this problem with what is given in place of its own."""
-        return Problem(
-            self.data if data is None else data,
-            self.model if model is None else model,
-            noise=self.noise if noise is None else noise,
-            sensors=self.sensors if sensors is None else sensors,
-            free=free,
-            fixed=fixed,
-            steady=self.steady,
-        )
+    def like(self, **changes: Any) -> Problem:
+        """Return this problem with some arguments of :class:`Problem` in place of its own."""
+        names = ("data", "model", "noise", "sensors", "steady")
+        return Problem(**{name: getattr(self, name) for name in names} | changes)
 
     def assuming(self, spread: Mapping[str, float]) -> Problem:
         """Return the problem with given parameters free, each with its value as a prior.
@@ -417,8 +398,7 @@ class Problem(BaseProblem):
             (value - mean)/std.
         """
         theta = self.space.checked(theta)
-        y, _ = self.whitened(theta, derivatives=False)
-        return self._with_priors(theta, y, [], scale)[..., 0, :]
+        return self._rows_at(theta, scale, derivatives=False, tails=True)[..., 0, :]
 
     def jacobian(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
         """Return the residuals' derivative with respect to theta, shape (m, P) or (S, m, P)."""
@@ -427,15 +407,13 @@ class Problem(BaseProblem):
     def residuals_and_jacobian(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
     ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian, for the price of the Jacobian.
-
-        Without `tails`, a covariance of few degrees of freedom counts as if it were known.
+        """Return residuals and Jacobian, see ``BaseProblem``.
 
         With noise in the amplitude the residuals are defined up to a rotation of each pair. The
         Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
         """
         theta = self.space.checked(theta)
-        rows = self._with_priors(theta, *self.whitened(theta, tails=tails), scale)
+        rows = self._rows_at(theta, scale, tails=tails)
         return rows[..., 0, :], rows[..., 1:, :].swapaxes(-1, -2)
 
     def quadratic(
@@ -447,7 +425,7 @@ class Problem(BaseProblem):
     ) -> Quadratic:
         """Return half the sum of squares with its gradient and Hessian, see ``BaseProblem``."""
         rho = rho or self._tail
-        rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
+        rows = self._rows_at(theta, scale)
         if chart is not None:
             r, J = rows[..., :1, :], rows[..., 1:, :]
             rows = np.concatenate([r, chart.swapaxes(-1, -2) @ J], axis=-2)
@@ -457,11 +435,11 @@ class Problem(BaseProblem):
             cost = 0.5 * products[..., 0, 0]
         else:
             m = self.n_residuals
-            z = _squares(rows[..., 0, :m])
+            z = squares_of(rows[..., 0, :m])
             loss, slope, curvature = rho(z)
             cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
             along = np.maximum(2.0 * curvature, -slope / np.maximum(z, 1e-300))
-            products = _weighted(rows, m, slope, along) @ rows.swapaxes(-1, -2)
+            products = weighted(rows, m, slope, along) @ rows.swapaxes(-1, -2)
         cost = np.where(cost < np.inf, cost, np.inf)
         return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
 
@@ -530,20 +508,9 @@ class Problem(BaseProblem):
     ) -> ComplexArray:
         """Return sets of responses drawn from the likelihood at theta: measurements repeated.
 
-        Parameters
-        ----------
-        theta : array_like, shape (P,)
-            Search coordinates.
-        scale : float
-            The noise's scale; 1 where it is known.
-        size : int
-            Number S of sets.
-        rng : numpy.random.Generator
-            Where the noise comes from.
-
         Returns
         -------
-        ndarray of complex, shape (S, n)
+        ndarray of complex, shape (size, n)
             Responses in the data's quantity. An error of the measured amplitudes appears, to
             first order, in the responses, so that amplitudes stay as they were measured.
         """
@@ -563,34 +530,19 @@ class Problem(BaseProblem):
         spread: ComplexArray = noise.amplitude.whitening(noise.covariance, slope).inverse(y)
         return np.asarray(value + spread)
 
-    def _with_priors(
-        self, theta: FloatArray, y: ComplexArray, changes: list[ComplexArray], scale: ArrayLike
+    def _rows_at(
+        self, theta: FloatArray, scale: ArrayLike, *, derivatives: bool = True, tails: bool = False
     ) -> FloatArray:
         """Return residuals and, below them, their derivatives: (..., 1 + P, m), priors last."""
-        lead, m, extra = self._shape(theta)[:-1], self.n_residuals, self.n_priors
-        pairs = np.empty((*lead, len(changes) + 1, m // 2), dtype=np.complex128)
-        pairs[..., 0, :] = y
-        for index, change in enumerate(changes, start=1):
-            pairs[..., index, :] = change
+        y, changes = self.whitened(theta, derivatives=derivatives, tails=tails)
+        shape = (*self._shape(theta)[:-1], len(changes) + 1, self.n_residuals // 2)
+        pairs = np.empty(shape, dtype=np.complex128)
+        for index, numbers in enumerate((y, *changes)):
+            pairs[..., index, :] = numbers
         rows = pairs.view(np.float64)
         if np.ndim(scale) or scale != 1.0:
             rows /= np.asarray(scale)[..., None, None]
-        if extra:
-            rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], extra))], axis=-1)
-            values = self.space.to_values(theta)
-            slopes = self.space.slopes(values)
-            for place, (name, prior) in enumerate(self.priors.items(), start=m):
-                index = self.names.index(name)
-                mean, std = _normal_moments(name, prior)
-                rows[..., 0, place] = (values[..., index] - mean) / std
-                if changes:
-                    rows[..., 1 + index, place] = slopes[..., index] / std
-            for place, (name, (mean, std)) in enumerate(self.ranges.items(), m + len(self.priors)):
-                index = self.names.index(name)
-                rows[..., 0, place] = (theta[..., index] - mean) / std
-                if changes:
-                    rows[..., 1 + index, place] = 1.0 / std
-        return rows
+        return self.with_priors(rows, theta)
 
     # Likelihood
 
@@ -636,17 +588,12 @@ class Problem(BaseProblem):
     def information(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None
     ) -> FloatArray:
-        """Return the Fisher information of theta, shape (P, P) or (S, P, P), priors included.
-
-        J' J of the whitened residuals; rows whose covariance was estimated count as
-        :mod:`dahl_ident.noise` says. With `chart` = dtheta/dphi, (P, Q), the information of phi.
-        """
+        """Return the Fisher information; an estimated covariance counts as noise.py says."""
         theta = self.space.checked(theta)
-        rows = self._with_priors(theta, *self.whitened(theta, tails=False), scale)
-        counted = rows
-        if self._tail is not None:
-            m = self.n_residuals
-            counted = _weighted(rows, m, *self._tail.information(_squares(rows[..., 0, :m])))
+        if self._tail is None:
+            return super().information(theta, scale, chart)
+        rows, m = self._rows_at(theta, scale), self.n_residuals
+        counted = weighted(rows, m, *self._tail.information(squares_of(rows[..., 0, :m])))
         J, counted = rows[..., 1:, :], counted[..., 1:, :]
         if chart is not None:
             J, counted = chart.T @ J, chart.T @ counted
@@ -655,58 +602,3 @@ class Problem(BaseProblem):
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
         """Return the shape of the rows' numbers for `theta`."""
         return (*theta.shape[:-1], self._rows.n)
-
-
-def checked_table(data: object) -> FrequencyResponse:
-    """Return `data` if it is a table, or say what it is instead."""
-    if isinstance(data, FrequencyResponse):
-        return data
-    raise DataError(
-        f"data is a {type(data).__name__}; expected a FrequencyResponse, as "
-        "read_frequency_response gives it, or extract from a Record"
-    )
-
-
-def as_response(data: FrequencyResponse, model: Model) -> FrequencyResponse:
-    """Return a table that a model predicts: a backbone with the model's mass."""
-    if data.quantity != "backbone":
-        return data
-    masses = [p for p in model.parameters if p.is_mass]
-    if not masses or any(p.free for p in masses):
-        raise ModelError(
-            f"natural frequencies and damping ratios determine {model!r} up to the mass; give the "
-            "modal mass in it, such as Mass(0.5)"
-        )
-    return data.with_mass(sum(float(p.value or 0.0) for p in masses))
-
-
-def _normal_moments(name: str, prior: Prior) -> tuple[float, float]:
-    """Return mean and standard deviation of a normal prior, the only kind least squares takes."""
-    kind = getattr(getattr(prior, "dist", None), "name", type(prior).__name__)
-    if kind != "norm":
-        raise ValidationError(
-            f"the prior of {name} is {kind}; least squares takes normal priors "
-            "(scipy.stats.norm), any other needs sampling"
-        )
-    return float(prior.mean()), float(prior.std())
-
-
-def _squares(residuals: FloatArray) -> FloatArray:
-    """Return the sum of squares of the two residuals of each row, (..., 2 n) -> (..., n)."""
-    return np.asarray(residuals[..., 0::2] ** 2 + residuals[..., 1::2] ** 2)
-
-
-def _weighted(rows: FloatArray, m: int, size: FloatArray, along: FloatArray) -> FloatArray:
-    """Return residuals times `size`, derivatives d of each pair y as size d + along y (y' d).
-
-    `rows` are residuals and, below them, their derivatives, (..., 1 + P, k); what stands after
-    the first `m` residuals, those of priors, stays.
-    """
-    first, second = rows[..., :1, 0:m:2], rows[..., :1, 1:m:2]
-    by_first, by_second = rows[..., 1:, 0:m:2], rows[..., 1:, 1:m:2]
-    lever = along[..., None, :] * (first * by_first + second * by_second)
-    result = rows.copy()
-    result[..., :m] *= np.repeat(size, 2, axis=-1)[..., None, :]
-    result[..., 1:, 0:m:2] += first * lever
-    result[..., 1:, 1:m:2] += second * lever
-    return result

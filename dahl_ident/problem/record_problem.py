@@ -9,7 +9,6 @@ sample, an offset and, for forces, a drift.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -44,10 +43,6 @@ _EXPONENT_STEP = 0.01  # of an exponent's logarithm, for derivatives
 _DELAY_STEP = 0.02  # of a sample, for derivatives with respect to the delay
 _LEAST = 1e-300  # of a positive value that has vanished
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
-
-
-Watch = Callable[["RecordProblem", FloatArray, float], None]
-"""Takes a problem, search coordinates and the cost there."""
 
 
 class RecordProblem(BaseProblem):
@@ -151,8 +146,8 @@ class RecordProblem(BaseProblem):
         self.displacement_noise = 0.0
         """Standard deviation of the displacement, m, within which no movement counts."""
         self.paths: tuple[FloatArray, ...] | None = None
-        self.watch: Watch | None = None
-        """Called after each evaluation of the cost."""
+        self.watch: Callable[[RecordProblem, FloatArray, float], None] | None = None
+        """Called after each evaluation of the cost, with search coordinates and cost."""
 
     def _check(self, record: Record, which: str) -> None:
         if len(record) < _SHORTEST:
@@ -217,43 +212,29 @@ class RecordProblem(BaseProblem):
 
     def weighted(self, whitening: FloatArray) -> RecordProblem:
         """Return the same problem with filtered residuals."""
-        other = copy(self)
-        other.whitening = whitening
-        return other
+        return self.altered(whitening=whitening)
 
     def measuring(self, outputs: Sequence[FloatArray]) -> RecordProblem:
         """Return the same problem with other measured outputs, in the same unit."""
-        other = copy(self)
-        other.sizes = self.sizes
-        other.measured = tuple(outputs)
-        return other
+        return self.altered(sizes=self.sizes, measured=tuple(outputs))
 
     def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
         """Return the same problem with other values of parameters that are fixed."""
-        other = copy(self)
-        other.model = self.model.with_fixed(values)
-        for of_model in ("system", "coefficients", "first"):
-            other.__dict__.pop(of_model, None)  # equations are shorter where a value is 0 or 1
-        return other
+        model = self.model.with_fixed(values)  # equations are shorter where a value is 0 or 1
+        return self.altered("system", "coefficients", "first", model=model)
 
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
         """Return the same problem, the displacement's noise not counted as travel.
 
         For the output "force"; see :func:`~.displacement_noise.travelled`.
         """
-        other = copy(self)
-        other.displacement_noise = noise
         x = self._displacements if noise else []
-        other.paths = tuple(travelled(wave, noise, lead) for wave in x) or None
-        return other
+        paths = tuple(travelled(wave, noise, lead) for wave in x) or None
+        return self.altered(displacement_noise=noise, paths=paths)
 
     def delayed(self, delay: float) -> RecordProblem:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
-        other = copy(self)
-        other.delay = delay
-        for cached in ("motions", "drives"):
-            other.__dict__.pop(cached, None)
-        return other.without_noise(self.displacement_noise) if self.paths else other
+        return self.altered("motions", "drives", delay=delay).without_noise(self.displacement_noise)
 
     def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
         """Return the derivatives of each record's output with respect to the delay, per s."""
@@ -282,19 +263,14 @@ class RecordProblem(BaseProblem):
 
     def differentiated_in(self, window: float) -> RecordProblem:
         """Return the same problem, displacements differentiated in a window of other length."""
-        other = copy(self)
-        other.window = window
-        other.__dict__.pop("motions", None)
-        return other
+        return self.altered("motions", window=window)
 
     @property
     def noise_travel(self) -> float:
         """Travel that the displacement's noise would add, over the travel that counts."""
-        if self.paths is None:
-            return 0.0
         measured = [np.abs(np.diff(np.asarray(r.displacement))).sum() for r in self.records]
-        counted = [np.abs(np.diff(path)).sum() for path in self.paths]
-        return float(sum(measured) / sum(counted) - 1.0)
+        counted = [np.abs(np.diff(path)).sum() for path in self.paths or ()]
+        return float(sum(measured) / sum(counted) - 1.0) if counted else 0.0
 
     def filtered(self, waves: FloatArray) -> FloatArray:
         """Return residuals or derivatives, (n, ...), filtered; the first `order` are left out."""
@@ -414,23 +390,19 @@ class RecordProblem(BaseProblem):
     def with_more_noise(self, noise: float, draw: int = 0) -> RecordProblem:
         """Return the same problem, white noise added to the displacements."""
         rng = np.random.default_rng(draw)
-        other = copy(self)
-        other.motions = self._motions_of(
-            [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
-        )
-        return other
+        noisy = [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
+        return self.altered(motions=self._motions_of(noisy))
 
     def with_noisier_drive(self, stds: Sequence[float], draw: int) -> RecordProblem:
         """Return the same problem, white noise added to the drive of each record."""
         from dahl_ident.engine import band_limited
 
         rng = np.random.default_rng(draw)
-        other = copy(self)
-        other.drives = tuple(
+        drives = tuple(
             (time, drive + band_limited(std * rng.standard_normal(time.size), 1.0 / r.sample_rate))
             for (time, drive), r, std in zip(self.drives, self.records, stds, strict=True)
         )
-        return other
+        return self.altered(drives=drives)
 
     @cached_property
     def system(self) -> System:
@@ -517,8 +489,8 @@ class RecordProblem(BaseProblem):
 
     def outputs(self, values: FloatArray) -> list[FloatArray]:
         """Return the predicted output of each record."""
-        places = range(len(self.records))
-        return [self.predict(values, i, derivatives=False).output for i in places]
+        every = range(len(self.records))
+        return [self.predict(values, i, derivatives=False).output for i in every]
 
     def split_residuals(self, values: FloatArray) -> list[FloatArray]:
         """Return measured minus predicted output of each record."""

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
-from dahl_ident.elements import Element
+from dahl_ident.data import FrequencyResponse
+from dahl_ident.elements import Element, Model
+from dahl_ident.errors import DataError, ModelError
 
 _CELL = 0.1  # of ln A, where starts interpolate: a curve bends by about 1 over a unit of ln A
 
@@ -86,3 +88,26 @@ class StiffnessData:
         place = (ln_A - low) / max(x[1] - x[0], SMALLEST)
         cell = np.minimum(place.astype(np.intp), x.size - 2)
         return x, cell, place - cell
+
+
+def checked_table(data: object) -> FrequencyResponse:
+    """Return `data` if it is a table, or say what it is instead."""
+    if isinstance(data, FrequencyResponse):
+        return data
+    raise DataError(
+        f"data is a {type(data).__name__}; expected a FrequencyResponse, as "
+        "read_frequency_response gives it, or extract from a Record"
+    )
+
+
+def as_response(data: FrequencyResponse, model: Model) -> FrequencyResponse:
+    """Return a table that a model predicts: a backbone with the model's mass."""
+    if data.quantity != "backbone":
+        return data
+    masses = [p for p in model.parameters if p.is_mass]
+    if not masses or any(p.free for p in masses):
+        raise ModelError(
+            f"natural frequencies and damping ratios determine {model!r} up to the mass; give the "
+            "modal mass in it, such as Mass(0.5)"
+        )
+    return data.with_mass(sum(float(p.value or 0.0) for p in masses))
