@@ -39,8 +39,6 @@ import pandas as pd
 from scipy.io import savemat
 
 from dahl_ident.data import Record, inspect, read_record, readers
-from dahl_ident.data.raw_columns import Source
-from dahl_ident.data.readers.file import File
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.results import fit
@@ -302,12 +300,12 @@ def visible(name: str, kind: str) -> bool:
 class ParsedOnce:
     """Parses a file once, in however many ways it is then read."""
 
-    def __init__(self, parsed: Callable[[File, str | None], Source]) -> None:
+    def __init__(self, parsed: Callable[[Any, str | None], Any]) -> None:
         self.parsed = parsed
         self.key: tuple[str, ...] | None = None
-        self.found: Source | DahlIdentError | None = None
+        self.found: Any = None
 
-    def __call__(self, file: File, sheet: str | None) -> Source:
+    def __call__(self, file: Any, sheet: str | None) -> Any:
         key = (file.name, file.sha256, str(sheet))
         if key != self.key:
             self.key = self.found = None  # an HDF5 file stays open as long as it is kept
@@ -316,10 +314,9 @@ class ParsedOnce:
             except DahlIdentError as exc:
                 self.found = exc
             self.key = key
-        if isinstance(self.found, Source):
-            return self.found
-        assert self.found is not None  # set above
-        raise self.found
+        if isinstance(self.found, DahlIdentError):
+            raise self.found
+        return self.found
 
 
 def judge(path: Path, name: str, kind: str) -> str:

@@ -30,8 +30,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident import population
 from dahl_ident.campaigns.engine import Limits, Local, run_jobs
-from dahl_ident.campaigns.run import _unless_refused
-from dahl_ident.campaigns.work import Job, failed
+from dahl_ident.campaigns.work import Job
 from dahl_ident.campaigns.worker import do_within
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
 from tests.command_line import Runner
@@ -243,12 +242,13 @@ def test_options_that_no_fit_can_use_leave_no_result(
 
 def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path: Path) -> None:
     """The first of the fits fails with an error of options; the others can use them."""
-    refused = failed("ValidationError: the drive has 3 rows", refused=True)
-    fine = {"status": "trusted"}
-    rows = iter([("a", refused), ("b", fine), ("c", refused)])
-    assert list(_unless_refused(rows, 3, "lab")) == [("a", refused), ("b", fine), ("c", refused)]
-    with pytest.raises(DataError, match="the drive has 3 rows"):
-        list(_unless_refused(iter([("a", refused)] * 3), 3, "lab"))
+    make_tables(tmp_path, 3)
+    table = di.read_frequency_response(tmp_path / "d001_r0.csv")
+    known = 0.003**2 * np.abs(table.response)[:, None, None] ** 2 * np.eye(2)
+    replace(table, covariance=known).save(tmp_path / "d001_r0.csv", overwrite=True)
+    rows = di.campaign(definition(tmp_path, fit__noise="measured"), jobs=1).table
+    assert rows["status"].tolist() == ["failed", "trusted", "failed"]
+    assert rows["error"].iloc[0] == rows["error"].iloc[2] != ""
 
 
 def test_what_a_report_cannot_use_is_named_before_anything_runs(
