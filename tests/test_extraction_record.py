@@ -61,11 +61,11 @@ def assert_near_truth(data: FrequencyResponse, sigmas: float = 4.0) -> None:
 @pytest.mark.parametrize("beta", [0.3, 3.0, 30.0])
 def test_unbiased_and_as_accurate_as_stated(noise: object, beta: float) -> None:
     kind = white if noise is white else one_over_f
-    result = accuracy(beta, kind, 80, seed=20, cycles=8)
+    result = accuracy(beta, kind, 40, seed=20, cycles=8)
     assert result.bias < 3.5
     assert result.coverage >= 0.88
     if noise is white:
-        assert result.efficiency < 1.05 + 2.0 / (2.0 * np.sqrt(80))
+        assert result.efficiency < 1.05 + 2.0 / (2.0 * np.sqrt(40))
 
 
 def test_rows_for_harmonics_amplitude_and_drive() -> None:

@@ -353,7 +353,8 @@ def write_uff(path: Path, *sets: dict[str, Any]) -> Path:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves binary files open
         pyuff.UFF(str(path)).write_sets(list(sets), mode="overwrite")
-        gc.collect()
+        if any(one.get("binary") for one in sets):
+            gc.collect()
     return path
 
 

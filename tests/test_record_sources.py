@@ -44,7 +44,7 @@ def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says() -> None:
     model = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
     truth = {p.name: float(p.value or 0.0) for p in plant.parameters if p.name != "alpha"}
     errors = []
-    for seed in range(8):
+    for seed in range(5):
         noise = np.random.default_rng(seed).standard_normal((2, len(clean)))
         x = np.asarray(clean.displacement) + 1e-5 * noise[0]
         force = clean.force_samples + 3e-4 * noise[1]

@@ -162,7 +162,7 @@ class TestFit:
         assert " N m, sigma = " in repr(result)
         assert list(result.summary()["unit"]) == list(units.values())
         assert "f_max [N m]" in str(result.conf_interval("wald"))
-        grid = posterior(turned, Dahl(), method="grid")
+        grid = posterior(turned, Dahl(alpha=1.0), method="grid")
         assert grid.units[:2] == ("N m", "N m/rad")
         assert " N m (from" in grid.priors["f_max"]
 
