@@ -44,7 +44,7 @@ def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path: Path) -> None:
     held = beam.select(level=[label for label in beam.levels if "Response" in str(label)])
     data = held.select(rows=np.arange(held.n) % 8 == 0)
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
-    posterior = di.posterior(data, model, seed=1, ess=300.0, uncertainty="noise")
+    posterior = di.posterior(data, model, seed=1, ess=150.0, uncertainty="noise")
     assert posterior.converged, posterior.message
     f_max = next(rule for rule in posterior.prior_influences if rule.name == "f_max")
     assert f_max.at_upper_end

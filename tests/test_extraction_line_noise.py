@@ -25,12 +25,12 @@ def noise_fit(channels: FloatArray, cycles: int, time: FloatArray | None = None)
 def test_white_noise_has_its_variance_next_to_every_harmonic(cycles: int, harmonic: int) -> None:
     rng = np.random.default_rng(cycles)
     powers, dof = [], 0.0
-    for _ in range(300):
+    for _ in range(150):
         fit = noise_fit(rng.standard_normal((2, cycles * PER_CYCLE)) * [[0.1], [2.0]], cycles)
         noise = line_noise(fit, [harmonic], cycles, fit.residual)[0]
         powers.append(np.diagonal(noise.matrix).real / [0.01, 4.0])
         dof = noise.dof
-    allowed = 4.0 * np.sqrt(2.0 / dof / 600)
+    allowed = 4.0 * np.sqrt(2.0 / dof / 300)
     assert np.mean(powers) == pytest.approx(1.0, abs=allowed)
 
 
@@ -40,7 +40,7 @@ def test_stated_error_is_that_of_the_phasor(
     noise: Callable[[np.random.Generator, int], FloatArray], cycles: int
 ) -> None:
     rng = np.random.default_rng(7)
-    records, inside, ratio = 600, 0, 0.0
+    records, inside, ratio = 300, 0, 0.0
     for _ in range(records):
         force = noise(rng, cycles * PER_CYCLE)
         fit = noise_fit(np.stack([force, force]), cycles)

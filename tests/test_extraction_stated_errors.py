@@ -19,7 +19,7 @@ from dahl_ident.extraction import extract
 from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
 from dahl_ident.extraction.transient import estimate_transient
 
-BETA, CYCLES, PER_CYCLE, RUNS = 2.0, 12, 60.37, 240
+BETA, CYCLES, PER_CYCLE, RUNS = 2.0, 12, 60.37, 120
 N = int(CYCLES * PER_CYCLE)
 ORDERS = (1, 3, 5)
 
@@ -109,12 +109,12 @@ def test_errors_scatter_as_theory_has_it(
 def test_stated_variance_scatters_as_its_degrees_of_freedom_say(
     noisy_force: Simulated, noisy_displacement: Simulated
 ) -> None:
-    """The variance of chi-square over dof is 2/dof; of 480 runs it is known to about 8 %."""
+    """The variance of chi-square over dof is 2/dof; of 240 runs it is known to about 11 %."""
     scatter = []
     for case in (noisy_force, noisy_displacement):
         variance = np.trace(case.covariance[:, 0], axis1=1, axis2=2)
         scatter.append(np.var(variance) / np.mean(variance) ** 2 * case.dof[:, 0].mean() / 2.0)
-    assert 0.75 < np.mean(scatter) < 1.3
+    assert 0.67 < np.mean(scatter) < 1.4
 
 
 def test_a_region_of_95_per_cent_holds_the_truth_so_often(
