@@ -122,3 +122,27 @@ def test_constraints() -> None:
 def test_options_of_the_other_kind_are_refused(data: Any, option: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=r"given with a fit of (records|tables), which has"):
         di.fit(data, MODEL, **option)
+
+
+def test_a_table_and_a_record_answer_the_same_questions(fit: di.FitResult) -> None:
+    table = di.fit(di.load_dataset("noisy"), MODEL)
+    for one in (fit, table):
+        report = one.fit_report()
+        titles = ("Verdict", "Parameters", "Derived", "Uncertainty budget", "Noise", "Solver")
+        assert [t for t in titles if f"\n{t}\n" in f"\n{report}"] == list(titles)
+        assert len(one.fit_report(details=False).splitlines()) <= 15
+        assert one.plot("budget") is not None
+        assert one.identifiability.complete
+        assert str(one.hold_out())
+        with pytest.raises(ValidationError, match="kind is 'spiral'; expected one of"):
+            one.plot("spiral")
+
+
+def test_what_one_kind_alone_has_is_refused_in_one_way(fit: di.FitResult) -> None:
+    table = di.fit(di.load_dataset("noisy"), MODEL)
+    with pytest.raises(ValidationError, match="a fit of tables has no prediction of a record"):
+        table.predict(record(TRUE))
+    with pytest.raises(ValidationError, match="a fit of records has no response at other freq"):
+        fit.predict(1.0, amplitude=1e-3)
+    with pytest.raises(ValidationError, match="a fit of records has no backbone"):
+        fit.backbone(1e-3)

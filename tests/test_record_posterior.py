@@ -43,6 +43,22 @@ def _counted_as_independent(fit: di.FitResult, name: str) -> float:
     return float(covariance[number, number] ** 0.5)
 
 
+def test_a_posterior_counts_noise_alone_or_the_stated_calibration() -> None:
+    """By importance points, of which the width is that of the fit's covariance."""
+    record, model = recorded(DAHL, "random", 300, 1e-3), di.Dahl(alpha=1.0)
+    gain = di.Sensors(force_gain=norm(1.0, 0.05))
+    fit = di.fit(record, model, sensors=gain)
+    both = {
+        kind: di.posterior(record, model, sensors=gain, method="grid", uncertainty=kind)
+        for kind in ("combined", "noise")
+    }
+    u = {kind: float(one.params["f_max"].stderr or 0.0) for kind, one in both.items()}
+    assert u["combined"] == pytest.approx(float(fit.params["f_max"].stderr or 0.0), rel=0.1)
+    assert u["combined"] == pytest.approx(0.05 * 0.1, rel=0.1)
+    assert u["noise"] == pytest.approx(fit.stderr_noise["f_max"], rel=0.1)
+    assert "Noise alone is counted" in both["noise"].verdict
+
+
 def test_priors_and_prediction() -> None:
     fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
     sigma = fit.params["sigma"]

@@ -85,14 +85,6 @@ class ModelOptions:
             "sensors": Sensors(**sensed),
         }
 
-    def refuse_sensors(self) -> None:
-        """Refuse the options of sensors where a posterior of records is sampled."""
-        refuse(
-            self._given(*_CHANNELS),
-            "together with --record, but a posterior of records takes the channels as exact; "
-            "leave it out, or fit the records, which counts it",
-        )
-
     def _friction(self) -> Element:
         from dahl_ident.elements import Dahl
 

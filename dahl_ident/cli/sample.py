@@ -34,7 +34,10 @@ from dahl_ident.cli.reading import Channels, Files, Reading
 _SAMPLING = "Sampling"
 _sampling = in_panel(_SAMPLING)
 _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
-_OF_RECORDS = ("model", "free", "fixed", "start", "priors", "progress", *_CHAIN)
+_OF_RECORDS = (
+    "model", "free", "fixed", "sensors", "start", "priors", "uncertainty", "method",
+    "progress", *_CHAIN,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,6 @@ def sample(
     how = {**model.keywords(), **sampling.keywords()}
     data: Any
     if record:
-        model.refuse_sensors()
         data = reading.read_records(files, channels)
         how = for_records("posterior", how, vars(Sampling()), _OF_RECORDS)
     else:

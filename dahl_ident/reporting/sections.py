@@ -315,7 +315,7 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     fit.conf_interval("wald")
     if fit.problem.settled and not fit.first_order:  # profiles of records take minutes
         fit.conf_interval("profile")
-    intervals = fit.intervals_run(CONFIDENCE)
+    intervals = fit.assessment.intervals_run(CONFIDENCE)
     alike = [one for one in drawn if one.problem.settled == fit.problem.settled]
     yield tables.parameters(fit, intervals, alike)
     by_note: dict[str, list[str]] = {}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,17 +12,35 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, curves
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError, choices
-from dahl_ident.plots import (
-    Axes,
-    Curve,
-    plot_residuals,
-)
+from dahl_ident.plots import Axes, Curve, plot_budget, plot_residuals
+from dahl_ident.plots.waveforms import KINDS as OF_RECORDS
+from dahl_ident.plots.waveforms import draw_record_fit
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
+    from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.results.fit_result import FitResult
 
 _POINTS = 200  # of a curve that looks smooth
+
+
+def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
+    """Draw a fit in one of the kinds that its data have; the first where none is given."""
+    kinds: dict[str, Callable[[], Any]] = {
+        "fit": lambda: draw_fit(fit, ax),
+        "residuals": lambda: draw_residuals(fit, None, ax),
+    }
+    if not fit.problem.settled:
+        kinds = {k: partial(draw_record_fit, fit, k, record, ax) for k in OF_RECORDS}
+    kinds["budget"] = lambda: _draw_budget(fit.budget(), ax)
+    if kind is not None and kind not in kinds:
+        raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
+    return kinds[kind or next(iter(kinds))]()
+
+
+def _draw_budget(budget: Budget, ax: Any) -> Axes:
+    shares = [(name, row.source, row.share) for name in budget for row in budget[name].rows]
+    return plot_budget(shares, ax=ax)
 
 
 def draw_fit(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:

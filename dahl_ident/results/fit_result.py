@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -26,7 +26,7 @@ from dahl_ident.diagnostics.intervals import (
 from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.diagnostics.verdicts import Identifiability, Verdict
 from dahl_ident.elements import Model
-from dahl_ident.errors import FitError, ValidationError, choices
+from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum
 from dahl_ident.results import fit_report, fit_storage
 from dahl_ident.results.record_assessment import RecordAssessment
@@ -258,10 +258,6 @@ class FitResult(Result):
             If there is no optimum to repeat.
         """
         return self.assessment.intervals(method, levels, replicates, seed)
-
-    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
-        """Return the intervals at a level of every method that has been asked for until now."""
-        return self.assessment.intervals_run(level)
 
     def compare_intervals(
         self,
@@ -515,26 +511,9 @@ class FitResult(Result):
         -------
         Axes, or a tuple of Axes
         """
-        kinds: dict[str, Callable[[], Any]] = {"budget": lambda: self._plot_budget(ax)}
-        if self.problem.settled:
-            kinds = {
-                "fit": lambda: self.plot_fit(ax), "residuals": lambda: self.plot_residuals(ax)
-            } | kinds  # fmt: skip
-        else:
-            from dahl_ident.plots.waveforms import KINDS, draw_record_fit
+        from dahl_ident.results.fit_plots import draw
 
-            of_record = {k: partial(draw_record_fit, self, k, record, ax) for k in KINDS}
-            kinds = of_record | kinds
-        if kind is not None and kind not in kinds:
-            raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
-        return kinds[kind or next(iter(kinds))]()
-
-    def _plot_budget(self, ax: Any) -> Axes:
-        from dahl_ident.plots import plot_budget
-
-        table = self.budget()
-        shares = [(name, row.source, row.share) for name in table for row in table[name].rows]
-        return plot_budget(shares, ax=ax)
+        return draw(self, kind, ax, record)
 
     def plot_fit(self, ax: Sequence[Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw data and fit, gain above phase, over amplitude or frequency.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Literal
@@ -28,8 +27,7 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import plain_data
 from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
 from dahl_ident.diagnostics.budget import Budget
-from dahl_ident.diagnostics.checks import doubted
-from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.arviz_export import to_arviz
@@ -37,6 +35,7 @@ from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_checks import (
     PredictiveCheck,
     PriorInfluence,
+    findings_of,
     predictive_checks,
     prior_influences,
 )
@@ -106,6 +105,8 @@ class Posterior(Result):
         "_density.likelihood", 'How rows count: "gaussian", "student_t" or "none".'
     )
     priors: Mapping[str, str] = part("_density.priors", "Every prior in words.")
+    counted: tuple[str, ...] = part("_density.counted", "The sources of error that are counted.")
+    normalised: bool = part("_density.normalised", "Whether there is an evidence: not of records.")
     converged: bool = part("sample.converged", "Whether the numbers can be used.")
     message: str = part(
         "sample.message", "Whether the numbers can be used, and what is missing if not."
@@ -130,6 +131,12 @@ class Posterior(Result):
     def units(self) -> tuple[str, ...]:
         """SI units of the parameters."""
         return tuple(self.params[name].unit for name in self.names)
+
+    @property
+    def default_priors(self) -> tuple[str, ...]:
+        """Names of parameters whose prior follows the data's size."""
+        parts = self._density.prior.priors
+        return tuple(part.parameter.name for part in parts if part.source == "default")
 
     @property
     def given_priors(self) -> Mapping[str, PriorLike]:
@@ -391,7 +398,12 @@ class Posterior(Result):
         Not determined where it has not converged, or a prior that nobody gave sets a parameter;
         not described where data or prior object; approximate where the fit's numbers are.
         """
-        return Judgement((*self._objections, *self._notes, *doubted(*self.provenances)))
+        return Judgement(findings_of(self))
+
+    @property
+    def counted_fit(self) -> FitResult | None:
+        """The fit whose sources of error are counted; None where noise alone is."""
+        return self.fit if self.uncertainty == "combined" else None
 
     @cached_property
     def prior_influences(self) -> tuple[PriorInfluence, ...]:
@@ -407,71 +419,10 @@ class Posterior(Result):
         None where the prior was sampled, or where rows share errors; the fit's tests count there.
         """
         density: Any = self._density
-        counted = self._counted_fit is not None
+        counted = self.counted_fit is not None
         if self.likelihood == "none" or counted or not density.normalised:
             return ()
         return predictive_checks(density, self._drawn(_CHECK_DRAWS, 0), np.random.default_rng(0))
-
-    @property
-    def _objections(self) -> Iterator[Finding]:
-        """Yield what speaks against the numbers."""
-        code = "sampled" if self.converged else "not_converged"
-        severity = VerdictStatus.TRUSTED if self.converged else VerdictStatus.NOT_DETERMINED
-        yield Finding(Question.DETERMINED, severity, code, {"message": self.message})
-        lost = VerdictStatus.NOT_DESCRIBED if self.converged else VerdictStatus.NOT_DETERMINED
-        default = {p.parameter.name for p in self._density.prior.priors if p.source == "default"}
-        for rule in self.prior_influences:
-            left_open = VerdictStatus.NOT_DETERMINED if rule.name in default else None
-            severity = lost if rule.contradicted else left_open or VerdictStatus.TRUSTED
-            yield rule.finding(severity)
-        yield from (replace(finding, severity=lost) for finding in self._misfits)
-        fit = self._counted_fit
-        if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
-            yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)
-
-    @property
-    def _counted_fit(self) -> FitResult | None:
-        """The fit whose sources of error are counted; None where noise alone is."""
-        return self.fit if self.uncertainty == "combined" else None
-
-    @property
-    def _misfits(self) -> tuple[Finding, ...]:
-        """Where the data contradict the model; with the fit's errors, what its status rests on."""
-        fit = self.fit
-        if fit is None or (self._counted_fit is None and self.problem.settled):
-            lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
-            failed = (check for check in self.checks if not check.passed)
-            return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)
-        if fit.status is VerdictStatus.NOT_DETERMINED and fit.goodness.objections:
-            return tuple(fit.goodness.findings())
-        if fit.status is not VerdictStatus.NOT_DESCRIBED:
-            return ()
-        return tuple(f for f in fit.findings if f.severity is not VerdictStatus.TRUSTED)
-
-    @property
-    def _notes(self) -> tuple[Finding, ...]:
-        """What the numbers count and assume, and the evidence."""
-        note = Question.ASSUMED, VerdictStatus.TRUSTED
-        notes: tuple[Finding, ...] = ()
-        if isinstance(self.sample, PointSample) and self._density.normalised:
-            values = {"ln": self.log_evidence}
-            notes = (Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", values),)
-        fit = self.fit
-        if fit is None or self.likelihood == "none":
-            return notes
-        assumed = fit.assessment.assumptions(counted=self._counted_fit is not None)
-        if self._counted_fit is not None:
-            free = [n for n in self.names if n not in (*fit.problem.names, SCALE)]
-            ranges = (f"{name} as a parameter, which was not given" for name in free)
-            counted = Finding(*note, "counted", {"sources": (*self._density.counted, *ranges)})
-            return (counted, *assumed, *notes)
-        if fit.errors is None:
-            return (*assumed, *notes)
-        std = dict(zip(self.names, self.std().tolist(), strict=True))
-        free = [n for n in fit.var_names if n in std]
-        u = [f"{fit.params[n].stderr:.2g} instead of {std[n]:.2g} for {n}" for n in free]
-        compared = Finding(*note, "noise_alone", {"compared": tuple(u)})
-        return (compared, *assumed, *notes)
 
     # What follows
 
