@@ -29,9 +29,6 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident import population
-from dahl_ident.campaigns.engine import Limits, Local, run_jobs
-from dahl_ident.campaigns.work import Job
-from dahl_ident.campaigns.worker import do_within
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
 from tests.command_line import Runner
 
@@ -284,20 +281,17 @@ def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> N
     assert (tmp_path / "results" / "reports" / table["report"].iloc[0]).stat().st_size > 1000
 
 
-def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path) -> None:
-    make_tables(tmp_path, 2)
-    options: dict[str, Any] = {"kind": "response", "model": [{"kind": "dahl"}], "posterior": None}
-    options |= {"read": {}, "fit": {}}
-    jobs = [
-        (name, Job(name, ((str(tmp_path / f"{name}_r0.csv"), None),), ("r0",), options, None))
-        for name in ("d000", "d001")
-    ]
-    deadly = Job("deadly", _Deadly(), ("r",), options, None)
-    with Local(2) as place:
-        rows = dict(run_jobs([jobs[0], ("deadly", deadly), *jobs[1:]], place, Limits()))
-    assert rows["deadly"]["status"] == "failed"
-    assert "died" in rows["deadly"]["error"]
-    assert {rows[name]["status"] for name, _ in jobs} == {"trusted"}
+class _Changed(ThreadPoolExecutor):
+    """Workers whose jobs for one device are changed on the way."""
+
+    def __init__(self, device: str, **changes: Any) -> None:
+        super().__init__(1)
+        self.device, self.changes = device, changes
+
+    def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Any:
+        job, *others = arguments
+        job = replace(job, **self.changes) if job.name == self.device else job
+        return super().submit(function, job, *others)
 
 
 class _Deadly(tuple[Any, ...]):
@@ -305,6 +299,14 @@ class _Deadly(tuple[Any, ...]):
 
     def __iter__(self) -> Any:
         os._exit(9)
+
+
+def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path) -> None:
+    make_tables(tmp_path, 3)
+    with _Changed("d001", files=_Deadly()) as pool:
+        table = di.campaign(definition(tmp_path), executor=pool).table
+    assert table["status"].tolist() == ["trusted", "failed", "trusted"]
+    assert "died" in table["error"].iloc[1]
 
 
 def test_a_killed_driver_and_a_killed_worker_lose_nothing(tmp_path: Path) -> None:
@@ -478,10 +480,9 @@ def test_workers_of_another_version_are_named_before_anything_runs(tmp_path: Pat
         ),
     ):
         di.campaign(definition(tmp_path), scheduler=cluster.address)
-    job = Job("d", (), (), {}, None, version="0.0.1")
-    row = do_within(job, 60.0, None)
-    assert "this worker has dahl_ident" in row["error"]
-    assert row["retry"]
+    with _Changed("d000", version="0.0.1") as pool:
+        table = di.campaign(definition(tmp_path), executor=pool).table
+    assert table["error"].str.contains("this worker has dahl_ident").tolist() == [True, False]
 
 
 @POSIX
@@ -565,14 +566,22 @@ class _Hungry(tuple[Any, ...]):
         return iter([np.ones(10**9)])
 
 
-def test_a_device_has_limits_of_time_and_memory() -> None:
-    row = do_within(Job("d", _Hanging(), ("r",), {}, None), 1.0, None)
-    assert row["error"].startswith("stopped after 1 s, the limit of time for a device; give")
-    assert row["retry"]
-    if sys.platform == "linux":
-        row = do_within(Job("d", _Hungry(), ("r",), {}, None), 60.0, 2.0)
-        assert row["error"].startswith("the limit of memory for a device does not suffice")
-        assert row["retry"]
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+@pytest.mark.parametrize(
+    ("files", "limits", "says"),
+    [
+        (_Hanging(), {"timeout": 1.0}, "stopped after 1 s, the limit of time for a device; give"),
+        (_Hungry(), {"memory": 2.0}, "the limit of memory for a device does not suffice"),
+    ],
+)
+def test_a_device_has_limits_of_time_and_memory(
+    tmp_path: Path, files: Any, limits: dict[str, float], says: str
+) -> None:
+    make_tables(tmp_path, 1)
+    with _Changed("d000", files=files) as pool:
+        table = di.campaign(definition(tmp_path), executor=pool, **limits).table  # type: ignore[arg-type]
+    assert table["error"].iloc[0].startswith(says)
+    assert di.campaign(definition(tmp_path), jobs=1).statuses == {"trusted": 1}
 
 
 def test_fits_that_were_stopped_are_done_with_more_time(tmp_path: Path, run: Runner) -> None:
