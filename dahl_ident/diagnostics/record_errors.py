@@ -29,8 +29,7 @@ from dahl_ident.diagnostics.record_sources import (
 from dahl_ident.diagnostics.turning_noise import noise_at_turns
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.problem.displacement_noise import LEADS
-from dahl_ident.problem.record_noise import drive_noise
+from dahl_ident.problem.record_noise import LEADS, drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # relative: noise of the drive below does not count

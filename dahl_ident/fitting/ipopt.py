@@ -29,7 +29,6 @@ from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
 from dahl_ident.errors import FitError, ValidationError, argument
 from dahl_ident.fitting.constraints import Constraints, Relations
 from dahl_ident.fitting.convergence import Ends, optima
-from dahl_ident.fitting.global_start import starts
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import (
@@ -41,11 +40,9 @@ from dahl_ident.fitting.optimum import (
     inverse,
 )
 from dahl_ident.fitting.record_search import Tell
-from dahl_ident.fitting.record_start import record_starts
-from dahl_ident.fitting.search import solve
+from dahl_ident.fitting.search import solve, starts_of
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import BaseProblem, Problem, Quadratic
-from dahl_ident.problem.record_problem import RecordProblem
 
 _TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
 _ITERATIONS = 300  # a limit for searches that do not end
@@ -65,7 +62,7 @@ _WORDS = {
 
 
 def solve_ipopt(
-    problem: BaseProblem,
+    problem: Any,
     *,
     constraints: Constraints | None = None,
     start: Mapping[str, float] | None = None,
@@ -130,18 +127,14 @@ def solve_ipopt(
     """
     given = problem
     if drive_std is not None or drive_covariance is not None:
-        assert isinstance(problem, Problem)
         problem = _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
     # a start takes no noise of the drive, which takes many times as long; a cost does
     begin = solve(problem if relations.texts else given, loss=loss, start=start, tell=tell)
     if begin.status.at_infinity and not relations.texts and problem is given:
         return replace(begin, method="ipopt")
-    if isinstance(problem, Problem):  # where there is no steady motion to begin from, a sine
-        if begin.problem.steady != problem.steady:
-            problem = problem.with_steady(begin.problem.steady)
-    else:
-        problem = begin.problem  # as its noise asked for
+    # as the search left it: by a sine where there is no steady motion, freed of a record's delay
+    problem = begin.problem if problem is given else problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss)
     found = _search(target, begin, relations)
@@ -216,7 +209,7 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
     low, high = problem.bounds()
     found += [
         _descend(target, theta, relations)
-        for theta in np.clip(_starts(problem)[:_MOST_STARTS], low, high)
+        for theta in np.clip(starts_of(problem)[:_MOST_STARTS], low, high)
         if np.isfinite(target.at(theta).cost)
     ]
     if not found:
@@ -226,14 +219,6 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
         found.append(_descend(target, best.theta, relations))
         best = best if found[-1].failure else found[-1]
     return replace(best, evaluations=sum(end.evaluations for end in found))
-
-
-def _starts(problem: BaseProblem) -> FloatArray:
-    """Return the search coordinates of global starts."""
-    if isinstance(problem, RecordProblem):
-        return problem.to_search(record_starts(problem))
-    assert isinstance(problem, Problem)
-    return starts(problem)
 
 
 def _descend(

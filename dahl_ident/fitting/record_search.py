@@ -14,8 +14,18 @@ from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import Optimum, agreed_scale
-from dahl_ident.fitting.record_descent import EXACT, LOOSE, ROUGH, SLOW, STEPS, Descent, correlation
-from dahl_ident.fitting.record_refinement import aligned, weighted, without_noise
+from dahl_ident.fitting.record_refinement import (
+    EXACT,
+    LOOSE,
+    ROUGH,
+    SLOW,
+    STEPS,
+    Descent,
+    aligned,
+    correlation,
+    weighted,
+    without_noise,
+)
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
 from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter
@@ -71,7 +81,7 @@ def solve_records(
     """
     problem.watch = trace = _Trace(tell)
     try:
-        found = _Search(method, loss).solved(problem, start)
+        found = RecordSearch(method, loss).solved(problem, start)
     except KeyboardInterrupt as stop:
         problem.watch = None
         so_far = trace.optimum(problem)
@@ -111,7 +121,7 @@ def solve_repetitions(
     from scipy.signal import lfilter  # slow to import, and for repetitions alone
 
     problem: RecordProblem = optimum.problem
-    values, search = optimum.values, _Search("lm", "linear")
+    values, search = optimum.values, RecordSearch("lm", "linear")
     outputs, residuals = problem.outputs(values), problem.split_residuals(values)
     noise = prediction_error_filter(residuals)
     white = [lfilter(noise, [1.0], e)[noise.size - 1 :] for e in residuals]
@@ -135,7 +145,7 @@ def _optimum(problem: RecordProblem, end: Minima, scale: float, method: str, los
     return optima(problem, Ends(end), scale, rho, method, end.evaluations)[0]
 
 
-class _Search(Descent):
+class RecordSearch(Descent):
     """One search, from starts to the estimate with what is taken out of the records."""
 
     def solved(self, problem: RecordProblem, start: Mapping[str, float]) -> Optimum:

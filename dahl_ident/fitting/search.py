@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,7 +34,7 @@ from dahl_ident.fitting.asymptotes import (
     stiffness_charts,
 )
 from dahl_ident.fitting.convergence import Ends, optima
-from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts
+from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts, starts
 from dahl_ident.fitting.levenberg_marquardt import (
     NEARLY,
     IntArray,
@@ -44,9 +45,9 @@ from dahl_ident.fitting.levenberg_marquardt import (
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
 from dahl_ident.fitting.record_search import Tell, solve_records
+from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import BaseProblem, Problem, ProblemBatch, Quadratic
-from dahl_ident.problem.record_problem import RecordProblem
 
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
 _STEPS = 80  # of a search; ten are the rule
@@ -119,10 +120,17 @@ def solve(
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
     _check(problem, start or {})
-    if isinstance(problem, RecordProblem):
-        return solve_records(problem, method, loss, start or {}, tell)
-    assert isinstance(problem, Problem)
-    search = _Search(problem, loss_named(loss, problem.parts), method=method, limits=limits)
+    given: Any = problem
+    if not problem.settled:
+        return solve_records(given, method, loss, start or {}, tell)
+    return _solve_table(given, method, loss, start or {}, limits=limits)
+
+
+def _solve_table(
+    problem: Problem, method: str, loss: str, start: Mapping[str, float], *, limits: bool
+) -> Optimum:
+    """Return the optimum of one table."""
+    search = TableSearch(problem, loss_named(loss, problem.parts), method=method, limits=limits)
     own = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(own) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
@@ -134,10 +142,16 @@ def solve(
     optimum = search.run(found)[0]
     if limits and problem.is_exact and not problem.takes_energy(optimum.theta):
         sine = problem.with_steady("describing function")
-        other = solve(sine, method=method, loss=loss, start=start)
+        other = _solve_table(sine, method, loss, start, limits=True)
         if not problem.takes_energy(other.theta):
             return other  # no steady motion is to be found there
     return optimum
+
+
+def starts_of(problem: BaseProblem) -> FloatArray:
+    """Return the search coordinates of global starts."""
+    one: Any = problem
+    return starts(one) if problem.settled else one.to_search(record_starts(one))
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
@@ -195,7 +209,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     parts = []
     for first in range(0, S, at_once):
         part = batch.take(slice(first, first + at_once))
-        search = _Search(part, None, tolerance=_MANY)
+        search = TableSearch(part, None, tolerance=_MANY)
         if begin is None:
             parts.append(search.run(own_starts(part)))
         else:
@@ -221,7 +235,7 @@ def _check(problem: BaseProblem, start: Mapping[str, float]) -> None:
         )
 
 
-class _Search:
+class TableSearch:
     """One search for all tables of a problem: what its steps share."""
 
     def __init__(
@@ -281,7 +295,7 @@ class _Search:
             return Ends(self._descend(begin, scale, steps=_BRIEF))
         coarser = self.problem.coarser()
         if coarser is not self.problem and len(begin.table) > self.problem.n_tables:
-            search = _Search(coarser, self.loss, self.method, self.tolerance)
+            search = TableSearch(coarser, self.loss, self.method, self.tolerance)
             tables = np.arange(self.problem.n_tables)
             begin = Starts(tables, search._descend(begin, scale).theta)
         ends = Ends(self._descend(begin, scale))
@@ -297,11 +311,11 @@ class _Search:
                 ends.put_one(table, self._trust_region(table, ends, begin, scale))
         return ends
 
-    def _of(self, tables: IntArray) -> _Search:
+    def _of(self, tables: IntArray) -> TableSearch:
         """Return the same search for some of the tables."""
         if len(tables) == self.problem.n_tables:
             return self
-        part = _Search(self.problem.take(tables), self.loss, self.method, self.tolerance)
+        part = TableSearch(self.problem.take(tables), self.loss, self.method, self.tolerance)
         part.given = self.given
         return part
 
@@ -404,7 +418,7 @@ class _Search:
         Exact steady motions far out cost too much. A search that ended nowhere goes on from the
         optimum of the describing function, and ends at its limit where it still has none.
         """
-        sine = _Search(
+        sine = TableSearch(
             self.problem.with_steady("describing function"), self.loss, self.method, self.tolerance
         )
         other = sine._search(begin, scale)

@@ -138,20 +138,20 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
     if isinstance(source, Element):
         return _of_model(as_model(source), ranges, draws, rng)
     problem, sampled = getattr(source, "problem", None), hasattr(source, "draws")
-    if isinstance(problem, RecordProblem):
+    if problem is None:
+        raise ValidationError(
+            f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
+            "posterior"
+        )
+    if not problem.settled:
         fit, values = (source.fit, source.draws(_MANY, seed)) if sampled else (source, None)
         return _of_records(fit, values, ranges, draws, rng)
-    if isinstance(problem, Problem) and sampled:
+    if sampled:
         values, P = np.asarray(source.draws(draws, seed)), len(problem.names)
         scale = values[:, P] if values.shape[1] > P else np.ones(draws)
         prior = _leaned_on(problem.parameters, *_moments(problem.parameters, ranges))
         return _of_data(problem, problem.to_search(values[:, :P]), scale, prior)
-    if isinstance(problem, Problem) and hasattr(source, "optimum"):
-        return _of_fit(source, ranges, draws, rng)
-    raise ValidationError(
-        f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
-        "posterior"
-    )
+    return _of_fit(source, ranges, draws, rng)
 
 
 def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:

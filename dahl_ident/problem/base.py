@@ -103,6 +103,11 @@ class BaseProblem(ABC):
         """The number of priors, those of assumed parameters included."""
         return len(self.priors) + len(self.ranges)
 
+    @property
+    def calibrations(self) -> Mapping[str, float]:
+        """Standard uncertainties of gains and delay of the channels, by name."""
+        return {name: float(prior.std()) for name, prior in self.priors.items()}
+
     @abstractmethod
     def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
         """Return sizes that a unit has in the data, by powers of force, displacement and time."""

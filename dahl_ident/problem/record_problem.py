@@ -26,10 +26,8 @@ from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.base import BaseProblem, Quadratic
-from dahl_ident.problem.displacement_noise import LEADS, noise_of, travelled
-from dahl_ident.problem.record_noise import in_band
-from dahl_ident.problem.record_prediction import Prediction, force_of, motion_of
-from dahl_ident.problem.record_unknowns import bends, nuisance
+from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
+from dahl_ident.problem.record_prediction import Predicted, bends, force_of, motion_of, nuisance
 from dahl_ident.problem.space import Space
 
 if TYPE_CHECKING:
@@ -95,7 +93,6 @@ class RecordProblem(BaseProblem):
         calibration: Mapping[str, float] | None = None,
     ) -> None:
         self.calibration = dict(calibration or {})
-        """Standard uncertainties of gains and delay of the channels, by the sensors' names."""
         self.records = tuple(records)
         if not self.records:
             raise DataError("there is no record; give one or more")
@@ -226,7 +223,7 @@ class RecordProblem(BaseProblem):
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
         """Return the same problem, the displacement's noise not counted as travel.
 
-        For the output "force"; see :func:`~.displacement_noise.travelled`.
+        For the output "force"; see :func:`~.record_noise.travelled`.
         """
         x = self._displacements if noise else []
         paths = tuple(travelled(wave, noise, lead) for wave in x) or None
@@ -289,6 +286,11 @@ class RecordProblem(BaseProblem):
     def n_reported(self) -> int:
         """How many parameters are the model's; states, offsets and drifts follow."""
         return len(self.free)
+
+    @property
+    def calibrations(self) -> Mapping[str, float]:
+        """Standard uncertainties of gains and delay of the channels, by the sensors' names."""
+        return self.calibration
 
     @property
     def every_parameter(self) -> tuple[Parameter, ...]:
@@ -466,7 +468,7 @@ class RecordProblem(BaseProblem):
         start = len(self.free) + number * self.per_record
         return values[start : start + self.per_record]
 
-    def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Prediction:
+    def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
         """Return what the samples of record `number` should be."""
         if self.output == "force":
             return force_of(self, values, number, derivatives=derivatives)

@@ -17,7 +17,6 @@ from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError, argument
-from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.html import html
 from dahl_ident.reporting.markdown import markdown
@@ -172,7 +171,7 @@ def _check_calibrations(results: Sequence[Result], known: Metadata) -> None:
     """Refuse results that do not count what the instruments state."""
     for name, u in known.calibrations().items():
         for result in results:
-            counted = _counted_calibration(result, name)
+            counted = result.problem.calibrations.get(name, 0.0)
             if not math.isclose(counted, u, rel_tol=0.01):
                 taken = f"a standard uncertainty of {counted:.3g}" if counted else "it as exact"
                 raise ValidationError(
@@ -180,14 +179,6 @@ def _check_calibrations(results: Sequence[Result], known: Metadata) -> None:
                     f"fit takes {taken}; fit with --metadata and this file (in Python with "
                     "Sensors.from_metadata), and report on that fit"
                 )
-
-
-def _counted_calibration(result: Result, name: str) -> float:
-    """Return the standard uncertainty of a channel's gain or delay that a result counts."""
-    if isinstance(result.problem, RecordProblem):
-        return result.problem.calibration.get(name, 0.0)
-    prior = result.problem.priors.get(name)
-    return 0.0 if prior is None else float(prior.std())
 
 
 def _one_line(title: str) -> str:

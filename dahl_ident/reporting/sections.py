@@ -15,7 +15,6 @@ from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
-from dahl_ident.problem import Problem
 from dahl_ident.reporting import posterior_sections, provenance, tables
 from dahl_ident.reporting.comparison import comparison_of
 from dahl_ident.reporting.document import (
@@ -86,7 +85,7 @@ def document(
         if not fits or not one.problem.settled:
             front.append(Section("Posterior", tuple(posterior_sections.answer(one))))
         details += posterior_sections.sections(one)
-    data = first.problem.data if isinstance(first.problem, Problem) else None
+    data = first.problem.data if first.problem.settled else None
     return Document(
         title=title or known.title or title_of(first),
         status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=RANK),
