@@ -206,6 +206,22 @@ class Measured(Noise):
             return None
         return Student(self.dof, np.where(self.covariance.ii == 0.0, 1.0, 2.0))
 
+    def widened(self, variance: FloatArray) -> Measured:
+        """Return Gaussian noise with a further variance of both parts of every row, (n,).
+
+        A covariance of few degrees of freedom counts as the one that Student's t has.
+        """
+        t = 1.0 if self.dof is None else self.dof / (self.dof - 2.0)
+        rr, ri, ii = self.covariance
+        covariance = Covariance(
+            t * rr + variance, t * ri, np.where(ii == 0.0, 0.0, t * ii + variance)
+        )
+        whitening, amplitude = Whitening.of(covariance), self.amplitude
+        area = np.log(whitening.a) + np.log(np.where(whitening.c == 0.0, 1.0, whitening.c))
+        if amplitude is not None:
+            amplitude = AmplitudeError(t * amplitude.variance, t * amplitude.cross)
+        return Measured(self.response, covariance, whitening, area.sum(axis=-1), None, amplitude)
+
     @property
     def rounding(self) -> FloatArray:
         """0: the scale is known, whatever the residuals are."""

@@ -43,9 +43,9 @@ class TestClosedForm:
             assert upper == pytest.approx(mean + t * error, abs=1e-7 * error)
 
     def test_known_noise_gives_normal_thresholds(self) -> None:
-        data = replace(spring_table(), covariance=np.tile(0.01 * np.eye(2), (8, 1, 1)))
+        data = replace(spring_table(), covariance=np.tile(0.04 * np.eye(2), (8, 1, 1)))
         (interval,) = fit(data, Spring()).conf_interval("wald", levels=[0.95])["stiffness"]
-        half = 1.959963984540054 * 0.1 / np.sqrt(8.0)
+        half = 1.959963984540054 * 0.2 / np.sqrt(8.0)
         assert 0.5 * (interval.upper - interval.lower) == pytest.approx(half, rel=1e-8)
 
 
@@ -53,7 +53,7 @@ class TestOtherLibraries:
     def test_lmfit_has_the_same_optimum_errors_and_profile(self) -> None:
         lmfit = importlib.import_module("lmfit")
         data = table(n=8)
-        result, amplitude = fit(data, Dahl()), amplitudes(data)
+        result, amplitude = fit(data, Dahl(alpha=1.0)), amplitudes(data)
 
         def residuals(p: Any) -> FloatArray:
             N = Dahl(p["f_max"].value, p["sigma"].value).describing_function(amplitude)
@@ -85,7 +85,7 @@ class TestOtherLibraries:
 
 class TestProfile:
     def test_limits_lie_where_brute_force_finds_the_threshold(self) -> None:
-        result = fit(table(n=8, noise=0.1), Dahl())
+        result = fit(table(n=8, noise=0.1), Dahl(alpha=1.0))
         optimum = result.optimum
         for index, intervals in enumerate(result.conf_interval("profile").values()):
             for level, *limits in intervals:
@@ -113,12 +113,9 @@ class TestProfile:
         assert np.isfinite(result.conf_interval()["sigma"][-1]).all()
 
     def test_an_optimum_at_infinity_has_a_lower_limit(self) -> None:
-        result = next(
-            r
-            for seed in range(20)
-            if (r := fit(table(beta=(1e-4, 1e-3), seed=seed), Dahl(), throw=False)).optimum.status
-            is Status.NO_LOSS
-        )
+        tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(20))
+        fits = (fit(data, Dahl(alpha=1.0), throw=False) for data in tables)
+        result = next(r for r in fits if r.optimum.status is Status.NO_LOSS)
         one, two, three = result.conf_interval()["f_max"]
         assert 0.0 < three.lower < two.lower < one.lower < np.inf
         assert {one.upper, two.upper, three.upper} == {np.inf}
@@ -140,7 +137,7 @@ class TestProfile:
                 assert (interval.lower, interval.upper) == (0.0, np.inf)
 
     def test_a_bound_ends_an_interval(self) -> None:
-        model = Dahl() + Spring()
+        model = Dahl(alpha=1.0) + Spring()
         (own,) = (p for p in model.parameters if p.name == "f_max")
         bounded = model.with_parameters({"f_max": replace(own, upper=0.1002)})
         data = table(model=Dahl(0.1, 30.0) + Spring(0.3))
@@ -158,13 +155,14 @@ class TestProfile:
         and a second valley, gross slip, holds the limits.
         """
         hidden = table(model=Dahl(0.1, 30.0) + Spring(30.0), beta=(100.0, 1000.0), seed=seed)
-        result = fit(hidden, Dahl() + Spring(), throw=False)
+        model = Dahl(alpha=1.0) + Spring()
+        result = fit(hidden, model, throw=False)
         for name in ("f_max", "sigma", "stiffness"):
             for level, *limits in result.conf_interval("profile")[name]:
                 target = special.stdtrit(result.optimum.dof, 0.5 + 0.5 * level) ** 2
                 for limit in limits:
                     if 0.0 < limit < np.inf:
-                        held = fit(result.data, Dahl() + Spring(), fixed={name: limit}, throw=False)
+                        held = fit(result.data, model, fixed={name: limit}, throw=False)
                         rise = 2.0 * (held.optimum.cost - result.optimum.cost) / result.scale**2
                         assert rise == pytest.approx(target, rel=0.02)
 
@@ -188,10 +186,10 @@ class TestProfile:
         data = table(beta=(10.0**low, 10.0 ** (low + decades)), n=n, noise=noise, seed=seed)
         result = fit(data, Dahl(), throw=False)
         found = result.conf_interval("profile")
-        finite = np.isfinite(result.optimum.values) & (result.optimum.values > 0.0)
-        for i in np.flatnonzero(finite):
-            assert (found.lower[:, i] <= result.optimum.values[i]).all()
-            assert (found.upper[:, i] >= result.optimum.values[i]).all()
+        values = np.array([result.params[name].value for name in found])
+        for i in np.flatnonzero(np.isfinite(values) & (values > 0.0)):
+            assert (found.lower[:, i] <= values[i]).all()
+            assert (found.upper[:, i] >= values[i]).all()
             assert (found.lower[1:, i] <= found.lower[:-1, i]).all()
             assert (found.upper[1:, i] >= found.upper[:-1, i]).all()
 

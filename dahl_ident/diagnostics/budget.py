@@ -29,6 +29,7 @@ from dahl_ident.diagnostics.error_sources import (
 from dahl_ident.diagnostics.formatting import (
     degrees_text,
     html_table,
+    interval,
     listed,
     pair,
     rounded,
@@ -44,6 +45,7 @@ from dahl_ident.fitting import Optimum
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # What rounding leaves where a source has no part: variances relative to the combined one.
 _ROUNDING = 1e-12
+_SAME = 1e-6  # relative difference of limits that no one sees
 _TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, TESTS)
 _COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
 _CHANNELS = {
@@ -90,6 +92,8 @@ class ParameterBudget:
         Its estimate.
     rows : tuple of BudgetRow
         One a source, the largest first.
+    limits : tuple of float, or None
+        The interval where it is not value ± U, as that of a factor either way.
     u, dof, k, U : float
         Combined standard uncertainty, its effective degrees of freedom, coverage factor for
         95.45 %, expanded uncertainty k u.
@@ -102,11 +106,18 @@ class ParameterBudget:
     u: float
     dof: float
     k: float
+    limits: tuple[float, float] | None = None
+    """The interval, where it is not value ± U; no U is printed then."""
 
     @property
     def U(self) -> float:
         """Expanded uncertainty, k u."""
         return self.k * self.u
+
+    @property
+    def expanded(self) -> str:
+        """U as it is printed, or the interval."""
+        return _u(self, self.U) if self.limits is None else interval(*self.limits, "")
 
 
 @dataclass(frozen=True)
@@ -149,11 +160,21 @@ class Budget(Mapping[str, ParameterBudget]):
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def within(self, limits: Mapping[str, tuple[float, float]]) -> Budget:
+        """Return the budget with the intervals of its parameters, where they are not value ± U."""
+
+        def stated(p: ParameterBudget) -> ParameterBudget:
+            ends = limits.get(p.name, (p.value - p.U, p.value + p.U))
+            plain = np.allclose(ends, (p.value - p.U, p.value + p.U), rtol=_SAME, atol=_SAME * p.U)
+            return p if plain else replace(p, limits=ends)
+
+        return replace(self, parameters=tuple(map(stated, self.parameters)))
+
     @property
     def _cells(self) -> Iterator[tuple[str, ...]]:
         """Yield name, value, then source, type, u, dof, share, k and U: the combined one first."""
         for p in self.parameters:
-            whole = ("combined", "", _u(p, p.u), _dof(p.dof), "100 %", f"{p.k:.2f}", _u(p, p.U))
+            whole = ("combined", "", _u(p, p.u), _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded)
             yield (p.name, rounded(p.value, p.u)[0], *whole)
             for r in p.rows:
                 share = f"{100.0 * r.share:.0f} %"
@@ -208,7 +229,8 @@ class Budget(Mapping[str, ParameterBudget]):
                     "u": p.u,
                     "dof": _finite(p.dof),
                     "k": p.k,
-                    "U": p.U,
+                    "U": p.U if p.limits is None else None,
+                    "interval": p.limits,
                     "sources": [{**vars(row), "dof": _finite(row.dof)} for row in p.rows],
                 }
                 for p in self.parameters

@@ -294,10 +294,8 @@ def robust_values(
     The noise's scale, where it is not stated, is the robust one of
     :mod:`dahl_ident.fitting.losses`, from `scale` on.
     """
-    problem, loss = errors.problem, LOSSES["huber"]
-    y, J = problem.residuals_and_jacobian(errors.theta, tails=False)
-    if problem.scale_known:
-        y, J = errors.estimate.weighted(y), errors.estimate.weighted(J)
+    problem, loss = errors.estimate.problem, LOSSES["huber"]
+    y, J = problem.residuals_and_jacobian(errors.theta)
     free = [i for i, name in enumerate(problem.names) if name not in errors.assumed]
     J, rows = J[:, free], problem.n_residuals // 2
     variance = 1.0 if problem.scale_known else scale**2

@@ -16,18 +16,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy import special
 
+from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
-from dahl_ident.diagnostics.verdicts import Fit
 from dahl_ident.elements import Damper, Element, Friction, Mass, Model, PowerDamper, Spring
 from dahl_ident.elements.facts import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
@@ -47,6 +47,18 @@ _DISAGREE = 0.2  # of a force limit: what else friction is then depends on the c
 _PLACES = 6  # of a change: less is rounding
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
+
+
+class Fit(Protocol):
+    """A fit whose model is compared with others."""
+
+    @property
+    def optimum(self) -> Optimum:
+        """The solver's result."""
+
+    @property
+    def errors(self) -> ErrorModel | None:
+        """The sources of error."""
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ from dahl_ident.diagnostics.residual_space import (
     run_deviations,
 )
 from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.optimum import blanked, inverse
 from dahl_ident.problem import Problem
 
 _BY_CHANCE = 2.0  # standard deviations
@@ -79,6 +80,8 @@ class ErrorModel:
     """The estimate, and its covariance by every source of error."""
 
     optimum: Optimum  # the least-squares fit that it started from
+    # the assumed exponents free, covariances as stated; its `names` order every array here
+    problem: Problem
     estimate: WeightedEstimate  # weighted least squares
     sources: tuple[Source, ...]  # random errors that rows share, those that the residuals show
     state: State  # the mixed model of the residuals at the variances of noise and sources
@@ -88,11 +91,6 @@ class ErrorModel:
     assumed: tuple[str, ...]
     limit: FloatArray
     """Factor of each parameter's uncertainty by the model error: tests left out limit it."""
-
-    @property
-    def problem(self) -> Problem:
-        """The problem with the assumed exponents free; its `names` order every array here."""
-        return self.estimate.problem
 
     @property
     def theta(self) -> FloatArray:
@@ -221,6 +219,31 @@ class ErrorModel:
         )  # fmt: skip
 
     @cached_property
+    def by_noise(self) -> Optimum:
+        """The estimate as the optimum that it is, of its own weights; noise is all that it counts.
+
+        What was assumed is held at its estimate.
+        """
+        held = {name: self.values[name] for name in self.assumed}
+        return self._with_own_weights(self.problem.like(fixed=held) if held else self.problem)
+
+    @cached_property
+    def by_noise_and_ranges(self) -> Optimum:
+        """The same with what was assumed free, in its range."""
+        return self._with_own_weights(self.problem)
+
+    def _with_own_weights(self, problem: Problem) -> Optimum:
+        stated, problem = self.at_estimate, problem.widened(self.estimate.misfit_variance)
+        kept = [self.names.index(name) for name in problem.names]
+        theta, lost = self.theta[kept], ~np.isfinite(np.diagonal(stated.covariance)[kept])
+        covariance, _ = inverse(problem.information(theta, stated.scale))
+        y = problem.residuals(theta, stated.scale)
+        return replace(
+            stated, problem=problem, theta=theta, values=stated.values[kept],
+            covariance=blanked(covariance, lost), cost=0.5 * stated.scale**2 * float(y @ y),
+        )  # fmt: skip
+
+    @cached_property
     def runs(self) -> RunDeviations | None:
         """How runs deviate from the generalised estimate; None where none scatters."""
         shown = [k for k, source in enumerate(self.sources) if source.name == RUNS]
@@ -234,8 +257,8 @@ class ErrorModel:
             effects[:, place] = predicted[self.state.model.columns(k)]
             spread[place] = self.variances[k] ** 0.5
         mean = -self._of_theta(predicted[: self.state.model.parameters])
-        noise = float(self.noises[0] ** 0.5 / self.estimate.factors[:, 0, 0].mean())
-        return run_deviations(self.problem, self.theta, mean, effects, spread, noise)
+        noise = float(self.noises[0] ** 0.5) * self.estimate.scale
+        return run_deviations(self.estimate.problem, self.theta, mean, effects, spread, noise)
 
     @cached_property
     def within_runs(self) -> ComplexArray:
@@ -301,15 +324,17 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
         return None
     try:
         estimate = weighted_estimate(optimum, problem, determined=determined)
-        return _with_sources(optimum, estimate, assumed)
+        return _with_sources(optimum, problem, estimate, assumed)
     except np.linalg.LinAlgError:
         return None
 
 
 def _with_sources(
-    optimum: Optimum, estimate: WeightedEstimate, assumed: Mapping[str, Assumption]
+    optimum: Optimum,
+    problem: Problem,
+    estimate: WeightedEstimate,
+    assumed: Mapping[str, Assumption],
 ) -> ErrorModel:
-    problem = estimate.problem
     sources: tuple[Source, ...] = ()
     if _distinguishes_noise(problem, assumed):
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
@@ -337,7 +362,9 @@ def _with_sources(
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)
-    return ErrorModel(optimum, estimate, sources, state, every, len(tests), tuple(assumed), limit)
+    return ErrorModel(
+        optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed), limit
+    )
 
 
 def _standing_apart(optimum: Optimum) -> list[int]:
@@ -359,7 +386,8 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
     harmonics = np.repeat(problem.data.harmonic != 1, 2) & problem.scale_known
     both = bool(harmonics.any() and not harmonics.all())
     group = np.concatenate([harmonics & both, np.full(problem.n_priors, 1 + both)]).astype(np.intp)
-    part = 0.5 * np.sum(estimate.factors**2, axis=(1, 2)) * problem.scale_known
+    stated = estimate.factors(problem.widened(np.zeros(problem.data.n)))
+    part = 0.5 * np.sum(stated**2, axis=(1, 2)) * problem.scale_known
     known = [float(part[group[:m:2] == g].mean()) for g in range(1 + both)]
     known += [1.0] * bool(problem.n_priors)
     Z, most = [s.columns for s in sources], np.array([s.largest for s in sources])

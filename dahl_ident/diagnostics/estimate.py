@@ -151,12 +151,13 @@ def with_assumed(problem: Problem) -> tuple[Problem, dict[str, Assumption]]:
 
 @dataclass(frozen=True)
 class WeightedEstimate:
-    """Weighted least squares."""
+    """Weighted least squares: the optimum of a problem whose covariances hold the misfit."""
 
-    problem: Problem  # the assumed exponents free
+    problem: Problem  # the assumed exponents free, its covariances with the misfit
     theta: FloatArray  # (Q,): the estimate, search coordinates
     misfit: float  # share s of the fundamental force of a row's test
-    factors: FloatArray  # (n, 2, 2): what takes each row's residuals to unit variance
+    misfit_variance: FloatArray  # (n,): what it adds to the stated covariances
+    scale: float  # of the residuals; 1 where the data state it
     y: FloatArray  # (M,): residuals of data, then of priors, of unit variance
     jacobian: FloatArray  # (M, Q): their derivatives
     # changes of theta that the data determine at all; None where that is every one
@@ -167,15 +168,18 @@ class WeightedEstimate:
         """Derivatives with respect to what the data determine, (M, r)."""
         return self.jacobian if self.basis is None else self.jacobian @ self.basis.matrix
 
-    def weighted(self, rows: FloatArray) -> FloatArray:
-        """Return residuals (M,), or columns (M, q), as of unit variance."""
-        return _weighted(self.factors, rows)
-
     def changed(self, changes: ComplexArray) -> FloatArray:
         """Return what changes (k, n) of the measured responses add to `y`, (M, k)."""
-        weight = row_weights(self.problem)[:, None]
-        columns = -self.problem.residual_change(self.theta, changes).T * weight
-        return np.pad(self.weighted(columns), ((0, self.problem.n_priors), (0, 0)))
+        columns = -self.problem.residual_change(self.theta, changes).T / self.scale
+        return np.pad(columns, ((0, self.problem.n_priors), (0, 0)))
+
+    def factors(self, problem: Problem) -> FloatArray:
+        """Return what takes each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
+        sides = np.array([1.0, 1.0j])[:, None] * np.ones(self.problem.data.n, dtype=np.complex128)
+        own, other = (p.residual_change(self.theta, sides) for p in (self.problem, problem))
+        pairs = (each.reshape(2, -1, 2).transpose(1, 2, 0) for each in (own / self.scale, other))
+        ours, theirs = pairs
+        return np.asarray(ours @ np.linalg.pinv(theirs))
 
     @cached_property
     def predicted(self) -> ComplexArray:
@@ -208,7 +212,7 @@ class WeightedEstimate:
         kept[left_out] = False
         step = np.linalg.lstsq(self.columns[kept], -self.y[kept], rcond=1e-13)[0]
         theta = _moved(self.problem, self.theta, np.asarray(step), self.basis)
-        y, J = (_weighted(self.factors, part) for part in _rows(self.problem, theta))
+        y, J = self.problem.residuals_and_jacobian(theta, self.scale)
         if not (np.isfinite(y).all() and np.isfinite(J).all()):
             return self
         basis = None if self.basis is None else self.basis.at(theta)
@@ -238,65 +242,45 @@ def weighted_estimate(optimum: Optimum, problem: Problem, *, determined: bool) -
     """Return the estimate, searched from an optimum."""
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters])
-    m, dof = problem.n_residuals, problem.n_numbers - len(problem.names)
-    y, J = _rows(problem, theta)
-    basis = None
+    stated, basis = problem.widened(np.zeros(problem.data.n)), None
     if not determined:
+        _, J = stated.residuals_and_jacobian(theta)
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
     last: FloatArray | None = None
     for _ in range(_STEPS):
-        misfit, factors = _weights(problem, theta, y, m, dof)
+        misfit, variance, scale = _weights(stated, theta)
+        weighted = stated.widened(variance)
+        y, J = weighted.residuals_and_jacobian(theta, scale)
         basis = None if basis is None else basis.at(theta)
         columns = J if basis is None else J @ basis.matrix
-        weighted, residuals = _weighted(factors, columns), _weighted(factors, y)
-        step = np.linalg.lstsq(weighted, -residuals, rcond=1e-13)[0]
-        size = np.linalg.norm(weighted @ step)
+        step = np.linalg.lstsq(columns, -y, rcond=1e-13)[0]
+        size = np.linalg.norm(columns @ step)
         if not np.isfinite(size):
             raise np.linalg.LinAlgError("no finite step from the estimate")
         if size < _SETTLED:
             break
-        moved = weighted @ step
+        moved = columns @ step
         further = _further(moved, last)
         step, last = further * step, moved if further == 1.0 else None
-        cost, length = float(residuals @ residuals), 1.0
+        cost, length = float(y @ y), 1.0
         for _ in range(_HALVINGS):
             trial = _moved(problem, theta, np.asarray(length * step), basis)
-            other, by = _rows(problem, trial)
-            value = _weighted(factors, other)
+            value = weighted.residuals_and_jacobian(trial, scale)[0]
             if np.isfinite(value).all() and value @ value < cost:
                 break
             length *= 0.5
         else:
             break
-        theta, y, J = trial, other, by
+        theta = trial
     if not np.isfinite(y).all():
         raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
-    return WeightedEstimate(
-        problem, theta, misfit, factors, _weighted(factors, y), _weighted(factors, J),
-        None if basis is None else basis.at(theta),
-    )  # fmt: skip
+    return WeightedEstimate(weighted, theta, misfit, variance, scale, y, J, basis)
 
 
 def _further(moved: FloatArray, last: FloatArray | None) -> float:
     """Return the factor of a step that the one before says is one of a geometric series."""
     ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
     return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
-
-
-def _rows(problem: Problem, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals and derivatives: data, then priors."""
-    y, J = problem.residuals_and_jacobian(theta, tails=False)
-    weight = np.concatenate([row_weights(problem), np.ones(problem.n_priors)])
-    return y * weight, J * weight[:, None]
-
-
-def row_weights(problem: Problem) -> FloatArray:
-    """Return the root of what an estimated covariance counts each residual for, (m,)."""
-    weight, dof = np.ones(problem.n_residuals), problem.data.dof
-    if not problem.gaussian and dof is not None:
-        nu = np.minimum(dof, 1e12)  # a covariance of few dof: the variance of Student's t
-        weight = np.repeat(np.sqrt((nu - 2.0) / nu), 2)
-    return weight
 
 
 def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -315,27 +299,24 @@ def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp
     return test, np.where(others, fundamental[test], np.arange(data.n))
 
 
-def _weights(
-    problem: Problem, theta: FloatArray, y: FloatArray, m: int, dof: int
-) -> tuple[float, FloatArray]:
-    """Return the misfit, and the factors of the weights."""
-    n = m // 2
-    dof = dof + problem.n_priors * problem.scale_known
-    if not problem.scale_known:
-        scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(problem.rounding), 1e-300)
-        return 0.0, np.broadcast_to(np.eye(2) / scale, (n, 2, 2))
-    target = dof - float(y[m:] @ y[m:])
-    if dof <= 0 or target <= 0.0 or y[:m] @ y[:m] <= target:
-        return 0.0, np.broadcast_to(np.eye(2), (n, 2, 2))
-    size = np.abs(problem.data.response)[tests_of(problem.data)[1]]
+def _weights(stated: Problem, theta: FloatArray) -> tuple[float, FloatArray, float]:
+    """Return the misfit, what it adds to each row's variance, and the scale of the residuals."""
+    nothing = np.zeros(stated.data.n)
+    m, dof = stated.n_residuals, stated.n_numbers - len(stated.names)
+    y = stated.residuals_and_jacobian(theta)[0]  # with what the weighted ones will need
+    if not stated.scale_known:
+        scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)
+        return 0.0, nothing, scale
+    target = dof + stated.n_priors - float(y[m:] @ y[m:])
+    if dof + stated.n_priors <= 0 or target <= 0.0 or y[:m] @ y[:m] <= target:
+        return 0.0, nothing, 1.0
+    size = np.abs(stated.data.response)[tests_of(stated.data)[1]]
     both = np.asarray(size[None] * np.array([[1.0], [1.0j]]), dtype=np.complex128)
-    D = problem.residual_change(theta, both)
-    D = D.reshape(2, n, 2).transpose(1, 2, 0)
+    D = stated.residual_change(theta, both).reshape(2, -1, 2).transpose(1, 2, 0)
     b, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
-    z = np.einsum("nji,nj->ni", turn, y[:m].reshape(n, 2)) ** 2
+    z = np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)) ** 2
     square = _root(z.ravel(), np.maximum(b, 0.0).ravel(), target)
-    small = 1.0 / np.sqrt(1.0 + square * np.maximum(b, 0.0))
-    return float(np.sqrt(square)), np.asarray(small[:, :, None] * turn.swapaxes(1, 2))
+    return float(np.sqrt(square)), square * size**2, 1.0
 
 
 def _root(z: FloatArray, b: FloatArray, target: float) -> float:
@@ -353,12 +334,6 @@ def _root(z: FloatArray, b: FloatArray, target: float) -> float:
         if step <= _SAME * x:
             break
     return x
-
-
-def _weighted(factors: FloatArray, rows: FloatArray) -> FloatArray:
-    m = 2 * len(factors)
-    own = rows[:m].reshape(len(factors), 2, -1)
-    return np.concatenate([(factors @ own).reshape(rows[:m].shape), rows[m:]])
 
 
 def _moved(

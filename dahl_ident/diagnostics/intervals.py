@@ -24,7 +24,7 @@ Where the noise's scale was estimated, thresholds are those of Student's t and F
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -122,6 +122,15 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         row = np.isclose(self.levels, level)
         return replace(self, levels=self.levels[row], lower=self.lower[row], upper=self.upper[row])
 
+    def of(self, names: Sequence[str]) -> ConfidenceIntervals:
+        """Return the intervals of some of the parameters."""
+        kept = [i for i, name in enumerate(self.names) if name in names]
+        units = tuple(self.units[i] for i in kept)
+        return replace(
+            self, names=tuple(self.names[i] for i in kept), units=units,
+            estimate=self.estimate[kept], lower=self.lower[:, kept], upper=self.upper[:, kept],
+        )  # fmt: skip
+
     def noted(self, note: str) -> ConfidenceIntervals:
         """Return these intervals with another note."""
         return replace(self, note=note)
@@ -169,11 +178,11 @@ def combined_intervals(
     optimum: Optimum,
     errors: ErrorModel,
     levels: Sequence[float],
-    profile: Callable[[], ConfidenceIntervals],
 ) -> ConfidenceIntervals:
     """Return intervals that count every source of error: value -+ k u.
 
-    Of a positive parameter whose u is above 20 %, value times or over exp(k u).
+    Of a positive parameter whose u is above 20 %, value times or over exp(k u). Of one without a
+    limit on either side, the profile's, with assumed exponents free in their ranges.
     """
     array = checked_levels(levels)
     held = np.array([errors.holds(name) for name in optimum.names])
@@ -193,14 +202,13 @@ def combined_intervals(
     by_noise = np.sqrt(np.diagonal(optimum.covariance))
     doubtful = ~held | ~(by_noise <= _LARGE)
     if doubtful.any():
-        shape = profile()
+        shape = profile_intervals(errors.by_noise_and_ranges, levels).of(optimum.names)
         values = np.where(held, values, shape.estimate)
-        open_below, open_above = (
-            doubtful & (~held | (np.isinf(end) | (positive & (end == 0.0))))
-            for end in (shape.lower, shape.upper)
-        )
-        lower = np.where(open_below, shape.lower, lower)
-        upper = np.where(open_above, shape.upper, upper)
+        # with no limit on one side, u says nothing of the other
+        unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))
+        by_profile = doubtful & (~held | unlimited.any(axis=0))
+        lower = np.where(by_profile, shape.lower, lower)
+        upper = np.where(by_profile, shape.upper, upper)
     shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"

@@ -30,7 +30,6 @@ from dahl_ident.diagnostics.error_sources import (
     parts,
     places,
 )
-from dahl_ident.diagnostics.estimate import row_weights
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.problem import Problem
 
@@ -107,10 +106,9 @@ def stated_noise(
 
     That of the row which was measured nearest to each point.
     """
-    predicted = problem.predict(theta)
+    problem, predicted = problem.widened(np.zeros(problem.data.n)), problem.predict(theta)
     sides = [-problem.residual_change(theta, f * predicted) for f in (1.0, 1j)]
-    weight = row_weights(problem)[::2, None, None]
-    units = np.linalg.pinv(np.stack([one.reshape(-1, 2) for one in sides], axis=-1)) / weight
+    units = np.linalg.pinv(np.stack([one.reshape(-1, 2) for one in sides], axis=-1))
     return _row_noise(units[_nearest(problem, amplitude, omega)])
 
 

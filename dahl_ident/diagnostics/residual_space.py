@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -76,13 +76,11 @@ def linearization(problem: Problem, theta: FloatArray, runs: RunDeviations) -> L
         runs.labels, runs.theta, runs.gain.tolist(), runs.phase.tolist(), strict=True
     ):
         rows = labels == label
-        own = problem.data.select(rows=rows)
-        deviation = gain + 1j * phase * own.harmonic
-        own = replace(own, response=own.response * np.exp(-deviation))
-        part = problem.like(data=own)
+        deviation = gain + 1j * phase * problem.data.harmonic[rows]
+        part = problem.part(rows, problem.data.response[rows] * np.exp(-deviation))
         there, both = theta + shift, np.repeat(rows, 2)
         at, by = part.residuals_and_jacobian(there, tails=False)
-        at, by = at[: 2 * own.n], by[: 2 * own.n]
+        at, by = at[: part.n_residuals], by[: part.n_residuals]
         predicted[rows] = part.predict(there)
         fitted[rows] = predicted[rows] * np.exp(deviation)
         residuals[both], J[both] = at, by
@@ -208,9 +206,10 @@ class ResidualSpace(_Space):
 
         The size of the latter's misfit is itself an estimate, as an unknown scale is.
         """
-        self._optimum, self._problem = optimum, optimum.problem
-        self._estimate = weights if weights is not None and weights.misfit > 0.0 else None
-        self._scale_known = optimum.scale_known and self._estimate is None
+        widened = weights is not None and weights.misfit > 0.0
+        self._optimum = optimum
+        self._problem = weights.problem if widened and weights is not None else optimum.problem
+        self._scale_known = optimum.scale_known and not widened
         self.dof = optimum.dof
         m = optimum.problem.n_residuals
         scale = optimum.scale
@@ -221,9 +220,6 @@ class ResidualSpace(_Space):
             near = linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
             own = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
-        if self._estimate is not None:
-            y, J = self._estimate.weighted(y), self._estimate.weighted(J)
-            own = self._estimate.weighted(own) if runs is not None else own
         if runs is not None:
             self.dof -= orthonormal(np.hstack([J[:m], own])).shape[1]
             self.dof += orthonormal(J[:m]).shape[1]
@@ -254,8 +250,6 @@ class ResidualSpace(_Space):
         theta = self._optimum.theta
         predicted = self._problem.predict(theta)
         columns = -self._problem.residual_change(theta, changes * predicted) / self._scale
-        if self._estimate is not None:
-            columns = self._estimate.weighted(columns.T).T
         return np.asarray(columns * self._column_weight)
 
     def p_value(self, changes: ComplexArray) -> float:

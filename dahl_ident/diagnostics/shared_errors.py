@@ -7,7 +7,6 @@ import numpy as np
 from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import NOISE, RUNS
-from dahl_ident.diagnostics.estimate import row_weights
 
 _SAME = 1e-6  # of the noise's variance: as stated
 
@@ -21,7 +20,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
     # residuals in units of the noise that each row has of its own, or of an unknown scale
     known = problem.scale_known
-    unit, size = (1.0, 1.0) if known else (errors.noises[0], 1.0 / estimate.factors[0, 0, 0])
+    unit, size = (1.0, 1.0) if known else (errors.noises[0], estimate.scale)
     root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
     jacobian = size * root[:, None] * estimate.columns[:m]
     columns = [
@@ -46,9 +45,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     volume = -float(np.log(np.diagonal(L)).sum())
     differing = {s.own for s in errors.sources if s.name == RUNS}
     scatters = np.array([name in differing for name in errors.names])
-    factors = (
-        size * root.reshape(-1, 2, 1) * estimate.factors * row_weights(problem).reshape(-1, 1, 2)
-    )
+    factors = size * root.reshape(-1, 2, 1) * estimate.factors(problem)
     volume += float(np.log(np.abs(np.linalg.det(factors))).sum())
     _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
     return RowErrors(

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,22 +72,11 @@ class Verdict(Enum):
 
 
 class Fit(Protocol):
-    """An optimum with its intervals."""
+    """A fit that knows what its data determine."""
 
     @property
-    def optimum(self) -> Optimum:
-        """The solver's result."""
-
-    @property
-    def first_order(self) -> bool:
-        """Whether there are no profiles."""
-
-    @property
-    def errors(self) -> ErrorModel | None:
-        """The sources of error."""
-
-    def conf_interval(self, method: Any = ...) -> ConfidenceIntervals:
-        """Return confidence intervals."""
+    def identifiability(self) -> Identifiability:
+        """Which parameters, or which combinations of them, the data determine."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +244,7 @@ def identifiability(fit: Fit) -> Identifiability:
     >>> print(identifiability(result).headline)
     Every parameter is identified.
     """
-    return judged(fit.optimum, None if fit.first_order else lambda: fit.conf_interval("profile"))
+    return fit.identifiability
 
 
 def judged(

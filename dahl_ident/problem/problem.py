@@ -23,6 +23,7 @@ from dahl_ident.errors import DataError, ModelError, ValidationError, argument
 from dahl_ident.noise import (
     ROUNDING,
     Measured,
+    Noise,
     Rho,
     bend,
     correct_amplitude,
@@ -150,6 +151,7 @@ class Problem(BaseProblem):
             )
         self.space = Space(parameters)
         self._orbits = {}
+        self._misfit: FloatArray | None = None
         self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
         self.ranges: dict[str, tuple[float, float]] = {}
@@ -157,14 +159,37 @@ class Problem(BaseProblem):
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
         self._predictor: Predictor | Nearby = self._predicting(exact=self.is_exact)
-        self._predicted: tuple[bytes, Prediction | None] = (b"", None)
-        self._noise = noise_for(rows, noise)
-        self.noise = self._noise.name
-        self.scale_known = self._noise.scale_known
-        self._tail = self._noise.tail if isinstance(self._noise, Measured) else None
-        self.gaussian = self._tail is None
+        self._predicted: dict[str, tuple[bytes, Prediction]] = {}
+        self._set_noise(noise_for(rows, noise))
         self.n_residuals = 2 * rows.n
         self.n_numbers = self.n_residuals - int(np.count_nonzero(rows.harmonic == 0))
+
+    def _set_noise(self, noise: Noise) -> None:
+        if self._misfit is not None and isinstance(noise, Measured):
+            noise = noise.widened(self._misfit)
+        self._noise = noise
+        self.noise = noise.name
+        self.scale_known = noise.scale_known
+        self._tail = noise.tail if isinstance(noise, Measured) else None
+        self.gaussian = self._tail is None
+
+    def widened(self, misfit: FloatArray) -> Problem:
+        """Return the problem whose stated covariances have a misfit's variance each, (n,), added.
+
+        Rows are Gaussian then; see ``Measured.widened`` in noise.py.
+        """
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.__dict__.pop("stiffness_data", None)
+        other._misfit = misfit
+        other._set_noise(noise_for(self._rows, self.noise))
+        return other
+
+    def part(self, rows: NDArray[np.bool_], response: ComplexArray) -> Problem:
+        """Return the problem of some rows, with other responses in place of the data's."""
+        data = replace(self.data.select(rows=rows), response=response)
+        other = self.like(data=data)
+        return other if self._misfit is None else other.widened(self._misfit[rows])
 
     def _with_rows(self, kind: type[_Kind], rows: Rows) -> _Kind:
         """Return this problem, or batch, with other rows."""
@@ -331,11 +356,10 @@ class Problem(BaseProblem):
         """Return the prediction; judging asks for that at one theta many times."""
         if theta.ndim > 1:
             return self._predictor(theta, derivatives=derivatives)
-        key, (last, found) = theta.tobytes(), self._predicted
-        if found is None or last != key or (derivatives and not found.changes):
-            found = self._predictor(theta, derivatives=derivatives)
-            self._predicted = (key, found)
-        return found
+        key, last = theta.tobytes(), self._predicted.get("last")
+        if last is None or last[0] != key or (derivatives and not last[1].changes):
+            last = self._predicted["last"] = (key, self._predictor(theta, derivatives=derivatives))
+        return last[1]
 
     def prediction_jacobian(self, theta: ArrayLike) -> ComplexArray:
         """Return dR/dtheta, shape (n, P) or (S, n, P)."""

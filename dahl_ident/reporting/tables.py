@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.diagnostics import ConfidenceIntervals
     from dahl_ident.diagnostics.bands import DerivedQuantity
-    from dahl_ident.diagnostics.budget import Budget
+    from dahl_ident.diagnostics.budget import Budget, ParameterBudget
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult, Posterior
 
@@ -82,7 +82,7 @@ def uncertainty(stated: Budget) -> Table:
         rows.append(
             (
                 Cell(p.name), _rounded(p.value, p.u), _dof(p.dof), Cell(f"{p.k:.2f}", p.k),
-                _rounded(p.value, p.U), Cell(p.unit or "-"), Cell(", ".join(sources) or "-"),
+                _expanded(p), Cell(p.unit or "-"), Cell(", ".join(sources) or "-"),
             )
         )  # fmt: skip
     header = (
@@ -102,7 +102,7 @@ def budget(stated: Budget) -> Table:
         rows.append(
             (
                 Cell(p.name), Cell("combined"), Cell("-"), _rounded(p.value, p.u), Cell(unit),
-                _dof(p.dof), Cell("100 %", 1.0), Cell(f"{p.k:.2f}", p.k), _rounded(p.value, p.U),
+                _dof(p.dof), Cell("100 %", 1.0), Cell(f"{p.k:.2f}", p.k), _expanded(p),
             )
         )  # fmt: skip
         rows += [
@@ -334,3 +334,8 @@ def _label(value: object) -> Cell:
     if isinstance(value, (int, float, np.number)):
         return number(float(value))
     return Cell(str(value))
+
+
+def _expanded(stated: ParameterBudget) -> Cell:
+    """Return U, or the interval where that is not value ± U."""
+    return Cell(stated.expanded, stated.U if stated.limits is None else None)

@@ -296,7 +296,9 @@ class FitResult(Result):
             Printed, a table: source, type A or B, standard uncertainty, degrees of freedom and
             share; then the combined and the expanded uncertainty.
         """
-        return self.assessment.budget()
+        limits = self.conf_interval().at(LEVELS[1])
+        ends = {name: (one.lower, one.upper) for name, one in limits.items()}
+        return self.assessment.budget().within(ends)
 
     @cached_property
     def stated_budget(self) -> Budget | None:

@@ -67,9 +67,10 @@ class Estimate:
     vary: bool
 
     def __str__(self) -> str:
-        if not self.vary:
+        if not self.vary and self.stderr is None:
             return f"{self.name} = {self.value:g} {self.unit}".rstrip() + " (fixed)"
-        return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}"
+        assumed = "" if self.vary else " (assumed)"
+        return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}{assumed}"
 
 
 class Parameters(Mapping[str, Estimate]):
@@ -121,7 +122,11 @@ class Parameters(Mapping[str, Estimate]):
 
     def _repr_html_(self) -> str:
         rows = [
-            (p.name, *(rounded(p.value, p.stderr) if p.vary else (f"{p.value:g}", "fixed")), p.unit)
+            (
+                p.name,
+                *((f"{p.value:g}", "fixed") if p.stderr is None else rounded(p.value, p.stderr)),
+                p.unit,
+            )
             for p in self.values()
         ]
         return html_table(("", "value", "u", "unit"), rows)

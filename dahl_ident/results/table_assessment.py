@@ -108,8 +108,9 @@ class TableAssessment(Assessment):
 
     @property
     def by_noise(self) -> Optimum:
-        """The optimum, whose covariance is that of noise alone."""
-        return self.optimum
+        """The estimate as an optimum whose covariance is that of noise alone."""
+        errors = self.errors_of_combinations
+        return self.optimum if errors is None else errors.by_noise
 
     @property
     def success(self) -> bool:
@@ -129,14 +130,10 @@ class TableAssessment(Assessment):
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
-
-        def profile() -> ConfidenceIntervals:
-            return self.intervals("profile", levels, None, 0)
-
         errors = self.errors_of_combinations
         if errors is None:
-            return replace(profile(), method="combined")
-        return combined_intervals(self.optimum, errors, levels, profile)
+            return replace(self.intervals("profile", levels, None, 0), method="combined")
+        return combined_intervals(self.optimum, errors, levels)
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -146,7 +143,7 @@ class TableAssessment(Assessment):
             return self.intervals("profile", LEVELS, None, 0)
 
         stated = self.intervals("combined", LEVELS, None, 0)
-        verdicts = judged(self.optimum, None if self.first_order else profile, self.errors, stated)
+        verdicts = judged(self.by_noise, None if self.first_order else profile, self.errors, stated)
         try:
             sources: Mapping[str, ParameterBudget] = self.budget()
         except FitError:
