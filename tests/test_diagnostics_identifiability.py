@@ -71,7 +71,7 @@ class TestVerdicts:
         """A spring as stiff as the contact: the loss and the sum of stiffnesses are left."""
         model = FRICTION + Spring(SIGMA)
         data = table(model=model, beta=(1e-2, 1e-1), noise=0.004)
-        found = identifiability(fit(data, Dahl() + Spring(), throw=False))
+        found = identifiability(fit(data, Dahl(alpha=1.0) + Spring(), throw=False))
         assert set(found.named(NOT)) == {"f_max", "sigma", "stiffness"}
         combined = {c.expression: c for c in found.combinations}
         assert set(combined) == {"sigma^2/f_max", "sigma + stiffness"}

@@ -38,6 +38,7 @@ _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands 
 _ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
 _DOUBTS_SHOWN = 5  # more would hide the verdict
 _CHANCE = 0.0027  # that data contradict a right constraint as much, as for a prior
+_OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 _PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
 
@@ -128,6 +129,7 @@ def _residuals(fit: Judged) -> Iterator[Finding]:
         (fit.errors is None and _is_determined(fit))
         or _stated_exponent_is_wrong(fit)
         or goodness.beyond_any_sensor
+        or goodness.of_several
         or any(finding.severity is _NOT_DESCRIBED for finding in _bands(fit))
     )
     large = goodness.rms_misfit > _TOO_LARGE
@@ -187,6 +189,7 @@ def _reservations(fit: Judged) -> Iterator[Finding]:
     yield from _beyond_limit(fit)
     yield from _below_zero(fit)
     yield from _contradicted_priors(fit)
+    yield from _beyond_range(fit)
     yield from _moved_by_outliers(fit)
 
 
@@ -269,6 +272,20 @@ def _contradicted_priors(fit: Judged) -> Iterator[Finding]:
         }
         if abs(values["value"] - values["mean"]) > _CONTRADICTED * values["std"]:
             yield Finding(_DESCRIBED, _APPROXIMATE, "prior", values)
+
+
+def _beyond_range(fit: Judged) -> Iterator[Finding]:
+    """Yield every assumed exponent that the data put outside its range."""
+    errors = fit.errors
+    if errors is None:
+        return
+    ranged = {p.name: p for p in errors.problem.parameters}
+    for name in errors.problem.ranges:
+        low, high = ranged[name].prior or (0.0, np.inf)
+        value, u = errors.values[name], errors.stderr[name]
+        if max(low - value, value - high) > _OUTSIDE * u:
+            values = {"name": name, "value": value, "stderr": u, "low": low, "high": high}
+            yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_range", values)
 
 
 def _moved_by_outliers(fit: Judged) -> Iterator[Finding]:

@@ -30,9 +30,10 @@ from functools import cached_property
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_sources import (
     HARMONICS,
+    LEVELS,
     MODEL_ERROR,
     NOISE,
     RUNS,
@@ -135,7 +136,10 @@ class ErrorModel:
     @cached_property
     def values(self) -> Mapping[str, float]:
         """The estimates by name."""
-        return dict(zip(self.names, self.problem.to_values(self.theta).tolist(), strict=True))
+        values = self.problem.to_values(self.theta)
+        for i, p in enumerate(self.problem.parameters):  # beyond a bound by rounding
+            values[i] = min(max(values[i], p.lower), p.upper)
+        return dict(zip(self.names, values.tolist(), strict=True))
 
     @cached_property
     def stderr(self) -> Mapping[str, float]:
@@ -269,14 +273,14 @@ class ErrorModel:
 
     @cached_property
     def parallel_to_the_law(self) -> ComplexArray:
-        """Responses (n,) by generalised least squares, parallel forces and rates included.
+        """Responses (n,) by generalised least squares: parallel forces, rates, levels' own errors.
 
         Without the smooth departure from the law itself, which its parameters do not describe.
         """
         model, effects = self.state.model, self.state.predicted.copy()
         for k, source in enumerate(self.sources):
-            counts = source.name == MODEL_ERROR and (source.shapes is None or source.parallel)
-            effects[model.columns(k)] *= counts
+            beside = source.name == MODEL_ERROR and (source.shapes is None or source.parallel)
+            effects[model.columns(k)] *= beside or source.name == LEVELS
         moved = (model.U @ effects)[: self.problem.n_residuals].reshape(-1, 2)
         relative = np.einsum("nij,nj->ni", self.estimate.relative_units, moved)
         return np.asarray(self.estimate.predicted * np.exp(relative @ np.array([1.0, 1.0j])))
@@ -285,6 +289,12 @@ class ErrorModel:
     def left_out(self) -> HeldOut | None:
         """Tests left out in turn and predicted; None with fewer than three."""
         return held_out(self.estimate, self.state)
+
+    @property
+    def structure(self) -> float:
+        """Rms of the smooth model error over that of the fundamentals' noise."""
+        noise = float(np.sqrt(self.noises[0] * self.noise_square))
+        return self.rms(MODEL_ERROR) / max(noise, TINY)
 
     def rms(self, name: str) -> float:
         """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.

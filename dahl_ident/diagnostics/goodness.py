@@ -26,7 +26,7 @@ from scipy import special
 
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.formatting import p_text, percent, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import (
@@ -65,6 +65,7 @@ _HINT = 0.05  # the same of hints, which doubt nothing
 _FAR_MORE = 2.0  # scatter over what was measured
 _NO_SENSOR = 0.3  # noise over the response
 _CLOSE = 0.8  # of the misfit: a bound above shows that no such law helps
+_OF_ONE_DEVICE = 0.25  # u of a logarithm: 95 % within a factor of 1.6, see verdicts.py
 _WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
 
 
@@ -137,6 +138,20 @@ class RunsDiffer:
         return f"the runs differ ({', '.join(parts)})"
 
 
+@dataclass(frozen=True)
+class SmoothMisfit:
+    """A departure smooth over amplitude and frequency that exceeds the noise; rms of ln gain."""
+
+    size: float
+    noise: float
+
+    def __str__(self) -> str:
+        return (
+            f"the data depart smoothly from the model by {percent(self.size)} rms, more than "
+            f"their noise ({percent(self.noise)})"
+        )
+
+
 _Test = GroupsDiffer | RunsDiffer | ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic
 
 
@@ -194,6 +209,8 @@ class Goodness:
     untested : bool
         Whether the amplitudes give no more numbers than friction has free parameters, which then
         meet them whatever the mechanism is.
+    smooth : SmoothMisfit or None
+        Where the error model has a smooth misfit that exceeds the noise.
     level : float
         p-value below which one test counts.
 
@@ -228,6 +245,7 @@ class Goodness:
     neighbours: str = ""
     bound: float | None = None
     rows: int = 0
+    smooth: SmoothMisfit | None = None
 
     @cached_property
     def level(self) -> float:
@@ -291,11 +309,20 @@ class Goodness:
         if self.exponent is not None and self.exponent.fixed == 1.0 and (curve or over):
             yield "these data are not linear Dahl"
         yield from map(str, (*over, *curve))
+        if self.smooth is not None and not (curve or over):
+            yield str(self.smooth)
         for test in (self.third_harmonic, self.chi_square):
             if test is not None and test.p_value < level:
                 yield str(test)
         if not found:
             yield from (f"{r}" for r in self.runs if r.p_value < level)
+
+    @property
+    def of_several(self) -> bool:
+        """Whether runs or labelled rows scatter as those of several devices do."""
+        runs = [] if self.runs_differ is None else list(self.runs_differ.scatter.values())
+        labelled = [one.scatter for one in self.groups if one.p_value < self.level]
+        return max([*runs, *labelled], default=0.0) > _OF_ONE_DEVICE
 
     @property
     def beyond_any_sensor(self) -> bool:
@@ -486,7 +513,15 @@ def _tested(
         flagged_rows(problem.data),
         _untested(optimum),
         int((problem.data.harmonic == 1).sum()),
+        smooth=_smooth(errors),
     )
+
+
+def _smooth(errors: ErrorModel | None) -> SmoothMisfit | None:
+    if errors is None or errors.structure <= 1.0:
+        return None
+    size = errors.rms(MODEL_ERROR)
+    return SmoothMisfit(size, size / errors.structure)
 
 
 def _relative(name: str, size: float) -> str:

@@ -167,10 +167,15 @@ def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> Confid
     )
 
 
-def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
-    """Return where the profile of the deviance meets the thresholds; open where it does not."""
+def profile_intervals(
+    optimum: Optimum, levels: Sequence[float] = LEVELS, names: Sequence[str] | None = None
+) -> ConfidenceIntervals:
+    """Return where the profile of the deviance meets the thresholds; open where it does not.
+
+    Of all parameters, or only searched for those of some names.
+    """
     array = checked_levels(levels)
-    lower, upper = Profiler(optimum).limits(thresholds(optimum, array))
+    lower, upper = Profiler(optimum).limits(thresholds(optimum, array), names)
     return intervals_from_search(optimum, "profile", array, lower, upper)
 
 
@@ -202,7 +207,8 @@ def combined_intervals(
     by_noise = np.sqrt(np.diagonal(optimum.covariance))
     doubtful = ~held | ~(by_noise <= _LARGE)
     if doubtful.any():
-        shape = profile_intervals(errors.by_noise_and_ranges, levels).of(optimum.names)
+        asked = [name for name, vague in zip(optimum.names, doubtful, strict=True) if vague]
+        shape = profile_intervals(errors.by_noise_and_ranges, levels, asked).of(optimum.names)
         values = np.where(held, values, shape.estimate)
         # with no limit on one side, u says nothing of the other
         unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))

@@ -334,6 +334,11 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "narrow_bands": _narrow_bands,
     "constraint": _constraint,
     "prior": _prior,
+    "beyond_range": lambda name, value, stderr, low, high: (
+        f"The data ask for {name} = {with_unit(value, stderr, '')}, outside the range assumed "
+        f"({low:g} to {high:g}): estimate it ({name}=None; {name}=free on the command line), or "
+        "use another law."
+    ),
     "moved": _moved,
     "negative": _negative,
     "slight": _slight,

@@ -197,6 +197,11 @@ class GroupsDiffer:
     highest: tuple[str, float]
     p_value: float
 
+    @property
+    def scatter(self) -> float:
+        """Half the range of ln gain."""
+        return 0.5 * float(np.log(self.highest[1] / self.lowest[1]))
+
     def __str__(self) -> str:
         ends = [
             f"{percent(abs(gain - 1.0))} {'below' if gain < 1.0 else 'above'} the model at {label}"
