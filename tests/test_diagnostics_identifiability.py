@@ -198,14 +198,14 @@ class TestVerdicts:
 
     def test_combinations_have_them_too(self) -> None:
         data = table(model=FRICTION + Spring(SIGMA), beta=(1e-2, 1e-1), noise=0.004)
-        found = identifiability(fit(turned(data), Dahl() + Spring(), throw=False))
+        found = identifiability(fit(turned(data), Dahl(alpha=1.0) + Spring(), throw=False))
         assert [c.unit for c in found.combinations] == ["N m/rad^2", "N m/rad"]
 
     @pytest.mark.parametrize("seed", [0, 6, 9, 10])
     def test_friction_that_does_not_show_leaves_the_stiffness_seen(self, seed: int) -> None:
         """Where friction may as well be none, sigma and its sum with the spring have no end."""
         data = table(model=FRICTION + Spring(30.0), beta=(1e-3, 1e-2), seed=seed)
-        found = identifiability(fit(data, Dahl() + Spring(), throw=False))
+        found = identifiability(fit(data, Dahl(alpha=1.0) + Spring(), throw=False))
         (seen,) = found.combinations
         assert seen.expression == "the stiffness seen at 1.05e-05 m"
         assert (

@@ -229,15 +229,8 @@ class ErrorModel:
         What was assumed is held at its estimate.
         """
         held = {name: self.values[name] for name in self.assumed}
-        return self._with_own_weights(self.problem.like(fixed=held) if held else self.problem)
-
-    @cached_property
-    def by_noise_and_ranges(self) -> Optimum:
-        """The same with what was assumed free, in its range."""
-        return self._with_own_weights(self.problem)
-
-    def _with_own_weights(self, problem: Problem) -> Optimum:
-        stated, problem = self.at_estimate, problem.widened(self.estimate.misfit_variance)
+        problem = self.problem.like(fixed=held) if held else self.problem
+        problem, stated = problem.widened(self.estimate.misfit_variance), self.at_estimate
         kept = [self.names.index(name) for name in problem.names]
         theta, lost = self.theta[kept], ~np.isfinite(np.diagonal(stated.covariance)[kept])
         covariance, _ = inverse(problem.information(theta, stated.scale))

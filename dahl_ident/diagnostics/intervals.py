@@ -24,7 +24,7 @@ Where the noise's scale was estimated, thresholds are those of Student's t and F
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -122,15 +122,6 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         row = np.isclose(self.levels, level)
         return replace(self, levels=self.levels[row], lower=self.lower[row], upper=self.upper[row])
 
-    def of(self, names: Sequence[str]) -> ConfidenceIntervals:
-        """Return the intervals of some of the parameters."""
-        kept = [i for i, name in enumerate(self.names) if name in names]
-        units = tuple(self.units[i] for i in kept)
-        return replace(
-            self, names=tuple(self.names[i] for i in kept), units=units,
-            estimate=self.estimate[kept], lower=self.lower[:, kept], upper=self.upper[:, kept],
-        )  # fmt: skip
-
     def noted(self, note: str) -> ConfidenceIntervals:
         """Return these intervals with another note."""
         return replace(self, note=note)
@@ -167,15 +158,10 @@ def wald_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> Confid
     )
 
 
-def profile_intervals(
-    optimum: Optimum, levels: Sequence[float] = LEVELS, names: Sequence[str] | None = None
-) -> ConfidenceIntervals:
-    """Return where the profile of the deviance meets the thresholds; open where it does not.
-
-    Of all parameters, or only searched for those of some names.
-    """
+def profile_intervals(optimum: Optimum, levels: Sequence[float] = LEVELS) -> ConfidenceIntervals:
+    """Return where the profile of the deviance meets the thresholds; open where it does not."""
     array = checked_levels(levels)
-    lower, upper = Profiler(optimum).limits(thresholds(optimum, array), names)
+    lower, upper = Profiler(optimum).limits(thresholds(optimum, array))
     return intervals_from_search(optimum, "profile", array, lower, upper)
 
 
@@ -183,11 +169,12 @@ def combined_intervals(
     optimum: Optimum,
     errors: ErrorModel,
     levels: Sequence[float],
+    profile: Callable[[], ConfidenceIntervals],
 ) -> ConfidenceIntervals:
     """Return intervals that count every source of error: value -+ k u.
 
-    Of a positive parameter whose u is above 20 %, value times or over exp(k u). Of one without a
-    limit on either side, the profile's, with assumed exponents free in their ranges.
+    Of a positive parameter whose u is above 20 %, value times or over exp(k u). Of one with an open
+    side, the profile's, widened by the sources that it does not count.
     """
     array = checked_levels(levels)
     held = np.array([errors.holds(name) for name in optimum.names])
@@ -204,17 +191,25 @@ def combined_intervals(
     values = errors.problem.to_values(errors.theta)[place]
     slopes = optimum.problem.space.slopes(values)
     lower, upper = around(optimum.problem.space, values, u * slopes, k)
-    by_noise = np.sqrt(np.diagonal(optimum.covariance))
+    noise = errors.by_noise
+    by_noise = np.sqrt(np.diagonal(noise.covariance))
     doubtful = ~held | ~(by_noise <= _LARGE)
     if doubtful.any():
-        asked = [name for name, vague in zip(optimum.names, doubtful, strict=True) if vague]
-        shape = profile_intervals(errors.by_noise_and_ranges, levels, asked).of(optimum.names)
+        shape = profile()
         values = np.where(held, values, shape.estimate)
-        # with no limit on one side, u says nothing of the other
+        # with no limit on one side, u says nothing of the other: the profile does, and its
+        # distance from the estimate is wider by all that it does not count
         unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))
         by_profile = doubtful & (~held | unlimited.any(axis=0))
-        lower = np.where(by_profile, shape.lower, lower)
-        upper = np.where(by_profile, shape.upper, upper)
+        beyond = np.where(held, np.maximum(u**2 - by_noise**2, 0.0), 0.0)
+        ends = []
+        for end, sign in ((shape.lower, -1.0), (shape.upper, 1.0)):
+            theta = _search(noise, end)
+            far = np.hypot(theta - noise.theta, k * np.sqrt(beyond))
+            moved = noise.problem.to_values(noise.theta + sign * far)
+            ends.append(np.where(np.isfinite(theta) & (beyond > 0.0), moved, end))
+        lower = np.where(by_profile, ends[0], lower)
+        upper = np.where(by_profile, ends[1], upper)
     shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"

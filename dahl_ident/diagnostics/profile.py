@@ -17,7 +17,6 @@ interval is open on that side.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -154,21 +153,17 @@ class Profiler:
 
     # Limits
 
-    def limits(
-        self, thresholds: FloatArray, wanted: Sequence[str] | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def limits(self, thresholds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper limits in search coordinates, each of shape (levels, P).
 
-        `thresholds` are roots of the deviance. Minus and plus infinity where a side is open, and
-        where a parameter is not among those wanted.
+        `thresholds` are roots of the deviance. Minus and plus infinity where a side is open.
         """
         P, L = self._problem.n_reported, len(thresholds)
         lower, upper = np.full((L, P), -np.inf), np.full((L, P), np.inf)
         if np.isfinite(self._scale) and np.isfinite(thresholds).all():
             ends = np.stack([lower, upper])
             side, level, index = (a.ravel() for a in np.indices((2, L, P)))
-            asked = np.array([wanted is None or n in wanted for n in self._problem.names[:P]])
-            search = np.flatnonzero(~self._open[side, index] & asked[index])
+            search = np.flatnonzero(~self._open[side, index])
             if search.size:
                 ends[side[search], level[search], index[search]] = self._ends(
                     index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
@@ -176,7 +171,7 @@ class Profiler:
                 if self._searched is not self._problem and not self._agrees(ends):
                     self._searched = self._problem
                     del self._at_optimum
-                    return self.limits(thresholds, wanted)
+                    return self.limits(thresholds)
             lower, upper = ends
         return lower, upper
 

@@ -130,10 +130,14 @@ class TableAssessment(Assessment):
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
+
+        def profile() -> ConfidenceIntervals:
+            return self.intervals("profile", levels, None, 0)
+
         errors = self.errors_of_combinations
         if errors is None:
-            return replace(self.intervals("profile", levels, None, 0), method="combined")
-        return combined_intervals(self.optimum, errors, levels)
+            return replace(profile(), method="combined")
+        return combined_intervals(self.optimum, errors, levels, profile)
 
     @cached_property
     def identifiability(self) -> Identifiability:
