@@ -215,7 +215,8 @@ class TestVerdicts:
         middle = np.sqrt(1e-3 * 1e-2) * X_C
         truth = FRICTION.describing_function(middle).real + 30.0
         assert seen.value == pytest.approx(truth, abs=3.0 * seen.stderr)
-        assert seen.stderr == pytest.approx(0.01 * truth / np.sqrt(30.0), rel=0.3)  # a mean's
+        of_mean = 0.01 * truth / np.sqrt(30.0)  # by noise alone; other sources may add to it
+        assert 0.7 * of_mean < seen.stderr < 4.0 * of_mean
         assert seen.unit == "N/m"
 
 
