@@ -114,8 +114,9 @@ class TestDepartures:
             judge(FrequencyResponse(f, N * relative_noise(10, 0.02, seed), A)) for seed in range(20)
         ]
         alarmed = [g.headline for g in found if not g.acceptable]
-        assert len(alarmed) >= 12
-        assert all("over frequency, from 0.25 to 2 Hz" in text for text in alarmed)
+        assert sum("over frequency, from 0.25 to 2 Hz" in text for text in alarmed) >= 12
+        known = ("over frequency", "depart smoothly")  # the latter where the trend is too vague
+        assert all(any(each in text for each in known) for text in alarmed)
 
     def test_the_size_does_not_depend_on_the_claimed_noise(self) -> None:
         data = swept_table(0.28)

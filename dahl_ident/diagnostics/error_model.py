@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import special
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_sources import (
@@ -288,6 +289,17 @@ class ErrorModel:
         """Rms of the smooth model error over that of the fundamentals' noise."""
         noise = float(np.sqrt(self.noises[0] * self.noise_square))
         return self.rms(MODEL_ERROR) / max(noise, TINY)
+
+    @cached_property
+    def structure_by_chance(self) -> float:
+        """Probability that noise alone makes as large a model error, by the likelihood's ratio."""
+        own = [k for k, source in enumerate(self.sources) if source.name == MODEL_ERROR]
+        if not own:
+            return 1.0
+        others = self.state.model.without(own)
+        alone = others.reml(np.ones(len(self.sources) - len(own)))
+        rise = 2.0 * (self.state.log_likelihood - alone.log_likelihood)
+        return float(0.5 * special.chdtrc(len(own), max(rise, 0.0)))
 
     def rms(self, name: str) -> float:
         """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.

@@ -144,6 +144,7 @@ class SmoothMisfit:
 
     size: float
     noise: float
+    p_value: float
 
     def __str__(self) -> str:
         return (
@@ -152,7 +153,17 @@ class SmoothMisfit:
         )
 
 
-_Test = GroupsDiffer | RunsDiffer | ChiSquare | Stiffening | Trend | Runs | Exponent | ThirdHarmonic
+_Test = (
+    SmoothMisfit
+    | GroupsDiffer
+    | RunsDiffer
+    | ChiSquare
+    | Stiffening
+    | Trend
+    | Runs
+    | Exponent
+    | ThirdHarmonic
+)
 
 
 @dataclass(frozen=True)
@@ -261,7 +272,7 @@ class Goodness:
     def _tests(self) -> list[_Test]:
         """Every test that applies."""
         first = (self.runs_differ, self.chi_square, self.stiffening)
-        last = (self.exponent, self.third_harmonic)
+        last = (self.exponent, self.third_harmonic, self.smooth)
         every = (*first, *self.groups, *self.trends, *self.runs, *last)
         return [test for test in every if test is not None]
 
@@ -309,7 +320,7 @@ class Goodness:
         if self.exponent is not None and self.exponent.fixed == 1.0 and (curve or over):
             yield "these data are not linear Dahl"
         yield from map(str, (*over, *curve))
-        if self.smooth is not None and not (curve or over):
+        if self.smooth is not None and self.smooth.p_value < level and not found:
             yield str(self.smooth)
         for test in (self.third_harmonic, self.chi_square):
             if test is not None and test.p_value < level:
@@ -513,7 +524,7 @@ def _tested(
         flagged_rows(problem.data),
         _untested(optimum),
         int((problem.data.harmonic == 1).sum()),
-        smooth=_smooth(errors),
+        smooth=_smooth(errors) if within is None else None,
     )
 
 
@@ -521,7 +532,7 @@ def _smooth(errors: ErrorModel | None) -> SmoothMisfit | None:
     if errors is None or errors.structure <= 1.0:
         return None
     size = errors.rms(MODEL_ERROR)
-    return SmoothMisfit(size, size / errors.structure)
+    return SmoothMisfit(size, size / errors.structure, errors.structure_by_chance)
 
 
 def _relative(name: str, size: float) -> str:

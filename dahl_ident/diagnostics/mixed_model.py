@@ -70,6 +70,13 @@ class MixedModel:
         ends = [*self.starts.tolist(), self.U.shape[1]]
         return slice(ends[k], ends[k + 1])
 
+    def without(self, left_out: Sequence[int]) -> MixedModel:
+        """Return the model without some of its sources."""
+        kept = [k for k in range(len(self.starts)) if k not in left_out]
+        Z = [self.U[:, self.columns(k)] for k in kept]
+        J, most = self.U[:, : self.parameters], self.most[self.noises :][kept]
+        return MixedModel(self.y, J, Z, self.group, self.known, self.noises, most)
+
     def elsewhere(self, y: FloatArray, J: FloatArray) -> MixedModel:
         """Return the same sources with residuals and derivatives at other parameters."""
         Z = [self.U[:, self.columns(k)] for k in range(len(self.starts))]
