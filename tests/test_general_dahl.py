@@ -61,7 +61,7 @@ def harmonic_gradient(beta: FloatArray, alpha: FloatArray, k: int) -> list[Compl
 )
 def test_turning_force_in_closed_form(alpha: float, exact: np.ufunc) -> None:
     beta = np.geomspace(1e-60, 1.99, 400)
-    np.testing.assert_allclose(turning_force(beta, at(alpha)), exact(beta), rtol=2e-15)
+    np.testing.assert_allclose(turning_force(beta, at(alpha)), exact(beta), rtol=1e-14)
 
 
 @pytest.mark.parametrize("k", ODD)
