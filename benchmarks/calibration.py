@@ -25,7 +25,7 @@ from scipy import stats
 import dahl_ident as di
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.storage import library
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 RANKS = 100
 LEVEL = 0.01
@@ -92,7 +92,7 @@ SCENARIOS = {"friction": friction, "plant": plant}
 
 def ranks(scenario: Scenario, tables: int, seed: int = 0) -> tuple[FloatArray, int]:
     """Return the rank of each truth, shape (tables, P), and how many chains did not converge."""
-    shape = Problem(scenario.table(None), scenario.model())
+    shape = TableProblem(scenario.table(None), scenario.model())
     found = np.empty((tables, len(shape.names)))
     failed = 0
     for index in range(tables):
@@ -162,7 +162,7 @@ def report(results: dict[str, tuple[FloatArray, int]], folder: Path) -> str:
     for name, (found, failed) in results.items():
         scenario = SCENARIOS[name]()
         limit = critical(len(found), found.shape[1])
-        names = Problem(scenario.table(None), scenario.model()).names
+        names = TableProblem(scenario.table(None), scenario.model()).names
         for parameter, column in zip(names, found.T, strict=True):
             value = extremity(column)
             lines.append(

@@ -39,7 +39,7 @@ from dahl_ident.diagnostics.verdicts import (
     natural_sizes,
 )
 from dahl_ident.fitting import Optimum, Status, solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -58,7 +58,7 @@ class Scenario:
     """A mechanism and an experiment on it."""
 
     name: str
-    problem: Problem
+    problem: TableProblem
     truth: FloatArray
     noise: float
 
@@ -87,10 +87,10 @@ def _friction(
     A = np.geomspace(low, high, n) * X_C
     model = Dahl() + Spring() if len(truth) == 3 else Model(Dahl())
     placeholder = FrequencyResponse(np.ones(n), np.ones(n), A)
-    problem = Problem(placeholder, model, noise="relative")
+    problem = TableProblem(placeholder, model, noise="relative")
     exact = problem.predict(problem.to_search(truth))
     data = FrequencyResponse(np.ones(n), exact, A)
-    return Scenario(name, Problem(data, model, noise="relative"), np.array(truth), noise)
+    return Scenario(name, TableProblem(data, model, noise="relative"), np.array(truth), noise)
 
 
 def _plant(name: str, noise: float) -> Scenario:
@@ -107,7 +107,7 @@ def _plant(name: str, noise: float) -> Scenario:
         quantity="receptance",
     )
     model = Dahl() + Mass() + Damper() + Spring()
-    return Scenario(name, Problem(data, model, noise="relative"), np.array(truth), noise)
+    return Scenario(name, TableProblem(data, model, noise="relative"), np.array(truth), noise)
 
 
 @dataclass
@@ -146,7 +146,7 @@ def tally(
         rng = np.random.default_rng([SEED, seed, index])
         drawn = problem.draw(theta, scenario.noise, 1, rng)
         data = replace(problem.data, response=drawn[0])
-        optimum = solve(Problem(data, problem.model, noise=problem.noise))
+        optimum = solve(TableProblem(data, problem.model, noise=problem.noise))
         _count(result, scenario, optimum, index - first < bootstrapped, replicates, index)
     return result
 

@@ -19,7 +19,7 @@ from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, fit_m
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element, linear_dahl
 from dahl_ident.fitting import solve, solve_many
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import ProblemBatch, TableProblem
 from dahl_ident.steady_state import Steady
 
 TITLE = "Least squares"
@@ -82,7 +82,7 @@ def _cold() -> Row:
     N = Dahl(*_TRUTH).describing_function(_AMPLITUDE) * _noise(_POINTS)
     data = FrequencyResponse(np.ones(_POINTS), N, _AMPLITUDE)
     peer = _lmfit_once(_AMPLITUDE, N)
-    np.testing.assert_allclose(solve(Problem(data, Dahl())).values, peer(), rtol=1e-6)
+    np.testing.assert_allclose(solve(TableProblem(data, Dahl())).values, peer(), rtol=1e-6)
     times = 100
     ours, theirs = median_of_pairs(
         _repeated(lambda: fit(data, Dahl()), times), _repeated(peer, times)
@@ -126,7 +126,9 @@ def _budgets() -> Row:
 
 def _bootstrap() -> Row:
     N = Dahl(*_TRUTH).describing_function(_AMPLITUDE)
-    problem = Problem(FrequencyResponse(np.ones(_POINTS), N * _noise(_POINTS), _AMPLITUDE), Dahl())
+    problem = TableProblem(
+        FrequencyResponse(np.ones(_POINTS), N * _noise(_POINTS), _AMPLITUDE), Dahl()
+    )
     start = problem.to_search(_TRUTH)
 
     def ours() -> object:
@@ -187,7 +189,7 @@ def _plant() -> list[Row]:
         return np.asarray(least_squares(residual, start, x_scale=start).x)
 
     def ours() -> FloatArray:
-        return solve(Problem(data, _PLANT, steady=SINE)).values
+        return solve(TableProblem(data, _PLANT, steady=SINE)).values
 
     np.testing.assert_allclose(ours(), peer(by_response), rtol=1e-5)
     mine, theirs = median_of_pairs(ours, lambda: peer(by_response))
@@ -201,7 +203,7 @@ def _plant() -> list[Row]:
 
 def _plant_bootstrap() -> Row:
     data = _plant_data(5, 12)
-    problem = Problem(data, _PLANT)
+    problem = TableProblem(data, _PLANT)
     start = problem.to_search(_PLANT_TRUTH)
     responses = problem.draw(start, _NOISE, _REPLICATES, np.random.default_rng(3))
     few = [replace(data, response=drawn) for drawn in responses[:20]]

@@ -12,7 +12,7 @@ from benchmarks.harness import Row, median_of_pairs, print_table
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, response
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.ipopt import solve_ipopt
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.steady_state import Steady
 
 LEVELS, FREQUENCIES = 12, 60
@@ -21,7 +21,7 @@ SINE: Steady = "describing function"
 TRUTH = (0.1, 30.0, 0.3, 0.24, 0.3)
 
 
-def problem(alpha: float | None = 1.0) -> Problem:
+def problem(alpha: float | None = 1.0) -> TableProblem:
     """Return the estimation problem, 2 % noise."""
     f_max, sigma, mass, damping, stiffness = TRUTH
     plant = Dahl(f_max, sigma) + Mass(mass) + Damper(damping) + Spring(stiffness)
@@ -33,10 +33,10 @@ def problem(alpha: float | None = 1.0) -> Problem:
     data = FrequencyResponse(
         frequency, measured, drive=drive, controlled="force", quantity="receptance"
     )
-    return Problem(data, Dahl(alpha=alpha) + Mass() + Damper() + Spring(), steady=SINE)
+    return TableProblem(data, Dahl(alpha=alpha) + Mass() + Damper() + Spring(), steady=SINE)
 
 
-def _from_optimum(plant: Problem) -> float:
+def _from_optimum(plant: TableProblem) -> float:
     """Return the median seconds that IPOPT adds to the least-squares search."""
     before, whole = median_of_pairs(lambda: solve(plant), lambda: solve_ipopt(plant))
     return whole - before

@@ -18,7 +18,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.fitting import solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
@@ -128,7 +128,7 @@ def beam() -> None:
         least = slip_density(data, di.Mass() + di.Damper()).least_misfit
         cells = [f"{100.0 * least:.1f} %"]
         for law in (di.Iwan(), di.Dahl()):
-            found = solve(Problem(data, law + di.Mass() + di.Damper()))
+            found = solve(TableProblem(data, law + di.Mass() + di.Damper()))
             cells.append(f"{100.0 * rms_misfit(found.problem, found.theta):.1f} %")
         print(f"| {kind.lower()} | {data.n} | {' | '.join(cells)} |", flush=True)
 

@@ -11,13 +11,13 @@ from dahl_ident import Dahl, FrequencyResponse, Model, Spring
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
 from dahl_ident.fitting.levenberg_marquardt import minimise
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 
 class Case(NamedTuple):
     """One problem, and its least cost by a dense scan over x_c, or by searches from many starts."""
 
-    problem: Problem
+    problem: TableProblem
     least_cost: float
     at_edge: bool
     """Whether the scan's least cost lies at the end of its range."""
@@ -36,7 +36,7 @@ def friction_alone(seed: int, count: int) -> Iterator[Case]:
         relative = bool(rng.random() < 0.5)
         measured = N * np.exp(error) if relative else N + error * np.abs(N).mean()
         data = FrequencyResponse(np.ones(n), measured, A)
-        problem = Problem(data, Dahl(), noise="relative" if relative else "absolute")
+        problem = TableProblem(data, Dahl(), noise="relative" if relative else "absolute")
         ln_x_c = np.linspace(np.log(A.min()) - 15.0, np.log(A.max()) + 12.0, 500)
         h = Dahl(1.0, 1.0).describing_function(A / np.exp(ln_x_c)[:, None])
         cost, ln_sigma = _log_scan(measured, h) if relative else _linear_scan(measured, h, [])
@@ -56,7 +56,7 @@ def friction_and_spring(seed: int, count: int) -> Iterator[Case]:
         level = 10.0 ** rng.uniform(-4.0, -1.0) * np.abs(Z).mean()
         measured = Z + level * (rng.normal(size=n) + 1j * rng.normal(size=n))
         data = FrequencyResponse(np.ones(n), measured, A)
-        problem = Problem(data, _with_spring(), noise="absolute")
+        problem = TableProblem(data, _with_spring(), noise="absolute")
         ln_x_c = np.linspace(np.log(A.min()) - 37.0, np.log(A.max()) + 11.0, 1500)
         h = Dahl(1.0, 1.0).describing_function(A / np.exp(ln_x_c)[:, None])
         cost, _ = _linear_scan(measured, h, [np.ones(n, dtype=np.complex128)])
@@ -104,16 +104,16 @@ def _around_the_knee(rng: np.random.Generator) -> FloatArray:
 
 def _observed(
     truth: Element, model: Element, A: FloatArray, rng: np.random.Generator
-) -> tuple[Problem, FloatArray, float]:
+) -> tuple[TableProblem, FloatArray, float]:
     """Return a problem with noise of 1e-4 to 0.03, nine x_c to start from, and the stiffness."""
     Z = truth.dynamic_stiffness(A)
     level = 10.0 ** rng.uniform(-4.0, -1.5)
     measured = Z * np.exp(level * (rng.normal(size=A.size) + 1j * rng.normal(size=A.size)))
-    problem = Problem(FrequencyResponse(np.ones(A.size), measured, A), model)
+    problem = TableProblem(FrequencyResponse(np.ones(A.size), measured, A), model)
     return problem, np.geomspace(0.03 * A.min(), 30.0 * A.max(), 9), float(np.abs(Z).max())
 
 
-def _searched(problem: Problem, starts: FloatArray) -> Case:
+def _searched(problem: TableProblem, starts: FloatArray) -> Case:
     """Return the least cost of searches from every start."""
     found = minimise(
         lambda at, _: problem.quadratic(at),
@@ -129,7 +129,9 @@ def _with_spring() -> Model:
     return Model(Dahl() + Spring())
 
 
-def _case(problem: Problem, cost: FloatArray, ln_x_c: FloatArray, ln_sigma: FloatArray) -> Case:
+def _case(
+    problem: TableProblem, cost: FloatArray, ln_x_c: FloatArray, ln_sigma: FloatArray
+) -> Case:
     """Polish the scan's least node; what it leads to does not depend on any other start."""
     node = int(cost.argmin())
     theta = np.array([[ln_x_c[node] + ln_sigma[node], ln_sigma[node]]])

@@ -21,7 +21,7 @@ from dahl_ident.bayes.moves import (
     snooker,
 )
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.bayes_cases import FRICTION, friction_table, with_covariance
 
 
@@ -143,7 +143,7 @@ def test_interchangeable_elements_keep_their_order() -> None:
     truth = di.Dahl(f_max=0.1, sigma=300.0, name="a") + di.Dahl(f_max=0.5, sigma=30.0, name="b")
     random = np.random.default_rng(2)
     noise = 0.01 * (random.normal(size=25) + 1j * random.normal(size=25))
-    exact = Problem(
+    exact = TableProblem(
         di.FrequencyResponse(np.ones(25), np.ones(25) + 0j, amplitude), truth, free=["a_f_max"]
     ).predict(np.log([0.1]))
     data = di.FrequencyResponse(np.ones(25), exact * np.exp(noise), amplitude)

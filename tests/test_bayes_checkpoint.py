@@ -18,7 +18,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident.data import storage
 from dahl_ident.errors import SamplingError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.results import Posterior
 from tests.bayes_cases import friction_table
 
@@ -100,16 +100,16 @@ def test_an_exception_leaves_all_steps_in_the_file(
 ) -> None:
     path = tmp_path / "chain.h5"
     calls = 0
-    likelihood = Problem.log_likelihood
+    likelihood = TableProblem.log_likelihood
 
-    def interrupted(self: Problem, *args: Any) -> Any:
+    def interrupted(self: TableProblem, *args: Any) -> Any:
         nonlocal calls
         calls += 1
         if calls == 300:
             raise KeyboardInterrupt
         return likelihood(self, *args)
 
-    monkeypatch.setattr(Problem, "log_likelihood", interrupted)
+    monkeypatch.setattr(TableProblem, "log_likelihood", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sampled(path, seed=9, steps=400)
     monkeypatch.undo()

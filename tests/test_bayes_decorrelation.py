@@ -8,18 +8,18 @@ import pytest
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.bayes_cases import FRICTION, X_C, friction_table, spring_table
 
 PLANT = di.Dahl() + di.Spring() + di.Damper() + di.Mass()
 
 
-def problem() -> Problem:
+def problem() -> TableProblem:
     amplitude = np.tile(np.geomspace(0.01, 1.0, 6) * X_C, 3)
     frequency = np.repeat([1.0, 2.0, 3.0], 6)
     truth = FRICTION + di.Spring(20.0) + di.Damper(0.3) + di.Mass(0.1)
     response = truth.dynamic_stiffness(amplitude, 2.0 * np.pi * frequency)
-    return Problem(di.FrequencyResponse(frequency, response, amplitude), PLANT)
+    return TableProblem(di.FrequencyResponse(frequency, response, amplitude), PLANT)
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +68,9 @@ def test_least_squares_for_given_friction_stays_in_place(decorrelation: Decorrel
 
 
 def test_friction_or_a_plant_alone_needs_none() -> None:
-    assert decorrelation_of(Problem(friction_table(), di.Dahl())) is None
-    assert decorrelation_of(Problem(friction_table(), di.Dahl() + di.Spring(3.0))) is None
-    assert decorrelation_of(Problem(friction_table(), FRICTION + di.Spring())) is None
+    assert decorrelation_of(TableProblem(friction_table(), di.Dahl())) is None
+    assert decorrelation_of(TableProblem(friction_table(), di.Dahl() + di.Spring(3.0))) is None
+    assert decorrelation_of(TableProblem(friction_table(), FRICTION + di.Spring())) is None
 
 
 def test_a_curved_ridge_is_walked_along() -> None:

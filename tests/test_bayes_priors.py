@@ -12,14 +12,14 @@ from scipy import stats
 import dahl_ident as di
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.bayes_cases import friction_table
 
 pytestmark = pytest.mark.versions
 
 
-def problem(**options: Any) -> Problem:
-    return Problem(friction_table(), di.Dahl(), **options)
+def problem(**options: Any) -> TableProblem:
+    return TableProblem(friction_table(), di.Dahl(), **options)
 
 
 def test_bounds_are_log_uniform() -> None:
@@ -79,7 +79,7 @@ def test_defaults_hold_what_the_data_show() -> None:
 def test_plants_and_sensors_have_defaults() -> None:
     plant = di.Dahl(alpha=1.0) + di.Spring() + di.Mass() + di.Damper()
     sensors = di.Sensors(force_gain=None, delay=None)
-    made = Problem(friction_table(), plant, sensors=sensors, free=["alpha"])
+    made = TableProblem(friction_table(), plant, sensors=sensors, free=["alpha"])
     prior = joint_prior(made)
     limits = dict(zip(made.names, (part.limits for part in prior.priors), strict=True))
     assert np.exp(limits["alpha"]) == pytest.approx((0.1, 10.0))
@@ -94,7 +94,7 @@ def test_rotation_has_the_same_defaults() -> None:
     table = friction_table()
     turned = replace(table, motion="rotation")
     model = di.Dahl() + di.Spring() + di.Damper()
-    here, there = (joint_prior(Problem(data, model)) for data in (table, turned))
+    here, there = (joint_prior(TableProblem(data, model)) for data in (table, turned))
     assert [p.limits for p in there.priors] == [p.limits for p in here.priors]
 
 
@@ -113,8 +113,8 @@ def test_a_law_gets_defaults_from_its_declaration() -> None:
             return values[1] * (1.0 - direction * force / values[0])
 
     table = friction_table()
-    prior = joint_prior(Problem(table, Law()))
-    dahl = joint_prior(Problem(table, di.Dahl()))
+    prior = joint_prior(TableProblem(table, Law()))
+    dahl = joint_prior(TableProblem(table, di.Dahl()))
     assert [p.limits for p in prior.priors[:2]] == [p.limits for p in dahl.priors]
     per_speed = np.abs(table.response) / (2.0 * np.pi * table.frequency_hz)
     assert np.exp(prior.priors[2].limits[1]) == pytest.approx(1e5 * per_speed.max())
@@ -122,7 +122,7 @@ def test_a_law_gets_defaults_from_its_declaration() -> None:
 
 
 def test_defaults_of_plants_hold_a_larger_estimate() -> None:
-    made = Problem(friction_table(), di.Dahl() + di.Spring())
+    made = TableProblem(friction_table(), di.Dahl() + di.Spring())
     prior = joint_prior(made, estimate=np.array([0.1, 30.0, -1e5]))
     assert prior.priors[2].limits == pytest.approx((-1e6, 1e6), rel=1e-9)
 

@@ -15,7 +15,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.levenberg_marquardt import minimise
-from dahl_ident.problem import Problem, ProblemBatch, Quadratic
+from dahl_ident.problem import ProblemBatch, Quadratic, TableProblem
 
 n = 20
 A = np.geomspace(1e-4, 1e-1, n)
@@ -42,7 +42,7 @@ def model(f_max: float, sigma: float) -> ComplexArray:
 @pytest.mark.parametrize("noise", ["measured", "relative", "absolute"])
 @pytest.mark.versions
 def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
-    problem = Problem(table(covariance=COVARIANCE), Dahl(), noise=noise)
+    problem = TableProblem(table(covariance=COVARIANCE), Dahl(), noise=noise)
     found = solve(problem)
     whitening = np.linalg.inv(np.linalg.cholesky(COVARIANCE))
 
@@ -106,7 +106,7 @@ def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
             controlled="force",
             quantity=quantity,  # type: ignore[arg-type]  # both are among the six
         )
-        found = solve(Problem(data, free))
+        found = solve(TableProblem(data, free))
         assert found.success
         z = (found.values - true) / list(found.stderr.values())
         assert np.all(np.abs(z) < 4.0)
@@ -118,9 +118,9 @@ def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
 @pytest.mark.parametrize("exponent", [-30, 30])
 @pytest.mark.versions
 def test_units_do_not_matter(exponent: int) -> None:
-    here = solve(Problem(table(), Dahl()))
+    here = solve(TableProblem(table(), Dahl()))
     a = 10.0**exponent
-    there = solve(Problem(FrequencyResponse(np.ones(n), MEASURED / a**2, A * a), Dahl()))
+    there = solve(TableProblem(FrequencyResponse(np.ones(n), MEASURED / a**2, A * a), Dahl()))
     np.testing.assert_allclose(there.values, here.values * [1.0 / a, 1.0 / a**2], rtol=1e-9)
     np.testing.assert_allclose(there.covariance, here.covariance, rtol=1e-6)
 
@@ -131,12 +131,12 @@ def test_a_parameter_at_its_bound_is_named() -> None:
             "f_max", "N", "friction limit", lower=0.0, upper=0.08, transform="log"
         )}
     )  # fmt: skip
-    found = solve(Problem(table(), capped))
+    found = solve(TableProblem(table(), capped))
     assert found.status is Status.AT_BOUND
     assert found.success
     assert found.values[0] == pytest.approx(0.08, rel=1e-7)
     assert "At its bound: f_max = 0.08." in found.message
-    held = solve(Problem(table(), Dahl(), fixed={"f_max": 0.08}))
+    held = solve(TableProblem(table(), Dahl(), fixed={"f_max": 0.08}))
     assert found.values[1] == pytest.approx(held.values[0], rel=1e-6)
 
 
@@ -145,10 +145,10 @@ def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
     spoiled = MEASURED.copy()
     spoiled[[3, 12]] *= [8.0, 0.2j]
     clean, robust = (
-        solve(Problem(table(), Dahl())),
-        solve(Problem(table(spoiled), Dahl()), loss=loss),
+        solve(TableProblem(table(), Dahl())),
+        solve(TableProblem(table(spoiled), Dahl()), loss=loss),
     )
-    ordinary = solve(Problem(table(spoiled), Dahl()))
+    ordinary = solve(TableProblem(table(spoiled), Dahl()))
     assert robust.status is Status.CONVERGED
     assert robust.loss == loss
     off = np.abs(robust.theta - clean.theta) / np.sqrt(np.diagonal(robust.covariance))
@@ -157,7 +157,7 @@ def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
         np.abs(ordinary.theta - clean.theta).max() > 3.0 * np.abs(robust.theta - clean.theta).max()
     )
     # the cost is at its minimum for the scale found
-    problem = Problem(table(spoiled), Dahl())
+    problem = TableProblem(table(spoiled), Dahl())
 
     def cost(theta: FloatArray) -> float:
         y = problem.residuals(theta).view(np.complex128)
@@ -179,7 +179,7 @@ def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(
     near[row] *= 1e5
     far[row] *= factor
     expected, found = (
-        solve(Problem(table(N), Dahl(), noise="absolute"), loss=loss) for N in (near, far)
+        solve(TableProblem(table(N), Dahl(), noise="absolute"), loss=loss) for N in (near, far)
     )
     assert found.status is expected.status is Status.CONVERGED
     error = np.sqrt(np.diagonal(expected.covariance))
@@ -192,7 +192,7 @@ def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
     rng, z, scales = np.random.default_rng(1), [], []
     for _ in range(80):
         error = rng.normal(size=n) + 1j * rng.normal(size=n)
-        found = solve(Problem(table(TRUE * np.exp(0.05 * error)), Dahl()), loss=loss)
+        found = solve(TableProblem(table(TRUE * np.exp(0.05 * error)), Dahl()), loss=loss)
         z.append((found.theta - np.log([0.1, 30.0])) / np.sqrt(np.diagonal(found.covariance)))
         scales.append(found.scale)
     assert np.abs(np.std(z, axis=0) - 1.0).max() < 0.22
@@ -202,9 +202,9 @@ def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
 @pytest.mark.versions
 def test_a_prior_joins_data_of_known_scale() -> None:
     data = table(covariance=COVARIANCE)
-    exact = solve(Problem(data, Dahl()))
+    exact = solve(TableProblem(data, Dahl()))
     prior = stats.norm(1.0, 0.03)
-    found = solve(Problem(data, Dahl(), sensors=Sensors(force_gain=prior)))
+    found = solve(TableProblem(data, Dahl(), sensors=Sensors(force_gain=prior)))
     # a force gain scales f_max and sigma alike, so its variance adds to both logarithms
     np.testing.assert_allclose(found.theta, [*exact.theta, 0.0], atol=1e-6)
     expected = exact.covariance + 0.03**2
@@ -214,21 +214,21 @@ def test_a_prior_joins_data_of_known_scale() -> None:
 
 def test_a_prior_joins_data_of_unknown_scale() -> None:
     prior = stats.norm(1.0, 0.03)
-    exact = solve(Problem(table(), Dahl()))
-    found = solve(Problem(table(), Dahl(), sensors=Sensors(force_gain=prior)))
+    exact = solve(TableProblem(table(), Dahl()))
+    found = solve(TableProblem(table(), Dahl(), sensors=Sensors(force_gain=prior)))
     assert found.scale == pytest.approx(exact.scale, rel=1e-6)
     np.testing.assert_allclose(found.covariance[:2, :2], exact.covariance + 0.03**2, rtol=1e-3)
 
 
 def test_what_cannot_be_told_apart_is_singular() -> None:
-    found = solve(Problem(table(), Dahl(), sensors=Sensors(force_gain=None)))
+    found = solve(TableProblem(table(), Dahl(), sensors=Sensors(force_gain=None)))
     assert found.status is Status.SINGULAR
     assert not found.success
     assert "Involved: f_max, sigma, force_gain." in found.message
     assert found.stderr["f_max"] == np.inf
     x_c = np.exp(found.theta[0] - found.theta[1])
     assert x_c == pytest.approx(
-        np.exp(-np.diff(solve(Problem(table(), Dahl())).theta))[0], rel=1e-6
+        np.exp(-np.diff(solve(TableProblem(table(), Dahl())).theta))[0], rel=1e-6
     )
 
 
@@ -236,7 +236,7 @@ def test_stated_intervals_cover_with_relative_noise_of_ten_percent() -> None:
     rng, tables = np.random.default_rng(21), 2000
     points = np.geomspace(1e-3, 1e-2, 8)
     N = Dahl(0.1, 30.0).describing_function(points)
-    problem = Problem(FrequencyResponse(np.ones(8), N, points), Dahl())
+    problem = TableProblem(FrequencyResponse(np.ones(8), N, points), Dahl())
     error = rng.normal(size=(tables, 8)) + 1j * rng.normal(size=(tables, 8))
     found = solve_many(ProblemBatch.replicates(problem, N * np.exp(0.1 * error)))
     assert found.success.all()
@@ -249,7 +249,7 @@ def test_stated_intervals_cover_with_relative_noise_of_ten_percent() -> None:
 
 
 def test_a_start_is_completed_and_checked() -> None:
-    problem = Problem(table(), Dahl())
+    problem = TableProblem(table(), Dahl())
     with pytest.raises(ModelError, match="start names mass; the free parameters are f_max, sigma"):
         solve(problem, start={"mass": 1.0})
     np.testing.assert_allclose(
@@ -260,14 +260,14 @@ def test_a_start_is_completed_and_checked() -> None:
 def test_too_little_data_are_refused() -> None:
     data = FrequencyResponse([1.0], [1.0 + 1.0j], [1.0])
     with pytest.raises(FitError, match="1 rows give 2 numbers, fewer than the 3 free parameters"):
-        solve(Problem(data, Dahl() + Spring()))
+        solve(TableProblem(data, Dahl() + Spring()))
     with pytest.raises(ValidationError, match="loss is 'cauchy'; expected linear, huber"):
-        solve(Problem(data, Dahl()), loss="cauchy")
+        solve(TableProblem(data, Dahl()), loss="cauchy")
 
 
 def test_as_many_numbers_as_parameters_leave_no_scale() -> None:
     data = FrequencyResponse([1.0], [20.0 + 10.0j], [1e-2])
-    found = solve(Problem(data, Dahl()))
+    found = solve(TableProblem(data, Dahl()))
     assert found.dof == 0
     assert np.isnan(found.scale)
     assert np.isinf(np.diagonal(found.covariance)).all()

@@ -14,7 +14,7 @@ from dahl_ident.elements import Element
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import Optimum, Status, solve, solve_many
 from dahl_ident.fitting.ipopt import solve_ipopt
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import ProblemBatch, TableProblem
 
 
 def positive(name: str, unit: str) -> di.Parameter:
@@ -110,7 +110,7 @@ def test_a_law_of_ten_lines_is_found_without_a_guess_by_every_method(
 ) -> None:
     table = alone() if data == "alone" else plant(data)
     model: Element = law() if data == "alone" else law() + di.Mass() + di.Damper() + di.Spring()
-    problem = Problem(table, model, steady="describing function")  # which made the data
+    problem = TableProblem(table, model, steady="describing function")  # which made the data
     by_lm = solve(problem)
     assert_truth(by_lm)
     assert by_lm.method == "lm"
@@ -130,7 +130,7 @@ def test_random_problems_over_twelve_decades_are_recovered() -> None:
         A = delta * 10.0 ** np.sort(rng.uniform(-0.3, rng.uniform(0.5, 2.0), n))
         data = di.FrequencyResponse(np.ones(n), noisy(jenkins(A, stiff, delta), 1e-3, index), A)
         law = (ByForce, BySlip)[index % 2]()
-        found = solve(Problem(data, law))
+        found = solve(TableProblem(data, law))
         truth = np.array([stiff, delta if index % 2 else stiff * delta])
         assert found.success
         spread = np.sqrt(np.diagonal(found.covariance))
@@ -141,7 +141,7 @@ def test_random_problems_over_twelve_decades_are_recovered() -> None:
 def test_a_law_that_never_slips_says_which_parameter_runs_away(law: type[di.Friction]) -> None:
     A = np.geomspace(1e-7, 1e-5, 20)
     data = di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, DELTA)), A)
-    found = solve(Problem(data, law(), noise="absolute"))
+    found = solve(TableProblem(data, law(), noise="absolute"))
     assert found.status is Status.RUNS_AWAY
     lost = found.names[1]
     assert found.values[1] == np.inf
@@ -155,7 +155,9 @@ def test_a_law_that_always_slips_determines_its_force() -> None:
     A = np.geomspace(1e5, 1e7, 20) * DELTA
     Z = 1j * np.exp(0.01j) * 4.0 / np.pi * STIFF * DELTA / A  # a stiffness a little below zero
     for law, expression in ((ByForce, "f_max"), (BySlip, "stiff delta")):
-        found = solve(Problem(di.FrequencyResponse(np.ones(20), Z, A), law(), noise="relative"))
+        found = solve(
+            TableProblem(di.FrequencyResponse(np.ones(20), Z, A), law(), noise="relative")
+        )
         assert found.status is Status.RUNS_AWAY
         (kept,) = found.combinations
         assert kept.expression == expression
@@ -166,7 +168,7 @@ def test_like_elements_of_any_law_are_ordered_by_their_knees() -> None:
     A = np.geomspace(1e-4, 1e-1, 24)
     Z = jenkins(A, 20.0, 1e-2) + jenkins(A, 30.0, 8e-4)
     data = di.FrequencyResponse(np.ones(24), noisy(Z, 1e-3), A)
-    found = solve(Problem(data, BySlip(name="first") + BySlip(name="second")))
+    found = solve(TableProblem(data, BySlip(name="first") + BySlip(name="second")))
     assert found.names[1::2] == ("first_delta", "second_delta")
     np.testing.assert_allclose(found.values, [30.0, 8e-4, 20.0, 1e-2], rtol=0.03)
 
@@ -179,7 +181,9 @@ def test_a_batch_of_a_law_equals_its_tables_one_by_one() -> None:
     ]
     together = solve_many(ProblemBatch(tables, BySlip()))
     for one, table in zip(together, tables, strict=True):
-        np.testing.assert_allclose(one.values, solve(Problem(table, BySlip())).values, rtol=1e-5)
+        np.testing.assert_allclose(
+            one.values, solve(TableProblem(table, BySlip())).values, rtol=1e-5
+        )
 
 
 def test_method_names_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,7 +204,7 @@ def test_method_names_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(calls) >= 1
     np.testing.assert_allclose(by_scipy.optimum.values, by_lm.optimum.values, rtol=1e-6)
     with pytest.raises(ValidationError, match="method is 'newton'; expected lm or scipy"):
-        solve(Problem(data, di.Dahl()), method="newton")
+        solve(TableProblem(data, di.Dahl()), method="newton")
 
 
 def test_even_harmonics_take_part_where_a_law_has_them() -> None:
@@ -208,9 +212,9 @@ def test_even_harmonics_take_part_where_a_law_has_them() -> None:
     A = np.geomspace(1e-3, 1e-1, 12)
     Z = [law.dynamic_stiffness(a, harmonic=k) for a in A for k in (1, 2)]
     both = di.FrequencyResponse(np.ones(24), Z, np.repeat(A, 2), harmonic=np.tile([1, 2], 12))
-    found = solve(Problem(both, OneWay(), noise="absolute"))
+    found = solve(TableProblem(both, OneWay(), noise="absolute"))
     np.testing.assert_allclose(found.values, [30.0, 0.1], rtol=1e-6)
     even = di.FrequencyResponse(np.ones(12), Z[1::2], A, harmonic=np.full(12, 2))
-    assert solve(Problem(even, OneWay(), noise="absolute")).success
+    assert solve(TableProblem(even, OneWay(), noise="absolute")).success
     with pytest.raises(DataError, match=r"harmonics 2, and no element of ByForce.* has any"):
-        Problem(even, ByForce(), noise="absolute")
+        TableProblem(even, ByForce(), noise="absolute")

@@ -10,7 +10,7 @@ from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum, Status, solve, solve_many
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import ProblemBatch, TableProblem
 from tests.random_problems import friction_and_spring
 
 n = 24
@@ -20,7 +20,7 @@ ERROR = RNG.normal(size=n) + 1j * RNG.normal(size=n)
 
 
 def fitted(Z: ArrayLike, model: Element, *, noise: str = "absolute") -> Optimum:
-    return solve(Problem(FrequencyResponse(np.ones(n), Z, A), model, noise=noise))
+    return solve(TableProblem(FrequencyResponse(np.ones(n), Z, A), model, noise=noise))
 
 
 def test_microslip_with_a_spring_determines_two_combinations() -> None:
@@ -64,7 +64,7 @@ def test_alpha_joins_the_combination() -> None:
 def test_alpha_tends_to_zero_where_the_knee_is_sharp() -> None:
     slips = np.geomspace(3.0, 100.0, n) * 1e-5 / 7.0
     Z = Dahl(1e-5, 7.0, 1e-9).describing_function(slips) * (1.0 - 0.01j / 3.0)
-    found = solve(Problem(FrequencyResponse(np.ones(n), Z, slips), Dahl(alpha=None)))
+    found = solve(TableProblem(FrequencyResponse(np.ones(n), Z, slips), Dahl(alpha=None)))
     assert found.status is Status.SHARP_KNEE
     assert found.values[2] == 0.0
     assert [c.expression for c in found.combinations] == ["f_max", "sigma"]
@@ -76,7 +76,7 @@ def test_alpha_and_f_max_grow_together_where_nothing_slips_fully() -> None:
     places = np.geomspace(0.3, 3.0, n) * phi / sigma
     exponential = Dahl(phi * 1e3, sigma, 1e3).describing_function(places)
     Z = exponential * np.exp(0.02 * np.log(places / places[0]))  # even less slip than that
-    found = solve(Problem(FrequencyResponse(np.ones(n), Z, places), Dahl(alpha=None)))
+    found = solve(TableProblem(FrequencyResponse(np.ones(n), Z, places), Dahl(alpha=None)))
     assert found.status is Status.NO_FULL_SLIP
     assert found.values.tolist()[0::2] == [np.inf, np.inf]
     assert [c.expression for c in found.combinations] == ["f_max/alpha", "sigma"]
@@ -141,7 +141,7 @@ def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -
         f, 1.0 / Z, drive=A * np.abs(Z), controlled="force", quantity="receptance"
     )
     plant = Dahl() + Mass() + Damper() + Spring()
-    found = solve(Problem(data, plant, steady="describing function"))  # which made the data
+    found = solve(TableProblem(data, plant, steady="describing function"))  # which made the data
     assert found.status is status
     np.testing.assert_allclose(found.values[2:4], [0.3, 0.24], rtol=0.05)
     assert np.isfinite(list(found.stderr.values())[2:4]).all()
@@ -150,7 +150,7 @@ def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -
 def test_an_unknown_displacement_gain_is_no_limit() -> None:
     N = Dahl(0.1, 30.0).describing_function(np.geomspace(1e-4, 1e-1, n)) * np.exp(0.01 * ERROR)
     data = FrequencyResponse(np.ones(n), N, np.geomspace(1e-4, 1e-1, n))
-    found = solve(Problem(data, Dahl(), sensors=Sensors(displacement_gain=None)))
+    found = solve(TableProblem(data, Dahl(), sensors=Sensors(displacement_gain=None)))
     assert found.status is Status.SINGULAR
     assert found.values[0] == pytest.approx(0.1, rel=0.02)
     assert np.isfinite(found.stderr["f_max"])
@@ -177,7 +177,7 @@ def test_a_given_f_max_far_beyond_the_data_leaves_sigma_to_be_found_with_a_sprin
     error = 1e-3 * (rng.normal(size=45) + 1j * rng.normal(size=45))
     Z = plant.dynamic_stiffness(amplitude, 2.0 * np.pi * f) * np.exp(error)
     data, free = FrequencyResponse(f, Z, amplitude), Dahl(1e5) + Mass() + Damper() + Spring()
-    found = solve(Problem(data, free))
+    found = solve(TableProblem(data, free))
     assert found.status is Status.CONVERGED
     off = np.abs(found.values - truth) / np.sqrt(np.diagonal(found.values_covariance))
     assert (off < 3.0).all()

@@ -11,7 +11,7 @@ from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring
 from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum, OptimumBatch, Status, solve, solve_many
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import ProblemBatch, TableProblem
 
 n = 20
 
@@ -66,14 +66,14 @@ def test_many_tables_end_as_one_by_one(
     made = tables(level, beta, spring)
     found = solve_many(ProblemBatch(made, model))
     assert set(found.status) >= statuses
-    assert_same(found, [solve(Problem(table, model)) for table in made])
+    assert_same(found, [solve(TableProblem(table, model)) for table in made])
 
 
 def test_tables_with_bounds_or_priors_are_solved_one_by_one() -> None:
     made = tables(0.02, 0.3, 0.0, count=3)
     sensors = Sensors(force_gain=stats.norm(1.0, 0.01))
     found = solve_many(ProblemBatch(made, Dahl(), sensors=sensors))
-    assert_same(found, [solve(Problem(table, Dahl(), sensors=sensors)) for table in made])
+    assert_same(found, [solve(TableProblem(table, Dahl(), sensors=sensors)) for table in made])
 
 
 def test_a_start_shared_or_each() -> None:
@@ -89,7 +89,7 @@ def test_a_start_shared_or_each() -> None:
 
 
 def test_bootstrap_spread_equals_the_stated_one() -> None:
-    problem = Problem(tables(0.02, 0.3, 0.0, count=1)[0], Dahl())
+    problem = TableProblem(tables(0.02, 0.3, 0.0, count=1)[0], Dahl())
     found = solve(problem)
     rng = np.random.default_rng(6)
     error = rng.normal(size=(2000, n)) + 1j * rng.normal(size=(2000, n))

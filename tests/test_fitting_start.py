@@ -18,7 +18,7 @@ from dahl_ident import (
 )
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.random_problems import Case, exponent_free, friction_alone, two_elements
 
 A = np.geomspace(1e-4, 1e-1, 20)
@@ -44,7 +44,7 @@ def test_optimum_equals_the_best_of_searches_from_all_over(
 @pytest.mark.parametrize("alpha", [0.5, 2.0])
 def test_alpha_is_searched_for_as_well(alpha: float) -> None:
     N = Dahl(0.1, 30.0, alpha).describing_function(A)
-    problem = Problem(FrequencyResponse(np.ones(20), N, A), Dahl(alpha=None))
+    problem = TableProblem(FrequencyResponse(np.ones(20), N, A), Dahl(alpha=None))
     np.testing.assert_allclose(solve(problem).values, [0.1, 30.0, alpha], rtol=1e-8)
 
 
@@ -52,7 +52,7 @@ def test_two_elements_are_told_apart_and_ordered() -> None:
     both = Dahl(0.5, 20.0, name="b") + Dahl(0.01, 30.0, name="a")
     N = both.dynamic_stiffness(A, 0.0)
     free = Dahl(name="first") + Dahl(name="second")
-    found = solve(Problem(FrequencyResponse(np.ones(20), N, A), free))
+    found = solve(TableProblem(FrequencyResponse(np.ones(20), N, A), free))
     assert found.names == ("first_f_max", "first_sigma", "second_f_max", "second_sigma")
     np.testing.assert_allclose(found.values, [0.01, 30.0, 0.5, 20.0], rtol=1e-6)
 
@@ -61,15 +61,15 @@ def test_harmonics_take_part_in_the_start() -> None:
     pivot = Dahl(0.1, 30.0)
     Z = [pivot.dynamic_stiffness(a, harmonic=k) for a in A for k in (3, 5)]
     data = FrequencyResponse(np.ones(40), Z, np.repeat(A, 2), harmonic=np.tile([3, 5], 20))
-    found = solve(Problem(data, Dahl(), noise="absolute"))
+    found = solve(TableProblem(data, Dahl(), noise="absolute"))
     np.testing.assert_allclose(found.values, [0.1, 30.0], rtol=1e-8)
 
 
 def test_one_friction_parameter_given() -> None:
     N = Dahl(0.1, 30.0).describing_function(A)
     data = FrequencyResponse(np.ones(20), N, A)
-    assert solve(Problem(data, Dahl(f_max=0.1))).values == pytest.approx([30.0], rel=1e-9)
-    assert solve(Problem(data, Dahl(sigma=30.0))).values == pytest.approx([0.1], rel=1e-9)
+    assert solve(TableProblem(data, Dahl(f_max=0.1))).values == pytest.approx([30.0], rel=1e-9)
+    assert solve(TableProblem(data, Dahl(sigma=30.0))).values == pytest.approx([0.1], rel=1e-9)
 
 
 def test_a_parameter_that_cannot_be_started_is_named() -> None:
@@ -80,7 +80,7 @@ def test_a_parameter_that_cannot_be_started_is_named() -> None:
 
     system = LinearSystem(mode, quantity="receptance", parameters={"mass": None})
     N = Dahl(0.1, 30.0).describing_function(A) + 10.0
-    problem = Problem(FrequencyResponse(np.ones(20), N, A), Dahl() + system)
+    problem = TableProblem(FrequencyResponse(np.ones(20), N, A), Dahl() + system)
     with pytest.raises(FitError, match="mass has no value to start from"):
         solve(problem)
 
@@ -94,7 +94,7 @@ def test_curves_of_many_rows_are_interpolated(law: Friction, error: float) -> No
     values = [
         np.ones(2) if p.name == "alpha" else v for p, v in zip(law.parameters, values, strict=True)
     ]
-    found = Problem(table, law, noise="relative").stiffness_data.of(law, values, at_nodes=True)
+    found = TableProblem(table, law, noise="relative").stiffness_data.of(law, values, at_nodes=True)
     for node, curve in enumerate(found):
         exact = law.stiffness([v[node] for v in values], many, np.ones(()))
         assert np.max(np.abs(curve - exact)) < error * np.max(np.abs(exact))

@@ -11,7 +11,7 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.elements import general_dahl, linear_dahl
 from dahl_ident.elements.general_dahl_table import stiffness
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.bayes_cases import friction_table, harmonic_table
 
 
@@ -100,7 +100,7 @@ def test_ends_and_what_is_no_number() -> None:
 def test_the_posterior_has_the_density_of_its_problem(
     data: di.FrequencyResponse, model: di.Element
 ) -> None:
-    problem = Problem(data, model)
+    problem = TableProblem(data, model)
     density = Density(problem, joint_prior(problem))
     assert type(density.tabulated.model.elements[0]).__name__ == "TabulatedDahl"
     theta = density.prior.draw(np.random.default_rng(3), 300)
@@ -109,5 +109,5 @@ def test_the_posterior_has_the_density_of_its_problem(
 
 
 def test_linear_friction_keeps_its_closed_form() -> None:
-    problem = Problem(friction_table(), di.Dahl())
+    problem = TableProblem(friction_table(), di.Dahl())
     assert Density(problem, joint_prior(problem)).tabulated is problem

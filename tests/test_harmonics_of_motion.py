@@ -9,7 +9,7 @@ import pytest
 
 import dahl_ident as di
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.synthetic import Experiment, SteppedSine, Table
 
 KNOWN = di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
@@ -61,7 +61,7 @@ def test_they_are_fitted_with_the_fundamental() -> None:
 
 def test_derivatives_are_differences() -> None:
     sensors = di.Sensors(force_gain=None, displacement_gain=1.02, delay=None)
-    problem = Problem(table(), di.Dahl(alpha=1.0) + FREE, sensors=sensors)
+    problem = TableProblem(table(), di.Dahl(alpha=1.0) + FREE, sensors=sensors)
     theta = problem.to_search([0.11, 28.0, 0.25, 0.33, 1.01, 1e-3])
     exact, step = problem.prediction_jacobian(theta), 1e-5
     moved = step * np.eye(theta.size)

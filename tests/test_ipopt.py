@@ -28,11 +28,11 @@ from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Optimum, Status, ipopt, solve
 from dahl_ident.fitting.ipopt import solve_ipopt
-from dahl_ident.problem import Problem as AnyProblem
+from dahl_ident.problem import TableProblem as AnyProblem
 from dahl_ident.sensors import Sensors
 
 # closed forms are fast, and predict the same whichever way the search came; exact rows further down
-Problem: Any = partial(AnyProblem, steady="describing function")
+TableProblem: Any = partial(AnyProblem, steady="describing function")
 fit = partial(any_fit, steady="describing function")
 response = partial(steady_state.response, steady="describing function")
 
@@ -101,13 +101,13 @@ def assert_same(found: Optimum, expected: Optimum) -> None:
 
 
 CASES: dict[str, Callable[[], AnyProblem]] = {
-    "relative": lambda: Problem(friction_data(), Dahl()),
-    "absolute": lambda: Problem(friction_data(), Dahl(), noise="absolute"),
-    "measured": lambda: Problem(friction_data(covariance=covariance_of()), Dahl()),
-    "few degrees of freedom": lambda: Problem(
+    "relative": lambda: TableProblem(friction_data(), Dahl()),
+    "absolute": lambda: TableProblem(friction_data(), Dahl(), noise="absolute"),
+    "measured": lambda: TableProblem(friction_data(covariance=covariance_of()), Dahl()),
+    "few degrees of freedom": lambda: TableProblem(
         friction_data(covariance=covariance_of(), dof=5.0), Dahl()
     ),
-    "error of the amplitude": lambda: Problem(
+    "error of the amplitude": lambda: TableProblem(
         friction_data(
             covariance=covariance_of(),
             dof=9.0,
@@ -118,33 +118,33 @@ CASES: dict[str, Callable[[], AnyProblem]] = {
         ),
         Dahl(),
     ),
-    "alpha free": lambda: Problem(friction_data(), Dahl(alpha=None)),
-    "alpha fixed": lambda: Problem(friction_data(Dahl(0.1, 30.0, 2.0)), Dahl(alpha=2.0)),
-    "two elements": lambda: Problem(
+    "alpha free": lambda: TableProblem(friction_data(), Dahl(alpha=None)),
+    "alpha fixed": lambda: TableProblem(friction_data(Dahl(0.1, 30.0, 2.0)), Dahl(alpha=2.0)),
+    "two elements": lambda: TableProblem(
         friction_data(Dahl(0.1, 30.0) + Dahl(0.01, 300.0, name="fine")),
         Dahl(name="coarse") + Dahl(name="fine"),
     ),
-    "sensors": lambda: Problem(
+    "sensors": lambda: TableProblem(
         friction_data(),
         Dahl(),
         sensors=Sensors(
             force_gain=stats.norm(1.01, 0.01), displacement_gain=stats.norm(0.99, 0.02), delay=None
         ),
     ),
-    "known linear system": lambda: Problem(
+    "known linear system": lambda: TableProblem(
         friction_data(FRICTION + Spring(2.0)),
         Dahl() + LinearSystem(control.tf([1.0], [2.0]), quantity="receptance"),
     ),
-    "plant": lambda: Problem(plant_data(), UNKNOWN_PLANT),
-    "plant, mass known": lambda: Problem(
+    "plant": lambda: TableProblem(plant_data(), UNKNOWN_PLANT),
+    "plant, mass known": lambda: TableProblem(
         plant_data(quantity="accelerance"),
         Dahl() + Mass(0.3) + Damper() + Spring(),
         sensors=Sensors(delay=None),
     ),
-    "plant, any exponent": lambda: Problem(
+    "plant, any exponent": lambda: TableProblem(
         plant_data(levels=4, frequencies=6), Dahl(alpha=None) + Mass() + Damper() + Spring()
     ),
-    "plant in other units": lambda: Problem(
+    "plant in other units": lambda: TableProblem(
         FrequencyResponse(
             plant_data().frequency_hz * 1e3,
             plant_data().response * 1e-9,
@@ -203,7 +203,7 @@ SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
 def test_robust_losses(loss: str) -> None:
     data = friction_data(covariance=covariance_of())
     spoiled = data.response * np.where(np.arange(data.n) == 7, 1.3, 1.0)
-    problem = Problem(
+    problem = TableProblem(
         FrequencyResponse(data.frequency_hz, spoiled, data.amplitude, covariance=data.covariance),
         Dahl(),
     )
@@ -215,7 +215,7 @@ def test_bound() -> None:
     f_max = model.parameters[0]
     bounded = model + Spring(1e-3)
     bounded = bounded.with_parameters({"f_max": type(f_max)("f_max", "N", "", lower=0.12)})
-    problem = Problem(friction_data(), bounded)
+    problem = TableProblem(friction_data(), bounded)
     found = solve_ipopt(problem)
     assert found.status is Status.AT_BOUND
     assert found.values == pytest.approx(solve(problem).values, rel=1e-6)
@@ -223,7 +223,7 @@ def test_bound() -> None:
 
 @pytest.mark.versions
 def test_equality_is_the_estimate_of_the_ratio_fixed() -> None:
-    problem = Problem(friction_data(), Dahl())
+    problem = TableProblem(friction_data(), Dahl())
     found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] == 250 * p["f_max"]])
 
     def cost(ln_f_max: float) -> float:
@@ -241,7 +241,7 @@ def test_equality_is_the_estimate_of_the_ratio_fixed() -> None:
 
 
 def test_equality_can_make_an_undetermined_parameter_known() -> None:
-    problem = Problem(friction_data(), Dahl() + Spring(name="own") + Spring(name="other"))
+    problem = TableProblem(friction_data(), Dahl() + Spring(name="own") + Spring(name="other"))
     alone = solve_ipopt(problem)
     assert alone.status is Status.SINGULAR
     tied = solve_ipopt(
@@ -249,13 +249,13 @@ def test_equality_can_make_an_undetermined_parameter_known() -> None:
     )
     assert tied.status is Status.CONVERGED
     assert np.isfinite(tied.covariance).all()
-    single = solve(Problem(friction_data(), Dahl() + Spring()))
+    single = solve(TableProblem(friction_data(), Dahl() + Spring()))
     assert tied.values[2] + tied.values[3] == pytest.approx(single.values[2], abs=1e-6)
     assert tied.values[2] == pytest.approx(3.0 * tied.values[3], rel=1e-9)
 
 
 def test_inequality_binds_only_where_it_has_to() -> None:
-    problem = Problem(friction_data(), Dahl())
+    problem = TableProblem(friction_data(), Dahl())
     free = solve(problem)
     loose = solve_ipopt(problem, constraints=lambda p: [p["sigma"] >= 250 * p["f_max"]])
     assert loose.status is Status.CONVERGED
@@ -268,7 +268,7 @@ def test_inequality_binds_only_where_it_has_to() -> None:
 
 
 def test_constraint_holds_a_plant_together() -> None:
-    problem = Problem(plant_data(4, 6), UNKNOWN_PLANT)
+    problem = TableProblem(plant_data(4, 6), UNKNOWN_PLANT)
 
     def ratio(p: Symbols) -> list[ca.SX]:
         return [p["damping"] ** 2 == 0.36 * p["mass"] * p["stiffness"]]
@@ -291,12 +291,12 @@ def test_constraint_makes_an_optimum_at_infinity_finite() -> None:
     """Microslip with a free spring: sigma and f_max run away together until f_max is held."""
     small = np.geomspace(1e-6, 1e-4, 16)
     N = FRICTION.describing_function(small) * (1.0 + noise(16, 3e-4, seed=4))
-    problem = Problem(FrequencyResponse(np.ones(16), N, small), Dahl() + Spring())
+    problem = TableProblem(FrequencyResponse(np.ones(16), N, small), Dahl() + Spring())
     alone = solve(problem)
     assert alone.status is Status.MICROSLIP
     assert solve_ipopt(problem).status is Status.MICROSLIP
     held = solve_ipopt(problem, constraints=lambda p: [p["f_max"] == 0.2])
-    expected = solve(Problem(problem.data, Dahl(f_max=0.2) + Spring()))
+    expected = solve(TableProblem(problem.data, Dahl(f_max=0.2) + Spring()))
     assert held.values[1:] == pytest.approx(expected.values, rel=1e-6)
     assert held.cost == pytest.approx(expected.cost, rel=1e-9)
 
@@ -319,7 +319,7 @@ def test_noise_of_the_drive() -> None:
             covariance=C,
         )  # fmt: skip
 
-    problem = Problem(table(drive), UNKNOWN_PLANT)
+    problem = TableProblem(table(drive), UNKNOWN_PLANT)
     found = solve_ipopt(problem, drive_std=s * drive, drive_covariance=shared)
     joint = np.empty((n, 3, 3))
     joint[:, 0, 0], joint[:, 1:, 1:] = s**2, C
@@ -327,7 +327,7 @@ def test_noise_of_the_drive() -> None:
     whiten = np.linalg.inv(np.linalg.cholesky(joint))
 
     def residuals(x: FloatArray) -> FloatArray:
-        r = R - Problem(table(drive * np.exp(-x[5:])), UNKNOWN_PLANT).predict(x[:5])
+        r = R - TableProblem(table(drive * np.exp(-x[5:])), UNKNOWN_PLANT).predict(x[:5])
         together = np.stack([x[5:], r.real, r.imag], axis=1)
         return np.asarray(np.einsum("nij,nj->ni", whiten, together)).ravel()
 
@@ -361,21 +361,21 @@ def test_noise_of_the_drive() -> None:
     ],
 )
 def test_bad_constraints(constraints: Any, error: type[Exception], message: str) -> None:
-    problem = Problem(friction_data(), Dahl())
+    problem = TableProblem(friction_data(), Dahl())
     with pytest.raises(error, match=message):
         solve_ipopt(problem, constraints=constraints)
 
 
 def test_no_constraints_in_the_list() -> None:
-    problem = Problem(friction_data(), Dahl())
+    problem = TableProblem(friction_data(), Dahl())
     assert_same(solve_ipopt(problem, constraints=lambda _: []), solve(problem))
 
 
 def test_misplaced_errors_of_the_drive() -> None:
     with pytest.raises(ValidationError, match="no row is force-controlled"):
-        solve_ipopt(Problem(friction_data(), Dahl()), drive_std=0.1)
+        solve_ipopt(TableProblem(friction_data(), Dahl()), drive_std=0.1)
     with pytest.raises(ValidationError, match="relative noise and linear loss"):
-        solve_ipopt(Problem(plant_data(3, 4), UNKNOWN_PLANT), drive_std=0.1)
+        solve_ipopt(TableProblem(plant_data(3, 4), UNKNOWN_PLANT), drive_std=0.1)
     driven = plant_data(3, 4)
     covariance = np.abs(driven.response[:, None, None]) ** 2 * 1e-4 * np.eye(2)
     known = FrequencyResponse(
@@ -383,9 +383,11 @@ def test_misplaced_errors_of_the_drive() -> None:
         quantity="receptance", covariance=covariance,
     )  # fmt: skip
     with pytest.raises(ValidationError, match=r"drive_std has shape \(3,\); expected .* \(12,\)"):
-        solve_ipopt(Problem(known, UNKNOWN_PLANT), drive_std=[0.1, 0.2, 0.3])
+        solve_ipopt(TableProblem(known, UNKNOWN_PLANT), drive_std=[0.1, 0.2, 0.3])
     with pytest.raises(ValidationError, match="without drive_std"):
-        solve_ipopt(Problem(plant_data(3, 4), UNKNOWN_PLANT), drive_covariance=np.zeros((12, 2)))
+        solve_ipopt(
+            TableProblem(plant_data(3, 4), UNKNOWN_PLANT), drive_covariance=np.zeros((12, 2))
+        )
 
 
 def test_plant_with_several_amplitudes_stays_on_the_one_measured() -> None:
@@ -402,13 +404,13 @@ def test_plant_with_several_amplitudes_stays_on_the_one_measured() -> None:
         controlled="force",
         quantity="receptance",
     )
-    problem = Problem(data, UNKNOWN_PLANT)
+    problem = TableProblem(data, UNKNOWN_PLANT)
     assert_same(solve_ipopt(problem), solve(problem))
 
 
 def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ipopt, "_ITERATIONS", 1)
-    problem = Problem(friction_data(), Dahl())
+    problem = TableProblem(friction_data(), Dahl())
     found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] <= 250 * p["f_max"]])
     assert found.status is Status.NOT_CONVERGED
     assert "IPOPT says: it reached the maximum number of iterations." in found.message
@@ -416,7 +418,7 @@ def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.versions
 def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
-    solve_ipopt(Problem(friction_data(), Dahl()), constraints=lambda p: [p["sigma"] <= 29])
+    solve_ipopt(TableProblem(friction_data(), Dahl()), constraints=lambda p: [p["sigma"] <= 29])
     assert capfd.readouterr() == ("", "")
 
 
@@ -430,7 +432,7 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 )
 def test_what_is_no_list_of_constraints_is_refused(constraints: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        solve_ipopt(Problem(friction_data(), Dahl()), constraints=constraints)
+        solve_ipopt(TableProblem(friction_data(), Dahl()), constraints=constraints)
 
 
 def test_noise_of_the_drive_is_judged_as_it_was_fitted() -> None:

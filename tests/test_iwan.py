@@ -8,7 +8,7 @@ import pytest
 
 from dahl_ident import Damper, FrequencyResponse, Iwan, Mass, MaxwellSlip, response
 from dahl_ident.errors import ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 AT_REST = np.zeros(())
 
@@ -98,7 +98,7 @@ def test_a_step_beyond_the_exponents_range_has_no_response() -> None:
     data = FrequencyResponse(
         f, motion.displacement / drive, drive=drive, quantity="receptance", controlled="force"
     )
-    problem = Problem(data, model)
+    problem = TableProblem(data, model)
     inside = problem.to_search([10.0, 1e4, -0.5, 1.0, 1.0])
     beyond = inside + np.array([0.0, 0.0, -1.3, 0.0, 0.0])
     found = problem.predict(np.array([inside, beyond]))

@@ -12,7 +12,7 @@ from scipy import optimize
 import dahl_ident as di
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.noise import Student
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.command_line import Runner
 
 F_MAX, SIGMA, ASYMMETRY = 0.8, 400.0, 0.2
@@ -78,7 +78,7 @@ def test_chi_square_has_the_mean_of_its_degrees_of_freedom() -> None:
     truth = np.array([np.log(F_MAX), np.log(SIGMA), ASYMMETRY])
     tables = [table(seed) for seed in range(40)]
     squares = [float(whitened(values, data) @ whitened(values, data)) for data in tables]
-    models = [Problem(data, di.Dahl(asymmetry=None)) for data in tables]
+    models = [TableProblem(data, di.Dahl(asymmetry=None)) for data in tables]
     mine = [float(np.sum(p.residuals_and_jacobian(truth)[0] ** 2)) for p in models]
     assert mine == pytest.approx(squares, rel=1e-9)
     m = 7 * AMPLITUDES.size

@@ -14,7 +14,7 @@ from dahl_ident.data.rows import Rows
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.noise import Measured, Student, bend, noise_for
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import ProblemBatch, TableProblem
 
 n = 8
 A = np.geomspace(1e-4, 1e-1, n)
@@ -33,7 +33,7 @@ def pairs(z: ComplexArray) -> FloatArray:
 
 
 def test_relative_noise_has_constant_variance_of_ln_gain_and_phase() -> None:
-    problem = Problem(table(), Dahl())
+    problem = TableProblem(table(), Dahl())
     assert problem.noise == "relative"
     theta = problem.to_search([0.12, 25.0])
     model = Dahl(0.12, 25.0).describing_function(A)
@@ -47,7 +47,7 @@ def test_relative_noise_has_constant_variance_of_ln_gain_and_phase() -> None:
 
 
 def test_absolute_noise_has_constant_variance_in_the_datas_quantity() -> None:
-    problem = Problem(table(), Dahl(), noise="absolute")
+    problem = TableProblem(table(), Dahl(), noise="absolute")
     theta = problem.to_search([0.12, 25.0])
     expected = pairs(MEASURED - Dahl(0.12, 25.0).describing_function(A))
     np.testing.assert_allclose(problem.residuals(theta), expected.ravel(), rtol=1e-12)
@@ -56,7 +56,7 @@ def test_absolute_noise_has_constant_variance_in_the_datas_quantity() -> None:
 
 
 def test_measured_noise_has_the_datas_covariance() -> None:
-    problem = Problem(table(covariance=COVARIANCE), Dahl())
+    problem = TableProblem(table(covariance=COVARIANCE), Dahl())
     assert problem.noise == "measured"
     assert problem.scale_known
     theta = problem.to_search([0.12, 25.0])
@@ -69,8 +69,8 @@ def test_measured_noise_has_the_datas_covariance() -> None:
 
 def test_few_degrees_of_freedom_count_less_the_farther_a_row_lies() -> None:
     dof = np.array([3.0, 4.0, 6.0, 9.0, 20.0, 50.0, np.inf, np.inf])
-    problem = Problem(table(covariance=COVARIANCE, dof=dof), Dahl())
-    gaussian = Problem(table(covariance=COVARIANCE), Dahl())
+    problem = TableProblem(table(covariance=COVARIANCE, dof=dof), Dahl())
+    gaussian = TableProblem(table(covariance=COVARIANCE), Dahl())
     theta = problem.to_search([0.12, 25.0])
     z = np.sum(gaussian.residuals(theta).reshape(n, 2) ** 2, axis=1)
     loss = np.append((dof[:6] - 2.0) * np.log1p(z[:6] / dof[:6]), z[6:])
@@ -106,7 +106,7 @@ def test_amplitude_errors_are_profiled_out() -> None:
     s = 0.08
     cross = 0.5 * s * A[:, None] * np.sqrt(np.diagonal(COVARIANCE, axis1=1, axis2=2))
     data = table(covariance=COVARIANCE, amplitude_std=s * A, amplitude_covariance=cross)
-    problem = Problem(data, Dahl())
+    problem = TableProblem(data, Dahl())
     theta = problem.to_search([0.12, 25.0])
     total = 0.0
     for row in range(n):
@@ -161,7 +161,7 @@ def test_harmonics_refer_to_the_measured_fundamental() -> None:
     pivot = Dahl(0.1, 30.0)
     both = [pivot.dynamic_stiffness(0.01, harmonic=k) for k in (1, 3)]
     data = FrequencyResponse(np.ones(2), np.multiply(both, 1.1), [0.01, 0.01], harmonic=[1, 3])
-    problem = Problem(data, Dahl())
+    problem = TableProblem(data, Dahl())
     r = problem.residuals(problem.to_search([0.1, 30.0])).view(np.complex128)
     assert r[0] == pytest.approx(np.log(1.1))
     assert r[1] == pytest.approx(0.1 * both[1] / (1.1 * np.abs(both[0])))
@@ -252,9 +252,9 @@ def test_data_that_the_noise_model_cannot_weigh(
     columns: dict[str, object], noise: str | None, message: str
 ) -> None:
     with pytest.raises(DataError, match=message):
-        Problem(table(**columns), Dahl(), noise=noise)  # type: ignore[arg-type]
+        TableProblem(table(**columns), Dahl(), noise=noise)  # type: ignore[arg-type]
 
 
 def test_an_unknown_noise_model_is_named() -> None:
     with pytest.raises(ValidationError, match="noise is 'white'; expected one of measured"):
-        Problem(table(), Dahl(), noise="white")
+        TableProblem(table(), Dahl(), noise="white")

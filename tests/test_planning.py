@@ -27,7 +27,7 @@ from dahl_ident.planning.design import (
     continuous_design,
     packed_information,
 )
-from dahl_ident.problem import Problem, ProblemBatch
+from dahl_ident.problem import ProblemBatch, TableProblem
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -122,7 +122,7 @@ class TestModelError:
         monkeypatch.setattr(error_sources, "_SMOOTH", 1e-9)
         errors = self._fit().errors
         A, omega = np.geomspace(0.3, 4.0, 4) * X_C, np.full(4, 2.0 * np.pi)
-        there = Problem(FrequencyResponse(omega / (2.0 * np.pi), np.ones(4), A), LINEAR)
+        there = TableProblem(FrequencyResponse(omega / (2.0 * np.pi), np.ones(4), A), LINEAR)
         R = there.predict(errors.theta)
         slopes = there.prediction_jacobian(errors.theta) / R[:, None]
         found = prediction_error.departures(errors, slopes, A, omega, R)

@@ -17,7 +17,7 @@ from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.moves import EnsembleMove
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.errors import DataError, SamplingError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.results import Posterior
 from tests.bayes_cases import friction_table, harmonic_table, spring_table, with_covariance
 
@@ -265,7 +265,7 @@ def test_student_t_is_a_density() -> None:
     total = 0.0
     for x in offsets:
         row = di.FrequencyResponse(np.ones(1), model + x * 0.2, amplitude, covariance=covariance)
-        problem = Problem(row, di.Dahl(sigma=30.0))
+        problem = TableProblem(row, di.Dahl(sigma=30.0))
         density = Density(problem, joint_prior(problem, {"f_max": (0.01, 1.0)}), "student_t")
         value = density.log_likelihood(np.log([[0.1]]), np.ones(1))[0]
         # radial symmetry: integrate over circles

@@ -18,7 +18,7 @@ from dahl_ident.bayes.importance import WeightedPoints, integrate
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior, joint_prior
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.results import Posterior
 from tests.bayes_cases import (
     FRICTION,
@@ -76,7 +76,7 @@ def test_one_parameter_against_scipy() -> None:
     grid = di.posterior(
         data, di.Dahl(sigma=30.0), priors={"f_max": prior}, method="grid", uncertainty="noise"
     )
-    problem = Problem(data, di.Dahl(sigma=30.0))
+    problem = TableProblem(data, di.Dahl(sigma=30.0))
 
     def density(theta: float, moment: int = 0) -> float:
         # the scale integrated out by hand: Gamma(n) / (2 (pi S)^n) / |R|^2 ...
@@ -137,7 +137,7 @@ def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows: int) -> None:
     grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
     nodes, mass = brute_force(grid, priors, 40)
     theta, mass = nodes.reshape(-1, 2), mass.ravel() / mass.sum()
-    y = np.log(data.response / Problem(data, di.Dahl()).predict(theta))
+    y = np.log(data.response / TableProblem(data, di.Dahl()).predict(theta))
     squares = np.sum(np.abs(y) ** 2, axis=1)
     for level in LEVELS:
         s = float(grid.quantile("noise_scale", level))

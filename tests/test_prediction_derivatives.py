@@ -8,18 +8,18 @@ import pytest
 
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Dahl, Damper, Mass, Model, Spring
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 FIG_7 = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 0.24, "stiffness": 0.3}
 
 
-def driven(model: Model, frequency: list[float], drive: list[float]) -> Problem:
+def driven(model: Model, frequency: list[float], drive: list[float]) -> TableProblem:
     """Return a problem whose force was controlled; its measured values do not matter here."""
     n = len(frequency)
     data = FrequencyResponse(
         frequency, np.ones(n), drive=drive, controlled="force", quantity="receptance"
     )
-    return Problem(data, model, noise="absolute", steady="describing function")
+    return TableProblem(data, model, noise="absolute", steady="describing function")
 
 
 def receptance_40_digits(p: list[mpmath.mpf], omega: float, drive: mpmath.mpf) -> mpmath.mpc:
@@ -97,12 +97,12 @@ def test_by_level() -> None:
     A = np.geomspace(1e-3, 0.1, 6)
     controlled = ["force", "displacement"] * 3
 
-    def at(factor: float) -> Problem:
+    def at(factor: float) -> TableProblem:
         data = FrequencyResponse(
             np.full(6, 0.3), np.ones(6), factor * A, drive=factor * A, controlled=controlled
         )
         model = Dahl() + Mass() + Damper()
-        return Problem(data, model, noise="absolute", steady="describing function")
+        return TableProblem(data, model, noise="absolute", steady="describing function")
 
     theta = at(1.0).to_search([0.1, 30.0, 0.3, 0.24])
     change = at(np.exp(1e-5)).predict(theta) - at(np.exp(-1e-5)).predict(theta)

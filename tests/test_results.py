@@ -33,7 +33,7 @@ from dahl_ident import (
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from tests.friction_tables import FRICTION, amplitudes, plant_table, table
 
 
@@ -436,7 +436,7 @@ class TestStorage:
     def test_priors_that_no_file_can_hold(self) -> None:
         result = fit(table(), Dahl())
         sensors = Sensors(force_gain=stats.uniform(0.9, 0.2))
-        odd = replace(result.optimum, problem=Problem(table(), Dahl(), sensors=sensors))
+        odd = replace(result.optimum, problem=TableProblem(table(), Dahl(), sensors=sensors))
         with pytest.raises(DataError, match="prior of kind uniform"):
             FitResult(odd).to_json()
 

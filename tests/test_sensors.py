@@ -8,7 +8,7 @@ from scipy import stats
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, fit
 from dahl_ident.errors import ValidationError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 A = np.geomspace(1e-4, 1e-1, 7)
 FREQUENCY = np.geomspace(0.2, 4.0, 7)
@@ -69,7 +69,7 @@ def test_each_quantity_sees_gains_and_delay(
         quantity=quantity,  # type: ignore[arg-type]  # the table above holds all six
     )
     sensors = Sensors(force_gain=None, displacement_gain=None, delay=None)
-    problem = Problem(data, PLANT, sensors=sensors, steady="describing function")
+    problem = TableProblem(data, PLANT, sensors=sensors, steady="describing function")
     theta = problem.to_search([force_gain, displacement_gain, delay])
     np.testing.assert_allclose(problem.predict(theta), response, rtol=1e-10)
 
@@ -86,15 +86,15 @@ def test_a_harmonic_sees_the_delay_k_times() -> None:
         spectrum[k] / np.abs(late[1]) * np.exp(-1j * k * np.angle(late[1])) for k in (1, 3, 5)
     ]
     data = FrequencyResponse(np.ones(3), measured, amplitude=np.full(3, 0.01), harmonic=[1, 3, 5])
-    problem = Problem(data, pivot, sensors=Sensors(delay=None), noise="absolute")
+    problem = TableProblem(data, pivot, sensors=Sensors(delay=None), noise="absolute")
     np.testing.assert_allclose(problem.predict([delay]), measured, rtol=2e-5)
 
 
 def test_an_unknown_gain_leaves_one_friction_parameter() -> None:
     N = Dahl(0.1, 30.0).describing_function(A)
     data = FrequencyResponse(np.ones(7), N, A)
-    by_force = Problem(data, Dahl(), sensors=Sensors(force_gain=None))
-    by_motion = Problem(data, Dahl(), sensors=Sensors(displacement_gain=None))
+    by_force = TableProblem(data, Dahl(), sensors=Sensors(force_gain=None))
+    by_motion = TableProblem(data, Dahl(), sensors=Sensors(displacement_gain=None))
     for factor in (0.5, 3.0):
         only_x_c = by_force.to_search([0.1 * factor, 30.0 * factor, 1.0 / factor])
         only_f_max = by_motion.to_search([0.1, 30.0 * factor, factor])

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _FARTHEST = 1e300  # replaces a shift that is not finite; no prior reaches it
 
@@ -32,7 +32,7 @@ class Decorrelation:
 
     Attributes
     ----------
-    problem : Problem
+    problem : TableProblem
         Whose search coordinates theta, (S, P), come first in the points moved, (S, D).
     friction : tuple of Element
         The nonlinear elements with free parameters.
@@ -42,7 +42,7 @@ class Decorrelation:
         From real and imaginary parts of N at every row to the shift.
     """
 
-    problem: Problem
+    problem: TableProblem
     friction: tuple[Element, ...]
     linear: NDArray[np.intp]
     projection: FloatArray
@@ -79,7 +79,7 @@ class Decorrelation:
         return np.asarray(sum(parts))
 
 
-def decorrelation_of(problem: Problem) -> Decorrelation | None:
+def decorrelation_of(problem: TableProblem) -> Decorrelation | None:
     """Return the coordinates of a problem; None where friction or a linear element is not free."""
     view = problem.stiffness_data
     free = set(problem.names)

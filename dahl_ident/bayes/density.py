@@ -33,7 +33,7 @@ from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.data.columns import one_of
 from dahl_ident.errors import SamplingError, ValidationError, argument
 from dahl_ident.fitting import solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
@@ -118,7 +118,7 @@ class Density(LogDensity):
 
     Attributes
     ----------
-    problem : Problem
+    problem : TableProblem
         Data, model and noise.
     prior : JointPrior
         Of theta.
@@ -129,7 +129,7 @@ class Density(LogDensity):
         Errors that rows share, with a Gaussian likelihood; left out, rows are independent.
     """
 
-    problem: Problem
+    problem: TableProblem
     prior: JointPrior
     likelihood: str = "gaussian"
     errors: RowErrors | None = None
@@ -308,7 +308,7 @@ class Density(LogDensity):
         return np.asarray(logsumexp(terms + self.errors.log_weights, axis=1))
 
     @cached_property
-    def tabulated(self) -> Problem:
+    def tabulated(self) -> TableProblem:
         """The problem for very many evaluations.
 
         Friction of any exponent from tables, and exact steady motions to second order in the

@@ -30,7 +30,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import HIGH, LOW, ModelError, ValidationError, argument, choices
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 
 _DECADES = 1e5  # beyond the data's sizes, either way: as data far from the knee leave open
 _WIDER = 10.0  # a gain that is farther from 1 is a mistake; times an estimate, for its bounds
@@ -215,7 +215,7 @@ class JointPrior:
 
 
 def joint_prior(
-    problem: BaseProblem,
+    problem: Problem,
     priors: Mapping[str, PriorLike] | None = None,
     estimate: FloatArray | None = None,
     assumed: Mapping[str, PriorLike] | None = None,
@@ -292,7 +292,7 @@ def _check_support(parameter: Parameter, given: Distribution) -> None:
         )
 
 
-def _default(problem: BaseProblem, parameter: Parameter, estimate: float) -> tuple[float, float]:
+def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[float, float]:
     """Return wide bounds of the value; `estimate` is one, not finite where unknown."""
     if parameter.name == "delay":
         half = np.pi * float(problem.unit_sizes((0, 0, 1)).min())

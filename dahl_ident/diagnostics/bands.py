@@ -27,7 +27,7 @@ from dahl_ident.diagnostics.prediction_error import prediction_error, stated_noi
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.units import shown_unit
 
@@ -174,24 +174,24 @@ def predicted_backbone(
     )  # fmt: skip
 
 
-def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[Problem, FloatArray]:
+def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[TableProblem, FloatArray]:
     """Return the combined estimate with the problem it belongs to, or the plain one."""
     return (optimum.problem, optimum.theta) if errors is None else (errors.problem, errors.theta)
 
 
-def _measured(there: Problem, R: ComplexArray, known: NDArray[np.bool_]) -> StiffnessData:
+def _measured(there: TableProblem, R: ComplexArray, known: NDArray[np.bool_]) -> StiffnessData:
     """Return amplitude and stiffness of predicted responses, as if they had been measured."""
     data = replace(there.data.select(rows=known), response=R[known])
     return there.like(data=data, noise="absolute").stiffness_data
 
 
 def problem_at(
-    problem: Problem,
+    problem: TableProblem,
     frequency_hz: ArrayLike,
     amplitude: ArrayLike | None,
     drive: ArrayLike | None,
     quantity: Any,
-) -> Problem:
+) -> TableProblem:
     """Return the same problem at other operating points, to predict with."""
     held = drive if amplitude is None else amplitude
     if held is None or (amplitude is not None and drive is not None):
@@ -242,7 +242,7 @@ def _omega(errors: ErrorModel) -> FloatArray:
 
 
 def friction_and_slopes(
-    problem: Problem, theta: FloatArray, A: FloatArray
+    problem: TableProblem, theta: FloatArray, A: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return N(A) of the friction, and its derivatives with respect to theta in a last axis."""
     names = problem.names

@@ -32,7 +32,7 @@ from dahl_ident.elements import Damper, Element, Friction, Mass, Model, PowerDam
 from dahl_ident.elements.facts import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.units import si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
@@ -307,7 +307,7 @@ class ModelComparison:
         )
 
 
-def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
+def _meaning(problem: TableProblem, values: Mapping[str, float]) -> dict[str, float]:
     """Return what all laws have in common at the values of the parameters, see `ComparedModel`."""
     A = problem.stiffness_data.amplitude
     sizes = np.geomspace(A.min(), A.max(), _LEVELS)
@@ -332,7 +332,7 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     }
 
 
-def _noise(problem: Problem) -> str:
+def _noise(problem: TableProblem) -> str:
     """Return how large the noise of the fundamental is, in words."""
     rows = problem.data.harmonic == 1
     covariance = problem.data.covariance

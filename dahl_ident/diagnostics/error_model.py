@@ -63,7 +63,7 @@ from dahl_ident.diagnostics.residual_space import (
 )
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import blanked, inverse
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _BY_CHANCE = 2.0  # standard deviations
 _FEWEST_TESTS = 5  # of which each is left out in turn
@@ -83,7 +83,7 @@ class ErrorModel:
 
     optimum: Optimum  # the least-squares fit that it started from
     # the assumed exponents free, covariances as stated; its `names` order every array here
-    problem: Problem
+    problem: TableProblem
     estimate: WeightedEstimate  # weighted least squares
     sources: tuple[Source, ...]  # random errors that rows share, those that the residuals show
     state: State  # the mixed model of the residuals at the variances of noise and sources
@@ -346,7 +346,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
 
 def _with_sources(
     optimum: Optimum,
-    problem: Problem,
+    problem: TableProblem,
     estimate: WeightedEstimate,
     assumed: Mapping[str, Assumption],
 ) -> ErrorModel:
@@ -497,5 +497,5 @@ def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[s
     return {**contributions, TESTS: _positive(C * np.outer(wider, wider) - C)}
 
 
-def _distinguishes_noise(problem: Problem, assumed: Collection[str]) -> bool:
+def _distinguishes_noise(problem: TableProblem, assumed: Collection[str]) -> bool:
     return problem.n_numbers - len(problem.names) + len(assumed) >= _LEAST_DOF

@@ -23,7 +23,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.quantities import COMPLIANCES
 from dahl_ident.diagnostics.estimate import WeightedEstimate, tests_of
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
 _MOST_LEVELS = 50  # with an error each: the cost is cubic in their number
@@ -366,7 +366,7 @@ def own_errors(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Sour
         yield Source(APART, columns, 0.0, chance=_SELDOM)
 
 
-def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
+def _sizes(problem: TableProblem, predicted: ComplexArray) -> ComplexArray:
     """Return what a departure is relative to: the row's response, a harmonic's fundamental."""
     _, fundamental = tests_of(problem.data)
     size = np.abs(predicted)
@@ -374,7 +374,7 @@ def _sizes(problem: Problem, predicted: ComplexArray) -> ComplexArray:
     return np.asarray(size[fundamental] * phase)
 
 
-def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArray:
+def _absorbed(problem: TableProblem, J: FloatArray, columns: FloatArray) -> FloatArray:
     """Return what the model's linear parts take of forces in parallel, as changes of theta."""
     names = {p.name for e in problem.model.elements if e.is_linear for p in e.parameters}
     linear = [i for i, name in enumerate(problem.names) if name in names]
@@ -384,7 +384,7 @@ def _absorbed(problem: Problem, J: FloatArray, columns: FloatArray) -> FloatArra
     return found
 
 
-def _scattering_parameters(problem: Problem) -> list[int]:
+def _scattering_parameters(problem: TableProblem) -> list[int]:
     """Return the columns of parameters that may differ from run to run, in addition to the gain."""
     found = []
     for element in problem.model.elements:

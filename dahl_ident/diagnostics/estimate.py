@@ -27,7 +27,7 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, limits
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
 _NOTICED = 1e-5  # change of residuals over the largest, below which a direction is undetermined
@@ -95,7 +95,7 @@ class Basis:
         return np.asarray(known & ((whole > 0.0) | ~slopes.any(axis=-1)))
 
 
-def chart_of_limit(optimum: Optimum, problem: Problem) -> Chart | None:
+def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart | None:
     """Return the coordinates of the limit at which an optimum lies; None where it is finite.
 
     `problem` may have more free parameters, coordinates in addition to those of the limit.
@@ -133,7 +133,7 @@ class Assumption(NamedTuple):
     std: float
 
 
-def with_assumed(problem: Problem) -> tuple[Problem, dict[str, Assumption]]:
+def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumption]]:
     """Return the problem with what was assumed free: exponents, and the factor of the drive."""
     assumed = {
         p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
@@ -153,7 +153,7 @@ def with_assumed(problem: Problem) -> tuple[Problem, dict[str, Assumption]]:
 class WeightedEstimate:
     """Weighted least squares: the optimum of a problem whose covariances hold the misfit."""
 
-    problem: Problem  # the assumed exponents free, its covariances with the misfit
+    problem: TableProblem  # the assumed exponents free, its covariances with the misfit
     theta: FloatArray  # (Q,): the estimate, search coordinates
     misfit: float  # share s of the fundamental force of a row's test
     misfit_variance: FloatArray  # (n,): what it adds to the stated covariances
@@ -173,7 +173,7 @@ class WeightedEstimate:
         columns = -self.problem.residual_change(self.theta, changes).T / self.scale
         return np.pad(columns, ((0, self.problem.n_priors), (0, 0)))
 
-    def factors(self, problem: Problem) -> FloatArray:
+    def factors(self, problem: TableProblem) -> FloatArray:
         """Return what takes each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
         sides = np.array([1.0, 1.0j])[:, None] * np.ones(self.problem.data.n, dtype=np.complex128)
         own, other = (p.residual_change(self.theta, sides) for p in (self.problem, problem))
@@ -238,7 +238,9 @@ class WeightedEstimate:
         return np.asarray(each.T @ each)
 
 
-def weighted_estimate(optimum: Optimum, problem: Problem, *, determined: bool) -> WeightedEstimate:
+def weighted_estimate(
+    optimum: Optimum, problem: TableProblem, *, determined: bool
+) -> WeightedEstimate:
     """Return the estimate, searched from an optimum."""
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters])
@@ -299,7 +301,7 @@ def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp
     return test, np.where(others, fundamental[test], np.arange(data.n))
 
 
-def _weights(stated: Problem, theta: FloatArray) -> tuple[float, FloatArray, float]:
+def _weights(stated: TableProblem, theta: FloatArray) -> tuple[float, FloatArray, float]:
     """Return the misfit, what it adds to each row's variance, and the scale of the residuals."""
     nothing = np.zeros(stated.data.n)
     m, dof = stated.n_residuals, stated.n_numbers - len(stated.names)
@@ -337,7 +339,7 @@ def _root(z: FloatArray, b: FloatArray, target: float) -> float:
 
 
 def _moved(
-    problem: Problem, theta: FloatArray, step: FloatArray, basis: Basis | None
+    problem: TableProblem, theta: FloatArray, step: FloatArray, basis: Basis | None
 ) -> FloatArray:
     """Return theta after a step, or the part of it that changes no logarithm by much."""
     logarithmic = problem.space.positive

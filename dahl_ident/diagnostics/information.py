@@ -6,7 +6,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
 _PART = 1e-4  # of a direction in the undetermined ones that matters
@@ -17,7 +17,7 @@ def parameter_values(optimum: Optimum) -> dict[str, float]:
     return values_at(optimum.problem, optimum.theta)
 
 
-def values_at(problem: Problem, theta: FloatArray) -> dict[str, float]:
+def values_at(problem: TableProblem, theta: FloatArray) -> dict[str, float]:
     """Return the value of every parameter of model and sensors at theta, by name."""
     values = {
         p.name: np.nan if p.value is None else p.value

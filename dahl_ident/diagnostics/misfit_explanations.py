@@ -25,7 +25,7 @@ from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.fitting.global_start import starts
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _LEVEL = 0.01  # false-alarm rate, of the worst of all points
 _SHARE = 0.1  # of the rows: if more stand out, model or noise is wrong, not single rows
@@ -203,12 +203,12 @@ TURNS = (
 )
 
 
-def rms_misfit(problem: Problem, theta: FloatArray) -> float:
+def rms_misfit(problem: TableProblem, theta: FloatArray) -> float:
     """Return the root mean square of abs(measured - fitted)/abs(measured) of fundamentals."""
     return rms_misfit_of(problem, problem.predict(theta))
 
 
-def rms_misfit_of(problem: Problem, fitted: ComplexArray) -> float:
+def rms_misfit_of(problem: TableProblem, fitted: ComplexArray) -> float:
     """Return the same for responses (n,) that were fitted in another way."""
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
@@ -306,7 +306,7 @@ def at_an_end(optimum: Optimum, rows: Sequence[int]) -> bool:
     return any(values[rows[0]] in (values.min(), values.max()) for values in ranges)
 
 
-def _misfit(problem: Problem, fitted: ComplexArray) -> FloatArray:
+def _misfit(problem: TableProblem, fitted: ComplexArray) -> FloatArray:
     response, harmonic = problem.data.response, problem.data.harmonic
     order = 1 if (harmonic == 1).any() else harmonic.min()
     rows = (harmonic == order) & (response != 0.0)

@@ -31,7 +31,7 @@ from dahl_ident.diagnostics.error_sources import (
     places,
 )
 from dahl_ident.diagnostics.mixed_model import MixedModel
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are beyond all use
 _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
@@ -100,7 +100,7 @@ def _row_noise(units: FloatArray) -> FloatArray:
 
 
 def stated_noise(
-    problem: Problem, theta: FloatArray, amplitude: FloatArray, omega: FloatArray
+    problem: TableProblem, theta: FloatArray, amplitude: FloatArray, omega: FloatArray
 ) -> FloatArray:
     """Return the covariance of ln gain and phase that residuals of unit variance are, (n, 2, 2).
 
@@ -112,7 +112,7 @@ def stated_noise(
     return _row_noise(units[_nearest(problem, amplitude, omega)])
 
 
-def _nearest(problem: Problem, amplitude: FloatArray, omega: FloatArray) -> NDArray[np.intp]:
+def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) -> NDArray[np.intp]:
     """Return the fundamental's row nearest to each point, in ln A and ln omega."""
     view = problem.stiffness_data
     rows = np.flatnonzero(view.harmonic == 1)

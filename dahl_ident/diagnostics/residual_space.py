@@ -28,7 +28,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as none
 _GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
@@ -55,7 +55,7 @@ class Linearization:
     predicted: ComplexArray  # (n,): responses, each run's at its own parameters
     fitted: ComplexArray  # (n,): the same with each run's gain and phase
     # problems, the rows (n,) that are theirs, and the theta of each
-    parts: Sequence[tuple[Problem, NDArray[np.bool_], FloatArray]]
+    parts: Sequence[tuple[TableProblem, NDArray[np.bool_], FloatArray]]
 
     def change(self, changes: ComplexArray) -> FloatArray:
         """Return what changes (k, n) of the measured responses add to residuals, shape (k, m)."""
@@ -65,7 +65,7 @@ class Linearization:
         return found
 
 
-def linearization(problem: Problem, theta: FloatArray, runs: RunDeviations) -> Linearization:
+def linearization(problem: TableProblem, theta: FloatArray, runs: RunDeviations) -> Linearization:
     """Return residuals and derivatives at theta and the runs' deviations, without priors."""
     m = problem.n_residuals
     residuals = np.zeros(m)
@@ -89,7 +89,7 @@ def linearization(problem: Problem, theta: FloatArray, runs: RunDeviations) -> L
 
 
 def run_deviations(
-    problem: Problem, theta: FloatArray, mean: FloatArray, effects: FloatArray,
+    problem: TableProblem, theta: FloatArray, mean: FloatArray, effects: FloatArray,
     spread: FloatArray, noise: float,
 ) -> RunDeviations:  # fmt: skip
     """Return how runs deviate, where each run's residuals and deviations together are least."""

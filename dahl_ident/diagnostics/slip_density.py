@@ -24,7 +24,7 @@ from dahl_ident.elements import Element, MaxwellSlip, Model
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.masing import jenkins
 from dahl_ident.errors import DataError, ModelError
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _PER_DECADE = 48  # 5 % apart
 _BELOW = 100.0  # below the smallest amplitude, where all elements slip alike
@@ -164,7 +164,7 @@ def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _System:
     if rows.sum() < 3:
         raise DataError(f"{int(rows.sum())} rows are fundamentals; a density needs at least three")
     stand_in = MaxwellSlip(1, name="slip_density")
-    view = Problem(data.select(harmonic=1), Model(*linear, stand_in)).stiffness_data
+    view = TableProblem(data.select(harmonic=1), Model(*linear, stand_in)).stiffness_data
     A, Z = view.amplitude, view.stiffness
     if np.any(Z == 0.0):
         raise DataError("a response is zero; errors cannot count relative to it")

@@ -41,7 +41,7 @@ from dahl_ident.elements import Asymptote, Element, Parameter
 from dahl_ident.fitting.directions import Direction, Directions, directions, free_springs
 from dahl_ident.fitting.optimum import DeterminedCombination, blanked
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 
 _NO_FRICTION = 1e-18  # friction's stiffness over the median one, where it counts as none
 _LEAST_FRICTION = -60.0  # ln of a scale over that of the data that a search may reach
@@ -170,7 +170,7 @@ def _spread(by_phi: FloatArray, covariance: FloatArray) -> float:
 class Reach:
     """Where friction is neither at a limit nor negligible: what a search may pass through."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: TableProblem) -> None:
         view = problem.stiffness_data
         springs = bool(free_springs(problem))
         P = len(problem.parameters)
@@ -218,7 +218,7 @@ class Reach:
         return np.asarray((theta @ self._rows > least).all(axis=-1))
 
 
-def _declared(element: Element, problem: Problem) -> tuple[Asymptote, ...]:
+def _declared(element: Element, problem: TableProblem) -> tuple[Asymptote, ...]:
     """Return the limits that a law declares, with numbers (S,) for the tables of a batch."""
     amplitude = problem.stiffness_data.amplitude
     low, high = amplitude.min(axis=-1), amplitude.max(axis=-1)
@@ -231,7 +231,7 @@ def _tying(element: Element) -> Asymptote | None:
     return next((a for a in every if a.adds_to_spring is not None), None)
 
 
-def _tied(problem: Problem) -> list[tuple[Element, Asymptote, int]]:
+def _tied(problem: TableProblem) -> list[tuple[Element, Asymptote, int]]:
     """Return element, limit and the spring's index for each pair that microslip confounds."""
     springs = [problem.names.index(p.name) for p in free_springs(problem)]
     return [
@@ -243,7 +243,7 @@ def _tied(problem: Problem) -> list[tuple[Element, Asymptote, int]]:
     ]
 
 
-def microslip_charts(problem: Problem) -> list[Chart]:
+def microslip_charts(problem: TableProblem) -> list[Chart]:
     """Return the straightened charts of microslip: each free law that ties a free spring.
 
     Their coordinates stand in the places of theta's: the determined combination in that of the
@@ -267,7 +267,7 @@ def microslip_charts(problem: Problem) -> list[Chart]:
     return charts
 
 
-def stiffness_charts(problem: Problem) -> list[Chart]:
+def stiffness_charts(problem: TableProblem) -> list[Chart]:
     """Return the same for laws whose other scale parameter is given: ln sigma, the sum."""
     found = []
     for element, asymptote, spring in _tied(problem):
@@ -286,7 +286,7 @@ def _straightened(matrix: FloatArray, spring: int, sigma: int) -> Chart:
     return Chart(matrix, np.zeros(len(matrix)), back, (spring, sigma))
 
 
-def limits(problem: Problem) -> list[Limit]:
+def limits(problem: TableProblem) -> list[Limit]:
     """Return the limits of every law with a free parameter.
 
     None where an unknown displacement gain could undo any distance from the amplitudes.
@@ -313,7 +313,9 @@ def limits(problem: Problem) -> list[Limit]:
     return found
 
 
-def _plain(problem: Problem, element: Element, asymptote: Asymptote, spring: bool) -> list[Limit]:
+def _plain(
+    problem: TableProblem, element: Element, asymptote: Asymptote, spring: bool
+) -> list[Limit]:
     """Return a declared limit, or none where the parameters that run away are not free."""
     free = {label for label, p in zip(element.labels, element.parameters, strict=True) if p.free}
     pins = _pins(element, asymptote)
@@ -335,7 +337,7 @@ def _plain(problem: Problem, element: Element, asymptote: Asymptote, spring: boo
 
 
 def _microslip(
-    problem: Problem, element: Element, asymptote: Asymptote, springs: list[Parameter]
+    problem: TableProblem, element: Element, asymptote: Asymptote, springs: list[Parameter]
 ) -> list[Limit]:
     """Return a limit that exists only with a free spring, for each of them."""
     pins = _pins(element, asymptote)
@@ -357,7 +359,7 @@ def _microslip(
     return found
 
 
-def _vanishing(problem: Problem, own: Directions) -> list[Limit]:
+def _vanishing(problem: TableProblem, own: Directions) -> list[Limit]:
     """Return the limit in which the law has no force: its free scale parameters go to zero."""
     view = problem.stiffness_data
     scale = [p for p in (*own.scale, *own.linear) if p.free and p.positive]
@@ -375,7 +377,7 @@ def _vanishing(problem: Problem, own: Directions) -> list[Limit]:
     return [Limit(problem.names, Status.NO_FRICTION, "", _chart(problem, pins), gone)]
 
 
-def _undeclared(problem: Problem, own: Directions) -> list[Limit]:
+def _undeclared(problem: TableProblem, own: Directions) -> list[Limit]:
     """Return limits far out in every direction with a unit, on either side of the data."""
     view = problem.stiffness_data
     found = []
@@ -421,7 +423,7 @@ def _undeclared(problem: Problem, own: Directions) -> list[Limit]:
 
 
 def _kept_product(
-    problem: Problem, reference: Parameter, direction: Direction, unit: int
+    problem: TableProblem, reference: Parameter, direction: Direction, unit: int
 ) -> tuple[str, FloatArray]:
     """Return the product of scale and length that has a unit: a stiffness (-1), a force (0).
 
@@ -438,7 +440,7 @@ def _kept_product(
     return text, powers
 
 
-def _middle(problem: Problem, direction: Direction) -> FloatArray | float:
+def _middle(problem: TableProblem, direction: Direction) -> FloatArray | float:
     """Return a plain value of a direction, as a search coordinate."""
     p = direction.parameter
     if direction.is_number:
@@ -460,7 +462,7 @@ def _pins(element: Element, asymptote: Asymptote) -> dict[str, FloatArray | floa
     return pins
 
 
-def _powers(element: Element, powers: Mapping[str, float], problem: Problem) -> FloatArray:
+def _powers(element: Element, powers: Mapping[str, float], problem: TableProblem) -> FloatArray:
     """Return a combination's powers as a row over theta; parameters that are given fall out."""
     row = np.zeros(len(problem.parameters))
     for label, power in powers.items():
@@ -470,12 +472,12 @@ def _powers(element: Element, powers: Mapping[str, float], problem: Problem) -> 
     return row
 
 
-def _kept(problem: Problem, element: Element, asymptote: Asymptote) -> list[FloatArray]:
+def _kept(problem: TableProblem, element: Element, asymptote: Asymptote) -> list[FloatArray]:
     rows = [_powers(element, powers, problem) for _, powers in asymptote.kept]
     return [row for row in rows if row.any()]
 
 
-def _limit(problem: Problem, element: Element, asymptote: Asymptote, chart: Chart) -> Limit:
+def _limit(problem: TableProblem, element: Element, asymptote: Asymptote, chart: Chart) -> Limit:
     """Return a declared limit with the parameters' full names."""
     status = Status.__members__.get(asymptote.name.upper(), Status.RUNS_AWAY)
     kept = []
@@ -489,7 +491,7 @@ def _limit(problem: Problem, element: Element, asymptote: Asymptote, chart: Char
 
 
 def _chart(
-    problem: Problem,
+    problem: TableProblem,
     pins: Mapping[str, FloatArray | float],
     follow: tuple[str, str, FloatArray] | None = None,
     kept: Sequence[FloatArray] = (),

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -44,7 +44,7 @@ class Relations:
         return sum(self.equal)
 
     @classmethod
-    def of(cls, problem: BaseProblem, constraints: Constraints | None) -> Relations:
+    def of(cls, problem: Problem, constraints: Constraints | None) -> Relations:
         """Read the user's comparisons, or say what they are instead."""
         import casadi as ca
 
@@ -74,7 +74,7 @@ class Relations:
         function = ca.Function("differences", list(symbols.values()), [ca.vertcat(*differences)])
         return cls(tuple(texts), tuple(equal), function)
 
-    def at(self, problem: BaseProblem, theta: ca.SX) -> ca.SX:
+    def at(self, problem: Problem, theta: ca.SX) -> ca.SX:
         """Return lhs - rhs as expressions of the search coordinates theta."""
         import casadi as ca
 

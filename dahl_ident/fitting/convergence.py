@@ -18,7 +18,7 @@ from dahl_ident.fitting.optimum import (
     inverse,
 )
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 
 
 class Ends:
@@ -84,7 +84,7 @@ class Ends:
 
 
 def optima(
-    problem: BaseProblem,
+    problem: Problem,
     ends: Ends,
     scale: float,
     loss: Loss | None,

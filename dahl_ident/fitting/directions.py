@@ -15,7 +15,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Parameter
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
 Dimension = tuple[int, int, int]
@@ -45,7 +45,7 @@ class Direction:
         """Whether it has no unit."""
         return not any(self.dimension)
 
-    def row(self, problem: Problem) -> tuple[FloatArray, float]:
+    def row(self, problem: TableProblem) -> tuple[FloatArray, float]:
         """Return its logarithm as row times theta plus number."""
         row, rest = np.zeros(len(problem.parameters)), 0.0
         for parameter, sign in ((self.parameter, 1.0), (self.over, -1.0)):
@@ -150,7 +150,7 @@ def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:
     return next(iter((*known, *stiff, *scale)), None)
 
 
-def free_springs(problem: Problem) -> list[Parameter]:
+def free_springs(problem: TableProblem) -> list[Parameter]:
     """Return the free stiffnesses of linear springs that no bound keeps from any value."""
     return [
         p

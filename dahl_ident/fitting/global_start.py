@@ -36,7 +36,7 @@ from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.elements import Element, Friction, Parameter
 from dahl_ident.errors import FitError, argument
 from dahl_ident.fitting.directions import Direction, Directions, directions, is_positive
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
 IntArray = NDArray[np.intp]
@@ -80,7 +80,7 @@ class Starts(NamedTuple):
         return Starts(np.searchsorted(tables, self.table[chosen]), self.theta[chosen])
 
 
-def starts(problem: Problem) -> FloatArray:
+def starts(problem: TableProblem) -> FloatArray:
     """Return the search coordinates of one table's best starts, best first, shape (starts, P).
 
     Values that the user gave to free parameters make one more start, the last.
@@ -88,7 +88,7 @@ def starts(problem: Problem) -> FloatArray:
     return own_starts(problem).theta
 
 
-def own_starts(problem: Problem, *, resistant: bool = False) -> Starts:
+def own_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
     """Return the best starts of every table of a problem, best first.
 
     `resistant` ones have an outlier rule some of them, but not all: by other weights as well. A
@@ -105,7 +105,7 @@ def own_starts(problem: Problem, *, resistant: bool = False) -> Starts:
     return found
 
 
-def _starts(problem: Problem, view: StiffnessData) -> Starts:
+def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
     grid = _grid(problem, view)
     cost, coefficients = grid.solved()
     best = _vertices(grid, cost, coefficients)
@@ -156,12 +156,12 @@ def _vertices(grid: _Grid, cost: FloatArray, coefficients: FloatArray) -> FloatA
     return np.where(best == nodes - 1, theta[..., 2, :], vertex).reshape(-1, P)
 
 
-def grid_size(problem: Problem) -> int:
+def grid_size(problem: TableProblem) -> int:
     """Return the number of nodes of the grid where starts are searched."""
     return len(_grid(problem, problem.stiffness_data).nodes)
 
 
-def edge_starts(problem: Problem) -> list[FloatArray]:
+def edge_starts(problem: TableProblem) -> list[FloatArray]:
     """Return the best nodes at both ends of each direction's grid, each (P,) or (S, P).
 
     They are where searches for limits start.
@@ -215,7 +215,7 @@ class _Curves:
 class _Grid:
     """Linear least squares at every combination of the elements' nodes."""
 
-    problem: Problem
+    problem: TableProblem
     curves: list[_Curves]
     nodes: IntArray  # (C, elements with more than one node)
     shape: tuple[int, ...]
@@ -298,7 +298,7 @@ def _scaled(values: dict[str, FloatArray], column: _Column, coefficient: FloatAr
         values[p.name] = values.get(p.name, np.ones(())) * size
 
 
-def _grid(problem: Problem, view: StiffnessData) -> _Grid:
+def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
     every = [directions(e) for e in problem.model.elements]
     searched = [d for d in every if d.nonlinear]
     rows = np.flatnonzero(view.harmonic <= _HIGHEST)

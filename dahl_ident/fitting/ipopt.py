@@ -42,7 +42,7 @@ from dahl_ident.fitting.optimum import (
 from dahl_ident.fitting.record_search import Tell
 from dahl_ident.fitting.search import solve, starts_of
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import BaseProblem, Problem, Quadratic
+from dahl_ident.problem import Problem, Quadratic, TableProblem
 
 _TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
 _ITERATIONS = 300  # a limit for searches that do not end
@@ -75,7 +75,7 @@ def solve_ipopt(
 
     Parameters
     ----------
-    problem : BaseProblem
+    problem : Problem
         One table, or records.
     constraints : callable, optional
         Takes a mapping of every parameter's name to its casadi symbol, returns comparisons with
@@ -117,7 +117,7 @@ def solve_ipopt(
     >>> from dahl_ident.data import FrequencyResponse
     >>> A = np.geomspace(1e-4, 1e-2, 5)
     >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
-    >>> problem = Problem(FrequencyResponse(np.ones(5), N, A), Dahl())
+    >>> problem = TableProblem(FrequencyResponse(np.ones(5), N, A), Dahl())
     >>> free = solve_ipopt(problem)
     >>> free.values.round(6).tolist()
     [0.1, 30.0]
@@ -157,7 +157,7 @@ class Target:
 
     Attributes
     ----------
-    problem : BaseProblem
+    problem : Problem
         One table, or records.
     scale : float
         What the data's residuals are divided by.
@@ -165,7 +165,7 @@ class Target:
         "linear" or a robust loss, see :mod:`dahl_ident.fitting.losses`.
     """
 
-    problem: BaseProblem
+    problem: Problem
     scale: float = 1.0
     loss: str = "linear"
 
@@ -358,8 +358,8 @@ def _callback() -> Any:
 
 
 def _with_drive_error(
-    problem: Problem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
-) -> Problem:
+    problem: TableProblem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
+) -> TableProblem:
     """Return the problem with the errors of its drives in its data, checked."""
     if std is None:
         if covariance is not None:

@@ -15,7 +15,7 @@ from scipy import special
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 
 _RESCALINGS = 100  # of the noise's scale; a handful is the rule
 _SAME_SCALE = 1e-9  # change of ln scale that ends them
@@ -69,7 +69,7 @@ class Optimum:
 
     Attributes
     ----------
-    problem : BaseProblem
+    problem : Problem
         What was solved; its `names` order every array here.
     theta : ndarray, shape (P,)
         Search coordinates. Where the optimum lies at infinity, a finite point so far out that
@@ -209,7 +209,7 @@ class OptimumBatch(Sequence[Optimum]):
     Arrays are those of the optima, led by S.
     """
 
-    problem: BaseProblem
+    problem: Problem
     theta: FloatArray
     values: FloatArray
     covariance: FloatArray
@@ -278,7 +278,7 @@ class OptimumBatch(Sequence[Optimum]):
         return tuple(self.problem.names)
 
     @classmethod
-    def joined(cls, problem: BaseProblem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
+    def joined(cls, problem: Problem, parts: Sequence[OptimumBatch]) -> OptimumBatch:
         """Return the optima of all parts, one after the other, as those of `problem`."""
         combinations, meanings, first = {}, {}, 0
         for part in parts:
@@ -325,7 +325,7 @@ class OptimumBatch(Sequence[Optimum]):
         return " ".join(parts)
 
 
-def at_bound(problem: BaseProblem, theta: FloatArray) -> NDArray[np.bool_]:
+def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
     """Return which parameters lie at a bound."""
     low, high = problem.bounds()
     with np.errstate(invalid="ignore"):
@@ -333,9 +333,7 @@ def at_bound(problem: BaseProblem, theta: FloatArray) -> NDArray[np.bool_]:
         return np.asarray((theta - low <= near) | (high - theta <= near))
 
 
-def estimated_scale(
-    problem: BaseProblem, cost: ArrayLike, dof: int | NDArray[np.intp]
-) -> FloatArray:
+def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.intp]) -> FloatArray:
     """Return the standard deviation of residuals whose half sum of squares is `cost`.
 
     It is what rounding makes it where the residuals are smaller, and NaN without freedom.
@@ -345,7 +343,7 @@ def estimated_scale(
 
 
 def _scale_ratio(
-    problem: BaseProblem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
+    problem: Problem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
 ) -> float:
     """Return the scale that the residuals at `theta` have, over the `scale` that was assumed.
 
@@ -359,7 +357,7 @@ def _scale_ratio(
 
 
 def agreed_scale(
-    problem: BaseProblem,
+    problem: Problem,
     loss: Loss | None,
     search: Callable[[float], tuple[FloatArray, int]],
     scale: float,
@@ -381,12 +379,12 @@ def agreed_scale(
     return scale
 
 
-def _is_rounding(problem: BaseProblem, scale: float) -> bool:
+def _is_rounding(problem: Problem, scale: float) -> bool:
     return not problem.scale_known and bool(scale < _BARELY * problem.rounding)
 
 
 def information_of(
-    problem: BaseProblem,
+    problem: Problem,
     theta: FloatArray,
     scale: float,
     loss: Loss | None,

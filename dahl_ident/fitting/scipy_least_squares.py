@@ -11,14 +11,14 @@ from dahl_ident.fitting.asymptotes import Chart
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.noise import bend
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 
 _COST, _STEP, _SLOPE = 1e-13, 1e-10, 1e-14  # relative changes that end a search
 _EVALUATIONS = 300  # a limit for searches that do not end
 
 
 def minimise_by_scipy(
-    problem: BaseProblem,
+    problem: Problem,
     start: FloatArray,
     scale: float,
     loss: Loss | None,
@@ -61,7 +61,7 @@ def minimise_by_scipy(
 
 
 def _rows(
-    problem: BaseProblem, scale: float, loss: Loss | None, chart: Chart | None
+    problem: Problem, scale: float, loss: Loss | None, chart: Chart | None
 ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
     """Return residuals and Jacobian, of which half the sum of squares is the cost, of a theta.
 

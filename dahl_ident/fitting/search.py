@@ -47,7 +47,7 @@ from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
 from dahl_ident.fitting.record_search import Tell, solve_records
 from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
-from dahl_ident.problem import BaseProblem, Problem, ProblemBatch, Quadratic
+from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
 
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
 _STEPS = 80  # of a search; ten are the rule
@@ -63,7 +63,7 @@ _CURVES_AT_ONCE = 2**20  # rows of data times nodes of the grid where starts are
 
 
 def solve(
-    problem: BaseProblem,
+    problem: Problem,
     *,
     method: str = "lm",
     loss: str = "linear",
@@ -75,7 +75,7 @@ def solve(
 
     Parameters
     ----------
-    problem : BaseProblem
+    problem : Problem
         A table or records.
     method : {"lm", "scipy"}, default "lm"
         Levenberg and Marquardt's method from all starts together, or
@@ -111,7 +111,7 @@ def solve(
     >>> from dahl_ident.data import FrequencyResponse
     >>> A = np.geomspace(1e-4, 1e-2, 5)
     >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
-    >>> optimum = solve(Problem(FrequencyResponse(np.ones(5), N, A), Dahl()))
+    >>> optimum = solve(TableProblem(FrequencyResponse(np.ones(5), N, A), Dahl()))
     >>> optimum.values.round(9).tolist()
     [0.1, 30.0]
     >>> optimum.status.name
@@ -127,7 +127,7 @@ def solve(
 
 
 def _solve_table(
-    problem: Problem, method: str, loss: str, start: Mapping[str, float], *, limits: bool
+    problem: TableProblem, method: str, loss: str, start: Mapping[str, float], *, limits: bool
 ) -> Optimum:
     """Return the optimum of one table."""
     search = TableSearch(problem, loss_named(loss, problem.parts), method=method, limits=limits)
@@ -148,7 +148,7 @@ def _solve_table(
     return optimum
 
 
-def starts_of(problem: BaseProblem) -> FloatArray:
+def starts_of(problem: Problem) -> FloatArray:
     """Return the search coordinates of global starts."""
     one: Any = problem
     return starts(one) if problem.settled else one.to_search(record_starts(one))
@@ -218,7 +218,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     return OptimumBatch.joined(batch, parts)
 
 
-def _check(problem: BaseProblem, start: Mapping[str, float]) -> None:
+def _check(problem: Problem, start: Mapping[str, float]) -> None:
     """Refuse starts of parameters that are not free, and more of these than numbers."""
     names, m = problem.names, problem.n_residuals + len(problem.priors)
     if not isinstance(start, Mapping):
@@ -240,7 +240,7 @@ class TableSearch:
 
     def __init__(
         self,
-        problem: Problem,
+        problem: TableProblem,
         loss: Loss | None,
         method: str = "lm",
         tolerance: float = 1.0,

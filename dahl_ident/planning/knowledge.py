@@ -20,7 +20,7 @@ from dahl_ident.diagnostics.error_sources import NOISE, RUNS
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import HIGH, LOW, ValidationError, argument, choices
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.space import Space
 from dahl_ident.sensors import Sensors
@@ -55,7 +55,7 @@ class Knowledge:
     # standard deviation of ln gain and of phase of a row of earlier data
     row_noise: float | None = None
     row_cycles: float = 1.0  # cycles that such a row averages, if the data state it; else 1
-    problem: Problem | None = None  # of the earlier data
+    problem: TableProblem | None = None  # of the earlier data
     scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
     errors: ErrorModel | None = None  # of an earlier fit
     # standard deviation of a sample of force in earlier records, N
@@ -100,14 +100,14 @@ class Knowledge:
         model: Model | None = None,
         harmonic: int = 1,
         noise: str = "relative",
-    ) -> Problem:
+    ) -> TableProblem:
         """Return the problem of levels whose response is not yet measured."""
         held: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
         data = FrequencyResponse(
             frequency_hz, np.ones(len(levels)), controlled=controlled, motion=self.motion,
             harmonic=harmonic, **held,
         )  # fmt: skip
-        return Problem(
+        return TableProblem(
             data, model or self.model, noise=noise, sensors=self.sensors, steady=self.steady
         )
 
@@ -226,7 +226,11 @@ def _of_errors(
 
 
 def _of_data(
-    fitted: Problem, drawn: FloatArray, scale: Any, leaned: FloatArray, at: FloatArray | None = None
+    fitted: TableProblem,
+    drawn: FloatArray,
+    scale: Any,
+    leaned: FloatArray,
+    at: FloatArray | None = None,
 ) -> Knowledge:
     """Return draws with the information of their data, at each draw or at one place."""
     model, assumed = _with_assumed(fitted.model)
@@ -340,7 +344,7 @@ def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
     return np.clip(theta, *Space(parameters).bounds)
 
 
-def _row_noise(problem: Problem, scale: float) -> tuple[float, float]:
+def _row_noise(problem: TableProblem, scale: float) -> tuple[float, float]:
     """Return the relative noise of a row of the data, and the cycles that it averages."""
     data, size = problem.data, np.abs(problem.data.response)
     if problem.noise == "relative":

@@ -30,7 +30,7 @@ class Quadratic(NamedTuple):
     hessian: FloatArray
 
 
-class BaseProblem(ABC):
+class Problem(ABC):
     """Residuals as functions of search coordinates, and what is known of their noise.
 
     Attributes
@@ -182,7 +182,7 @@ class BaseProblem(ABC):
         """Whether any parameter has a finite bound in search coordinates."""
         return self.space.is_bounded
 
-    def near(self, theta: FloatArray) -> BaseProblem:
+    def near(self, theta: FloatArray) -> Problem:
         """Return a problem that predicts as this one does near theta, where one is faster."""
         return self
 

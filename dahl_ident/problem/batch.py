@@ -12,23 +12,23 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
 from dahl_ident.errors import DataError
-from dahl_ident.problem.problem import Problem
 from dahl_ident.problem.stiffness import as_response, checked_table
+from dahl_ident.problem.table_problem import TableProblem
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 
 
-class ProblemBatch(Problem):
+class ProblemBatch(TableProblem):
     """The same estimate for S tables: theta has shape (S, P), one row for each table.
 
-    Every method of :class:`Problem` takes theta of shape (S, P) and applies row s to table s.
+    Every method of :class:`TableProblem` takes theta of shape (S, P) and applies row s to table s.
 
     Parameters
     ----------
     data : sequence of FrequencyResponse
         Tables with the same number of rows, quantity, harmonics and controlled variable.
     model, noise, sensors, free, fixed, steady
-        As for :class:`Problem`.
+        As for :class:`TableProblem`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class ProblemBatch(Problem):
         self.tables = tuple(tables)
 
     @classmethod
-    def replicates(cls, problem: Problem, responses: ComplexArray) -> ProblemBatch:
+    def replicates(cls, problem: TableProblem, responses: ComplexArray) -> ProblemBatch:
         """Return `problem` with each of S sets of responses, shape (S, n), in place of its own.
 
         Everything else, covariance included, stays as it is.
@@ -90,9 +90,9 @@ class ProblemBatch(Problem):
         """Return the batch of some of the tables."""
         return self._with_rows(ProblemBatch, self._rows.take(tables))
 
-    def table(self, index: int) -> Problem:
+    def table(self, index: int) -> TableProblem:
         """Return the problem of one table."""
-        problem = self._with_rows(Problem, self._rows.table(index))
+        problem = self._with_rows(TableProblem, self._rows.table(index))
         if "tables" in self.__dict__:  # replicates are responses alone
             problem.data = self.tables[index]
         return problem

@@ -25,7 +25,7 @@ from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.noise import Rho
-from dahl_ident.problem.base import BaseProblem, Quadratic
+from dahl_ident.problem.base import Problem, Quadratic
 from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
 from dahl_ident.problem.record_prediction import Predicted, bends, force_of, motion_of, nuisance
 from dahl_ident.problem.space import Space
@@ -43,7 +43,7 @@ _LEAST = 1e-300  # of a positive value that has vanished
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
 
 
-class RecordProblem(BaseProblem):
+class RecordProblem(Problem):
     """Records of one device and a model: residuals, Jacobian and cost.
 
     Residuals are measured minus predicted samples over the standard deviation of the output, so

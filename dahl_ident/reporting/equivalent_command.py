@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from dahl_ident.elements.law_checks import is_of_package
 from dahl_ident.elements.law_files import own_laws, source_path
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.tables import prior_text
 from dahl_ident.results import FitResult, Posterior
@@ -133,7 +133,7 @@ def _sample(posterior: Posterior) -> list[str]:
     ]  # fmt: skip
 
 
-def _model(problem: Problem) -> list[str]:
+def _model(problem: TableProblem) -> list[str]:
     """Return the options of elements and sensors that differ from the usual ones."""
     model = problem.model
     names = {p.name for p in model.parameters}
@@ -147,7 +147,7 @@ def _model(problem: Problem) -> list[str]:
     return [*words, *(w for p in problem.sensors.parameters for w in _parameter(p, problem))]
 
 
-def _parameter(parameter: Parameter, problem: Problem) -> Iterator[str]:
+def _parameter(parameter: Parameter, problem: TableProblem) -> Iterator[str]:
     name = parameter.name
     value = "free"
     if name in problem.priors:

@@ -34,7 +34,7 @@ from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.fitting.record_search import Tell
-from dahl_ident.problem import BaseProblem, Problem, ProblemBatch
+from dahl_ident.problem import Problem, ProblemBatch, TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
@@ -167,7 +167,7 @@ def fit(
             f"{' and '.join(given)} given; only {argument('method', 'ipopt')} takes that"
         )
 
-    def optimum_of(problem: BaseProblem, tell: Tell | None) -> Optimum:
+    def optimum_of(problem: Problem, tell: Tell | None) -> Optimum:
         if method != "ipopt":
             return solve(problem, method=method, loss=loss, start=start, tell=tell)
         from dahl_ident.fitting.ipopt import solve_ipopt
@@ -207,7 +207,7 @@ def _problem(
 ) -> Any:
     """Return the problem of a table or of records."""
     if isinstance(data, FrequencyResponse):
-        return Problem(
+        return TableProblem(
             data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
         )
     return RecordProblem(
@@ -504,7 +504,7 @@ def _record_density(
 
 
 def _density(
-    problem: Problem,
+    problem: TableProblem,
     fit: FitResult | None,
     priors: Mapping[str, PriorLike] | None,
     likelihood: str,

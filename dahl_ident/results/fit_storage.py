@@ -23,7 +23,7 @@ from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError
 from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import BaseProblem, Problem
+from dahl_ident.problem import Problem, TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
@@ -127,7 +127,7 @@ def _agrees(optimum: Optimum) -> bool:
     return bool(same and np.isclose(cost, optimum.cost, rtol=_SAME, atol=least))
 
 
-def _describe_table(problem: Problem) -> dict[str, Any]:
+def _describe_table(problem: TableProblem) -> dict[str, Any]:
     return {
         "data": _describe_data(problem.data),
         "noise": problem.noise,
@@ -136,9 +136,9 @@ def _describe_table(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _table_problem(content: Mapping[str, Any]) -> Problem:
+def _table_problem(content: Mapping[str, Any]) -> TableProblem:
     known = Sensors(**{name: _channel(content["sensors"][name]) for name in _SENSORS})
-    return Problem(
+    return TableProblem(
         _data(content["data"]),
         model_from_description(content["model"]),
         noise=content["noise"],
@@ -189,7 +189,7 @@ def describe_optimum(optimum: Optimum) -> dict[str, Any]:
     }
 
 
-def optimum_from(problem: BaseProblem, stored: Mapping[str, Any]) -> Optimum:
+def optimum_from(problem: Problem, stored: Mapping[str, Any]) -> Optimum:
     """Return the optimum of a problem that :func:`describe_optimum` described."""
     if list(problem.names) != stored["names"]:
         raise KeyError(f"the free parameters {stored['names']}, found {list(problem.names)}")

@@ -14,7 +14,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.diagnostics.bands import ENERGY, DerivedQuantity
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.elements import Element
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 from dahl_ident.units import shown_unit
 
 
@@ -70,7 +70,7 @@ def _central(values: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
 
 
 def derived_at_draws(
-    problem: BaseProblem,
+    problem: Problem,
     by_name: Mapping[str, FloatArray],
     amplitudes: Sequence[float],
     frequency_hz: float | None,

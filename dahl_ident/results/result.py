@@ -25,7 +25,7 @@ from dahl_ident.diagnostics.formatting import (
     with_unit,
 )
 from dahl_ident.diagnostics.judgement import Finding, Judgement, VerdictStatus
-from dahl_ident.problem import BaseProblem
+from dahl_ident.problem import Problem
 from dahl_ident.units import Quantity, shown_unit
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class Parameters(Mapping[str, Estimate]):
 
     @classmethod
     def of(
-        cls, problem: BaseProblem, values: Mapping[str, float], stderr: Mapping[str, float]
+        cls, problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
     ) -> Parameters:
         """Return every parameter of a problem, with the values that were estimated."""
         estimates = {}
@@ -206,7 +206,7 @@ class Result(ABC):
 
     @property
     @abstractmethod
-    def problem(self) -> BaseProblem:
+    def problem(self) -> Problem:
         """Data, model, noise and sensors."""
 
     @property

@@ -36,7 +36,7 @@ from dahl_ident.elements import Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import Optimum, propagated
-from dahl_ident.problem import Problem
+from dahl_ident.problem import TableProblem
 from dahl_ident.results.assessment import Assessment
 
 _NOISE = {
@@ -49,7 +49,7 @@ _NOISE = {
 class TableAssessment(Assessment):
     """A fit of a table, with its error model."""
 
-    problem: Problem
+    problem: TableProblem
     kind = "tables"
     instead = "extract the table from the waveforms, or fit the record itself"
 

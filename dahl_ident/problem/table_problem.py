@@ -31,7 +31,7 @@ from dahl_ident.noise import (
     squares_of,
     weighted,
 )
-from dahl_ident.problem.base import EXPLICIT, BaseProblem, Quadratic
+from dahl_ident.problem.base import EXPLICIT, Problem, Quadratic
 from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
@@ -42,14 +42,14 @@ from dahl_ident.units import Motion, shown_unit
 _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()
 """Where shooting last ended, by table and number of states: one fit makes many problems of one."""
 
-_Kind = TypeVar("_Kind", bound="Problem")
+_Kind = TypeVar("_Kind", bound="TableProblem")
 
 _LOST = 2e-6
 """Noise of the data's mean over that of a calibration, below which its part of the information
 (1e-12 of it, as a square) is near rounding."""
 
 
-class Problem(BaseProblem):
+class TableProblem(Problem):
     """Data, model, noise and sensors: residuals, Jacobian and likelihood of one estimate.
 
     Parameters
@@ -95,7 +95,7 @@ class Problem(BaseProblem):
     >>> from dahl_ident.data import FrequencyResponse
     >>> A = np.array([1e-4, 1e-3, 1e-2])
     >>> N = Dahl(f_max=0.1, sigma=30.0).describing_function(A)
-    >>> problem = Problem(FrequencyResponse(np.ones(3), N, A), Dahl())
+    >>> problem = TableProblem(FrequencyResponse(np.ones(3), N, A), Dahl())
     >>> problem.names
     ('f_max', 'sigma')
     >>> theta = problem.to_search([0.1, 30.0])
@@ -173,7 +173,7 @@ class Problem(BaseProblem):
         self._tail = noise.tail if isinstance(noise, Measured) else None
         self.gaussian = self._tail is None
 
-    def widened(self, misfit: FloatArray) -> Problem:
+    def widened(self, misfit: FloatArray) -> TableProblem:
         """Return the problem whose stated covariances have a misfit's variance each, (n,), added.
 
         Rows are Gaussian then; see ``Measured.widened`` in noise.py.
@@ -185,7 +185,7 @@ class Problem(BaseProblem):
         other._set_noise(noise_for(self._rows, self.noise))
         return other
 
-    def part(self, rows: NDArray[np.bool_], response: ComplexArray) -> Problem:
+    def part(self, rows: NDArray[np.bool_], response: ComplexArray) -> TableProblem:
         """Return the problem of some rows, with other responses in place of the data's."""
         data = replace(self.data.select(rows=rows), response=response)
         other = self.like(data=data)
@@ -275,7 +275,7 @@ class Problem(BaseProblem):
         first = Z.harmonic == 1
         return bool(np.all(Z.stiffness.imag[first] > 0.0))
 
-    def near(self, theta: FloatArray) -> Problem:
+    def near(self, theta: FloatArray) -> TableProblem:
         """Return a problem that predicts as this one does near theta, and much faster.
 
         Exact steady motions are taken to second order in the distance from theta, shape (P,), see
@@ -294,12 +294,12 @@ class Problem(BaseProblem):
         shooting = self._shooting if exact else None
         return Predictor(self.model, self.sensors, self.space, self._rows, shooting, self._orbits)
 
-    def like(self, **changes: Any) -> Problem:
-        """Return this problem with some arguments of :class:`Problem` in place of its own."""
+    def like(self, **changes: Any) -> TableProblem:
+        """Return this problem with some arguments of :class:`TableProblem` in place of its own."""
         names = ("data", "model", "noise", "sensors", "steady")
-        return Problem(**{name: getattr(self, name) for name in names} | changes)
+        return TableProblem(**{name: getattr(self, name) for name in names} | changes)
 
-    def assuming(self, spread: Mapping[str, float]) -> Problem:
+    def assuming(self, spread: Mapping[str, float]) -> TableProblem:
         """Return the problem with given parameters free, each with its value as a prior.
 
         Parameters
@@ -431,7 +431,7 @@ class Problem(BaseProblem):
     def residuals_and_jacobian(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
     ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian, see ``BaseProblem``.
+        """Return residuals and Jacobian, see ``Problem``.
 
         With noise in the amplitude the residuals are defined up to a rotation of each pair. The
         Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
@@ -447,7 +447,7 @@ class Problem(BaseProblem):
         rho: Rho | None = None,
         chart: FloatArray | None = None,
     ) -> Quadratic:
-        """Return half the sum of squares with its gradient and Hessian, see ``BaseProblem``."""
+        """Return half the sum of squares with its gradient and Hessian, see ``Problem``."""
         rho = rho or self._tail
         rows = self._rows_at(theta, scale)
         if chart is not None:
