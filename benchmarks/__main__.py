@@ -16,6 +16,7 @@ TOPICS = (
     "general_dahl",
     "hysteresis",
     "time_domain",
+    "compiled_laws",
     "steady_state",
     "error_bars",
     "reading",
@@ -40,8 +41,8 @@ def main() -> None:
         "# Benchmarks\n\nMeasured side by side by `make bench`; ratios carry over to "
         "other machines, times do not.\n\n"
         f"Python {platform.python_version()}, {versions}. {os.cpu_count()} processors, "
-        f"load average {os.getloadavg()[0]:.1f} at the start; bounds in seconds are meant for an "
-        "idle machine."
+        f"load average {os.getloadavg()[0]:.1f} at the start. Times are the "
+        "processor's; on a busy machine they are up to twice those on an idle one."
     ]
     print(parts[0])
     for topic in arguments.topics:

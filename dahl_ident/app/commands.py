@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.elements import Damper, Mass, Spring
-from dahl_ident.elements.element import class_named
+from dahl_ident.elements.law_files import class_named
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.units import SI_UNITS, parse_quantity
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.elements import BoucWen, Dahl, Friction, Iwan, LuGre, MaxwellSlip, PowerDamper
-from dahl_ident.elements.element import KINDS
-from dahl_ident.elements.law_files import load_laws
+from dahl_ident.elements.law_files import KINDS, load_laws
 
 _PICTURE = re.compile(r"!\[(.*)\]\(<?(.*?)>?\)")
 _SHOWN: dict[str, Callable[[], Any]] = {

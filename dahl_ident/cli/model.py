@@ -121,7 +121,7 @@ def _element(text: str) -> Element:
 
 def _entry(text: str) -> dict[str, Any]:
     """Return an element as plain data; that behind a gap is written inside its brackets."""
-    from dahl_ident.elements.element import KINDS, class_named
+    from dahl_ident.elements.law_files import KINDS, class_named
 
     call = _CALL.fullmatch(text.strip())
     if call is None:

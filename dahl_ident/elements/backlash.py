@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import KINDS, Element, class_named, prefixed
+from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.facts import (
     Asymptote,
     Combination,
@@ -26,6 +26,7 @@ from dahl_ident.elements.facts import (
 )
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.held_motion import loops_of
+from dahl_ident.elements.law_files import KINDS, class_named
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError
 
@@ -111,6 +112,11 @@ class Backlash(Friction):
         crossing = room * (1.0 - (direction * force < 0.0))
         slope = self.slope(force, direction, velocity, values)
         return Mechanics(0.0, force, (slope * velocity * (1.0 - crossing), velocity * crossing))
+
+    @property
+    def inside(self) -> tuple[Any, ...]:
+        """The element behind the gap."""
+        return (self._element,)
 
     @property
     def n_states(self) -> int:

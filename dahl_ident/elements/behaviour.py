@@ -197,6 +197,11 @@ class Behaviour(ABC):
         )
 
     @property
+    def inside(self) -> tuple[Any, ...]:
+        """Elements of which this one is made, such as that behind a gap."""
+        return ()
+
+    @property
     def n_states(self) -> int:
         """States in an equation of motion."""
         return int(self.has_memory)

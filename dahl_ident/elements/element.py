@@ -30,32 +30,11 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     Values,
 )
-from dahl_ident.elements.law_files import file_of, restored, source_path
+from dahl_ident.elements.law_files import file_of, register, restored
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
 Value = TypeVar("Value")
-
-KINDS: dict[str, type[Element]] = {}
-"""Every element class by the name that files and the command line know it by."""
-
-
-def register(cls: type[Element]) -> None:
-    """Make a class known by its kind; a file that is run again replaces its own classes."""
-    known = KINDS.get(cls.kind)
-    home, known_home = (known and (source_path(c) or c.__module__) for c in (cls, known or cls))
-    if known and (known_home, known.__qualname__) != (home, cls.__qualname__):
-        raise ModelError(
-            f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
-            f"{known.__qualname__} has already; choose another"
-        )
-    KINDS[cls.kind] = cls
-
-
-def class_named(name: str) -> type[Element] | None:
-    """Return the class with this kind, or else with this name; None if there is none."""
-    named = [cls for cls in KINDS.values() if cls.__name__ == name]
-    return KINDS.get(name) or (named[0] if len(named) == 1 else None)
 
 
 class Element(Behaviour):

@@ -433,8 +433,6 @@ def traced(
     ModelError
         If the slope of a user's law fails with symbols, or is another one than with numbers.
     """
-    from dahl_ident.elements.friction import Friction
-
     if is_of_package(type(element)):
         return element.mechanics(values, x, v, s, states)
     try:
@@ -445,12 +443,12 @@ def traced(
         raise ModelError(
             f"{type(element).__name__} cannot be compiled: {_in_words(exc)}, and on symbols"
         ) from exc
-    if isinstance(element, Friction) and type(element).mechanics is Friction.mechanics:
+    if getattr(element, "one_state", False):
         _compare(element, values, v, s, states[0])
     return part
 
 
-def _compare(law: Friction, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
+def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
     """Refuse a slope that is another one in symbols than in numbers."""
     import casadi as ca
 

@@ -1,4 +1,4 @@
-"""Files in which users define laws: run once, known by kind, and taken along by pickles.
+"""Laws by their kinds, and files in which users define some: run once, taken along by pickles.
 
 A file becomes a module of a name made from its path and content, so that it can neither hide
 another module nor be mistaken for an earlier version of itself. An element whose class comes from a
@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dahl_ident.data.storage import read_text
+from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.elements.law_checks import check_declarations, is_of_package
 from dahl_ident.errors import DahlIdentError, ModelError
 
@@ -50,6 +51,27 @@ class LawFile(NamedTuple):
 
 _FILES: dict[str, LawFile] = {}
 """Files that were run, by the names of their modules."""
+
+KINDS: dict[str, type[Element]] = {}
+"""Every element class by the name that files and the command line know it by."""
+
+
+def register(cls: type[Element]) -> None:
+    """Make a class known by its kind; a file that is run again replaces its own classes."""
+    known = KINDS.get(cls.kind)
+    home, known_home = (known and (source_path(c) or c.__module__) for c in (cls, known or cls))
+    if known and (known_home, known.__qualname__) != (home, cls.__qualname__):
+        raise ModelError(
+            f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
+            f"{known.__qualname__} has already; choose another"
+        )
+    KINDS[cls.kind] = cls
+
+
+def class_named(name: str) -> type[Element] | None:
+    """Return the class with this kind, or else with this name; None if there is none."""
+    named = [cls for cls in KINDS.values() if cls.__name__ == name]
+    return KINDS.get(name) or (named[0] if len(named) == 1 else None)
 
 
 def load_laws(path: str | Path) -> tuple[type[Element], ...]:
@@ -95,8 +117,6 @@ def load_laws(path: str | Path) -> tuple[type[Element], ...]:
 
 def run(file: LawFile) -> tuple[type[Element], ...]:
     """Return the laws of a file, which is run where this process has not done it yet."""
-    from dahl_ident.elements.element import Element, register
-
     path, name = Path(file.path), file.module
     if name not in _FILES:
         module = ModuleType(name)
@@ -116,10 +136,10 @@ def run(file: LawFile) -> tuple[type[Element], ...]:
             ) from exc
         finally:
             sys.path.remove(folder)
-    laws = tuple(
+    laws: tuple[Any, ...] = tuple(
         value
         for value in vars(sys.modules[name]).values()
-        if isinstance(value, type) and issubclass(value, Element) and value.__module__ == name
+        if isinstance(value, type) and issubclass(value, Behaviour) and value.__module__ == name
         and not inspect.isabstract(value)
     )  # fmt: skip
     if not laws:
@@ -169,11 +189,7 @@ def restored(file: LawFile, name: str) -> Any:
 
 def own_laws(elements: Iterable[Element]) -> list[type[Element]]:
     """Return the classes of a model's laws that are not this package's; those behind gaps too."""
-    from dahl_ident.elements.backlash import Backlash
-
-    every = list(elements)
-    every += [e.element for e in every if isinstance(e, Backlash)]
-    both = (type(element) for element in every)
+    both = (type(part) for element in elements for part in (element, *element.inside))
     return list(dict.fromkeys(law for law in both if not is_of_package(law)))
 
 
@@ -196,8 +212,6 @@ def require_laws(laws: Sequence[Mapping[str, Any]], holder: str) -> None:
     ModelError
         If one is not known here; it names the file that defines it.
     """
-    from dahl_ident.elements.element import KINDS
-
     for law in laws:
         if law["kind"] not in KINDS:
             file = law["file"] or "an interactive session, which no file holds"
