@@ -390,14 +390,15 @@ any exponent, with two limits or behind a gap are compared with their closed for
 to turning point instead, and loops of any amplitude, 1e-8 to 1e8 characteristic displacements, with
 their closed form and Gauss's quadrature, both in {times} times as many cases. Units of force and
 length are random, from 1e-6 to 1e6; other amplitudes are 0.01 to 100 characteristic displacements;
-drives are 0.05 to 30 times
-the friction limit, at 0.2 to 3 times the natural frequency. Errors of settled motions are those of
-harmonics 0 to 5, over the largest; those of others are over the largest value of the motion.
+drives are 0.05 to 30 times the friction limit, at 0.2 to 3 times the natural frequency. Errors of
+loops and settled motions are those of harmonics 0 to 5, over the largest; those of others are over
+the largest value of the motion.
 
 Refused: the friction is too stiff for the explicit reference; such cases are left out, because they
 do not test the engine. An error of inf is a motion that the engine did not find. Iwan's
-thirty elements are compared along force histories alone: each settled motion takes the reference
-half a minute. `make validation` renews this page; the tests run a part of it.
+thirty elements are compared along force histories and in loops, as sums in closed form: another
+settled motion takes the reference half a minute. `make validation` renews this page; the tests run
+a part of it.
 
 {table}
 """

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+import dahl_ident as di
 from dahl_ident import (
     Backlash,
     Dahl,
@@ -217,3 +218,15 @@ def test_amplitudes_within_the_gap_are_no_misfit() -> None:
     assert found.status == "trusted"
     assert found.params["gap"].value == pytest.approx(1e-3, rel=2e-3)
     assert found.goodness.rms_misfit < 0.02
+
+
+def test_a_plant_that_moves_within_the_gap_is_linear() -> None:
+    f_max, sigma, gap = 6.468504e-05, 7.829406e-03, 4.0916780e-02
+    linear = di.Mass(1.3699373e-09) + di.Damper(2.9454746e-08) + di.Spring(3.6530052e-03)
+    plant = di.Backlash(di.Dahl(f_max, sigma), gap=gap) + linear
+    f, drive = np.array([80.0, 130.0, 400.0]), 0.06 * f_max
+    X = drive / linear.dynamic_stiffness(1.0, 2.0 * np.pi * f)
+    assert (np.abs(X) < 0.5 * gap).all()
+    found = di.response(plant, f, drive)
+    assert found.steady == "exact"
+    np.testing.assert_allclose(found.displacement, X, rtol=1e-8)

@@ -29,6 +29,7 @@ from dahl_ident.arrays import FloatArray
 
 STAGES = 5
 _NEWTON = 12  # iterations of the stages; two are the rule
+_PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is no pivot
 _SOLVED = 1e-7  # change of the stages, over the states' sizes, whose square is rounding
 
 
@@ -224,10 +225,16 @@ def weigh(place, w, at):
 
 @compiled
 def eliminate(matrix, columns, n, q):
-    """Solve matrix x = columns in place by Gauss's method with pivots; False if singular."""
+    """Solve matrix x = columns in place by Gauss's method with pivots; False if singular.
+
+    A row whose diagonal is its largest number stays: in place of one with larger numbers, such as
+    accelerations, rounding would leave some force where there is none.
+    """
     for k in range(n):
-        pivot, largest = k, abs(matrix[k, k])
-        for i in range(k + 1, n):
+        pivot, largest, beside = k, abs(matrix[k, k]), 0.0
+        for j in range(k + 1, n):
+            beside = max(beside, abs(matrix[k, j]))
+        for i in range(k + 1, n if largest < _PIVOT * beside else 0):
             if abs(matrix[i, k]) > largest:
                 pivot, largest = i, abs(matrix[i, k])
         if not 0.0 < largest < np.inf:
