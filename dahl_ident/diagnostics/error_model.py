@@ -33,7 +33,6 @@ from scipy import special
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_sources import (
-    HARMONICS,
     LEVELS,
     MODEL_ERROR,
     NOISE,
@@ -65,7 +64,6 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import blanked, inverse
 from dahl_ident.problem import TableProblem
 
-_BY_CHANCE = 2.0  # standard deviations
 _FEWEST_TESTS = 5  # of which each is left out in turn
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
@@ -371,9 +369,6 @@ def _with_sources(
     if estimate.basis is None and ranged:
         whole, others = (np.asarray(sum(parts.values())) for parts in (every, given))
         every = {**given, EXPONENT: given.get(EXPONENT, 0.0) + _positive(whole - others)}
-    moved = _by_harmonics(estimate)
-    if moved.any():
-        every[HARMONICS] = np.outer(moved, moved)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)
@@ -443,20 +438,6 @@ def _by_source(
     for row, name in enumerate(priors, start=problem.n_residuals):
         found[name] = found.get(name, 0.0) + np.outer(lever[:, row], lever[:, row])
     return found
-
-
-def _by_harmonics(estimate: WeightedEstimate) -> FloatArray:
-    """Return how far harmonics move theta from the fundamentals' estimate, beyond chance, (Q,)."""
-    problem, y = estimate.problem, estimate.y
-    kept = np.pad(
-        np.repeat(problem.data.harmonic == 1, 2), (0, problem.n_priors), constant_values=True
-    )
-    few = 2 * (problem.data.harmonic == 1).sum() <= len(problem.names)
-    if estimate.basis is not None or kept.all() or few:
-        return np.zeros(len(problem.names))
-    fundamentals = estimate.lever(kept=kept)
-    moved, chance = fundamentals @ y, np.linalg.norm(fundamentals - estimate.lever(), axis=1)
-    return np.where(np.abs(moved) > _BY_CHANCE * chance, moved, 0.0)
 
 
 def _limited_shares(

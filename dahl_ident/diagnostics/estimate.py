@@ -4,9 +4,10 @@ A row of the covariance C and the fundamental force F_1 of its test counts as on
 
     C + s^2 |F_1|^2,
 
-the misfit s the same for all rows and harmonics, and such that chi-square equals its degrees of
-freedom: zero where the model describes the data. So harmonics of tiny covariances cannot pull the
-estimate from the fundamentals. Where no covariance is stated, the noise's scale takes its place.
+the misfit s the same for all fundamentals, and such that chi-square equals its degrees of freedom:
+zero where the model describes the data. That of harmonics is the larger of it and their own, and
+they count less the farther their estimate lies from that of the fundamentals, so that they cannot
+pull it away. Where no covariance is stated, the noise's scale takes its place.
 Priors of sensors and ranges of assumed exponents are further rows. Where the optimum lies at
 infinity, the coordinates are those of its limit (:mod:`dahl_ident.fitting.asymptotes`), such as
 sigma^2/f_max in microslip. Source: Paule and Mandel,
@@ -41,6 +42,8 @@ _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
 _HALVINGS = 8  # of a step, until the sum of squares falls
 _ROOT_STEPS = 200  # Newton's, from below, for the misfit: it doubles where it is far off
 _LEAST_LEFT = 1e-3  # of a test, that the others do not determine
+_MOST_DISAGREEMENT = 1e6  # of harmonics with fundamentals, as a factor of their variance
+_HALVINGS_OF_FACTOR = 30  # of its logarithm's range: to 1e-8
 _SAME = 1e-9  # relative change of the misfit's square that no longer counts
 
 
@@ -309,16 +312,58 @@ def _weights(stated: TableProblem, theta: FloatArray) -> tuple[float, FloatArray
     if not stated.scale_known:
         scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)
         return 0.0, nothing, scale
-    target = dof + stated.n_priors - float(y[m:] @ y[m:])
-    if dof + stated.n_priors <= 0 or target <= 0.0 or y[:m] @ y[:m] <= target:
+    first = stated.data.harmonic == 1
+    apart = bool(first.any() and not first.all() and 2 * first.sum() > len(stated.names))
+    first = first | (not apart)
+    numbers = np.where(stated.data.harmonic == 0, 1, 2)
+    free = len(stated.names) - stated.n_priors + float(y[m:] @ y[m:])
+    squares = np.sum(y[:m].reshape(-1, 2) ** 2, axis=1)
+    targets = [(first, numbers[first].sum() - free), (~first, numbers[~first].sum())]
+    if targets[0][1] <= 0.0 or all(squares[rows].sum() <= target for rows, target in targets):
         return 0.0, nothing, 1.0
     size = np.abs(stated.data.response)[tests_of(stated.data)[1]]
     both = np.asarray(size[None] * np.array([[1.0], [1.0j]]), dtype=np.complex128)
     D = stated.residual_change(theta, both).reshape(2, -1, 2).transpose(1, 2, 0)
     b, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
-    z = np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)) ** 2
-    square = _root(z.ravel(), np.maximum(b, 0.0).ravel(), target)
-    return float(np.sqrt(square)), square * size**2, 1.0
+    b, z = np.maximum(b, 0.0), np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)) ** 2
+    square = np.zeros(len(first))
+    for rows, target in targets:
+        if squares[rows].sum() > target:
+            square[rows] = _root(z[rows].ravel(), b[rows].ravel(), float(target))
+    square[~first] = np.maximum(square[~first], square[first].max())
+    variance = square * size**2
+    if apart:
+        at_misfit = stated.widened(variance).residuals_and_jacobian(theta)
+        variance = np.where(first, 1.0, _disagreement(*at_misfit, ~first)) * variance
+    return float(np.sqrt(square.max())), variance, 1.0
+
+
+def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) -> float:
+    """Return the factor of the harmonics' variance by which they agree with the fundamentals.
+
+    Both are estimates of the parameters, and the factor is that of Paule and Mandel: the square of
+    their distance, over its variance, is the number of directions that harmonics determine.
+    """
+    own = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
+    (A, b), (A_h, b_h) = ((J[rows].T @ J[rows], J[rows].T @ y[rows]) for rows in (~own, own))
+    size = np.sqrt(np.maximum(np.diagonal(A + A_h), TINY))
+    A, A_h, b, b_h = A / np.outer(size, size), A_h / np.outer(size, size), b / size, b_h / size
+    directions = int(np.linalg.matrix_rank(A_h, tol=_NOTICED, hermitian=True))
+
+    def explained(M: FloatArray, v: FloatArray) -> float:
+        return float(v @ np.linalg.pinv(M, rcond=_NOTICED**2, hermitian=True) @ v)
+
+    def distance(factor: float) -> float:
+        apart = explained(A, b) + explained(A_h, b_h) / factor
+        return apart - explained(A + A_h / factor, b + b_h / factor)
+
+    low, high = 0.0, np.log(_MOST_DISAGREEMENT)
+    if distance(1.0) <= directions:
+        return 1.0
+    for _ in range(_HALVINGS_OF_FACTOR):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if distance(np.exp(middle)) > directions else (low, middle)
+    return float(np.exp(high))
 
 
 def _root(z: FloatArray, b: FloatArray, target: float) -> float:
