@@ -287,11 +287,12 @@ def _physics(fit: JudgedRecords) -> Iterator[Finding]:
                 yield Finding(_DESCRIBED, _APPROXIMATE, "unphysical", {"objection": text})
     for one in fit.errors.exponents:
         if one.contradicted:
-            asked = {"name": one.name, "wanted": one.found, "held": one.value}
+            asked = {"name": one.name, "wanted": one.found}
             if one.assumed:
                 yield Finding(_DESCRIBED, _APPROXIMATE, "exponent", asked)
             else:
-                yield Finding(_DESCRIBED, _NOT_DESCRIBED, "stated_exponent", asked)
+                stated = {**asked, "held": one.value}
+                yield Finding(_DESCRIBED, _NOT_DESCRIBED, "stated_exponent", stated)
 
 
 def _slight(fit: JudgedRecords) -> Iterator[Finding]:

@@ -19,6 +19,8 @@ from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
+from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.record_search import followed
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
@@ -29,6 +31,8 @@ _LONG = 0.05  # of a step of it, beyond which slopes change
 _SHORT = 0.01  # of a step that is the last
 _STEPS = 6
 _FARTHEST = 1.0  # of the logarithm of any other value in a step
+_ROUNDS = 3  # of the exponents: each changes what is best for the delay and for the others
+_SLIGHT = 0.1  # of its standard deviation, by which an exponent need not be moved
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
 
@@ -46,8 +50,10 @@ class HeldValue:
     mean, std : float
         What the records and its range say together, relative to `value`: of its logarithm, of a
         delay in samples.
-    by_records : float
-        The standard deviation that the records alone know it to.
+    asked, by_records : float
+        What the records alone ask for, also outside the range, and its standard deviation.
+    values : ndarray, shape (P,)
+        The estimate with the value at `mean`, to first order.
     contribution : ndarray, shape (P, P)
         Covariance of the estimate through it: as if it were estimated too, and at least as much
         as what the records ask for moves the estimate.
@@ -61,24 +67,27 @@ class HeldValue:
     range: tuple[float, float]
     mean: float
     std: float
+    asked: float
     by_records: float
+    values: FloatArray
     contribution: FloatArray
     assumed: bool
 
     @property
     def contradicted(self) -> bool:
         """Whether the records ask for another value."""
-        return abs(self.mean) > _CONTRADICTED * self.by_records
+        return abs(self.asked) > _CONTRADICTED * self.by_records
 
     @property
     def found(self) -> str:
         """What the records ask for, in words."""
-        value = self.value * np.exp(self.mean)
-        return with_unit(value, value * self.std, self.unit)
+        value = self.value * np.exp(self.asked)
+        return with_unit(value, value * self.by_records, self.unit)
 
     def __str__(self) -> str:
         low, high = self.range
-        return f"{self.name} between {low:g} and {high:g} (here {self.found})"
+        here = with_unit(self.value, self.value * self.std, self.unit)
+        return f"{self.name} between {low:g} and {high:g} (here {here})"
 
 
 def held_exponents(
@@ -113,6 +122,38 @@ def held_exponents(
         except FitError:
             continue  # no motion next to the estimate
     return tuple(found)
+
+
+def with_exponents(optimum: Optimum) -> Optimum:
+    """Return the estimate with exponents that nobody stated where records and range have them.
+
+    The other parameters are those that go with them, so that all of them together are a model.
+    """
+    usual = {p.name: float(p.value or 1.0) for p in _assumed(optimum.problem)}
+    for name in list(usual) * _ROUNDS:
+        problem: RecordProblem = optimum.problem
+        places = range(len(problem.records))
+        predicted = [problem.predict(optimum.values, i) for i in places]
+        residuals = [
+            problem.filtered(y - p.output) for y, p in zip(problem.measured, predicted, strict=True)
+        ]
+        jacobians = [problem.filtered(p.by) for p in predicted]
+        (parameter,) = (p for p in _assumed(problem) if p.name == name)
+        try:
+            search = _Search(problem, parameter, optimum.values, usual[name])
+            one = search.result(jacobians, residuals)
+        except FitError:
+            continue  # no motion next to the estimate
+        if abs(one.mean) > _SLIGHT * one.std:
+            held = problem.with_fixed({name: one.value * float(np.exp(one.mean))})
+            there = followed(optimum, held, problem.to_search(one.values))
+            optimum = there if there.converged else optimum
+    return optimum
+
+
+def _assumed(problem: RecordProblem) -> list[Parameter]:
+    """Return the exponents that nobody stated."""
+    return [p for p in problem.model.parameters if p.assumed and p.prior is not None]
 
 
 def by_delay(
@@ -153,20 +194,21 @@ def _counted(
     mean: float,
     s: float,
     moved: FloatArray,
+    usual: float = 0.0,
 ) -> tuple[float, float, float, FloatArray]:
     """Return mean and std of a held value, its std by the records alone, and what it moves.
 
-    `s` is the standard deviation of what is known of it beforehand, about 0.
+    `usual` is what is known of it beforehand, `s` its standard deviation.
     """
     covariance, _ = sandwich(jacobians, residuals)
     beyond = between_blocks(jacobians, residuals, covariance, place + 1)
     u2 = float((covariance if beyond is None else covariance + beyond)[place, place])
     if not np.isfinite(u2):
-        mean, std = 0.0, s
+        mean, std = usual, s
     else:
         s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
         weight = s**2 / (s**2 + u2)
-        mean, std = mean * weight, (u2 * weight) ** 0.5
+        mean, std = usual + (mean - usual) * weight, (u2 * weight) ** 0.5
     change = moved * max(std, abs(mean))
     return mean, std, u2**0.5, np.outer(change, change)
 
@@ -174,9 +216,16 @@ def _counted(
 class _Search:
     """The estimate with an exponent free, from where the exponent is held."""
 
-    def __init__(self, problem: RecordProblem, parameter: Parameter, values: FloatArray) -> None:
+    def __init__(
+        self,
+        problem: RecordProblem,
+        parameter: Parameter,
+        values: FloatArray,
+        usual: float | None = None,
+    ) -> None:
         self.problem, self.parameter, self.values = problem, parameter, values
         self.default = float(parameter.value or 1.0)
+        self.usual = float(np.log((usual or self.default) / self.default))
         self.range = parameter.prior or (self.default, self.default)
         low, high = (np.log(end / self.default) for end in self.range)
         self.limits = np.array([min(low, 0.0), max(high, 0.0)])
@@ -186,19 +235,28 @@ class _Search:
         """Return what the records say, given derivatives and residuals at the held value."""
         joint = self._joint(jacobians, self.values, 0.0)
         step, moved = _freed(joint, residuals, self.place)
-        at, mean = self.values, float(step[self.place])
+        at, asked = self.values, float(step[self.place])
+        mean = float(np.clip(asked, *self.limits))
         if abs(mean) > _LONG:
-            at, mean, joint, residuals = self._refined(step)
+            at, mean, asked, joint, residuals = self._refined(step)
             moved = (at - self.values) / mean
         s = float(np.ptp(self.limits)) / 12.0**0.5
-        known = _counted(joint, residuals, self.place, mean, s, moved)
-        p = self.parameter
-        return HeldValue(p.name, p.unit, self.default, self.range, *known, p.assumed)
+        mean, std, by_records, moves = _counted(
+            joint, residuals, self.place, mean, s, moved, self.usual
+        )
+        values, p = self.values + mean * moved, self.parameter
+        return HeldValue(
+            p.name, p.unit, self.default, self.range, mean, std, asked, by_records, values, moves,
+            p.assumed,
+        )  # fmt: skip
 
     def _refined(
         self, step: FloatArray
-    ) -> tuple[FloatArray, float, list[FloatArray], list[FloatArray]]:
-        """Return values, the exponent's logarithm, derivatives and residuals after more steps."""
+    ) -> tuple[FloatArray, float, float, list[FloatArray], list[FloatArray]]:
+        """Return values, the exponent's logarithm, derivatives and residuals after more steps.
+
+        After the logarithm within the range stands the one that the next step would lead to.
+        """
         problem, mean, at = self.problem, 0.0, self.values
         for _ in range(_STEPS):
             wanted = mean + float(step[self.place])
@@ -219,7 +277,7 @@ class _Search:
             step, _ = _freed(joint, left, self.place)
             if abs(float(step[self.place])) < _SHORT:
                 break
-        return at, mean, joint, left
+        return at, mean, mean + float(step[self.place]), joint, left
 
     def _joint(
         self, jacobians: Sequence[FloatArray], at: FloatArray, mean: float

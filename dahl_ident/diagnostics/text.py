@@ -363,8 +363,8 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "records_misfit": lambda: "The misfit exceeds the noise.",
     "record_parameter": _record_parameter,
     "unphysical": lambda objection: f"Physically doubtful: {objection}.",
-    "exponent": lambda name, wanted, held: (
-        f"The records ask for {name} = {wanted} instead of the assumed {held:g}: estimate it "
+    "exponent": lambda name, wanted: (
+        f"The records ask for {name} = {wanted}, beyond the range that is assumed: estimate it "
         f"({spelled(f'{name}=None', f'{name}=free')})."
     ),
     "stated_exponent": lambda name, wanted, held: (

@@ -22,6 +22,16 @@ _LONGEST_DELAY = 2.0  # samples: twice the standard deviation that nobody stated
 _ALIGNMENTS = 4  # steps of the delay: each leaves a hundredth of the one before
 
 
+def refined(search: Descent, problem: RecordProblem, end: Minima) -> tuple[RecordProblem, Minima]:
+    """Return the estimate with everything taken out that the residuals ask for."""
+    if problem.output == "force":
+        problem, end = without_noise(search, problem, end)
+    problem, end = aligned(search, problem, end)
+    if problem.output == "motion" and search.loss == "linear":
+        problem, end = weighted(search, problem, end)
+    return problem, end
+
+
 def aligned(search: Descent, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
     """Return the estimate with the delay between the channels that the residuals ask for.
 
@@ -39,7 +49,7 @@ def aligned(search: Descent, problem: RecordProblem, plain: Minima) -> tuple[Rec
         step, fall = _delay_step(search, found, end.theta[0])
         residuals = found.split_residuals(found.to_values(end.theta[0]))
         chance = by_chance(float(end.cost[0]), found.n_residuals, residuals)
-        part = _ALIGNED * 2.0 * float(end.cost[0]) if found is problem else 0.0
+        part = 0.0 if found.delay else _ALIGNED * 2.0 * float(end.cost[0])
         if not fall > max(chance, part):
             break
         if abs(found.delay + step) > _LONGEST_DELAY * sample:

@@ -21,10 +21,8 @@ from dahl_ident.fitting.record_refinement import (
     SLOW,
     STEPS,
     Descent,
-    aligned,
     correlation,
-    weighted,
-    without_noise,
+    refined,
 )
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
 from dahl_ident.problem import Quadratic
@@ -110,6 +108,22 @@ def optimum_at(
     return _optimum(problem, end, scale, method, loss)
 
 
+def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Optimum:
+    """Return the optimum of a problem that is near another one's, from search coordinates.
+
+    What was taken out of the records is judged again.
+    """
+    search = Descent(optimum.method, optimum.loss)
+    search.rho = loss_named(optimum.loss, problem.parts)
+    search.scale = 1.0 if search.rho is None else optimum.scale
+    if problem.output == "force":
+        problem = problem.without_noise(0.0)
+    problem = problem.weighted(np.ones(1)) if problem.whitening.size > 1 else problem
+    problem, end = refined(search, problem, search.descend(problem, theta, STEPS))
+    end = replace(end, evaluations=np.array([optimum.nfev + search.evaluations]))
+    return _optimum(problem, end, search.scale, optimum.method, optimum.loss)
+
+
 def solve_repetitions(
     optimum: Optimum, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
@@ -164,11 +178,7 @@ class RecordSearch(Descent):
         else:
             starts = _changed(started_at(problem, begin)[None], problem, start)
             end = self.best(problem, starts, steps)
-        if problem.output == "force":
-            problem, end = without_noise(self, problem, end)
-        problem, end = aligned(self, problem, end)
-        if problem.output == "motion" and self.loss == "linear":
-            problem, end = weighted(self, problem, end)
+        problem, end = refined(self, problem, end)
         if self.loss != "linear":
             end = self.robust(problem, end)
         end = replace(end, evaluations=np.array([self.evaluations]))

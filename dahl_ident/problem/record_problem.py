@@ -217,7 +217,7 @@ class RecordProblem(Problem):
 
     def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
         """Return the same problem with other values of parameters that are fixed."""
-        model = self.model.with_fixed(values)  # equations are shorter where a value is 0 or 1
+        model = self.model.with_values(values)  # equations are shorter where a value is 0 or 1
         return self.altered("system", "coefficients", "first", model=model)
 
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:

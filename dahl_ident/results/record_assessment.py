@@ -101,8 +101,11 @@ class RecordAssessment(Assessment):
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
         """Estimates and combined standard uncertainties by name."""
         names, u = self.optimum.names, np.sqrt(np.diagonal(self.covar)).tolist()
-        values = self.optimum.values.tolist()
-        return dict(zip(names, values, strict=True)), dict(zip(names, u, strict=True))
+        values = dict(zip(names, self.optimum.values.tolist(), strict=True))
+        stderr = dict(zip(names, u, strict=True))
+        for one in self.errors.assumed:
+            values[one.name], stderr[one.name] = one.value, one.value * one.std
+        return values, stderr
 
     @property
     def assumed(self) -> tuple[str, ...]:
