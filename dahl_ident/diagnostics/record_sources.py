@@ -20,7 +20,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.fitting.record_search import followed
+from dahl_ident.fitting.record_search import followed, optimum_near
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
@@ -79,6 +79,11 @@ class HeldValue:
         return abs(self.asked) > _CONTRADICTED * self.by_records
 
     @property
+    def estimate(self) -> float:
+        """The value that the records and its range ask for together."""
+        return self.value * float(np.exp(self.mean))
+
+    @property
     def found(self) -> str:
         """What the records ask for, in words."""
         value = self.value * np.exp(self.asked)
@@ -130,7 +135,9 @@ def with_exponents(optimum: Optimum) -> Optimum:
     The other parameters are those that go with them, so that all of them together are a model.
     """
     usual = {p.name: float(p.value or 1.0) for p in _assumed(optimum.problem)}
-    for name in list(usual) * _ROUNDS:
+    left = list(usual) * _ROUNDS
+    while left:
+        name = left.pop(0)
         problem: RecordProblem = optimum.problem
         places = range(len(problem.records))
         predicted = [problem.predict(optimum.values, i) for i in places]
@@ -144,9 +151,14 @@ def with_exponents(optimum: Optimum) -> Optimum:
             one = search.result(jacobians, residuals)
         except FitError:
             continue  # no motion next to the estimate
-        if abs(one.mean) > _SLIGHT * one.std:
-            held = problem.with_fixed({name: one.value * float(np.exp(one.mean))})
-            there = followed(optimum, held, problem.to_search(one.values))
+        if abs(one.mean) < _SLIGHT * one.std:
+            continue
+        held, theta = problem.with_fixed({name: one.estimate}), problem.to_search(one.values)
+        if one.mean**2 < _SLIGHT * one.std:  # first order is as good
+            optimum = optimum_near(optimum, held, theta)
+            left = [other for other in left if other != name]
+        else:
+            there = followed(optimum, held, theta)
             optimum = there if there.converged else optimum
     return optimum
 

@@ -124,6 +124,15 @@ def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Opt
     return _optimum(problem, end, search.scale, optimum.method, optimum.loss)
 
 
+def optimum_near(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Optimum:
+    """Return the optimum of a problem that is so near another one's that its place is known."""
+    return optimum_at(
+        problem, theta, converged=optimum.converged, evaluations=optimum.nfev + 1,
+        scale=1.0 if optimum.loss == "linear" else optimum.scale,
+        method=optimum.method, loss=optimum.loss,
+    )  # fmt: skip
+
+
 def solve_repetitions(
     optimum: Optimum, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
