@@ -76,10 +76,19 @@ def test_derivatives_are_differences(law: Element) -> None:
         assert np.all(np.abs(found.by_amplitude * A - (high - low) / 2e-4) < 1e-5 * size)
 
 
-@every_law
+UNKNOWN = [
+    Dahl(asymmetry=None, name="pivot"),
+    Backlash(Dahl(1.0, None, name="pivot"), 0.1),
+    Backlash(Dahl(asymmetry=None)),
+    PowerDamper(2.0, 0.5, name="oil"),
+]
+
+
+@pytest.mark.parametrize("law", [*EVERY, *UNKNOWN], ids=repr)
 def test_description_comes_back(law: Element) -> None:
     (again,) = model_from_description(json.loads(json.dumps(describe_model(law)))).elements
     assert again.parameters == law.parameters
+    assert repr(again) == repr(law)
     assert type(again) is type(law)
 
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import mpmath
 import numpy as np
 import pytest
 
 from dahl_ident import Damper, Mass, Model, PowerDamper, Spring, response
-from dahl_ident.elements import describe_model, model_from_description
 from dahl_ident.errors import ValidationError
 
 
@@ -63,11 +60,9 @@ def test_derivatives_against_high_precision(p: float, k: int) -> None:
     assert abs(complex(found.by_parameter[2]) + p * value) < 1e-11 * size
 
 
-def test_force_description_and_refusals() -> None:
+def test_force_and_refusals() -> None:
     law = PowerDamper(2.0, 0.5, name="oil")
     assert law.force([0.0, 0.0], velocity=[0.25, -4.0]).tolist() == [1.0, -4.0]
-    (again,) = model_from_description(json.loads(json.dumps(describe_model(law)))).elements
-    assert again.parameters == law.parameters
     assert [p.dimension for p in law.parameters] == [(1, 0, 0), (0, 0, 0), (0, 1, -1)]
     with pytest.raises(ValidationError, match="needs velocity"):
         law.force([0.0, 1.0])
