@@ -77,7 +77,7 @@ class TestSilence:
         """Covariances as rough as a few cycles give: chi-square keeps its distribution."""
         rng = np.random.default_rng(5)
         values = []
-        for seed in range(150):
+        for seed in range(60):
             data = table(seed=seed, noise=0.01)
             s2 = (0.01 * np.abs(data.response)) ** 2
             factors = rng.standard_normal((30, int(dof), 2))
@@ -85,8 +85,8 @@ class TestSilence:
             found = judge(replace(data, covariance=C, dof=np.full(30, dof)))
             assert found.chi_square is not None
             values.append(found.chi_square.p_value)
-        assert np.mean(np.array(values) < 0.05) < 0.12
-        assert np.mean(values) == pytest.approx(0.5, abs=0.1)
+        assert np.mean(np.array(values) < 0.05) < 0.17  # of 60: more come once in 3,000 times
+        assert np.mean(values) == pytest.approx(0.5, abs=0.12)
 
     def test_a_driven_plant(self) -> None:
         result = fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
