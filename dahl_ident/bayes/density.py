@@ -180,7 +180,7 @@ class Density(LogDensity):
     @property
     def decorrelation(self) -> Decorrelation | None:
         """Coordinates in which ridges between linear elements and friction are straight."""
-        return decorrelation_of(self.tabulated)
+        return decorrelation_of(self.quick)
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return theta, (S, P), and s, (S,), which is 1 where it is known."""
@@ -226,7 +226,7 @@ class Density(LogDensity):
         result = self.log_prior(theta)
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
-            result[inside] += self.tabulated.log_likelihood(theta[inside])
+            result[inside] += self.quick.log_likelihood(theta[inside])
         return result
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
@@ -244,7 +244,7 @@ class Density(LogDensity):
             rest = self._constant - self.problem.n_residuals * np.log(scale)
             return self._mean(terms) + rest
         if self.likelihood != "student_t":
-            return self.tabulated.log_likelihood(theta, scale if self.has_scale else None)
+            return self.quick.log_likelihood(theta, scale if self.has_scale else None)
         z = self.squares(theta)
         n = z.shape[-1]
         tails = np.log1p(z / (TAIL_DOF * scale[:, None] ** 2)).sum(axis=-1)
@@ -253,7 +253,7 @@ class Density(LogDensity):
 
     def squares(self, theta: FloatArray) -> FloatArray:
         """Return |y|^2 of every row, (S, n), the scale taken as 1."""
-        y, _ = self.tabulated.whitened(theta, derivatives=False)
+        y, _ = self.quick.whitened(theta, derivatives=False)
         with np.errstate(over="ignore"):  # far off, a point has no chance
             return np.asarray(y.real**2 + y.imag**2)
 
@@ -262,7 +262,7 @@ class Density(LogDensity):
         if self.errors is None:
             return np.asarray(self.squares(theta).sum(axis=-1)[:, None])
         held = self.errors.held(theta)
-        y, _ = self.tabulated.whitened(held, derivatives=False, tails=False)
+        y, _ = self.quick.whitened(held, derivatives=False, tails=False)
         parts = np.broadcast_to(y, (len(theta), y.shape[-1])).copy().view(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
             squares = self.errors.squares(parts + self.errors.moved(theta))
@@ -308,19 +308,16 @@ class Density(LogDensity):
         return np.asarray(logsumexp(terms + self.errors.log_weights, axis=1))
 
     @cached_property
-    def tabulated(self) -> TableProblem:
+    def quick(self) -> TableProblem:
         """The problem for very many evaluations.
 
-        Friction of any exponent from tables, and exact steady motions to second order in the
-        distance from the least-squares optimum.
+        Exact steady motions are taken to second order in the distance from the least-squares
+        optimum.
         """
         problem = self.problem
-        model = problem.model.tabulated()
-        if model is not problem.model:
-            problem = problem.like(model=model)
         if not problem.is_exact:
             return problem
-        alone = self.problem.like(sensors=problem.sensors.with_free(list(problem.priors)))
+        alone = problem.like(sensors=problem.sensors.with_free(list(problem.priors)))
         return problem.near(solve(alone).theta)
 
     @cached_property
@@ -338,7 +335,7 @@ class Density(LogDensity):
         ones = np.ones(len(theta)) if self.has_scale else None
         squares = self.squares(theta).sum(axis=-1)
         with np.errstate(invalid="ignore"):
-            constant = self.tabulated.log_likelihood(theta, ones) + 0.5 * squares
+            constant = self.quick.log_likelihood(theta, ones) + 0.5 * squares
         if not np.isfinite(constant).any():
             raise SamplingError("the model predicts nothing anywhere in the prior; check both")
         return float(constant[np.nanargmin(np.where(np.isfinite(constant), squares, np.nan))])

@@ -23,7 +23,7 @@ from dahl_ident.arrays import (
     array_between,
     non_negative_array,
 )
-from dahl_ident.elements import general_dahl, general_dahl_table, hysteresis, linear_dahl
+from dahl_ident.elements import general_dahl, hysteresis, linear_dahl
 from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.bouc_wen import BoucWen
 from dahl_ident.elements.element import Element
@@ -392,19 +392,6 @@ class Dahl(Friction):
         _, sigma, alpha = (float(v) for v in self.known_values())
         return UniversalCurve(sigma, linear_dahl.describing_function) if alpha == 1.0 else None
 
-    def tabulated(self) -> Dahl:
-        """Return this element with N from tables in place of quadratures, if it needs any.
-
-        Examples
-        --------
-        >>> Dahl(alpha=2.0).tabulated()
-        TabulatedDahl(f_max=free, sigma=free, alpha=2)
-        >>> Dahl().tabulated()
-        Dahl(f_max=free, sigma=free, alpha=1)
-        """
-        alpha = self.parameters[2]
-        return TabulatedDahl(self) if alpha.free or alpha.value != 1.0 else self
-
 
 class _AsymmetricDahl(Dahl):
     """Dahl friction with two limits; results that assume symmetry are computed from the slope."""
@@ -439,10 +426,6 @@ class _AsymmetricDahl(Dahl):
             return ()
         return (f"{self.parameters[3].name} leaves almost no friction in one direction",)
 
-    def tabulated(self) -> Dahl:
-        """Return this element, which has no tables."""
-        return self
-
     def __repr__(self) -> str:
         return super().__repr__().replace(type(self).__name__, "Dahl", 1)
 
@@ -452,26 +435,6 @@ class _AsymmetricDahl(Dahl):
     _step = Friction._step
     branch = Friction.branch
     _loop = Friction._loop
-
-
-class TabulatedDahl(Dahl):
-    """The same element with N from tables, to 1e-10; made by :meth:`Dahl.tabulated`."""
-
-    def __init__(self, element: Dahl) -> None:
-        self._name, self.parameters = element.name, element.parameters
-
-    @each_harmonic
-    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return F_k/X_1 at `values`; what the tables do not have by quadrature."""
-        if sine.harmonic != 1 or derivatives > 1:
-            return super().settled(values, sine, derivatives)
-        f_max, sigma, alpha = values
-        beta = np.asarray(sigma * sine.amplitude / f_max)
-        h, by_ln_beta = general_dahl_table.stiffness(beta, alpha, slope=derivatives > 0)
-        if not derivatives:
-            return StiffnessGradient(np.asarray(sigma * h), _NONE, ())
-        by_amplitude = _by_amplitude(values, beta, 1, -by_ln_beta)
-        return StiffnessGradient(np.asarray(sigma * h), by_amplitude, ())
 
 
 def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:

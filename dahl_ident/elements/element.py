@@ -138,10 +138,6 @@ class Element(Behaviour):
             )
         )
 
-    def tabulated(self) -> Element:
-        """Return this element, or a faster variant of it for very many evaluations."""
-        return self
-
     def dynamic_stiffness(
         self, amplitude: ArrayLike, omega: ArrayLike = 0.0, *, harmonic: int = 1
     ) -> ComplexArray:
@@ -395,22 +391,9 @@ class Model(Element):
         """Return the objections of all elements to their values."""
         return tuple(text for element, own in self.of(values) for text in element.physics(own))
 
-    def tabulated(self) -> Model:
-        """Return the model with tables in place of quadratures; itself where it needs none.
-
-        Examples
-        --------
-        >>> from dahl_ident import Dahl
-        >>> Model(Dahl(alpha=2.0)).tabulated()
-        TabulatedDahl(f_max=free, sigma=free, alpha=2)
-        """
-        return self._replaced([element.tabulated() for element in self._elements])
-
     def coarser(self) -> Model:
         """Return the model of elements whose motion under a force costs less, or itself."""
-        return self._replaced([element.coarser() for element in self._elements])
-
-    def _replaced(self, elements: Sequence[Element]) -> Model:
+        elements = [element.coarser() for element in self._elements]
         same = all(new is old for new, old in zip(elements, self._elements, strict=True))
         return self if same else Model(*elements)
 
