@@ -15,7 +15,6 @@ from benchmarks import planning
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import Multisine, Plan, Trapezoid
-from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.problem import RecordProblem
 
 TRUTH = {"f_max": 0.1, "sigma": 30.0}
@@ -23,7 +22,8 @@ NEAR = {"f_max": (0.0999, 0.1001), "sigma": (29.97, 30.03)}
 LINEAR = di.Model(di.Dahl(alpha=1.0))
 BENCH = {"displacement": (1e-4, 3e-2), "speed": 0.05, "acceleration": 1.0, "frequency_hz": 5.0}
 NOISE, RATE = 0.005, 100.0
-FEW: tuple[PlannedMotion, ...] = (
+Motion = Trapezoid | Multisine
+FEW: tuple[Motion, ...] = (
     Trapezoid(0.006, 0.02, 1.0),
     Trapezoid(0.02, 0.02, 1.0),
     Trapezoid(0.02, 0.05, 1.0, dwell=0.2),
@@ -38,7 +38,7 @@ def _plan(candidates: Any, limits: Any, **options: Any) -> Plan:
     )  # fmt: skip
 
 
-def _covariance(motions: list[tuple[PlannedMotion, int]]) -> FloatArray:
+def _covariance(motions: list[tuple[Any, int]]) -> FloatArray:
     """Return that of ln f_max and ln sigma by a fit to the records at every sample."""
     records = []
     for motion, repeats in motions:
@@ -56,7 +56,7 @@ def _covariance(motions: list[tuple[PlannedMotion, int]]) -> FloatArray:
 
 class TestMotions:
     @pytest.mark.parametrize("motion", [*FEW, Trapezoid(0.001, 0.2, 0.1), Multisine(0.3, 3.1, 1.0)])
-    def test_a_period_starts_and_ends_at_rest_within_its_peaks(self, motion: PlannedMotion) -> None:
+    def test_a_period_starts_and_ends_at_rest_within_its_peaks(self, motion: Motion) -> None:
         time = np.linspace(0.0, 2.0 * motion.period, 200_001)
         x = motion.displacement(time)
         v = np.gradient(x, time)
@@ -76,9 +76,7 @@ class TestMotions:
 
 class TestPlan:
     @pytest.mark.parametrize("motion", FEW)
-    def test_the_prediction_is_the_covariance_of_the_records_fit(
-        self, motion: PlannedMotion
-    ) -> None:
+    def test_the_prediction_is_the_covariance_of_the_records_fit(self, motion: Motion) -> None:
         plan = _plan([motion], {"time": 20.0})
         (step,) = plan.steps
         expected = np.sqrt(np.diagonal(_covariance([(motion, step.measured_cycles)])))
