@@ -118,9 +118,7 @@ def test_of_two_files_with_one_name_both_are_kept(server: Server) -> None:
     [
         (b"", "empty"),
         (b"\x00\x01\x02\x03" * 100, "a file.csv"),
-        (NOISY.read_bytes().replace(b"displacement", b"velocity", 1), "velocity"),
         (b"frequency [Hz],amplitude [m],gain [N/m],phase [deg]\n1,1e-3,30,5\n1,2e-3,x9,6\n", "x9"),
-        (b"a,b\n1,2\n2,3\n", "frequency"),
     ],
 )
 def test_a_bad_file_is_refused_in_the_reader_s_words(
