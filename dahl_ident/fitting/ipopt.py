@@ -39,7 +39,7 @@ from dahl_ident.fitting.optimum import (
     information_of,
     inverse,
 )
-from dahl_ident.fitting.record_search import Tell
+from dahl_ident.fitting.record_refinement import Tell
 from dahl_ident.fitting.search import solve, starts_of
 from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem, Quadratic, TableProblem

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
+from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -164,13 +165,30 @@ _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that 
 STEPS = 75  # at most; a search without convergence is not an estimate
 
 
-class Descent:
-    """How a search steps, what it minimises, and the evaluations until now."""
+Tell = Callable[[int, float], None]
+"""Takes the number of evaluations and the share of variance left."""
 
-    def __init__(self, method: str, loss: str) -> None:
-        self.method, self.loss = method, loss
+
+class Descent:
+    """How a search steps, what it minimises, and how far it has come."""
+
+    def __init__(self, method: str, loss: str, tell: Tell | None = None) -> None:
+        self.method, self.loss, self._tell = method, loss, tell
         self.evaluations, self.scale = 0, 1.0
         self.rho: Loss | None = None
+        self.lowest: tuple[RecordProblem, FloatArray, float] | None = None
+        """Problem, search coordinates and cost of the best place until now."""
+
+    def evaluated(self, problem: RecordProblem, theta: FloatArray) -> Quadratic:
+        """Return the cost at theta, (1, P), with its derivatives, and remember the lowest."""
+        at = problem.quadratic(theta, self.scale, self.rho)
+        self.evaluations += 1
+        cost = float(at.cost[0])
+        if self.lowest is None or self.lowest[0] is not problem or cost < self.lowest[2]:
+            self.lowest = problem, theta[0].copy(), cost
+        if self._tell is not None:
+            self._tell(self.evaluations, 2.0 * self.lowest[2] / problem.n_residuals)
+        return at
 
     def descend(self, problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
         """Return the minimum near a start; first roughly, then to a small part of the noise."""
@@ -207,19 +225,18 @@ class Descent:
 
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
-        else:
-            end = minimise(
-                lambda at, _which: problem.quadratic(at, self.scale, self.rho),
-                begin,
-                problem.space.relative,
-                problem.n_residuals,
-                tolerance_factor=LOOSE,
-                enough=lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals,
-                steps=most,
-                bounds=within if bounded else None,
-            )
-        self.evaluations += int(end.evaluations[0])
-        return end
+            self.evaluations += int(end.evaluations[0])
+            return end
+        return minimise(
+            lambda at, _which: self.evaluated(problem, at),
+            begin,
+            problem.space.relative,
+            problem.n_residuals,
+            tolerance_factor=LOOSE,
+            enough=lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals,
+            steps=most,
+            bounds=within if bounded else None,
+        )
 
 
 def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from dahl_ident.fitting.record_refinement import (
     SLOW,
     STEPS,
     Descent,
+    Tell,
     correlation,
     refined,
 )
@@ -37,35 +38,6 @@ _SETTLING = 2000  # samples after which simulated noise has forgotten its start
 _MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
 
 
-Tell = Callable[[int, float], None]
-"""Takes the number of evaluations and the share of variance left."""
-
-
-class _Trace:
-    """Remembers the best values of a search, and tells how it goes."""
-
-    def __init__(self, tell: Tell | None) -> None:
-        self._tell, self._count = tell, 0
-        self._best: tuple[RecordProblem, FloatArray, float] | None = None
-
-    def __call__(self, problem: RecordProblem, theta: FloatArray, cost: float) -> None:
-        self._count += 1
-        if self._best is None or self._best[0] is not problem or cost < self._best[2]:
-            self._best = problem, theta.copy(), cost
-        if self._tell is not None:
-            self._tell(self._count, 2.0 * self._best[2] / problem.n_residuals)
-
-    def optimum(self, problem: RecordProblem) -> Optimum | None:
-        """Return the best so far, None before the first evaluation."""
-        if self._best is None:
-            return None
-        part, theta, _ = self._best
-        if part.records is not problem.records:  # of a shortened problem
-            values = started_at(problem, part.to_values(theta)[: len(problem.free)].tolist())
-            part, theta = problem, problem.to_search(values)
-        return optimum_at(part, theta, converged=False, evaluations=self._count)
-
-
 def solve_records(
     problem: RecordProblem,
     method: str,
@@ -77,35 +49,20 @@ def solve_records(
 
     Where all parameters of the model are started, no other start is looked at.
     """
-    problem.watch = trace = _Trace(tell)
+    search = RecordSearch(method, loss, tell)
     try:
-        found = RecordSearch(method, loss).solved(problem, start)
+        return search.solved(problem, start)
     except KeyboardInterrupt as stop:
-        problem.watch = None
-        so_far = trace.optimum(problem)
-        if so_far is None:
+        if search.lowest is None:
             raise
+        part, theta, _ = search.lowest
+        if part.records is not problem.records:  # of a shortened problem
+            values = started_at(problem, part.to_values(theta)[: len(problem.free)].tolist())
+            part, theta = problem, problem.to_search(values)
+        at, count = part.quadratic(theta[None]), np.array([search.evaluations])
+        end = Minima(theta[None], *at[::2], np.array([False]), count)
+        so_far = _optimum(part, end, 1.0, "lm", "linear")
         raise FitInterrupted("the fit was stopped before it found a minimum", so_far) from stop
-    finally:
-        problem.watch = None
-    found.problem.watch = None  # of a weighted problem
-    return found
-
-
-def optimum_at(
-    problem: RecordProblem,
-    theta: FloatArray,
-    *,
-    converged: bool,
-    evaluations: int,
-    scale: float = 1.0,
-    method: str = "lm",
-    loss: str = "linear",
-) -> Optimum:
-    """Return the optimum at search coordinates where a search has ended."""
-    at = problem.quadratic(theta[None], scale, loss_named(loss, problem.parts))
-    end = Minima(theta[None], *at[::2], np.array([converged]), np.array([evaluations]))
-    return _optimum(problem, end, scale, method, loss)
 
 
 def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Optimum:
@@ -126,11 +83,11 @@ def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Opt
 
 def optimum_near(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Optimum:
     """Return the optimum of a problem that is so near another one's that its place is known."""
-    return optimum_at(
-        problem, theta, converged=optimum.converged, evaluations=optimum.nfev + 1,
-        scale=1.0 if optimum.loss == "linear" else optimum.scale,
-        method=optimum.method, loss=optimum.loss,
-    )  # fmt: skip
+    scale = 1.0 if optimum.loss == "linear" else optimum.scale
+    at = problem.quadratic(theta[None], scale, loss_named(optimum.loss, problem.parts))
+    converged, evaluations = np.array([optimum.converged]), np.array([optimum.nfev + 1])
+    end = Minima(theta[None], *at[::2], converged, evaluations)
+    return _optimum(problem, end, scale, optimum.method, optimum.loss)
 
 
 def solve_repetitions(

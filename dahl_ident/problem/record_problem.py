@@ -8,7 +8,7 @@ sample, an offset and, for forces, a drift.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -143,8 +143,6 @@ class RecordProblem(Problem):
         self.displacement_noise = 0.0
         """Standard deviation of the displacement, m, within which no movement counts."""
         self.paths: tuple[FloatArray, ...] | None = None
-        self.watch: Callable[[RecordProblem, FloatArray, float], None] | None = None
-        """Called after each evaluation of the cost, with search coordinates and cost."""
 
     def _check(self, record: Record, which: str) -> None:
         if len(record) < _SHORTEST:
@@ -192,9 +190,7 @@ class RecordProblem(Problem):
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
             parts.append(cut(thin, slice(start, start + n)))
-        other = self.remade(parts)
-        other.watch = self.watch
-        return other
+        return self.remade(parts)
 
     def remade(self, records: Sequence[Record]) -> RecordProblem:
         """Return the problem of other records, as they were measured."""
@@ -541,8 +537,6 @@ class RecordProblem(Problem):
         vanished |= self.space.angular & (np.abs(gradient) >= far)
         gradient[vanished], hessian[vanished], hessian[:, vanished] = 0.0, 0.0, 0.0
         hessian[vanished, vanished] = 1.0
-        if self.watch is not None:
-            self.watch(self, theta, cost)
         if chart is not None:
             gradient, hessian = chart.T @ gradient, chart.T @ hessian @ chart
         return Quadratic(np.asarray(cost), gradient, hessian)

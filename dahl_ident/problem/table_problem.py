@@ -178,10 +178,7 @@ class TableProblem(Problem):
 
         Rows are Gaussian then; see ``Measured.widened`` in noise.py.
         """
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        other.__dict__.pop("stiffness_data", None)
-        other._misfit = misfit
+        other = self.altered("stiffness_data", _misfit=misfit)
         other._set_noise(noise_for(self._rows, self.noise))
         return other
 

@@ -35,6 +35,7 @@ _OF_ONE_KIND = {
     "predict_record": "prediction of a record",
     "record_at_draws": "prediction of a record",
     "residuals": "residuals sample by sample",
+    "weighted": "weights by spectrum",
 }
 """What one kind of data alone has, in words."""
 

@@ -34,7 +34,7 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
-from dahl_ident.fitting.record_search import Tell
+from dahl_ident.fitting.record_refinement import Tell
 from dahl_ident.problem import Problem, ProblemBatch, TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_batch import FitBatch
@@ -194,7 +194,7 @@ def fit(
     if problem.settled and not np.isfinite(result.optimum.residuals).all():
         raise FitError(_no_prediction(result.optimum))
     if throw and not result.success:
-        raise FitError(" ".join([*filter(None, [result.goodness.cause]), result.message]), result)
+        raise FitError(f"{result.goodness.cause} {result.message}".strip(), result)
     return result
 
 
@@ -424,13 +424,12 @@ def posterior(
                 density, start, settings, seed=seed, resume=resume, pool=pool, listeners=listeners
             )
 
-    fitted = given
-    if not isinstance(data, FitResult):
+    if isinstance(data, FitResult):
+        problem, fitted = data.problem, given
+    else:
         problem = _problem(data, _checked(model), free, fixed, sensors, noise, steady or "exact")
         optimum = optimum_of(problem)
         fitted = None if optimum is None else FitResult(optimum)
-    else:
-        problem = data.problem
     if fitted is None or likelihood != "gaussian":
         uncertainty = "noise"
     density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)

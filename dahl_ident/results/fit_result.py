@@ -149,6 +149,10 @@ class FitResult(Result):
     residuals: tuple[FloatArray, ...] = part(
         "assessment.residuals", "Of records: measured minus predicted, record by record."
     )
+    weighted: bool = part(
+        "assessment.weighted",
+        "Of records: whether residuals were weighted by their spectrum: slow noise prevails.",
+    )
     effective_samples: float = part(
         "errors.effective", "Of records: white samples that would tell as much as the residuals."
     )
@@ -160,11 +164,6 @@ class FitResult(Result):
         Assumed exponents of tables have their estimates, so that all of them are a model.
         """
         return Parameters.of(self.problem, *self.assessment.known)
-
-    @property
-    def weighted(self) -> bool:
-        """Whether residuals of records were weighted by their spectrum: slow noise prevails."""
-        return bool(self.problem.whitening.size > 1)
 
     def verdict_on(self, name: str) -> tuple[Verdict, str]:
         """Return whether the data determine a parameter, and what they say of it."""

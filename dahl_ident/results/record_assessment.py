@@ -218,10 +218,14 @@ class RecordAssessment(Assessment):
         return (record_assumptions(self.problem, self.errors),)
 
     @property
+    def weighted(self) -> bool:
+        """Whether residuals were weighted by their spectrum."""
+        return self.problem.whitening.size > 1
+
+    @property
     def noise_in_words(self) -> list[str]:
         """How residuals were weighted."""
-        spectrum = self.problem.whitening.size > 1
-        weighted = "weighted by their spectrum" if spectrum else "of constant variance"
+        weighted = "weighted by their spectrum" if self.weighted else "of constant variance"
         return [
             f"residuals {weighted}; worth {self.errors.effective:.3g} independent samples of "
             f"{self.problem.n_samples}"
