@@ -165,6 +165,8 @@ class Budget(Mapping[str, ParameterBudget]):
 
         def stated(p: ParameterBudget) -> ParameterBudget:
             ends = limits.get(p.name, (p.value - p.U, p.value + p.U))
+            if not np.isfinite(p.U):
+                return p
             plain = np.allclose(ends, (p.value - p.U, p.value + p.U), rtol=_SAME, atol=_SAME * p.U)
             return p if plain else replace(p, limits=ends)
 
