@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,10 @@ _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it l
 _LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
 _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
+
+
+_LEVELS_OF: WeakKeyDictionary[FrequencyResponse, NDArray[np.intp]] = WeakKeyDictionary()
+"""Number of each row's level, by table: sources, tests and groups ask for it."""
 
 
 def rows_of_levels(data: FrequencyResponse) -> FloatArray:
@@ -89,9 +94,11 @@ def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
     Rows are of one level where the frequency and what was held, drive or amplitude, agree as
     closely as repeats do; not where a sweep is dense.
     """
-    driven = data.controlled == "force"
-    frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
-    return _agreeing(np.log(_held(data)), 2 * frequency + driven)
+    if data not in _LEVELS_OF:
+        driven = data.controlled == "force"
+        frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
+        _LEVELS_OF[data] = _agreeing(np.log(_held(data)), 2 * frequency + driven)
+    return _LEVELS_OF[data]
 
 
 def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:

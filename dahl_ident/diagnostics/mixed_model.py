@@ -117,6 +117,8 @@ class MixedModel:
         q = state.degrees[doubtful - G]  # a score is distributed nearly as chi-square of q
         beyond = (special.chdtri(q, chance[doubtful - G]) - q) / np.sqrt(2.0 * q)
         price[doubtful] = beyond * np.sqrt(np.maximum(own, 0.0))
+        if (state.gradient[doubtful] <= price[doubtful]).all():
+            return state  # the highest, with or without them
         free = self.most.copy()
         asked = self._highest(state.variances, least, free, price)
         free[doubtful] = np.where(asked.variances[doubtful] > 0.0, free[doubtful], 0.0)
