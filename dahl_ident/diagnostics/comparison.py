@@ -104,10 +104,18 @@ class ComparedModel:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the data determine every parameter, to a factor those that are above zero."""
-        o = self.optimum
+        """Whether the data determine every parameter, to a factor those that are above zero.
+
+        Not each of a law's like parts, as Maxwell slip has them: their sums are what it says.
+        """
+        o, parts = self.optimum, set[str]()
+        for element in o.problem.model.elements:
+            labels = {label for part in element.like_parts for label in part}
+            parts |= {element.parameter(label).name for label in labels}
         return all(
-            np.isfinite(error) and (p.lower != 0.0 or error < _VAGUE * value)
+            np.isfinite(value)
+            and (p.name in parts or np.isfinite(error))
+            and (p.name in parts or p.lower != 0.0 or error < _VAGUE * value)
             for p, value, error in zip(
                 o.problem.parameters, o.values.tolist(), o.stderr.values(), strict=True
             )
@@ -181,9 +189,19 @@ class ModelComparison:
 
         Apart from the one that was fitted, only models count whose parameters are determined and
         physical, and whose force limit and stiffness are not a hundred times those of the fit. It
-        is the one that was fitted where models that are alike disagree (`undecided`).
+        is the one that was fitted where models that are alike disagree (`undecided`), and where one
+        that the data do not determine leaves far less (`undetermined`).
         """
-        return self.models[0] if self.undecided else self._simplest
+        return self.models[0] if self.undecided or self.undetermined else self._simplest
+
+    @cached_property
+    def undetermined(self) -> ComparedModel | None:
+        """A physical model that leaves far less than the best, if the data do not determine it."""
+        best, every = self._simplest, [m for m in self.models if m.is_physical]
+        found = max(every, key=lambda model: model.density.total)
+        gain, error = found.density.gain_over(best.density)
+        far = found.density.misfit < FAR_LESS * best.density.misfit
+        return found if far and gain > max(error, _BY_CHANCE) else None
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
@@ -229,6 +247,13 @@ class ModelComparison:
                 f"{one.name} and {other.name} would both be better, and these data do not "
                 f"distinguish them: their force limits are {listed(limits)}. Neither is "
                 "recommended."
+            )
+        if self.undetermined is not None:
+            one = self.undetermined
+            return (
+                f"{one.name} would leave far less ({percent(one.density.misfit)} of the "
+                "fundamental), but these data do not determine its parameters. No model compared "
+                "is recommended."
             )
         if best is first:
             return "No model compared is better than the one fitted."
