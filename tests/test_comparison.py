@@ -16,6 +16,7 @@ from dahl_ident import (
     FrequencyResponse,
     LuGre,
     Mass,
+    MaxwellSlip,
     PowerDamper,
     Spring,
     compare_models,
@@ -146,3 +147,15 @@ def test_models_whose_parameters_are_open_are_not_recommended() -> None:
     assert sprung.is_determined
     best = replace(comparison, models=(first, replace(sprung, density=better))).best
     assert best.name == "spring added"
+
+
+def test_two_jenkins_elements_are_maxwell_slip() -> None:
+    """Not the law of a free exponent that leaves ten times as much."""
+    A = np.geomspace(0.1, 10.0, 12) / 300.0
+    exact = MaxwellSlip([1e-3, 8e-3], [20.0, 10.0]).describing_function(A)
+    noise = 0.01 * np.random.default_rng(0).standard_normal((2, A.size)).T @ [1.0, 1.0j]
+    comparison = compare_models(
+        fit(FrequencyResponse(np.ones(12), exact * np.exp(noise), A), Dahl())
+    )
+    assert "Maxwell slip" in comparison.headline
+    assert comparison.best.name in ("Maxwell slip", "as fitted")

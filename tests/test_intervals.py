@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, special, stats
 
-from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit
+from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics import identifiability
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
 from dahl_ident.results import FitResult
@@ -351,3 +352,29 @@ class TestOneInterval:
         predicted = found.predict(1.0, amplitude=A), found.describing_function(A)
         for response in (found.best_fit, *(band.response for band in predicted)):
             np.testing.assert_allclose(response, law.describing_function(A), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["alpha_2", "outliers"])
+def test_every_method_begins_at_the_one_estimate(name: str) -> None:
+    """Also where the exponent was assumed, and where a misfit counts."""
+    result = fit(load_dataset(name), Dahl())
+    stated = {p.name: p.value for p in result.model.parameters}
+    assert stated == {name: p.value for name, p in result.params.items()}
+    for method in ("combined", "wald", "profile", "bootstrap"):
+        found = result.conf_interval(method, replicates=99 if method == "bootstrap" else None)
+        for i, each in enumerate(found.names):
+            value = result.params[each].value
+            assert found.estimate[i] == pytest.approx(value)
+            assert (found.lower[:, i] < value).all()
+            assert (found.upper[:, i] > value).all()
+
+
+def test_an_open_parameter_has_one_limit_and_no_expanded_uncertainty() -> None:
+    result = fit(load_dataset("microslip"), Dahl())
+    limits = result.conf_interval()["f_max"][1]
+    stated = result.budget()["f_max"]
+    assert limits.upper == np.inf
+    assert stated.limits == (limits.lower, limits.upper)
+    assert f"f_max: at least {limits.lower:.3g} N" in str(identifiability(result))
+    assert f"at least {limits.lower:.3g}" in str(result.budget())
+    assert result.budget().to_dict()["parameters"]["f_max"]["U"] is None

@@ -16,6 +16,7 @@ from dahl_ident import (
     Element,
     FitResult,
     FrequencyResponse,
+    Friction,
     MaxwellSlip,
     Sensors,
     Spring,
@@ -23,6 +24,7 @@ from dahl_ident import (
     fit,
     load_dataset,
 )
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
@@ -326,3 +328,53 @@ class TestFindings:
         assert any(finding.code == "assumed" for finding in wrong.findings)
         assert "Assumed:" not in wrong.verdict
         assert "Assumed:" in fit(table(), Dahl()).verdict
+
+
+class TestDescribed:
+    """The status of laws and devices that one Dahl element is not; never better without noise."""
+
+    @staticmethod
+    def status(N: ComplexArray, A: FloatArray, *, stated: bool, run: object = None) -> FitResult:
+        noisy = N * relative_noise(len(A), 0.01, 4)
+        C = (0.01 * np.abs(noisy))[:, None, None] ** 2 * np.eye(2) if stated else None
+        return fit(
+            FrequencyResponse(np.ones(len(A)), noisy, A, covariance=C, run=run),
+            Dahl(),
+            throw=False,
+        )
+
+    @pytest.mark.parametrize("stated", [True, False])
+    @pytest.mark.parametrize(
+        "law",
+        [
+            BoucWen(30.0, 300.0, 300.0, exponent=2.0),
+            MaxwellSlip([2e-3, 5e-3], [20.0, 12.0]),
+            Dahl(0.1, 30.0, alpha=0.265),
+        ],
+    )
+    def test_another_law_is_not_trusted(self, law: Friction, *, stated: bool) -> None:
+        A = X_C * np.geomspace(0.1, 10.0, 12)
+        assert not self.status(law.describing_function(A), A, stated=stated).trusted
+
+    @pytest.mark.parametrize("stated", [True, False])
+    def test_several_devices_are_not_one(self, *, stated: bool) -> None:
+        limits, A = 0.1 * np.geomspace(0.4, 1.7, 6), X_C * np.geomspace(0.2, 8.0, 8)
+        N = np.concatenate([Dahl(f, 300.0 * f).describing_function(A) for f in limits])
+        run = np.repeat([f"band {i}" for i in range(6)], 8)
+        result = self.status(N, np.tile(A, 6), stated=stated, run=run)
+        assert result.status == "not described"
+        assert "the runs differ (gain by" in result.verdict
+
+    def test_harmonics_of_another_law_do_not_move_the_estimate(self) -> None:
+        A, law = X_C * np.geomspace(0.1, 10.0, 12), MaxwellSlip([2e-3, 5e-3], [20.0, 12.0])
+        own = [np.asarray(p.value) for p in law.parameters]
+        exact = np.concatenate([law.stiffness(own, A, np.zeros(()), k) for k in (1, 3, 5)])
+        size = 1e-3 * np.abs(np.tile(exact[:12], 3))
+        data = FrequencyResponse(
+            np.ones(36), exact + size * (relative_noise(36, 0.7, 4) - 1.0), np.tile(A, 3),
+            harmonic=np.repeat([1, 3, 5], 12), covariance=size[:, None, None] ** 2 * np.eye(2),
+        )  # fmt: skip
+        first, every = fit(data.select(harmonic=1), Dahl()), fit(data, Dahl())
+        for name in ("f_max", "sigma"):
+            before, after = first.params[name], every.params[name]
+            assert after.value == pytest.approx(before.value, abs=before.stderr)
