@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from dahl_ident import (
@@ -334,7 +335,9 @@ class TestDescribed:
     """The status of laws and devices that one Dahl element is not; never better without noise."""
 
     @staticmethod
-    def status(N: ComplexArray, A: FloatArray, *, stated: bool, run: object = None) -> FitResult:
+    def status(
+        N: ComplexArray, A: FloatArray, *, stated: bool, run: ArrayLike | None = None
+    ) -> FitResult:
         noisy = N * relative_noise(len(A), 0.01, 4)
         C = (0.01 * np.abs(noisy))[:, None, None] ** 2 * np.eye(2) if stated else None
         return fit(
