@@ -152,15 +152,6 @@ class Backlash(Friction):
         zero = np.zeros(path.displacement.shape)
         return found._replace(by_parameter=(*found.by_parameter, zero))
 
-    def steady_force(self, values: Values, path: FloatArray, cycles: int) -> FloatArray:
-        """Return the force of the element along the path without the play."""
-        half = 0.5 * np.asarray(values[-1])
-        y, moved = np.zeros(path.shape[:-1]), np.empty(path.shape)
-        for _ in range(2):  # the play repeats itself after the first cycle
-            for i in range(path.shape[-1]):
-                moved[..., i] = y = np.clip(y, path[..., i] - half, path[..., i] + half)
-        return self._element.steady_force(values[:-1], y, cycles)
-
     def rest_stiffness(self, values: Values) -> FloatArray:
         """Return 0: small motions do not cross the gap."""
         return np.zeros(np.broadcast_shapes(*(np.shape(v) for v in values)))

@@ -230,15 +230,6 @@ class Behaviour(ABC):
         """Return the force from each state of a linear element at the first sample, (n, states)."""
         return np.zeros((samples, 0))
 
-    def steady_force(self, values: Values, path: FloatArray, cycles: int) -> FloatArray:
-        """Return the force along closed paths of displacement, (..., n), after some cycles."""
-        every = np.broadcast_arrays(*(np.asarray(v) for v in values), path[..., 0])
-        force = np.empty(path.shape)
-        for i in np.ndindex(path.shape[:-1]):
-            own = [float(v[i]) for v in every[:-1]]
-            force[i] = self.force_history(own, np.tile(path[i], cycles))[-path.shape[-1] :]
-        return force
-
     def branch(
         self, values: Sequence[float], start: FloatArray | float, path: FloatArray
     ) -> FloatArray | None:

@@ -258,13 +258,6 @@ class Dahl(Friction):
     def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
         return hysteresis.steady_force(theta, amplitude, *values)
 
-    def _step(self, values: Values, force: FloatArray, step: FloatArray) -> FloatArray:
-        f_max, sigma, alpha = values
-        sign = np.sign(step)
-        margin = 1.0 - sign * force / f_max
-        change = hysteresis.margin_change(margin, np.abs(step) * sigma / f_max, float(alpha))
-        return np.asarray(force - sign * f_max * change)
-
     def branch(
         self, values: Sequence[float], start: FloatArray | float, path: FloatArray
     ) -> FloatArray | None:
@@ -432,7 +425,6 @@ class _AsymmetricDahl(Dahl):
     settled = Friction.settled
     history = Friction.history
     transient_decay = Friction.transient_decay
-    _step = Friction._step
     branch = Friction.branch
     _loop = Friction._loop
 

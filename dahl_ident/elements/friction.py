@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 _SMALLEST = 1e-100  # m; smaller amplitudes are rest
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
 _SECTIONS = 16  # of a bracket, when the force is sought at which the slope vanishes
-_START = 60  # steps from rest to the start of a path: as fine as a cycle of 240
 
 
 class Friction(Element):
@@ -312,24 +311,6 @@ class Friction(Element):
         """Return the factor by which a deviation from the settled loop shrinks in one cycle."""
         at, rows = self._rows(values, amplitude, omega)
         return np.asarray(np.abs(self._loops(at).decays)[rows])
-
-    def steady_force(self, values: Values, path: FloatArray, cycles: int) -> FloatArray:
-        """Return the force along closed paths of displacement, (..., n), by small steps."""
-        steps = np.diff(path, append=path[..., :1], axis=-1)
-        force, forces = np.zeros(path.shape[:-1]), np.empty(path.shape)
-        for _ in range(_START):
-            force = self._step(values, force, path[..., 0] / _START)
-        for _ in range(cycles):
-            for i in range(path.shape[-1]):
-                forces[..., i] = force
-                force = self._step(values, force, steps[..., i])
-        return forces
-
-    def _step(self, values: Values, force: FloatArray, step: FloatArray) -> FloatArray:
-        """Return the force after a small step of displacement, by the midpoint rule."""
-        heading = np.where(step < 0.0, -1.0, 1.0)
-        middle = force + 0.5 * step * self.quasi_static_slope(force, heading, values)
-        return np.asarray(force + step * self.quasi_static_slope(middle, heading, values))
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
         up, down = (float(v) for v in self.force_limits([np.asarray(v) for v in values]))
