@@ -87,7 +87,7 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
     >>> intervals = fit.conf_interval("profile", levels=(0.95,))
     >>> limits = intervals["f_max"][0]
     >>> print(f"f_max from {limits.lower:.4f} to {limits.upper:.4f} N")
-    f_max from 0.0993 to 0.1004 N
+    f_max from 0.0995 to 0.1006 N
     """
 
     method: Method
