@@ -20,6 +20,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.record_refinement import by_chance
 from dahl_ident.fitting.record_search import followed, optimum_near
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -155,12 +156,26 @@ def with_exponents(optimum: Optimum) -> Optimum:
             continue
         held, theta = problem.with_fixed({name: one.estimate}), problem.to_search(one.values)
         if one.mean**2 < _SLIGHT * one.std:  # first order is as good
-            optimum = optimum_near(optimum, held, theta)
-            left = [other for other in left if other != name]
+            optimum, again = optimum_near(optimum, held, theta), False
         else:
             there = followed(optimum, held, theta)
-            optimum = there if there.converged else optimum
+            again = there.converged and _no_worse(there, optimum)
+            optimum = there if again else optimum
+        if not again:
+            left = [other for other in left if other != name]
     return optimum
+
+
+def _no_worse(there: Optimum, optimum: Optimum) -> bool:
+    """Return whether an estimate leaves no more of the records than another, beyond chance."""
+
+    def left(of: Optimum) -> list[FloatArray]:
+        parts = of.problem.split_residuals(of.values)
+        return [e / size for e, size in zip(parts, of.problem.sizes, strict=True)]
+
+    before, after = left(optimum), left(there)
+    sums = [sum(float(e @ e) for e in parts) for parts in (before, after)]
+    return sums[1] - sums[0] <= by_chance(0.5 * sums[0], optimum.problem.n_residuals, before)
 
 
 def _assumed(problem: RecordProblem) -> list[Parameter]:

@@ -141,8 +141,8 @@ def minimise(
     Searches that leave the region `inside`, which is called like `evaluate`, end there, not
     converged; so do those that are still higher after twice the steps in which another one of the
     same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
-    search has converged; `enough` gives the fall of a cost that is not worth a step, however long.
-    `accuracy` is that of predictions, relative to the data. No step leads beyond the `bounds` at
+    search has converged; `enough` gives the fall of a cost that is not worth a step, however long:
+    the search ends before it. `accuracy` is that of predictions, relative to the data. No step leads beyond the `bounds` at
     theta; a coordinate at its bound that would go on stays there.
     """
     owner = np.arange(len(theta)) if owner is None else owner
@@ -226,7 +226,8 @@ def _minimise(
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
-        settled |= enough is not None and predicted < enough(at.cost)
+        short = settled  # and taken unseen; a long step that is not worth its cost is left out
+        settled = settled | (enough is not None and predicted < enough(at.cost))
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
         which = None if active.size == S else active
@@ -240,7 +241,7 @@ def _minimise(
             converged[active] = settled
             np.minimum.at(first, own[settled], count)
             np.minimum.at(lowest, own[settled], at.cost[settled])
-            ends.put(active, at.moved(settled, step, predicted))
+            ends.put(active, at.moved(settled & short, step, predicted))
             keep = ~ended
             active, at = active[keep], at.take(keep)
             if not active.size:
