@@ -142,8 +142,8 @@ def minimise(
     converged; so do those that are still higher after twice the steps in which another one of the
     same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
     search has converged; `enough` gives the fall of a cost that is not worth a step, however long:
-    the search ends before it. `accuracy` is that of predictions, relative to the data. No step leads beyond the `bounds` at
-    theta; a coordinate at its bound that would go on stays there.
+    the search ends before it. `accuracy` is that of predictions, relative to the data. No step
+    leads beyond the `bounds` at theta; a coordinate at its bound that would go on stays there.
     """
     owner = np.arange(len(theta)) if owner is None else owner
     with np.errstate(all="ignore"):
