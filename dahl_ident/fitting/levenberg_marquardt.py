@@ -27,8 +27,8 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
 """(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
-Bounds = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""theta (S, P) -> between which coordinates the next ones may lie."""
+Bounds = tuple[FloatArray, FloatArray]
+"""Between which coordinates, (P,) each, steps may lead."""
 Fall = Callable[[FloatArray], FloatArray | float]
 """Costs (S,) -> their falls that are not worth a step."""
 
@@ -143,7 +143,7 @@ def minimise(
     same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
     search has converged; `enough` gives the fall of a cost that is not worth a step, however long:
     the search ends before it. `accuracy` is that of predictions, relative to the data. No step
-    leads beyond the `bounds` at theta; a coordinate at its bound that would go on stays there.
+    leads beyond the `bounds` of theta; a coordinate at its bound that would go on stays there.
     """
     owner = np.arange(len(theta)) if owner is None else owner
     with np.errstate(all="ignore"):
@@ -316,7 +316,7 @@ def _step(
     H = at.hessian / (size[:, :, None] * size[:, None, :])
     g = at.gradient / size
     if bounds is not None:
-        low, high = bounds(at.theta)
+        low, high = bounds
         held = ((at.theta <= low) & (g > 0.0)) | ((at.theta >= high) & (g < 0.0))
         g = np.where(held, 0.0, g)
         H = np.where(held[:, :, None] | held[:, None, :], np.eye(P), H)

@@ -219,23 +219,22 @@ class Descent:
 
         With first states `bounded`, which a search from far off must not be: it would end there.
         """
-
-        def within(at: FloatArray) -> tuple[FloatArray, FloatArray]:
-            return problem.start_bounds(problem.to_values(at[0]))
-
+        bounds = problem.start_bounds(problem.to_values(begin[0])) if bounded else None
+        known = bounded or problem.whitening.size > 1  # how large the noise is
+        enough = (lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals) if known else None
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
             self.evaluations += int(end.evaluations[0])
             return end
         return minimise(
             lambda at, _which: self.evaluated(problem, at),
-            begin,
+            begin if bounds is None else np.clip(begin, *bounds),
             problem.space.relative,
             problem.n_residuals,
             tolerance_factor=LOOSE,
-            enough=lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals,
+            enough=enough,
             steps=most,
-            bounds=within if bounded else None,
+            bounds=bounds,
         )
 
 

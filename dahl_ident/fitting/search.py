@@ -379,7 +379,7 @@ class TableSearch:
             tolerance_factor=_AT_LIMIT if limit else self.tolerance,
             steps=steps,
             accuracy=problem.accuracy,
-            bounds=(lambda _: problem.bounds()) if self.bounded and chart is None else None,
+            bounds=problem.bounds() if self.bounded and chart is None else None,
         )
         if self.bounded:
             theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)
