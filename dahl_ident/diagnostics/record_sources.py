@@ -21,7 +21,7 @@ from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.record_refinement import by_chance
-from dahl_ident.fitting.record_search import followed, optimum_near
+from dahl_ident.fitting.record_search import followed
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
@@ -155,13 +155,11 @@ def with_exponents(optimum: Optimum) -> Optimum:
         if abs(one.mean) < _SLIGHT * one.std:
             continue
         held, theta = problem.with_fixed({name: one.estimate}), problem.to_search(one.values)
-        if one.mean**2 < _SLIGHT * one.std:  # first order is as good
-            optimum, again = optimum_near(optimum, held, theta), False
-        else:
-            there = followed(optimum, held, theta)
-            again = there.converged and _no_worse(there, optimum)
-            optimum = there if again else optimum
-        if not again:
+        far = one.mean**2 > _SLIGHT * one.std  # beyond first order
+        there = followed(optimum, held, theta, far=far)
+        better = there.converged and _no_worse(there, optimum)
+        optimum = there if better else optimum
+        if not (far and better):
             left = [other for other in left if other != name]
     return optimum
 

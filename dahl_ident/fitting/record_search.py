@@ -65,29 +65,23 @@ def solve_records(
         raise FitInterrupted("the fit was stopped before it found a minimum", so_far) from stop
 
 
-def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Optimum:
+def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray, *, far: bool) -> Optimum:
     """Return the optimum of a problem that is near another one's, from search coordinates.
 
-    What was taken out of the records is judged again.
+    Where it is `far`, what was taken out of the records is judged again.
     """
     search = Descent(optimum.method, optimum.loss)
     search.rho = loss_named(optimum.loss, problem.parts)
     search.scale = 1.0 if search.rho is None else optimum.scale
-    if problem.output == "force":
+    if far and problem.output == "force":
         problem = problem.without_noise(0.0)
-    problem = problem.weighted(np.ones(1)) if problem.whitening.size > 1 else problem
-    problem, end = refined(search, problem, search.descend(problem, theta, STEPS))
+    if far and problem.whitening.size > 1:
+        problem = problem.weighted(np.ones(1))
+    end = search.descend(problem, theta, STEPS)
+    if far:
+        problem, end = refined(search, problem, end)
     end = replace(end, evaluations=np.array([optimum.nfev + search.evaluations]))
     return _optimum(problem, end, search.scale, optimum.method, optimum.loss)
-
-
-def optimum_near(optimum: Optimum, problem: RecordProblem, theta: FloatArray) -> Optimum:
-    """Return the optimum of a problem that is so near another one's that its place is known."""
-    scale = 1.0 if optimum.loss == "linear" else optimum.scale
-    at = problem.quadratic(theta[None], scale, loss_named(optimum.loss, problem.parts))
-    converged, evaluations = np.array([optimum.converged]), np.array([optimum.nfev + 1])
-    end = Minima(theta[None], *at[::2], converged, evaluations)
-    return _optimum(problem, end, scale, optimum.method, optimum.loss)
 
 
 def solve_repetitions(
