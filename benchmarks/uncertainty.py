@@ -439,7 +439,7 @@ def judge(cell: Cell, tables: int, seed: int = SEED) -> Outcome:
         usable[index] = result.status.usable
         trusted[index] = result.trusted
         for i, (name, value) in enumerate(zip(("f_max", "sigma"), truth, strict=True)):
-            own, noise = _interval(result, "combined", name), _interval(result, "profile", name)
+            own, noise = _interval(result, name), _by_noise(result, name)
             covered[index, i] = own[0] <= value <= own[1]
             plain[index, i] = noise[0] <= value <= noise[1]
             with np.errstate(invalid="ignore"):
@@ -457,9 +457,14 @@ def judge(cell: Cell, tables: int, seed: int = SEED) -> Outcome:
     )
 
 
-def _interval(result: FitResult, method: str, name: str) -> tuple[float, float]:
-    limits = result.conf_interval("profile" if method == "profile" else "combined")[name][1]
+def _interval(result: FitResult, name: str) -> tuple[float, float]:
+    limits = result.conf_interval()[name][1]
     return limits.lower, limits.upper
+
+
+def _by_noise(result: FitResult, name: str) -> tuple[float, float]:
+    value, u = result.params[name].value, 2.0 * result.stderr_noise[name]
+    return value - u, value + u
 
 
 @dataclass(frozen=True)

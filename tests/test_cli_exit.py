@@ -336,8 +336,6 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "--f-max, --force-std is given together with run.toml, which describes the whole"),
         (("report", "t.csv", "--waveforms-columns", "columns.toml"),
          "--waveforms-columns is given without --waveforms"),
-        (("sample", "r.csv", "--record", "--force-gain", "0.5 %"),
-         "--force-gain is given together with --record, but a posterior of records takes the "),
     ],
 )  # fmt: skip
 def test_input_without_effect_or_of_another_kind_is_refused(

@@ -108,8 +108,8 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     unit = np.sqrt(stated + beyond[group] + _EXACT**2)
     Z = [one[keep] / unit[:, None] for one in scatter]
     model = MixedModel(
-        y / unit, X[keep] / unit[:, None], Z, group, np.full(groups, _ROUNDING), groups,
-        np.full(len(Z), np.inf),
+        y / unit, orthonormal(X[keep] / unit[:, None]), Z, group, np.full(groups, _ROUNDING),
+        groups, np.full(len(Z), np.inf),
     )  # fmt: skip
     state = model.reml(np.ones(len(Z)))
     tests = _densities(state, np.repeat(test, 2)[keep], unit, robust=optimum.loss != "linear")

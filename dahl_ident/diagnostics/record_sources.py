@@ -165,13 +165,21 @@ def with_exponents(optimum: Optimum) -> Optimum:
 
 
 def _no_worse(there: Optimum, optimum: Optimum) -> bool:
-    """Return whether an estimate leaves no more of the records than another, beyond chance."""
+    """Return whether an estimate leaves no more of the records than another, beyond chance.
+
+    Nor does it where no motion is next to it, so that its errors could not be stated.
+    """
 
     def left(of: Optimum) -> list[FloatArray]:
-        parts = of.problem.split_residuals(of.values)
-        return [e / size for e, size in zip(parts, of.problem.sizes, strict=True)]
+        problem: RecordProblem = of.problem
+        predicted = [problem.predict(of.values, i).output for i in range(len(problem.records))]
+        parts = zip(problem.measured, predicted, problem.sizes, strict=True)
+        return [(y - output) / size for y, output, size in parts]
 
-    before, after = left(optimum), left(there)
+    try:
+        before, after = left(optimum), left(there)
+    except FitError:
+        return False
     sums = [sum(float(e @ e) for e in parts) for parts in (before, after)]
     return sums[1] - sums[0] <= by_chance(0.5 * sums[0], optimum.problem.n_residuals, before)
 

@@ -255,11 +255,8 @@ class ResidualSpace(_Space):
     def p_value(self, changes: ComplexArray) -> float:
         """Return how likely noise alone gives as much departure along `changes`, (k, n)."""
         basis = orthonormal(self.columns(changes).T)
-        k = basis.shape[1]
-        if k == 0:
-            return np.nan
         explained = float(np.sum((basis.T @ self.residuals) ** 2))
-        return self.tail(explained, k)
+        return self.tail(explained, basis.shape[1])
 
     def tail(self, explained: float, k: int) -> float:
         """Return the probability of more than this sum of squares in `k` directions of noise."""
@@ -267,6 +264,8 @@ class ResidualSpace(_Space):
 
     def tail_of(self, explained: float, k: int, total: float, dof: int) -> float:
         """Return the same where only `total`, with `dof` degrees of freedom, is left of them."""
+        if k == 0:
+            return np.nan
         if self._scale_known:
             return float(special.chdtrc(k, explained))
         if dof <= k or total <= explained:

@@ -134,6 +134,7 @@ def minimise(
     steps: int = 80,
     accuracy: float = EXPLICIT,
     bounds: Bounds | None = None,
+    unseen: bool = True,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
@@ -149,7 +150,7 @@ def minimise(
     with np.errstate(all="ignore"):
         return _minimise(
             evaluate, theta, logarithmic, n_residuals, inside, owner, tolerance_factor, enough,
-            steps, accuracy, bounds,
+            steps, accuracy, bounds, unseen,
         )  # fmt: skip
 
 
@@ -210,6 +211,7 @@ def _minimise(
     steps: int,
     accuracy: float,
     bounds: Bounds | None,
+    unseen: bool,
 ) -> Minima:
     S, P = theta.shape
     unseen_change = _UNSEEN if accuracy <= EXPLICIT else _OF_ACCURACY * accuracy
@@ -226,7 +228,7 @@ def _minimise(
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
-        short = settled  # and taken unseen; a long step that is not worth its cost is left out
+        short = settled
         settled = settled | (enough is not None and predicted < enough(at.cost))
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
@@ -241,7 +243,7 @@ def _minimise(
             converged[active] = settled
             np.minimum.at(first, own[settled], count)
             np.minimum.at(lowest, own[settled], at.cost[settled])
-            ends.put(active, at.moved(settled & short, step, predicted))
+            ends.put(active, at.moved(settled & (short | unseen), step, predicted))
             keep = ~ended
             active, at = active[keep], at.take(keep)
             if not active.size:
@@ -253,9 +255,9 @@ def _minimise(
         new = _State(trial, *evaluate(trial, which))
         evaluations[active] += 1
         # a fall too small to see next to one enormous row's cost is taken as predicted
-        unseen = predicted <= unseen_change * at.cost
-        better = (new.cost < at.cost) | (unseen & (new.cost <= (1.0 + unseen_change) * at.cost))
-        gain = np.where(unseen, 1.0, at.cost - new.cost) / np.where(unseen, 1.0, predicted)
+        tiny = predicted <= unseen_change * at.cost
+        better = (new.cost < at.cost) | (tiny & (new.cost <= (1.0 + unseen_change) * at.cost))
+        gain = np.where(tiny, 1.0, at.cost - new.cost) / np.where(tiny, 1.0, predicted)
         calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)

@@ -235,6 +235,7 @@ class Descent:
             enough=enough,
             steps=most,
             bounds=bounds,
+            unseen=False,
         )
 
 

@@ -167,8 +167,10 @@ class Shooting:
             possible &= again | ~known
         self._solve(result, possible & ~result.found, ask)
         unstable = np.isfinite(result.multiplier)
-        if stable or np.all(values == values[0]):  # a search passes values at which nothing settles
-            self._solve(result, possible & ~result.found & ~unstable, ask, finer=_FINER)
+        lost = possible & ~result.found & ~unstable
+        # a search passes values at which nothing settles; a few rows may take as long as the others
+        if stable or np.all(values == values[0]) or _FINER * lost.sum() <= omega.size:
+            self._solve(result, lost, ask, finer=_FINER)
         self._solve(result, possible & ~result.found & unstable, ask, cycles=_LONG)
         if slopes is not None:
             result = result._replace(by_parameter=result.by_parameter @ slopes[:, chosen])
