@@ -135,7 +135,7 @@ def with_exponents(optimum: Optimum) -> Optimum:
 
     The other parameters are those that go with them, so that all of them together are a model.
     """
-    usual = {p.name: float(p.value or 1.0) for p in _assumed(optimum.problem)}
+    usual = {p.name: float(p.value or 1.0) for p in optimum.problem.assumed_exponents}
     left = list(usual) * _ROUNDS
     while left:
         name = left.pop(0)
@@ -146,7 +146,7 @@ def with_exponents(optimum: Optimum) -> Optimum:
             problem.filtered(y - p.output) for y, p in zip(problem.measured, predicted, strict=True)
         ]
         jacobians = [problem.filtered(p.by) for p in predicted]
-        (parameter,) = (p for p in _assumed(problem) if p.name == name)
+        (parameter,) = (p for p in problem.assumed_exponents if p.name == name)
         try:
             search = _Search(problem, parameter, optimum.values, usual[name])
             one = search.result(jacobians, residuals)
@@ -182,11 +182,6 @@ def _no_worse(there: Optimum, optimum: Optimum) -> bool:
         return False
     sums = [sum(float(e @ e) for e in parts) for parts in (before, after)]
     return sums[1] - sums[0] <= by_chance(0.5 * sums[0], optimum.problem.n_residuals, before)
-
-
-def _assumed(problem: RecordProblem) -> list[Parameter]:
-    """Return the exponents that nobody stated."""
-    return [p for p in problem.model.parameters if p.assumed and p.prior is not None]
 
 
 def by_delay(

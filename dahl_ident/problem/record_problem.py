@@ -235,13 +235,14 @@ class RecordProblem(Problem):
         low, high = (self.delayed(self.delay + d) for d in (-step, step))
         return _slopes(low, high, values, step)
 
+    @property
+    def assumed_exponents(self) -> list[Parameter]:
+        """The exponents that nobody stated."""
+        return [p for p in self.model.parameters if p.assumed and p.prior is not None]
+
     def exponent_slopes(self, values: FloatArray) -> list[list[FloatArray]]:
         """Return the derivatives of each record's output by each exponent that nobody stated."""
-        return [
-            self.slopes_with_respect_to(p, values)
-            for p in self.model.parameters
-            if p.assumed and p.prior is not None and not p.free
-        ]
+        return [self.slopes_with_respect_to(p, values) for p in self.assumed_exponents]
 
     def slopes_with_respect_to(
         self, parameter: Parameter, values: FloatArray, at: float | None = None

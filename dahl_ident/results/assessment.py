@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,6 @@ from dahl_ident.diagnostics.intervals import (
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
-
-if TYPE_CHECKING:
-    pass
-
 
 _OF_ONE_KIND = {
     "predict_response": "response at other frequencies",
