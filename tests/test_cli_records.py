@@ -127,15 +127,14 @@ def test_the_force_is_predicted_although_the_model_has_a_mass(
     assert "--record" in why
 
 
-def test_models_of_records_are_not_compared_as_tables(
+def test_models_of_records_are_compared(
     odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, _, why = told(monkeypatch, capsys, "fit", odd_columns, "--record", "--compare")
-    assert code == 1
-    assert "compares models of tables alone" in why
-    fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
-    with pytest.raises(di.errors.ValidationError, match="takes a fit of a table"):
-        di.compare_models(fit)
+    place = odd_columns.with_name("columns.toml")
+    words = ("fit", odd_columns, "--record", "--columns", place, "--compare")
+    _, out, _ = told(monkeypatch, capsys, *words)
+    assert "No model compared is better" in out
+    assert "of the force left" in out
 
 
 def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:

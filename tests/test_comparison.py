@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from benchmarks.selection import choices
 from dahl_ident import (
     Backlash,
+    BoucWen,
     Dahl,
     Damper,
     Element,
@@ -18,6 +20,7 @@ from dahl_ident import (
     Mass,
     MaxwellSlip,
     PowerDamper,
+    Record,
     Spring,
     compare_models,
     fit,
@@ -159,3 +162,59 @@ def test_two_jenkins_elements_are_maxwell_slip() -> None:
     )
     assert "Maxwell slip" in comparison.headline
     assert comparison.best.name in ("Maxwell slip", "as fitted")
+
+
+T = np.arange(1500) / 100.0
+X = 1e-3 * np.sin(3.0 * T) + 7e-3 * np.sin(0.9 * T) * np.sin(0.31 * T)
+
+
+def loop(x: np.ndarray) -> np.ndarray:
+    """Bouc-Wen's equation, dF = 30 (1 - 500 |F/30| sgn(F dx) + 200 F/30) dx, in small steps."""
+    fine = np.interp(np.linspace(0, x.size - 1, 40 * (x.size - 1) + 1), np.arange(x.size), x)
+    z = np.zeros(fine.size)
+    for i, dx in enumerate(np.diff(fine)):
+        middle = z[i]
+        for _ in range(3):  # the implicit midpoint rule
+            change = dx - 500.0 * abs(dx) * middle + 200.0 * dx * abs(middle)
+            middle = z[i] + 0.5 * change
+        z[i + 1] = z[i] + change
+    return 30.0 * z[::40]
+
+
+def test_the_law_of_a_record_is_recognised() -> None:
+    noise = 2e-4 * np.random.default_rng(0).standard_normal(T.size)
+    force = loop(X) + noise
+    record = Record(T, displacement=X, force=force)
+    laws = {"Bouc-Wen": BoucWen(), "Maxwell slip": MaxwellSlip(3)}
+    comparison = compare_models(fit(record, Dahl(alpha=1.0), throw=False), laws)
+    first, true, slips = comparison.models
+    assert comparison.best is true
+    assert true.density.misfit == pytest.approx(2e-4 / np.std(force), rel=0.05)
+    for other in (first, slips):
+        gain, error = true.density.gain_over(other.density)
+        assert gain > 5.0 * error > 0.0
+    size = float(np.std(X))
+    cycle = size * np.sin(np.linspace(0.0, 8.0 * np.pi, 4001))
+    closed = loop(cycle)[-1001:]
+    (key,) = (key for key in true.meaning if key.startswith("energy"))
+    lost = float(np.trapezoid(closed, cycle[-1001:]))
+    assert true.meaning[key] == pytest.approx(lost, rel=0.01)
+    assert "of the force" in comparison.headline
+
+
+def test_the_density_of_a_record_is_that_of_blocks_left_out() -> None:
+    """A spring, an offset and a drift: linear regression, repeated without each block."""
+    rng = np.random.default_rng(2)
+    force = 3.0 * X + 1e-3 * rng.standard_normal(T.size)
+    found = predictive_density(fit(Record(T, displacement=X, force=force), Spring()).optimum)
+    columns = np.column_stack([X, np.ones(T.size), T])
+    y = force / np.std(force)
+    left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+    variance = float(left @ left) / (T.size - 3)
+    for rows, density in zip(np.array_split(np.arange(T.size), 20), found.tests, strict=True):
+        others = np.delete(columns, rows, axis=0)
+        estimate = np.linalg.lstsq(others, np.delete(y, rows), rcond=None)[0]
+        own = columns[rows]
+        spread = np.eye(rows.size) + own @ np.linalg.inv(others.T @ others) @ own.T
+        normal = multivariate_normal(own @ estimate, variance * spread)
+        assert density == pytest.approx(normal.logpdf(y[rows]), rel=1e-6)

@@ -279,7 +279,7 @@ def test_free_and_fixed_reach_model_and_sensors() -> None:
         (
             lambda: TableProblem(data(), FREE).log_likelihood(np.zeros(5), 1.0),
             ValidationError,
-            "scale is given, but measured noise has a known scale",
+            "scale is given, but the noise has a known scale",
         ),
         (
             lambda: TableProblem(data(), FREE).residuals(np.zeros(4)),

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import dahl_ident as di
 from dahl_ident.errors import ValidationError
@@ -60,6 +61,16 @@ def test_intervals_by_noise_agree_where_the_problem_is_linear(
         assert ours[0] == theirs[0]
         assert abs(ours[1].lower - theirs[1].lower) < 0.35 * half
         assert abs(ours[1].upper - theirs[1].upper) < 0.35 * half
+
+
+def test_likelihood_and_criteria(fit: di.FitResult) -> None:
+    (predicted,) = fit.best_fit
+    left = TRUE + NOISE - predicted
+    density = norm(0.0, np.sqrt(np.mean(left**2))).logpdf(left).sum()
+    assert fit.log_likelihood == pytest.approx(density)
+    counted = len(fit.var_names) + 1  # the noise's scale
+    assert fit.aic == pytest.approx(2.0 * counted - 2.0 * density)
+    assert fit.bic == pytest.approx(np.log(2000.0) * counted - 2.0 * density)
 
 
 def test_profile_counts_correlated_noise() -> None:

@@ -161,10 +161,8 @@ def fit(
         place_of(save, "a fit", FORMATS)
     if predicted is not None and not record:
         raise ValidationError("--predicted is given without --record; give both, or neither")
-    _refuse_comparison(compare and record)
     read = reading.read_records if record else reading.read_either
     data = read(files, channels)
-    _refuse_comparison(compare and isinstance(data, list))
     result = fitted(data, model, estimating, predicted)
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
@@ -174,14 +172,6 @@ def fit(
         _print(result, verbose=verbose, compare=compare, of_records=isinstance(data, list))
     report_also([result], report, writing, model.metadata)
     finish(result)
-
-
-def _refuse_comparison(of_records: bool) -> None:
-    if of_records:
-        raise ValidationError(
-            "--compare is given together with --record, but compares models of tables alone; "
-            "leave it out, and fit each model to the records (hold_out() in Python)"
-        )
 
 
 def _print(result: Any, *, verbose: bool, compare: bool, of_records: bool) -> None:

@@ -22,17 +22,27 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import special
 
-from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
+from dahl_ident.diagnostics.record_sources import with_exponents
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
-from dahl_ident.elements import Damper, Element, Friction, Mass, Model, PowerDamper, Spring
+from dahl_ident.elements import (
+    Damper,
+    Element,
+    Friction,
+    Mass,
+    Model,
+    Parameter,
+    PowerDamper,
+    Spring,
+)
 from dahl_ident.elements.facts import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
-from dahl_ident.problem import TableProblem
+from dahl_ident.problem import Problem
 from dahl_ident.units import si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
@@ -57,8 +67,8 @@ class Fit(Protocol):
         """The solver's result."""
 
     @property
-    def errors(self) -> ErrorModel | None:
-        """The sources of error."""
+    def params(self) -> Mapping[str, Any]:
+        """Every parameter with its estimate, which counts every source of error."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +105,17 @@ class ComparedModel:
     @property
     def estimates(self) -> str:
         """The free parameters in one line; a number without an error is none."""
-        o = self.optimum
-        units = [p.unit for p in o.problem.parameters]
-        rows = zip(o.names, o.values.tolist(), o.stderr.values(), units, strict=True)
-        known = [f"{n} = {with_unit(v, e, unit)}" for n, v, e, unit in rows if np.isfinite(e)]
-        unknown = [name for name, error in o.stderr.items() if not np.isfinite(error)]
+        rows = [(p.name, with_unit(v, e, p.unit), np.isfinite(e)) for p, v, e in self._of_device]
+        known = [f"{name} = {text}" for name, text, is_known in rows if is_known]
+        unknown = [name for name, _, is_known in rows if not is_known]
         return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
+
+    @property
+    def _of_device(self) -> list[tuple[Parameter, float, float]]:
+        """The free parameters of the device, with value and standard error of each."""
+        o, count = self.optimum, self.optimum.problem.n_reported
+        parameters = o.problem.parameters[:count]
+        return list(zip(parameters, o.values.tolist(), o.stderr.values(), strict=False))
 
     @property
     def is_determined(self) -> bool:
@@ -108,27 +123,24 @@ class ComparedModel:
 
         Not each of a law's like parts, as Maxwell slip has them: their sums are what it says.
         """
-        o, parts = self.optimum, set[str]()
-        for element in o.problem.model.elements:
+        parts = set[str]()
+        for element in self.optimum.problem.model.elements:
             labels = {label for part in element.like_parts for label in part}
             parts |= {element.parameter(label).name for label in labels}
         return all(
             np.isfinite(value)
             and (p.name in parts or np.isfinite(error))
             and (p.name in parts or p.lower != 0.0 or error < _VAGUE * value)
-            for p, value, error in zip(
-                o.problem.parameters, o.values.tolist(), o.stderr.values(), strict=True
-            )
+            for p, value, error in self._of_device
         )
 
     @property
     def is_physical(self) -> bool:
         """Whether every exponent is near its usual range."""
-        o = self.optimum
         return all(
             p.prior is None or any(p.dimension) or not p.positive
             or p.prior[0] / _UNUSUAL < value < p.prior[1] * _UNUSUAL
-            for p, value in zip(o.problem.parameters, o.values.tolist(), strict=True)
+            for p, value, _ in self._of_device
         )  # fmt: skip
 
     @cached_property
@@ -136,7 +148,8 @@ class ComparedModel:
         """Quantities common to all laws: force limit, stiffness at zero force, energies.
 
         Of all elements with memory together: N, N/m, and joules lost in a cycle at the smallest,
-        the middle and the largest amplitude. Infinite where a law never slips.
+        the middle and the largest amplitude, of records at their rms displacements. Infinite where
+        a law never slips.
         """
         return _meaning(self.optimum.problem, parameter_values(self.optimum))
 
@@ -144,12 +157,11 @@ class ComparedModel:
     def resemblances(self) -> list[str]:
         """Which element these data cannot distinguish from a simpler one, in sentences."""
         problem, values = self.optimum.problem, parameter_values(self.optimum)
-        view, found = problem.stiffness_data, []
-        noise = self.density.misfit / np.sqrt(np.count_nonzero(view.harmonic == 1))
+        found = []
         for element in problem.model.elements:
             own = [values[p.name] for p in element.parameters]
-            known = element.resembles(own, view.amplitude, view.omega)
-            if known is not None and known[1] < _SEEN * noise:
+            known = element.resembles(own, *_levels(problem))
+            if known is not None and known[1] < _SEEN * self.density.noise:
                 found.append(
                     f"{self.name}: at these levels it differs from {known[0]} by "
                     f"{percent(known[1])} rms, too little for these data to distinguish the two."
@@ -240,6 +252,7 @@ class ModelComparison:
     def headline(self) -> str:
         """The verdict in a sentence or two."""
         first, best = self.models[0], self.best
+        output = first.optimum.problem.output_in_words
         if self.undecided:
             one, other = self.undecided
             limits = [f"{m.meaning['force limit']:.3g}" for m in self.undecided]
@@ -251,8 +264,8 @@ class ModelComparison:
         if self.undetermined is not None:
             one = self.undetermined
             return (
-                f"{one.name} would leave far less ({percent(one.density.misfit)} of the "
-                "fundamental), but these data do not determine its parameters. No model compared "
+                f"{one.name} would leave far less ({percent(one.density.misfit)} of {output}), "
+                "but these data do not determine its parameters. No model compared "
                 "is recommended."
             )
         if best is first:
@@ -260,8 +273,8 @@ class ModelComparison:
         gain, error = best.density.gain_over(first.density)
         text = (
             f"{best.name} would be better: the log density of tests left out is higher by "
-            f"{gain:.0f} ± {error:.0f}. It leaves {percent(best.density.misfit)} of the "
-            f"fundamental, and {_noise(best.optimum.problem)}."
+            f"{gain:.0f} ± {error:.0f}. It leaves {percent(best.density.misfit)} of {output}, "
+            f"and {_noise(best.optimum.problem)}."
         )
         absurd = [f"There {warning}." for warning in negative_parameters(best.optimum)]
         return " ".join([text, *absurd])
@@ -332,12 +345,17 @@ class ModelComparison:
         )
 
 
-def _meaning(problem: TableProblem, values: Mapping[str, float]) -> dict[str, float]:
+def _levels(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Return amplitudes, m, and angular frequencies, rad/s: of each row, or of each record."""
+    return problem.unit_sizes((0, 1, 0)), problem.unit_sizes((0, 0, -1))
+
+
+def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     """Return what all laws have in common at the values of the parameters, see `ComparedModel`."""
-    A = problem.stiffness_data.amplitude
-    sizes = np.geomspace(A.min(), A.max(), _LEVELS)
-    omega = np.asarray(np.exp(np.mean(np.log(problem.stiffness_data.omega))))
-    limit, stiffness, energy = 0.0, 0.0, np.zeros(_LEVELS)
+    A, rates = _levels(problem)
+    sizes = np.unique(np.geomspace(A.min(), A.max(), _LEVELS))
+    omega = np.asarray(np.exp(np.mean(np.log(rates))))
+    limit, stiffness, energy = 0.0, 0.0, np.zeros(sizes.size)
     for element in problem.model.elements:
         if not isinstance(element, Friction):
             continue
@@ -350,19 +368,19 @@ def _meaning(problem: TableProblem, values: Mapping[str, float]) -> dict[str, fl
             stiffness += contact
             energy += np.pi * sizes**2 * np.imag(element.stiffness(own, sizes, omega))
     found = {"force limit": limit, "stiffness at zero force": stiffness}
-    unit = si_unit("displacement", problem.data.motion)
+    unit = si_unit("displacement", problem.motion)
     return found | {
         f"energy a cycle at {size:.2g} {unit}": float(e)
         for size, e in zip(sizes, energy, strict=True)
     }
 
 
-def _noise(problem: TableProblem) -> str:
+def _noise(problem: Any) -> str:
     """Return how large the noise of the fundamental is, in words."""
-    rows = problem.data.harmonic == 1
-    covariance = problem.data.covariance
-    if not problem.scale_known or covariance is None:
+    covariance = problem.data.covariance if problem.scale_known else None
+    if covariance is None:
         return "how much of that is noise is not known"
+    rows = problem.data.harmonic == 1
     size = np.abs(problem.data.response[rows])
     share = np.trace(covariance[rows], axis1=1, axis2=2) / size**2
     return f"the noise is {percent(float(np.sqrt(np.mean(share))))}"
@@ -383,6 +401,7 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     ----------
     fit : FitResult
         From :func:`dahl_ident.fit`; its data, noise model, sensors and loss are used for all.
+        Of records, blocks of samples are left out, and each candidate is a search of its own.
     models : mapping of str to Element, optional
         Models to compare with, by a name for each. Left out: for a Dahl element another exponent,
         two elements, two limits (where even harmonics are given), a gap, Bouc-Wen's and Iwan's
@@ -413,11 +432,6 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
             "compare_models got several fits; it takes one, and a mapping of names to other models "
             "of its data. What changed between fits of different data is in di.report([fit, ...])"
         )
-    if not fit.optimum.problem.settled:
-        raise ValidationError(
-            "compare_models got a fit of records; it takes a fit of a table. Compare models of "
-            "records by fitting each, and by what their hold_out() says"
-        )
     if not isinstance(models, Mapping | None):
         raise ValidationError(
             f"models is a {type(models).__name__}; expected a mapping of names to models, such as "
@@ -432,19 +446,19 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     for name, (reason, model) in offered.items():
         try:
             other = _solved(optimum, model, own=models is not None)
-            fitted.append(ComparedModel(name, other, predictive_density(other), reason))
+            density = predictive_density(other, optimum)
+            fitted.append(ComparedModel(name, other, density, reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
-    stated = None
-    if fit.errors is not None:
-        values = parameter_values(optimum) | dict(fit.errors.values)
-        stated = _meaning(optimum.problem, values)
-    return ModelComparison(tuple(fitted), failed, stated)
+    stated = _meaning(optimum.problem, {name: p.value for name, p in fit.params.items()})
+    same = stated == fitted[0].meaning
+    return ModelComparison(tuple(fitted), failed, None if same else stated)
 
 
 def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
     """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
-    return solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
+    other = solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
+    return other if optimum.problem.settled else with_exponents(other)
 
 
 def _candidates(
@@ -452,24 +466,25 @@ def _candidates(
 ) -> Iterator[tuple[str, tuple[str, Element]]]:
     """Yield the name of each candidate, its reason and the model."""
     problem = optimum.problem
-    model, data = problem.model, problem.data
+    model = problem.model
     values = parameter_values(optimum)
-    misfit = f"{percent(left.misfit)} of the fundamental left"
+    misfit = f"{percent(left.misfit)} of {problem.output_in_words} left"
     if np.isfinite(left.harmonic_misfit):
         misfit += f", {percent(left.harmonic_misfit)} in harmonics"
-    smallest = float(problem.stiffness_data.amplitude.min())
+    smallest = float(_levels(problem)[0].min())
     offers: list[tuple[Element, dict[str, Alternative]]] = []
     for e in model.elements:
         own = [values[p.name] for p in e.parameters]
         known = np.all(np.isfinite(own)) and all(own[:2])
         stays = e.started(own) if np.all(np.isfinite(own)) else e
         offers.append((stays, e.alternatives(own, smallest) if known else {}))
-    shown = {
-        "shape": misfit,
-        "asymmetry": _even(optimum),
-        "speed": _falling_force(optimum),
-        "masing": _jenkins(optimum, left),
-    }
+    shown = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
+    if problem.settled:
+        shown |= {
+            "asymmetry": _even(optimum),
+            "speed": _falling_force(optimum),
+            "masing": _jenkins(optimum, left),
+        }
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
         taken = [offered[name] for _, offered in offers if name in offered]
         if len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken):
@@ -484,21 +499,22 @@ def _candidates(
                 Model(*(n for e, o in offers for n in (o[name].elements if name in o else (e,)))),
             ),
         )
-    f = data.frequency_hz
+    f, span = problem.data.frequency_hz if problem.settled else None, misfit
     added: dict[str, Element] = {}
     if not any(is_spring(e) for e in model.elements):
         added["spring added"] = Spring()
     kinds = {e.kind for e in model.elements}
     rated: tuple[Element, ...] = ()
-    several = f.max() > _RATES * f.min()
+    several = f is None or f.max() > _RATES * f.min()
     if several or optimum.loss == "linear":  # else outliers at large amplitudes look like a damper
         rated = (PowerDamper().started((_force(optimum), 0.5, 1.0)),)
     if several:  # at one frequency a mass is a spring
         rated = (Mass(), Damper(), *rated)
+    if f is not None:
+        span = f"{misfit}; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
     for element in rated:
         if element.kind not in kinds:
             added[f"{element.kind.replace('_', ' ')} added"] = element
-    span = f"{misfit}; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
     if not several:
         span = f"{misfit}; one frequency, so only the amplitude can tell"
     base = [e.started([values[p.name] for p in e.parameters]) for e in model.elements]
@@ -579,7 +595,5 @@ def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
 
 def _force(optimum: Optimum) -> float:
     """Return a tenth of the typical force, where a damper starts."""
-    view = optimum.problem.stiffness_data
-    rows = view.harmonic == 1
-    force = np.abs(view.stiffness[rows]) * view.amplitude[rows]
+    force = optimum.problem.unit_sizes((1, 0, 0))
     return 0.1 * float(np.sqrt(np.mean(force**2)))  # not the median, which may be zero

@@ -167,7 +167,7 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
         (parameter,) = element.parameters
         value, error = values[parameter.name], optimum.stderr.get(parameter.name, 0.0)
         if value < 0.0 and np.isfinite(value):
-            unit = shown_unit(parameter.unit, problem.data.motion)
+            unit = shown_unit(parameter.unit, problem.motion)
             within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
             given = parameter.name not in optimum.names
             size = f"as given: {value:g} {unit}" if given else with_unit(value, error or None, unit)

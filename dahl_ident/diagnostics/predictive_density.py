@@ -23,13 +23,16 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.estimate import tests_of
 from dahl_ident.diagnostics.mixed_model import MixedModel, State
+from dahl_ident.diagnostics.record_sources import blocks_of
 from dahl_ident.diagnostics.residual_space import orthonormal
 from dahl_ident.fitting import Optimum
+from dahl_ident.problem import RecordProblem
 
 _EXACT = 1e-5  # relative errors that count as none
 _ROUNDING = 1e-12  # variance of residuals that are none, in units of what is stated or left
 _RANK = 1e-7  # singular value of the derivatives, over the largest, that counts as none
 _LEAST_LEFT = 1e-9  # of a row's weight, that the others do not determine
+_LEAST_SHARED = 1e-6  # of a direction of the parameters outside a block, the same
 _HEAVY = 4.0  # degrees of freedom of the density with a robust loss
 
 
@@ -43,6 +46,8 @@ class PredictiveDensity:
     # fundamental; NaN where there are none
     misfit: float
     harmonic_misfit: float
+    # of an average over all fundamentals; NaN of records
+    noise: float = float("nan")
 
     @property
     def total(self) -> float:
@@ -63,8 +68,15 @@ class PredictiveDensity:
         return float(each.sum()), max(errors)
 
 
-def predictive_density(optimum: Optimum) -> PredictiveDensity:
+def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> PredictiveDensity:
     """Return the log density of every test, predicted by the model fitted to the others.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        Of the model.
+    fitted : Optimum, optional
+        The one it is compared with, which weighs the residuals of records for both.
 
     Examples
     --------
@@ -77,6 +89,8 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     >>> one.total > other.total
     True
     """
+    if not optimum.problem.settled:
+        return _of_records(optimum, (fitted or optimum).problem)
     problem, data = optimum.problem, optimum.problem.data
     test, owner = tests_of(data)
     run = np.zeros(data.n, dtype=np.intp)
@@ -116,14 +130,54 @@ def predictive_density(optimum: Optimum) -> PredictiveDensity:
     first = np.unique(test, return_index=True)[1]
     square = np.abs(missed) ** 2
     others = ~fundamental
+    misfit = float(np.sqrt(square[fundamental].mean())) if fundamental.any() else float("nan")
     return PredictiveDensity(
         tests,
         run[first],
-        float(np.sqrt(square[fundamental].mean())) if fundamental.any() else float("nan"),
+        misfit,
         float(np.sqrt(square[others].sum() / max(fundamental.sum(), 1)))
         if others.any()
         else float("nan"),
+        misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan)),
     )
+
+
+def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:
+    """Return the log density of blocks of records, residuals weighed as another problem does.
+
+    Noise is white then. A direction of the parameters that one block alone determines, such as a
+    first state, costs a sample.
+    """
+    problem: RecordProblem = optimum.problem
+    robust = optimum.loss != "linear"
+    predicted = [problem.predict(optimum.values, i) for i in range(len(problem.records))]
+    pairs = list(zip(problem.measured, predicted, strict=True))
+    left = [weighed.filtered((y - p.output) / problem.sizes[0]) for y, p in pairs]
+    y, blocks = np.concatenate(left), blocks_of(left)
+    Q = orthonormal(np.concatenate([weighed.filtered(p.by) for p in predicted]), _RANK)
+    variance = float(y @ y) / max(y.size - Q.shape[1], 1) + _EXACT**2
+    first = np.cumsum([0, *(len(e) for e in left)])
+    tests = np.empty(len(blocks))
+    for number, (record, rows) in enumerate(blocks):
+        own, e = Q[first[record] + rows], y[first[record] + rows]
+        values, vectors = np.linalg.eigh(np.eye(Q.shape[1]) - own.T @ own)
+        shared = values > _LEAST_SHARED
+        part = vectors.T[shared] @ (own.T @ e)
+        squares = float(e @ e + np.sum(part**2 / values[shared])) / variance
+        n = e.size - np.count_nonzero(~shared)
+        volume = np.log(values[shared]).sum() - n * np.log(2.0 * np.pi * variance)
+        tests[number] = _log_density(squares, float(volume), e.size, robust=robust)
+    missed = np.concatenate([y - p.output for y, p in pairs])
+    share = float(np.sqrt(np.mean(missed**2))) / problem.sizes[0]
+    run = np.array([problem.runs[record] for record, _ in blocks])
+    return PredictiveDensity(tests, np.unique(run, return_inverse=True)[1], share, float("nan"))
+
+
+def _log_density(squares: float, volume: float, size: int, *, robust: bool) -> float:
+    """Return a normal log density, or Student's where it is robust, up to a constant."""
+    if robust:
+        squares = (_HEAVY + size) * float(np.log1p(squares / _HEAVY))
+    return 0.5 * (volume - squares)
 
 
 def _parts(values: ComplexArray) -> FloatArray:
@@ -149,9 +203,8 @@ def _densities(
         rows = np.flatnonzero(test == number)
         values, vectors = np.linalg.eigh(state.block(rows))
         values = np.maximum(values, _LEAST_LEFT * state.weights[state.model.group[rows]].max())
-        loss = float(np.sum((vectors.T @ state.weighted[rows]) ** 2 / values))
-        if robust:
-            loss = (_HEAVY + len(rows)) * float(np.log1p(loss / _HEAVY))
-        volume = np.log(values).sum() - len(rows) * np.log(2.0 * np.pi)
-        found[number] = 0.5 * float(volume - loss) - float(np.log(unit[rows]).sum())
+        squares = float(np.sum((vectors.T @ state.weighted[rows]) ** 2 / values))
+        volume = float(np.log(values).sum() - len(rows) * np.log(2.0 * np.pi))
+        density = _log_density(squares, volume, len(rows), robust=robust)
+        found[number] = density - float(np.log(unit[rows]).sum())
     return found

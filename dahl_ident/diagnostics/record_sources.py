@@ -338,12 +338,20 @@ def between_blocks(
     samples = sum(e.size for e in residuals)
     if samples < BLOCKS * BLOCKS:
         return None
-    blocks = [
-        (J[rows], e[rows])
-        for J, e in zip(jacobians, residuals, strict=True)
-        for rows in np.array_split(np.arange(e.size), max(1, round(BLOCKS * e.size / samples)))
-    ]
+    blocks = [(jacobians[i][rows], residuals[i][rows]) for i, rows in blocks_of(residuals)]
     return _beyond(blocks, noise, count, _LEVEL)
+
+
+def blocks_of(waves: Sequence[FloatArray]) -> list[tuple[int, NDArray[np.intp]]]:
+    """Return the number of each block's record, and the block's samples in it."""
+    samples = sum(len(wave) for wave in waves)
+    return [
+        (number, rows)
+        for number, wave in enumerate(waves)
+        for rows in np.array_split(
+            np.arange(len(wave)), max(1, round(BLOCKS * len(wave) / samples))
+        )
+    ]
 
 
 def between_records(

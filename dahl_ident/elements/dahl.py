@@ -359,7 +359,7 @@ class Dahl(Friction):
             exponent: Alternative((changed.started((f_max, sigma, 1.0, *values[3:])),)),
             "two Dahl elements": Alternative(tuple(two)),
         }
-        if alpha.free or alpha.value != 1.0:
+        if not alpha.assumed and (alpha.free or alpha.value != 1.0):
             return found
         limits = Dahl(asymmetry=None, name=name).started((f_max, sigma, 1.0, 0.01))
         if not isinstance(self, _AsymmetricDahl):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,6 +63,8 @@ class Problem(ABC):
         The runs, of which one may be named several times.
     """
 
+    arguments: ClassVar[tuple[str, ...]]
+    """Names of those of the class, each an attribute as well."""
     model: Model
     space: Space
     motion: Motion
@@ -111,6 +113,11 @@ class Problem(ABC):
     @abstractmethod
     def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
         """Return sizes that a unit has in the data, by powers of force, displacement and time."""
+
+    @property
+    @abstractmethod
+    def output_in_words(self) -> str:
+        """What a misfit is a share of."""
 
     # Tables
 
@@ -190,6 +197,10 @@ class Problem(ABC):
         """Return theta with interchangeable elements in order, where there are some."""
         return self.space.checked(theta)
 
+    def like(self, **changes: Any) -> Self:
+        """Return this problem with some arguments of its class in place of its own."""
+        return type(self)(**{name: getattr(self, name) for name in self.arguments} | changes)
+
     def altered(self, *stale: str, **changes: Any) -> Self:
         """Return this problem with other attributes, without the `stale` ones that it computed."""
         other = copy(self)
@@ -197,6 +208,10 @@ class Problem(ABC):
             other.__dict__.pop(name, None)
         other.__dict__.update(changes)
         return other
+
+    @abstractmethod
+    def fitted(self, theta: FloatArray) -> Any:
+        """Return what should have been measured: a response, or a wave for each record."""
 
     # Residuals
 
@@ -257,6 +272,49 @@ class Problem(ABC):
     @abstractmethod
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
         """Return the sum of squared residuals of every row, (..., n), without priors, unchecked."""
+
+    @property
+    @abstractmethod
+    def log_area(self) -> Any:
+        """Return ln of the size of the residuals' units, in those of the data."""
+
+    def log_likelihood(self, theta: ArrayLike, scale: ArrayLike | None = None) -> FloatArray:
+        """Return ln of the density of the data: of Re R and Im R of every row, or of samples.
+
+        Parameters
+        ----------
+        theta : array_like, shape (P,) or (S, P)
+            Search coordinates.
+        scale : array_like, shape () or (S,), optional
+            The noise's scale, where it is unknown: standard deviation of ln gain and of phase
+            (rad) for "relative", of Re R and Im R for "absolute", of samples over `sizes` for
+            records. Left out, the scale of the highest likelihood,
+            (sum of squares / n_residuals)^(1/2), at each theta.
+
+        Returns
+        -------
+        ndarray, shape () or (S,)
+            Priors not included; -inf where the model has no prediction. All noise models give
+            densities of the same numbers, so their likelihoods compare. Where a covariance has
+            few degrees of freedom it is a likelihood up to a constant: the loss of
+            :mod:`dahl_ident.noise` in place of the sum of squares. Residuals of records count as
+            independent once they are filtered.
+
+        Raises
+        ------
+        ValidationError
+            If `scale` is given where it is known.
+        """
+        theta = self.space.checked(theta)
+        if self.scale_known and scale is not None:
+            raise ValidationError("scale is given, but the noise has a known scale; leave it out")
+        total, m = self.squares(theta).sum(axis=-1), self.n_residuals
+        s2 = np.asarray(1.0 if scale is None else scale) ** 2
+        if scale is None and not self.scale_known:
+            s2 = total / m
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result = self.log_area - 0.5 * (m * np.log(2.0 * np.pi * s2) + total / s2)
+        return np.where(np.isnan(result), -np.inf, result)[()]
 
     def information(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None

@@ -80,6 +80,7 @@ class RecordProblem(Problem):
     ('f_max', 'sigma', 'initial_force', 'offset', 'drift')
     """
 
+    arguments = ("records", "model", "output", "excitation", "calibration")
     parts = 1
     settled = False
 
@@ -190,18 +191,11 @@ class RecordProblem(Problem):
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
             parts.append(cut(thin, slice(start, start + n)))
-        return self.remade(parts)
-
-    def remade(self, records: Sequence[Record]) -> RecordProblem:
-        """Return the problem of other records, as they were measured."""
-        return RecordProblem(
-            records, self.model, output=self.output, excitation=self.excitation,
-            calibration=self.calibration,
-        )  # fmt: skip
+        return self.like(records=parts)
 
     def of(self, records: Sequence[Record]) -> RecordProblem:
         """Return the problem of other records, freed of this one's delay and noise."""
-        return self.remade(records).delayed(self.delay).without_noise(self.displacement_noise)
+        return self.like(records=records).delayed(self.delay).without_noise(self.displacement_noise)
 
     def weighted(self, whitening: FloatArray) -> RecordProblem:
         """Return the same problem with filtered residuals."""
@@ -313,6 +307,11 @@ class RecordProblem(Problem):
         """How much was measured, in words."""
         n = len(self.records)
         return f"{n} record{'s' if n > 1 else ''}, {self.n_samples} samples"
+
+    @property
+    def output_in_words(self) -> str:
+        """What a misfit is a share of: of its variation."""
+        return f"the {self.output}"
 
     @property
     def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
@@ -491,6 +490,10 @@ class RecordProblem(Problem):
         every = range(len(self.records))
         return [self.predict(values, i, derivatives=False).output for i in every]
 
+    def fitted(self, theta: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the predicted output of each record."""
+        return tuple(self.outputs(self.to_values(theta)))
+
     def split_residuals(self, values: FloatArray) -> list[FloatArray]:
         """Return measured minus predicted output of each record."""
         return [y - p for y, p in zip(self.measured, self.outputs(values), strict=True)]
@@ -567,7 +570,9 @@ class RecordProblem(Problem):
         return np.concatenate(residuals) / size, np.concatenate(jacobians) / size
 
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
-        """Return the squared residuals of all samples at theta, (P,)."""
+        """Return the squared residuals of all samples, (m,) or (S, m)."""
+        if theta.ndim > 1:
+            return np.stack([self.squares(one) for one in theta])
         places = range(len(self.records))
         return np.concatenate([self.rows(theta, i, derivatives=False)[0] ** 2 for i in places])
 
@@ -575,6 +580,11 @@ class RecordProblem(Problem):
     def rounding(self) -> FloatArray:
         """Size of residuals that may be rounding errors alone."""
         return np.asarray(self.accuracy)
+
+    @property
+    def log_area(self) -> float:
+        """Return ln of the size of the residuals' units, in that of the output."""
+        return -self.n_residuals * float(np.log(self.sizes[0]))
 
     @cached_property
     def sizes(self) -> tuple[float, ...]:

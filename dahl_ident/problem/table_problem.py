@@ -19,7 +19,7 @@ from dahl_ident.data.rows import Rows
 from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
-from dahl_ident.errors import DataError, ModelError, ValidationError, argument
+from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.noise import (
     ROUNDING,
     Measured,
@@ -103,6 +103,8 @@ class TableProblem(Problem):
     True
     """
 
+    arguments = ("data", "model", "noise", "sensors", "steady")
+    output_in_words = "the fundamental"
     _orbits: dict[int, FloatArray]
 
     def __init__(
@@ -291,11 +293,6 @@ class TableProblem(Problem):
         shooting = self._shooting if exact else None
         return Predictor(self.model, self.sensors, self.space, self._rows, shooting, self._orbits)
 
-    def like(self, **changes: Any) -> TableProblem:
-        """Return this problem with some arguments of :class:`TableProblem` in place of its own."""
-        names = ("data", "model", "noise", "sensors", "steady")
-        return TableProblem(**{name: getattr(self, name) for name in names} | changes)
-
     def assuming(self, spread: Mapping[str, float]) -> TableProblem:
         """Return the problem with given parameters free, each with its value as a prior.
 
@@ -343,6 +340,8 @@ class TableProblem(Problem):
         theta = self.space.checked(theta)
         found = self._prediction(theta, derivatives=False)
         return np.array(np.broadcast_to(found.value, self._shape(theta)))
+
+    fitted = predict
 
     def level_slope(self, theta: FloatArray) -> ComplexArray:
         """Return dR by ln of the amplitude, or of the drive where that is controlled, (n,)."""
@@ -394,6 +393,11 @@ class TableProblem(Problem):
         widths = [float(p.std()) for name, p in self.priors.items() if name.endswith("_gain")]
         known = _LOST * max(widths, default=0.0) * self.n_residuals**0.5 / ROUNDING
         return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT, known))
+
+    @property
+    def log_area(self) -> Any:
+        """Return ln of the size of the residuals' units, in those of Re R and Im R."""
+        return self._noise.log_area
 
     @property
     def accuracy(self) -> float:
@@ -564,47 +568,6 @@ class TableProblem(Problem):
         if np.ndim(scale) or scale != 1.0:
             rows /= np.asarray(scale)[..., None, None]
         return self.with_priors(rows, theta)
-
-    # Likelihood
-
-    def log_likelihood(self, theta: ArrayLike, scale: ArrayLike | None = None) -> FloatArray:
-        """Return ln of the density of the data, per unit of Re R and Im R of every row.
-
-        Parameters
-        ----------
-        theta : array_like, shape (P,) or (S, P)
-            Search coordinates.
-        scale : array_like, shape () or (S,), optional
-            The noise's scale, where it is unknown: standard deviation of ln gain and of phase
-            (rad) for "relative", of Re R and Im R for "absolute". Left out, the scale of the
-            highest likelihood, (sum of squares / 2n)^(1/2), at each theta.
-
-        Returns
-        -------
-        ndarray, shape () or (S,)
-            Priors not included; -inf where the model has no prediction. All noise models give
-            densities of the same numbers, so their likelihoods compare. Where a covariance has
-            few degrees of freedom it is a likelihood up to a constant: the loss of
-            :mod:`dahl_ident.noise` in place of the sum of squares.
-
-        Raises
-        ------
-        ValidationError
-            If `scale` is given where it is known.
-        """
-        theta = self.space.checked(theta)
-        if self.scale_known and scale is not None:
-            raise ValidationError(
-                f"scale is given, but {self.noise} noise has a known scale; leave it out"
-            )
-        total = self.squares(theta).sum(axis=-1)
-        n = self._rows.n
-        s2 = np.asarray(1.0 if scale is None else scale) ** 2
-        if scale is None and not self.scale_known:
-            s2 = total / (2.0 * n)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            result = self._noise.log_area - n * np.log(2.0 * np.pi * s2) - 0.5 * total / s2
-        return np.where(np.isnan(result), -np.inf, result)[()]
 
     def information(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None

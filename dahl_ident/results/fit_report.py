@@ -124,9 +124,8 @@ def _counted(fit: FitResult) -> str:
 
 
 def _solver(fit: FitResult) -> list[str]:
-    criteria = f"; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}" if fit.problem.settled else ""
     return [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
-        f"{fit.optimum.status.outcome}{criteria}",
+        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",
         f"sum of squares{_counted(fit)} {fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}",
     ]

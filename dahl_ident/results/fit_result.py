@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.diagnostics.bands import DerivedQuantity, ResponseBand
 from dahl_ident.diagnostics.budget import Budget
@@ -93,16 +93,14 @@ class FitResult(Result):
     log_likelihood: float = part(
         "optimum.log_likelihood",
         "Log-density of the data at the optimum, at the likeliest scale where unknown; with a "
-        "robust loss rho, that of the density proportional to exp(-rho/2). Of tables.",
+        "robust loss rho, that of the density proportional to exp(-rho/2).",
     )
     aic: float = part(
         "optimum.aic",
         "Akaike's criterion, -2 ln L + 2 k; k counts an estimated noise scale, and no parameter "
-        "whose optimum lies at infinity. Of tables.",
+        "whose optimum lies at infinity.",
     )
-    bic: float = part(
-        "optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`. Of tables."
-    )
+    bic: float = part("optimum.bic", "Schwarz's criterion, -2 ln L + k ln(ndata); k as for `aic`.")
 
     # What was fitted
 
@@ -171,11 +169,10 @@ class FitResult(Result):
         return known.verdict, known.reason
 
     @cached_property
-    def best_fit(self) -> ComplexArray:
-        """Predicted response of a table at the estimate, shape (n,)."""
+    def best_fit(self) -> Any:
+        """Prediction at the estimate: the response of each row, (n,), or a wave a record."""
         estimate = self.assessment.estimate
-        predicted: ComplexArray = estimate.problem.predict(estimate.theta)
-        return predicted
+        return estimate.problem.fitted(estimate.theta)
 
     @property
     def var_names(self) -> list[str]:

@@ -307,7 +307,7 @@ class RecordAssessment(Assessment):
         start = dict(zip(problem.names[: problem.n_reported], self.optimum.values, strict=False))
         left_out = []
         for k, (number, piece) in enumerate(pieces):
-            others = problem.remade([other for i, (_, other) in enumerate(pieces) if i != k])
+            others = problem.like(records=[other for i, (_, other) in enumerate(pieces) if i != k])
             optimum = solve(others, loss=self.optimum.loss, start=start)
             fit = RecordAssessment(with_exponents(optimum))
             band = fit.predict_record(piece, "fitted")
