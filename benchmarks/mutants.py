@@ -1,9 +1,10 @@
 """Small changes in the code that the tests should notice: which of them survive.
 
 ``python -m benchmarks.mutants --sample 150 --seed 1`` changes one operator, number or condition at
-a time in a copy of the project, runs the tests that are responsible for its room, and prints every
-change that passed them all. The changes are drawn at random from all that are possible. Names of
-rooms or files restrict the draw; ``--sample 0`` tries every change.
+a time in a copy of the project, and prints every change that its tests did not notice: those that
+are responsible for its room, of them those that execute the line. The changes are drawn at random
+from all that are possible. Names of rooms or files restrict the draw; ``--sample 0`` tries every
+change.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parent.parent
 RESPONSIBLE = {
@@ -94,37 +97,70 @@ def changes(module: str) -> list[Change]:
     return [Change(module, i) for i, node in enumerate(nodes) if _change(node)]
 
 
-def tests_of(module: str) -> list[str]:
-    """Return the responsible tests; those that name the file come first."""
-    room, stem = Path(module).parts[1], Path(module).stem
+def responsible(room: str) -> list[str]:
+    """Return the test files of a room."""
     names = [f"test_{name}.py" for name in RESPONSIBLE[room]]
-    files = {path: None for name in names for path in sorted((ROOT / "tests").glob(name))}
-    ordered = sorted(
-        files, key=lambda path: (stem not in path.read_text("utf-8"), stem not in path.stem)
-    )
-    return [str(path.relative_to(ROOT)) for path in ordered]
+    return [f"tests/{p.name}" for name in names for p in sorted((ROOT / "tests").glob(name))]
 
 
-def survivor(tree: Path, change: Change) -> str | None:
+def executed(tree: Path, rooms: Iterable[str]) -> CoverageData:
+    """Run the responsible tests once in a copy of the project; return who executes which line."""
+    settings = tree / "contexts.ini"
+    settings.write_text("[run]\ndynamic_context = test_function\nsource = dahl_ident\n", "utf-8")
+    files = {file: None for room in rooms for file in responsible(room)}
+    command = ["-m", "coverage", "run", f"--rcfile={settings}", "--data-file=contexts", "-m"]
+    status = _run(tree, [*command, "pytest", "-q", "-n", "0", *files], None)
+    if status != 0:
+        raise SystemExit("the tests fail without a change; mend them first")
+    data = CoverageData(str(tree / "contexts"))
+    data.read()
+    return data
+
+
+def tests_of(module: str, line: int, tree: Path, data: CoverageData) -> list[str]:
+    """Return the responsible tests that execute a line; those of its name come first.
+
+    All of them for what is compiled, or executed on import or by a fixture: who needs that is not
+    known.
+    """
+    room, stem = Path(module).parts[1], Path(module).stem
+    files = responsible(room)
+    contexts = data.contexts_by_lineno(str(tree / module)).get(line, [])
+    names = [name.split(".") for name in contexts if name]
+    tests = [f"tests/{file}.py::{'::'.join(test)}" for _, file, *test in names]
+    chosen = [test for test in tests if test.partition("::")[0] in files]
+    return sorted(chosen, key=lambda test: (stem not in test, test)) or files
+
+
+def _run(tree: Path, command: list[str], limit: int | None) -> int:
+    """Run Python in a copy of the project, with a limit of processor time in s."""
+    environment = os.environ | {"PYTHONPATH": str(tree), "XDG_CACHE_HOME": str(tree / "cache")}
+
+    def bound() -> None:
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+
+    return subprocess.run(
+        [sys.executable, *command, "-p", "no:cacheprovider"],
+        cwd=tree, env=environment, stdout=subprocess.DEVNULL, check=False, preexec_fn=bound,
+    ).returncode  # fmt: skip
+
+
+def survivor(tree: Path, change: Change, data: CoverageData) -> str | None:
     """Make one change in a copy of the project, run its tests; return the change if they pass."""
     source = (ROOT / change.module).read_text("utf-8")
     parsed = ast.parse(source)
     node = list(_code(parsed))[change.node]
+    line = int(node.lineno)  # type: ignore[attr-defined]  # statements and expressions have it
     _change(node)
     (tree / change.module).write_text(ast.unparse(parsed), "utf-8")
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
-    environment = os.environ | {"PYTHONPATH": str(tree), "XDG_CACHE_HOME": str(tree / "cache")}
+    tests = tests_of(change.module, line, tree, data)
     try:
-        status = subprocess.run(
-            [*command, *tests_of(change.module)],
-            cwd=tree, env=environment, stdout=subprocess.DEVNULL, check=False,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (_LIMIT, _LIMIT)),
-        ).returncode  # fmt: skip
+        status = _run(tree, ["-m", "pytest", "-x", "-q", "-n", "0", *tests], _LIMIT)
     finally:
         (tree / change.module).write_text(source, "utf-8")
     if status != 0:
         return None
-    line = int(node.lineno)  # type: ignore[attr-defined]  # statements and expressions have it
     return f"{change.module}:{line} {type(node).__name__}: {source.splitlines()[line - 1].strip()}"
 
 
@@ -153,9 +189,10 @@ def main() -> None:
         for name in _COPIED:
             copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy2
             copy(ROOT / name, tree / name)
+        data = executed(tree, {Path(change.module).parts[1] for change in drawn})
         survived = 0
         for number, change in enumerate(drawn, 1):
-            text = survivor(tree, change)
+            text = survivor(tree, change, data)
             survived += text is not None
             print(f"{number}/{len(drawn)} {text or change.module + ' noticed'}", flush=True)
     share = 100.0 * (1.0 - survived / max(len(drawn), 1))

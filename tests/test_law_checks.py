@@ -135,6 +135,7 @@ def test_the_energy_created_is_that_of_the_loop() -> None:
         ((positive("a", "N"), positive("a", "N")), "Mine declares the parameter a 2 times"),
         ((positive("a b", "N"),), "a parameter called 'a b'; expected letters, digits"),
         ((positive("name", "N"),), "a parameter called 'name'"),
+        ((positive("lambda", "N"),), "a parameter called 'lambda'; expected"),
         ((di.Parameter("a", "N", "", lower=2.0, upper=1.0),), "bounds of a are 2 and 1; expected"),
         ((di.Parameter("a", "N", "", prior=(2.0, 1.0)),), "prior of a are 2 and 1"),
         ((di.Parameter("a", "N", "", upper=-1.0, transform="log"),), "its upper bound is -1"),

@@ -51,9 +51,10 @@ class ModelOptions:
     sigma: Annotated[
         str | None, model_option("Contact stiffness, 30N/m; estimated if left out.")
     ] = None
-    alpha: Annotated[str | None, model_option("Exponent, or 'free'; 1 is assumed if left out.")] = (
-        None
-    )
+    alpha: Annotated[
+        str | None,
+        model_option("Exponent, or 'free'; if left out, it is estimated within 0.5 to 2."),
+    ] = None
     element: Annotated[list[str] | None, model_option(ELEMENT_HELP)] = None
     mass: Annotated[str | None, model_option("Add a mass: 300g, or 'free'.")] = None
     damping: Annotated[str | None, model_option("Add a damper: '0.2 N s/m', or 'free'.")] = None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from keyword import iskeyword
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -73,10 +74,12 @@ def check_declarations(law: type[Element]) -> None:
                 f"{name} declares the parameter {label} {count} times; give each its own name"
             )
     for p in declared:
-        if not (isinstance(p.name, str) and p.name.isidentifier()) or p.name in _RESERVED:
+        usable = isinstance(p.name, str) and p.name.isidentifier() and not iskeyword(p.name)
+        if not usable or p.name in _RESERVED:
             raise ValidationError(
                 f"{name} declares a parameter called {p.name!r}; expected letters, digits and "
-                f"underscores, such as 'f_max', and none of {', '.join(_RESERVED)}"
+                f"underscores, such as 'f_max', no word of Python, and none of "
+                f"{', '.join(_RESERVED)}"
             )
         for what, (low, high) in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
             if not low < high:
