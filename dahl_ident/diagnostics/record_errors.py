@@ -36,6 +36,7 @@ _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
 _DRIVE_DRAWS = 4, 16  # of the drive's noise, least and most: the latter know it to a third
 _DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
+_BENT = 6.0  # times the displacement's noise: what a second difference has by chance once in 100
 _OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
@@ -43,6 +44,7 @@ _NOT_FOUND = ", though it was not given: with another no motion was found"
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 TURNS = "displacement at turning points"
+SAMPLING = "turning points between samples"
 WINDOW = "window of differentiation"
 DISPLACEMENT_GAIN, DELAY = "displacement calibration", "delay between the channels"
 
@@ -118,7 +120,7 @@ def record_errors(
     power within its band, and makes the plant wander; a calibration error of the force scales every
     force. Noise in a measured displacement counts as far as it shifts the estimate; where the
     residuals show larger errors of the displacement at turning points, what these shift beyond
-    that.
+    that; and so does what samples miss of the turning points that lie between them.
 
     Parameters
     ----------
@@ -167,6 +169,7 @@ def record_errors(
         if problem.with_memory and not problem.displacement_noise:
             more = noise_at_turns(problem, values, jacobians, residuals)
             count(TURNS, _beyond(more, found.get(DISPLACEMENT, 0.0 * moved), covariance))
+            count(SAMPLING, _between_samples(problem, values, jacobians))
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -336,6 +339,31 @@ def _by_displacement(
         return covariance
     # rough motion looks like noise, but so much noise would leave larger residuals
     return noisier(noise * (squares / left) ** 0.5)[0]
+
+
+def _between_samples(
+    problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
+) -> FloatArray:
+    """Return the covariance of the estimate through turning points that lie between samples.
+
+    The motion is taken to turn at a sample. By how much it went farther follows from the parabola
+    through three samples, unless noise bends it as much.
+    """
+    least = _BENT * problem.estimated_noise
+    motions = []
+    for record, (x, v, a) in zip(problem.records, problem.motions, strict=True):
+        slope = np.diff(x) / np.diff(record.time)
+        before, after = slope[:-1], slope[1:]
+        bend = (after - before) / (record.time[2:] - record.time[:-2])
+        gap = np.minimum(np.diff(record.time)[:-1], np.diff(record.time)[1:])
+        turns = (before * after < 0.0) & (np.abs(bend) * gap**2 > least)
+        middle = before + bend * np.diff(record.time)[:-1]  # the slope at the middle sample
+        farther = x.copy()
+        farther[1:-1][turns] -= middle[turns] ** 2 / (4.0 * bend[turns])
+        motions.append((farther, v, a))
+    plain, other = problem.outputs(values), problem.altered(motions=tuple(motions)).outputs(values)
+    change = _change_of(problem, jacobians)([b - a for a, b in zip(plain, other, strict=True)])
+    return np.outer(change, change)
 
 
 def _change_of(
