@@ -195,11 +195,12 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
     moves = q > 0 and (e > 0 or not at.held)  # turning points of a held motion do not move
     if e == 0 and not at.held:
         y[1] = 0.0
-    rates, late = np.zeros(n), np.zeros(q)
     if moves:
         put(y, w)
         evaluate(f, signal, t, 2.0, w, at)
-        rates[:] = w[o : o + n]
+        for r in range(n):
+            w[at.jump + r] = w[o + r]
+        w[at.late : at.late + q] = 0.0
         slope, row = slope_of(e, w, at), o + m * (1 + n) + (n + e) * (1 + at.P)
         for z in range(q if slope != 0.0 else 0):
             value = 0.0
@@ -212,7 +213,7 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
                     value += w[row + 1 + chosen[z - first - 1]]
                 elif z == first and signal.sine and not at.held:
                     value += w[row] * np.cos(signal.omega * t)
-            late[z] = -value / slope
+            w[at.late + z] = -value / slope
     if e > 0:  # others may be zero here too, such as y < a and y >= a
         slope_at(f, signal, t, y, e, w, at)
         for j in range(1, 1 + at.k):
@@ -235,6 +236,6 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
         put(y, w)
         evaluate(f, signal, t, 0.0, w, at)
         for r in range(n):
-            jump = rates[r] - w[o + r]
+            jump = w[at.jump + r] - w[o + r]
             for z in range(q if jump != 0.0 else 0):
-                S[r, z] += jump * late[z]
+                S[r, z] += jump * w[at.late + z]

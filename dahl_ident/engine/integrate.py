@@ -181,7 +181,7 @@ def advance(
     sample, stuck, last = 0, 0, 0.0
     read = harmonics.size > 0
     fresh, turned, after_turn = True, True, step
-    states = np.concatenate((solved, followers)) if at.held and samples.size else solved
+    dense = at.held and samples.size > 0
     stop_of(signal, t, end, span, w, at)
     choose_branch(f, signal, t, y, w, at)
     for _ in range(_MOST + _PER_SAMPLE * samples.size):
@@ -214,7 +214,7 @@ def advance(
             if step < _SMALLEST * span:
                 return 0.0
             continue
-        error = error_of(f, states, read, signal, t, h, y, w, at) / tolerance
+        error = error_of(f, solved, followers, dense, read, signal, t, h, y, w, at) / tolerance
         factor = _GROW
         if error > 0.0:
             factor = min(_GROW, max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))))
@@ -238,7 +238,7 @@ def advance(
             if h <= 0.0 or (h > _TOGETHER * span and passed_another(which, w, at)):
                 step, last = 0.5 * where * whole, 0.0
                 continue
-            error = error_of(f, states, read, signal, t, h, y, w, at) / tolerance
+            error = error_of(f, solved, followers, dense, read, signal, t, h, y, w, at) / tolerance
             if error * tolerance > allowed and h > LOCATED * span:
                 step, last = h * max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
                 continue

@@ -70,7 +70,12 @@ FUNCTION = types.FunctionType(types.void(types.CPointer(float64)))
 NUMBERS, VECTOR, TABLE = int64[::1], float64[::1], float64[:, ::1]
 """Types of the kernels' arguments."""
 
-OPTIONS = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+OPTIONS = {
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "_nrt": False,  # counting who uses an array takes longer than to compute with it
+}
 compiled = njit(**OPTIONS)
 inlined = njit(inline="always", **OPTIONS)
 
@@ -84,7 +89,8 @@ of shape (degree + 1, n - 1).
 Layout = namedtuple(
     "Layout",
     "n k P held rated degree outputs values rates state_slopes drive_slopes solved_slopes coupling "
-    "follow follow_slopes stages last changes scale sides before output weights interval length",
+    "follow follow_slopes stages last changes scale sides before output weights jump late interval "
+    "length",
 )
 """Numbers of states, switches, parameters; then where each quantity begins in `w`."""
 
@@ -111,12 +117,14 @@ def layout(sizes, columns, degree):
     before = sides + 1 + k  # velocity and switching functions at the beginning, (1 + k)
     output = before + 1 + k  # at the beginning
     weights = output + 1  # of the stages in a polynomial's value, (s)
-    interval = weights + s  # the signal's: number, begin, end, 1 where pinned, coefficients
+    jump = weights + s  # rates before an event, (n)
+    late = jump + n  # derivatives of its time, (columns)
+    interval = late + columns  # the signal's: number, begin, end, 1 where pinned, coefficients
     length = interval + 4 + degree + 1
     return Layout(
         n, k, P, sizes[3], sizes[4], degree, outputs, values, rates, state_slopes, drive_slopes,
         solved_slopes, coupling, follow, follow_slopes, stages, last, changes, scale, sides,
-        before, output, weights, interval, length,
+        before, output, weights, jump, late, interval, length,
     )  # fmt: skip
 
 
@@ -400,20 +408,23 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
 
 
 @compiled
-def error_of(f, states, read, signal, t, h, y, w, at):
+def error_of(f, solved, followers, dense, read, signal, t, h, y, w, at):
     """Return the error of the step's polynomials, over the largest sizes.
 
     By how far a state's slope at the beginning is from the rate there: of order 6 in the step, and
     larger than the error at the step's end. The same before the first stage and the last one, which
     finds what is as short as that. Where the output is integrated, which is `read` then, by how far
-    the polynomial of its values at the stages is from it at the beginning.
+    the polynomial of its values at the stages is from it at the beginning. Followers count where
+    the polynomials are read between the stages, which is `dense` then.
     """
     largest, m = 0.0, at.n + 1 + at.k
+    R = solved.size
     for i in range(-1, CHECKED.size):
         if i >= 0:
             put_place(y, CHECKED[i], w, at)
             evaluate(f, signal, t + CHECKED[i] * h, 0.0, w, at)
-        for r in states:
+        for a in range(R + (followers.size if dense else 0)):
+            r = solved[a] if a < R else followers[a - R]
             change = -h * (w[at.outputs + r] if i >= 0 else w[at.rates + r])
             size = max(w[at.scale + r], abs(y[r]))
             for j in range(STAGES):
