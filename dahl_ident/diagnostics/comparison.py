@@ -27,7 +27,6 @@ from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
-from dahl_ident.diagnostics.record_sources import with_exponents
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.elements import (
     Damper,
@@ -457,8 +456,7 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
 
 def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
     """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
-    other = solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
-    return other if optimum.problem.settled else with_exponents(other)
+    return solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
 
 
 def _candidates(

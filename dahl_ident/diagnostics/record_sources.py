@@ -19,27 +19,20 @@ from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
-from dahl_ident.fitting.optimum import Optimum
-from dahl_ident.fitting.record_refinement import by_chance
-from dahl_ident.fitting.record_search import followed
+from dahl_ident.fitting.record_refinement import STEPS, Descent
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
 """Of all records together, from which the model error is estimated."""
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
-_LONG = 0.05  # of a step of it, beyond which slopes change
-_SHORT = 0.01  # of a step that is the last
-_STEPS = 6
-_FARTHEST = 1.0  # of the logarithm of any other value in a step
-_ROUNDS = 3  # of the exponents: each changes what is best for the delay and for the others
-_SLIGHT = 0.1  # of its standard deviation, by which an exponent need not be moved
+_LONG = 0.05  # step of an exponent's logarithm, beyond which slopes change
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
 
 @dataclass(frozen=True)
 class HeldValue:
-    """A value that the fit holds: an exponent, or the delay between the channels.
+    """An exponent that the fit holds.
 
     Attributes
     ----------
@@ -48,13 +41,11 @@ class HeldValue:
         What it is held at.
     range : tuple of float
         Where it may lie; nothing but `value` where the user stated it.
-    mean, std : float
-        What the records and its range say together, relative to `value`: of its logarithm, of a
-        delay in samples.
+    std : float
+        Of its logarithm, by the records and its range together.
     asked, by_records : float
-        What the records alone ask for, also outside the range, and its standard deviation.
-    values : ndarray, shape (P,)
-        The estimate with the value at `mean`, to first order.
+        Logarithm of what the records alone ask for, also outside the range, over `value`, and its
+        standard deviation.
     contribution : ndarray, shape (P, P)
         Covariance of the estimate through it: as if it were estimated too, and at least as much
         as what the records ask for moves the estimate.
@@ -66,11 +57,9 @@ class HeldValue:
     unit: str
     value: float
     range: tuple[float, float]
-    mean: float
     std: float
     asked: float
     by_records: float
-    values: FloatArray
     contribution: FloatArray
     assumed: bool
 
@@ -78,11 +67,6 @@ class HeldValue:
     def contradicted(self) -> bool:
         """Whether the records ask for another value."""
         return abs(self.asked) > _CONTRADICTED * self.by_records
-
-    @property
-    def estimate(self) -> float:
-        """The value that the records and its range ask for together."""
-        return self.value * float(np.exp(self.mean))
 
     @property
     def found(self) -> str:
@@ -104,8 +88,9 @@ def held_exponents(
 ) -> tuple[HeldValue, ...]:
     """Return what the records say of each exponent that the fit holds, stated or not.
 
-    Gauss-Newton steps from the estimate: one, or more where it is long. As for tables, the range
-    counts as a uniform distribution of the logarithm, and for less where the records say more.
+    By a Gauss-Newton step from the estimate, or by a search where they contradict it. As for
+    tables, the range counts as a uniform distribution of the logarithm, and for less where the
+    records say more.
 
     Parameters
     ----------
@@ -119,69 +104,61 @@ def held_exponents(
     -------
     tuple of HeldValue
     """
-    found = []
-    for parameter in problem.model.parameters:
-        if parameter.free or parameter.prior is None:
-            continue
-        try:
-            found.append(_Search(problem, parameter, values).result(jacobians, residuals))
-        except FitError:
-            continue  # no motion next to the estimate
-    return tuple(found)
-
-
-def with_exponents(optimum: Optimum) -> Optimum:
-    """Return the estimate with exponents that nobody stated where records and range have them.
-
-    The other parameters are those that go with them, so that all of them together are a model.
-    """
-    usual = {p.name: float(p.value or 1.0) for p in optimum.problem.assumed_exponents}
-    left = list(usual) * _ROUNDS
-    while left:
-        name = left.pop(0)
-        problem: RecordProblem = optimum.problem
-        places = range(len(problem.records))
-        predicted = [problem.predict(optimum.values, i) for i in places]
-        residuals = [
-            problem.filtered(y - p.output) for y, p in zip(problem.measured, predicted, strict=True)
-        ]
-        jacobians = [problem.filtered(p.by) for p in predicted]
-        (parameter,) = (p for p in problem.assumed_exponents if p.name == name)
-        try:
-            search = _Search(problem, parameter, optimum.values, usual[name])
-            one = search.result(jacobians, residuals)
-        except FitError:
-            continue  # no motion next to the estimate
-        if abs(one.mean) < _SLIGHT * one.std:
-            continue
-        held, theta = problem.with_fixed({name: one.estimate}), problem.to_search(one.values)
-        far = one.mean**2 > _SLIGHT * one.std  # beyond first order
-        there = followed(optimum, held, theta, far=far)
-        better = there.converged and _no_worse(there, optimum)
-        optimum = there if better else optimum
-        if not (far and better):
-            left = [other for other in left if other != name]
-    return optimum
-
-
-def _no_worse(there: Optimum, optimum: Optimum) -> bool:
-    """Return whether an estimate leaves no more of the records than another, beyond chance.
-
-    Nor does it where no motion is next to it, so that its errors could not be stated.
-    """
-
-    def left(of: Optimum) -> list[FloatArray]:
-        problem: RecordProblem = of.problem
-        predicted = [problem.predict(of.values, i).output for i in range(len(problem.records))]
-        parts = zip(problem.measured, predicted, problem.sizes, strict=True)
-        return [(y - output) / size for y, output, size in parts]
-
+    exponents, place = problem.exponents, len(problem.free)
     try:
-        before, after = left(optimum), left(there)
+        slopes = _exponent_slopes(problem, exponents, values)
     except FitError:
-        return False
-    sums = [sum(float(e @ e) for e in parts) for parts in (before, after)]
-    return sums[1] - sums[0] <= by_chance(0.5 * sums[0], optimum.problem.n_residuals, before)
+        return ()  # no motion next to the estimate
+    held = []
+    for p, waves in zip(exponents, slopes, strict=True):
+        joint = [np.insert(J, place, w, axis=1) for J, w in zip(jacobians, waves, strict=True)]
+        step, moved = _freed(joint, residuals, place)
+        value, limits = float(p.value or 1.0), p.prior or (1.0, 1.0)
+        low, high = (float(np.log(end / value)) for end in limits)
+        low, high = min(low, 0.0), max(high, 0.0)
+        asked, s = float(step[place]), (high - low) / 12.0**0.5
+        mean = float(np.clip(asked, low, high))
+        std, by_records, contribution = _counted(joint, residuals, place, mean, s, moved)
+        if abs(asked) > max(_LONG, _CONTRADICTED * by_records):
+            asked, by_records = _asked(problem, p.name, values) or (asked, by_records)
+        held.append(
+            HeldValue(
+                p.name, p.unit, value, limits, std, asked, by_records, contribution, p.assumed
+            )
+        )
+    return tuple(held)
+
+
+def _exponent_slopes(
+    problem: RecordProblem, exponents: Sequence[Parameter], values: FloatArray
+) -> list[list[FloatArray]]:
+    """Return the filtered derivatives of each output by the logarithm of each exponent."""
+    if not exponents:
+        return []
+    free = problem.freed([p.name for p in exponents])
+    known = {p.name: p.value for p in exponents} | dict(zip(problem.names, values, strict=True))
+    at = np.array([known[name] for name in free.names], dtype=np.float64)
+    by = [free.predict(at, number).by for number in range(len(problem.records))]
+    places = [free.names.index(p.name) for p in exponents]
+    return [[problem.filtered(at[i] * slopes[:, i]) for slopes in by] for i in places]
+
+
+def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float, float] | None:
+    """Return the logarithm of an exponent that the records ask for, over its value, and its std."""
+    free = problem.freed([name])
+    place = free.names.index(name)
+    (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
+    end = Descent("lm", "linear").descend(
+        free, free.to_search(np.insert(values, place, value)), STEPS
+    )
+    if not end.converged[0]:
+        return None
+    at = free.to_values(end.theta[0])
+    predicted = [free.predict(at, number) for number in range(len(problem.records))]
+    J = [free.filtered(p.by) for p in predicted]
+    e = [free.filtered(y - p.output) for y, p in zip(free.measured, predicted, strict=True)]
+    u = _variance(J, e, place) ** 0.5
+    return float(np.log(at[place] / value)), u / float(at[place])
 
 
 def by_delay(
@@ -222,99 +199,29 @@ def _counted(
     mean: float,
     s: float,
     moved: FloatArray,
-    usual: float = 0.0,
-) -> tuple[float, float, float, FloatArray]:
-    """Return mean and std of a held value, its std by the records alone, and what it moves.
+) -> tuple[float, float, FloatArray]:
+    """Return the std of a held value, its std by the records alone, and what it moves.
 
-    `usual` is what is known of it beforehand, `s` its standard deviation.
+    `mean` is what the records ask for, `s` the standard deviation of what is known beforehand.
     """
-    covariance, _ = sandwich(jacobians, residuals)
-    beyond = between_blocks(jacobians, residuals, covariance, place + 1)
-    u2 = float((covariance if beyond is None else covariance + beyond)[place, place])
-    if not np.isfinite(u2):
-        mean, std = usual, s
-    else:
+    u2, std = _variance(jacobians, residuals, place), s
+    if np.isfinite(u2):
         s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
         weight = s**2 / (s**2 + u2)
-        mean, std = usual + (mean - usual) * weight, (u2 * weight) ** 0.5
+        mean, std = mean * weight, (u2 * weight) ** 0.5
+    else:
+        mean = 0.0
     change = moved * max(std, abs(mean))
-    return mean, std, u2**0.5, np.outer(change, change)
+    return std, u2**0.5, np.outer(change, change)
 
 
-class _Search:
-    """The estimate with an exponent free, from where the exponent is held."""
-
-    def __init__(
-        self,
-        problem: RecordProblem,
-        parameter: Parameter,
-        values: FloatArray,
-        usual: float | None = None,
-    ) -> None:
-        self.problem, self.parameter, self.values = problem, parameter, values
-        self.default = float(parameter.value or 1.0)
-        self.usual = float(np.log((usual or self.default) / self.default))
-        self.range = parameter.prior or (self.default, self.default)
-        low, high = (np.log(end / self.default) for end in self.range)
-        self.limits = np.array([min(low, 0.0), max(high, 0.0)])
-        self.place = len(problem.free)
-
-    def result(self, jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> HeldValue:
-        """Return what the records say, given derivatives and residuals at the held value."""
-        joint = self._joint(jacobians, self.values, 0.0)
-        step, moved = _freed(joint, residuals, self.place)
-        at, asked = self.values, float(step[self.place])
-        mean = float(np.clip(asked, *self.limits))
-        if abs(mean) > _LONG:
-            at, mean, asked, joint, residuals = self._refined(step)
-            moved = (at - self.values) / mean
-        s = float(np.ptp(self.limits)) / 12.0**0.5
-        mean, std, by_records, moves = _counted(
-            joint, residuals, self.place, mean, s, moved, self.usual
-        )
-        values, p = self.values + mean * moved, self.parameter
-        return HeldValue(
-            p.name, p.unit, self.default, self.range, mean, std, asked, by_records, values, moves,
-            p.assumed,
-        )  # fmt: skip
-
-    def _refined(
-        self, step: FloatArray
-    ) -> tuple[FloatArray, float, float, list[FloatArray], list[FloatArray]]:
-        """Return values, the exponent's logarithm, derivatives and residuals after more steps.
-
-        After the logarithm within the range stands the one that the next step would lead to.
-        """
-        problem, mean, at = self.problem, 0.0, self.values
-        for _ in range(_STEPS):
-            wanted = mean + float(step[self.place])
-            after = float(np.clip(wanted, *self.limits))
-            part = (after - mean) / (wanted - mean) if wanted != mean else 1.0
-            chain = problem.space.slopes(at)
-            turn = np.delete(step, self.place) / np.where(chain == 0.0, np.inf, chain)
-            long = part * float(np.abs(turn[problem.space.relative]).max(initial=0.0))
-            if long > _FARTHEST:
-                part, after = part * _FARTHEST / long, mean + (after - mean) * _FARTHEST / long
-            at, mean = problem.to_values(problem.to_search(at) + part * turn), after
-            there = problem.with_fixed({self.parameter.name: self.default * np.exp(mean)})
-            found = [there.predict(at, i) for i in range(len(problem.records))]
-            left = [
-                problem.filtered(y - p.output) for y, p in zip(problem.measured, found, strict=True)
-            ]
-            joint = self._joint([problem.filtered(p.by) for p in found], at, mean)
-            step, _ = _freed(joint, left, self.place)
-            if abs(float(step[self.place])) < _SHORT:
-                break
-        return at, mean, mean + float(step[self.place]), joint, left
-
-    def _joint(
-        self, jacobians: Sequence[FloatArray], at: FloatArray, mean: float
-    ) -> list[FloatArray]:
-        """Return the derivatives with respect to the parameters and the exponent's logarithm."""
-        held = self.default * float(np.exp(mean))
-        slopes = self.problem.slopes_with_respect_to(self.parameter, at, held)
-        pairs = zip(jacobians, map(self.problem.filtered, slopes), strict=True)
-        return [np.insert(J, self.place, slope, axis=1) for J, slope in pairs]
+def _variance(
+    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray], place: int
+) -> float:
+    """Return the variance of one value by noise and by scatter between blocks."""
+    covariance, _ = sandwich(jacobians, residuals)
+    beyond = between_blocks(jacobians, residuals, covariance, place + 1)
+    return float((covariance if beyond is None else covariance + beyond)[place, place])
 
 
 def between_blocks(

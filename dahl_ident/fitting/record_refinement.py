@@ -1,4 +1,4 @@
-"""Gauss-Newton steps for records, and what an estimate takes out: a delay and noise."""
+"""Steps of a search of records, and what an estimate takes out: a delay and noise."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def refined(search: Descent, problem: RecordProblem, end: Minima) -> tuple[Recor
 def aligned(search: Descent, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
     """Return the estimate with the delay between the channels that the residuals ask for.
 
-    Steps of the delay with all values free, exponents that nobody stated too, as long as each
-    explains more than chance does. Where it explains little, or what remains is not noise, it may
-    as well stand for a part of what the model misses: such a delay counts as an uncertainty alone.
-    So does one beyond what channels sampled together have, such as that of a damper that the model
-    lacks. None is taken out where the user stated the delay.
+    Steps of the delay with all values free, as long as each explains more than chance does. Where
+    it explains little, or what remains is not noise, it may as well stand for a part of what the
+    model misses: such a delay counts as an uncertainty alone. So does one beyond what channels
+    sampled together have, such as that of a damper that the model lacks. None is taken out where
+    the user stated the delay.
     """
     share = 2.0 * float(plain.cost[0]) / problem.n_residuals
     if not plain.converged[0] or "delay" in problem.calibration or share < EXACT:
@@ -134,17 +134,12 @@ def weighted(
 
 def _delay_step(search: Descent, problem: RecordProblem, theta: FloatArray) -> tuple[float, float]:
     """Return the delay's Gauss-Newton step, s, and by how much the sum of squares falls."""
-    values = problem.to_values(theta)
-    held = [*problem.exponent_slopes(values), problem.delay_slopes(values)]
-    count = theta.size + len(held)
-    normal, right = np.zeros((count, count)), np.zeros(count)
-    for number, slopes in enumerate(zip(*held, strict=True)):
-        residual, jacobian = problem.rows(theta, number)
-        more = [problem.filtered(slope / -problem.sizes[number]) for slope in slopes]
-        columns = np.column_stack([jacobian, *more])
-        normal += columns.T @ columns
-        right += columns.T @ residual
-    search.evaluations += 1 + 2 * len(held)
+    residual, jacobian = problem.residuals_and_jacobian(theta)
+    waves = problem.delay_slopes(problem.to_values(theta))
+    slope = np.concatenate([problem.filtered(wave / -problem.sizes[0]) for wave in waves])
+    columns = np.column_stack([jacobian, np.pad(slope, (0, len(residual) - len(slope)))])
+    normal, right = columns.T @ columns, columns.T @ residual
+    search.evaluations += 3
     size = np.sqrt(normal.diagonal())
     size[size == 0.0] = 1.0
     inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
@@ -219,7 +214,8 @@ class Descent:
 
         With first states `bounded`, which a search from far off must not be: it would end there.
         """
-        bounds = problem.start_bounds(problem.to_values(begin[0])) if bounded else None
+        bounds = problem.step_bounds(problem.to_values(begin[0]), of_starts=bounded)
+        within = bounds if np.isfinite(bounds).any() else None
         known = bounded or problem.whitening.size > 1  # how large the noise is
         enough = (lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals) if known else None
         if self.method == "scipy":
@@ -228,21 +224,26 @@ class Descent:
             return end
         return minimise(
             lambda at, _which: self.evaluated(problem, at),
-            begin if bounds is None else np.clip(begin, *bounds),
+            np.clip(begin, *bounds),
             problem.space.relative,
             problem.n_residuals,
             tolerance_factor=LOOSE,
             enough=enough,
             steps=most,
-            bounds=bounds,
+            bounds=within,
             unseen=False,
         )
 
 
 def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
     """Return the fall of the sum of squares that one more value makes by chance."""
+    return _CONFIRMED * noise_power(cost, samples, residuals)
+
+
+def noise_power(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
+    """Return the variance of residuals as slow as those given, times what slowness makes of it."""
     slow = correlation(residuals)
-    return _CONFIRMED * 2.0 * cost / samples * (1.0 + slow) / (1.0 - slow)
+    return 2.0 * cost / samples * (1.0 + slow) / (1.0 - slow)
 
 
 def correlation(residuals: Sequence[FloatArray]) -> float:

@@ -23,6 +23,7 @@ from dahl_ident.fitting.record_refinement import (
     Descent,
     Tell,
     correlation,
+    noise_power,
     refined,
 )
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
@@ -34,6 +35,8 @@ _SHORT = {"force": 8192, "motion": 4096}  # samples with which a long record is 
 _COMPARED = 8  # steps after which starts of a driven motion are compared
 _GOOD = 0.01  # share of variance left at which no further start is tried, if it may be noise
 _SAME = 1e-3  # relative difference of the costs of one minimum
+_PRIORS = 4  # descents until the noise is known of which a prior is one more sample
+_SAME_NOISE = 1.3  # factor within which it is
 _SETTLING = 2000  # samples after which simulated noise has forgotten its start
 _MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
 
@@ -61,27 +64,8 @@ def solve_records(
             part, theta = problem, problem.to_search(values)
         at, count = part.quadratic(theta[None]), np.array([search.evaluations])
         end = Minima(theta[None], *at[::2], np.array([False]), count)
-        so_far = _optimum(part, end, 1.0, "lm", "linear")
+        so_far = RecordSearch("lm", "linear").optimum(part, end)
         raise FitInterrupted("the fit was stopped before it found a minimum", so_far) from stop
-
-
-def followed(optimum: Optimum, problem: RecordProblem, theta: FloatArray, *, far: bool) -> Optimum:
-    """Return the optimum of a problem that is near another one's, from search coordinates.
-
-    Where it is `far`, what was taken out of the records is judged again.
-    """
-    search = Descent(optimum.method, optimum.loss)
-    search.rho = loss_named(optimum.loss, problem.parts)
-    search.scale = 1.0 if search.rho is None else optimum.scale
-    if far and problem.output == "force":
-        problem = problem.without_noise(0.0)
-    if far and problem.whitening.size > 1:
-        problem = problem.weighted(np.ones(1))
-    end = search.descend(problem, theta, STEPS)
-    if far:
-        problem, end = refined(search, problem, end)
-    end = replace(end, evaluations=np.array([optimum.nfev + search.evaluations]))
-    return _optimum(problem, end, search.scale, optimum.method, optimum.loss)
 
 
 def solve_repetitions(
@@ -114,11 +98,6 @@ def solve_repetitions(
     return theta, np.sqrt(np.diagonal(optimum.covariance)) * scales / own
 
 
-def _optimum(problem: RecordProblem, end: Minima, scale: float, method: str, loss: str) -> Optimum:
-    rho = loss_named(loss, problem.parts)
-    return optima(problem, Ends(end), scale, rho, method, end.evaluations)[0]
-
-
 class RecordSearch(Descent):
     """One search, from starts to the estimate with what is taken out of the records."""
 
@@ -138,11 +117,48 @@ class RecordSearch(Descent):
         else:
             starts = _changed(started_at(problem, begin)[None], problem, start)
             end = self.best(problem, starts, steps)
-        problem, end = refined(self, problem, end)
+        problem, end = refined(self, *self.freed(problem, end))
         if self.loss != "linear":
             end = self.robust(problem, end)
+        return self.optimum(problem, end)
+
+    def optimum(self, problem: RecordProblem, end: Minima) -> Optimum:
+        """Return the optimum where a search has ended, exponents that nobody stated held there."""
+        if problem.ranges:
+            values = dict(zip(problem.names, problem.to_values(end.theta[0]), strict=True))
+            problem = problem.held({name: values.pop(name) for name in problem.ranges})
+            theta = problem.to_search(list(values.values()))[None]
+            cost, _, hessian = problem.quadratic(theta, self.scale, self.rho)
+            end = replace(end, theta=theta, cost=cost, hessian=hessian)
         end = replace(end, evaluations=np.array([self.evaluations]))
-        return _optimum(problem, end, self.scale, self.method, self.loss)
+        rho = loss_named(self.loss, problem.parts)
+        return optima(problem, Ends(end), self.scale, rho, self.method, end.evaluations)[0]
+
+    def freed(self, problem: RecordProblem, held: Minima) -> tuple[RecordProblem, Minima]:
+        """Return the estimate with exponents that nobody stated free, their ranges as priors.
+
+        A prior counts as one more sample of the residuals' noise, of which neighbours are alike.
+        The estimate stays as it was where no motion is next to it.
+        """
+        assumed = [p.name for p in problem.exponents if p.assumed]
+        exact = 2.0 * held.cost[0] < EXACT * problem.n_residuals
+        if not assumed or exact or not held.converged[0]:
+            return problem, held
+        wider, end, last = problem, held, 0.0
+        for _ in range(_PRIORS):
+            values = wider.to_values(end.theta[0])
+            residuals = wider.split_residuals(values)
+            noise = noise_power(float(end.cost[0]), problem.n_residuals, residuals) ** 0.5
+            if last / _SAME_NOISE < noise < last * _SAME_NOISE:
+                break
+            known = dict(zip(wider.names, values.tolist(), strict=True))
+            wider, last = problem.freed(assumed, noise), noise
+            known = {p.name: p.value for p in problem.exponents} | known
+            begin = wider.to_search([known[name] for name in wider.names])
+            end = self.descend(wider, begin, STEPS)
+            if not end.converged[0]:
+                return problem, held
+        return wider, end
 
     def robust(self, problem: RecordProblem, plain: Minima) -> Minima:
         """Return the end of searches with a robust loss, the noise's scale estimated with it."""

@@ -48,7 +48,7 @@ class Problem(ABC):
     priors : mapping of str to Prior
         The priors of sensor parameters that are free.
     ranges : mapping of str to (float, float)
-        Mean and standard deviation of the search coordinates of assumed parameters.
+        Mean and standard deviation of the logarithms of assumed parameters.
     scale_known : bool
         Whether the residuals have unit variance as they are.
     gaussian : bool
@@ -222,9 +222,10 @@ class Problem(ABC):
         more = np.zeros((*rows.shape[:-1], self.n_priors))
         values = self.space.to_values(theta)
         slopes = self.space.slopes(values)
-        priors, one = self.priors.items(), np.ones_like(theta)
+        priors = self.priors.items()
         known = [(name, *_normal_moments(name, prior), values, slopes) for name, prior in priors]
-        known += [(name, *moments, theta, one) for name, moments in self.ranges.items()]
+        logarithms = np.log(np.abs(values)) if self.ranges else values
+        known += [(n, *moments, logarithms, slopes / values) for n, moments in self.ranges.items()]
         for place, (name, mean, std, at, slope) in enumerate(known):
             index = self.names.index(name)
             more[..., 0, place] = (at[..., index] - mean) / std

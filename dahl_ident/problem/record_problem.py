@@ -8,7 +8,8 @@ sample, an offset and, for forces, a drift.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +20,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
-from dahl_ident.elements import Element, Friction, Parameter
+from dahl_ident.elements import Element, Friction, Model, Parameter
 from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 Output = Literal["force", "motion"]
 _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
-_EXPONENT_STEP = 0.01  # of an exponent's logarithm, for derivatives
 _DELAY_STEP = 0.02  # of a sample, for derivatives with respect to the delay
 _LEAST = 1e-300  # of a positive value that has vanished
 _VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
@@ -226,28 +226,48 @@ class RecordProblem(Problem):
     def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
         """Return the derivatives of each record's output with respect to the delay, per s."""
         step = _DELAY_STEP / self.records[0].sample_rate
-        low, high = (self.delayed(self.delay + d) for d in (-step, step))
-        return _slopes(low, high, values, step)
+        low, high = (self.delayed(self.delay + d).outputs(values) for d in (-step, step))
+        return [(b - a) / (2.0 * step) for a, b in zip(low, high, strict=True)]
 
     @property
-    def assumed_exponents(self) -> list[Parameter]:
-        """The exponents that nobody stated."""
-        return [p for p in self.model.parameters if p.assumed and p.prior is not None]
+    def exponents(self) -> list[Parameter]:
+        """The exponents that the model holds, stated or not."""
+        known = [p for p in self.model.parameters if p.prior is not None and not p.free]
+        return [p for p in known if p.positive]
 
-    def exponent_slopes(self, values: FloatArray) -> list[list[FloatArray]]:
-        """Return the derivatives of each record's output by each exponent that nobody stated."""
-        return [self.slopes_with_respect_to(p, values) for p in self.assumed_exponents]
+    def freed(self, names: Iterable[str], noise: float | None = None) -> RecordProblem:
+        """Return the same problem with some exponents free.
 
-    def slopes_with_respect_to(
-        self, parameter: Parameter, values: FloatArray, at: float | None = None
-    ) -> list[FloatArray]:
-        """Return the derivatives with respect to the logarithm of a fixed parameter, at a value."""
-        value = float(parameter.value or 1.0) if at is None else at
-        low, high = (
-            self.with_fixed({parameter.name: value * float(np.exp(d))})
-            for d in (-_EXPONENT_STEP, _EXPONENT_STEP)
-        )
-        return _slopes(low, high, values, _EXPONENT_STEP)
+        With the `noise` of the residuals their ranges are priors, and bounds.
+        """
+        chosen = {p.name: p.freed() for p in self.exponents if p.name in names}
+        ranges = {}
+        if noise is not None:
+            for name, p in chosen.items():
+                usual, (low, high) = float(p.value or 1.0), p.prior or (1.0, 1.0)
+                low, high = min(low, usual), max(high, usual)
+                ranges[name] = np.log(usual), np.log(high / low) / 12.0**0.5 / noise
+                chosen[name] = replace(p, lower=low, upper=high)
+        return self._of_model(self.model.with_parameters(chosen), ranges)
+
+    def held(self, values: Mapping[str, float]) -> RecordProblem:
+        """Return the same problem with free parameters held, as assumed ones, at some values."""
+        known = {p.name: p for p in self.model.parameters}
+        fixed = {n: replace(known[n].fixed(v), assumed=True) for n, v in values.items()}
+        return self._of_model(self.model.with_parameters(fixed), {})
+
+    def _of_model(self, model: Model, ranges: dict[str, tuple[float, float]]) -> RecordProblem:
+        """Return the same problem with other parameters of the model free."""
+        free = [p for p in model.parameters if p.free]
+        parameters = (*free, *self.parameters[self.n_reported :])
+        inside = np.array([p.name not in ranges for p in parameters])
+        space = Space(parameters, bends(free, len(parameters), self.records), inside=inside)
+        stale = ("system", "coefficients", "first", "chosen")
+        return self.altered(*stale, model=model, free=free, space=space, ranges=ranges)
+
+    def _prior_rows(self, theta: FloatArray) -> FloatArray:
+        """Return the residuals of priors, and below them their derivatives."""
+        return self.with_priors(np.zeros((1 + theta.size, 0)), theta)
 
     def differentiated_in(self, window: float) -> RecordProblem:
         """Return the same problem, displacements differentiated in a window of other length."""
@@ -433,13 +453,18 @@ class RecordProblem(Problem):
         array = np.asarray(values, dtype=np.float64)
         return self.space.to_search(np.where(self.space.positive & (array == 0.0), _LEAST, array))
 
-    def start_bounds(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return between which search coordinates friction at the first sample may lie.
+    def step_bounds(self, values: FloatArray, *, of_starts: bool) -> tuple[FloatArray, FloatArray]:
+        """Return between which search coordinates steps may lead.
 
-        These are the forces of full slip at the values. Beyond them friction falls back within a
-        small part of x_c, so that the motion hardly tells how far beyond it began.
+        Exponents with a prior stay within their ranges, and on request friction at the first sample
+        below the forces of full slip at the values. Beyond them friction falls back within a small
+        part of x_c, so that the motion hardly tells how far beyond it began.
         """
         low, high = np.full((2, values.size), np.inf) * [[-1.0], [1.0]]
+        for i in map(self.names.index, self.ranges):
+            low[i], high[i] = (end[i] for end in self.bounds())
+        if not of_starts:
+            return low, high
         of_model = zip(self.model.parameters, self.full_values(values), strict=True)
         by_name = {p.name: np.asarray(value) for p, value in of_model}
         for element in self.with_memory:
@@ -534,6 +559,11 @@ class RecordProblem(Problem):
                 gradient += jacobian.T @ (slope * residual)
                 weight = np.maximum(slope + 2.0 * curvature * z, 0.0)
                 hessian += jacobian.T @ (weight[:, None] * jacobian)
+        if self.ranges:
+            priors = self._prior_rows(theta) / size
+            cost += 0.5 * float(priors[0] @ priors[0])
+            gradient += priors[1:] @ priors[0]
+            hessian += priors[1:] @ priors[1:].T
         if not (np.isfinite(cost) and np.isfinite(hessian).all()):  # a motion beyond all bounds
             return nowhere
         far = _VANISHED * hessian.diagonal()
@@ -559,12 +589,18 @@ class RecordProblem(Problem):
     def residuals_and_jacobian(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
     ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals, (m,), and Jacobian, (m, P), of all records at theta, (P,)."""
+        """Return residuals, (m,), and Jacobian, (m, P), of all records at theta, (P,).
+
+        Those of priors, in units of the residuals, come last.
+        """
         at = self.space.checked(theta)
         try:
             rows = [self.rows(at, number) for number in range(len(self.records))]
         except FitError:
             return np.full(self.n_residuals, np.nan), np.full((self.n_residuals, at.size), np.nan)
+        if self.ranges:
+            priors = self._prior_rows(at)
+            rows.append((priors[0], priors[1:].T))
         residuals, jacobians = zip(*rows, strict=True)
         size = float(np.asarray(scale))
         return np.concatenate(residuals) / size, np.concatenate(jacobians) / size
@@ -593,11 +629,3 @@ class RecordProblem(Problem):
         if size == 0.0:
             raise DataError("the output of the records is constant; nothing can be fitted to it")
         return (size,) * len(self.records)
-
-
-def _slopes(
-    low: RecordProblem, high: RecordProblem, values: FloatArray, step: float
-) -> list[FloatArray]:
-    """Return the difference of two problems' outputs over twice the step, record by record."""
-    pairs = zip(low.outputs(values), high.outputs(values), strict=True)
-    return [(b - a) / (2.0 * step) for a, b in pairs]

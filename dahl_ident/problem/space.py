@@ -30,7 +30,7 @@ class Space:
         The P free ones.
     bends : ndarray, shape (P,), optional
         The sizes; 0 for parameters that are searched otherwise.
-    inside : bool, default False
+    inside : bool or ndarray of bool, shape (P,), default False
         Whether parameters between two finite bounds are searched by angles.
 
     Attributes
@@ -48,7 +48,7 @@ class Space:
         parameters: Sequence[Parameter],
         bends: FloatArray | None = None,
         *,
-        inside: bool = False,
+        inside: bool | NDArray[np.bool_] = False,
     ) -> None:
         self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in self.parameters)

@@ -28,7 +28,6 @@ from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.estimate import EXPONENT, with_assumed
-from dahl_ident.diagnostics.record_sources import with_exponents
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
@@ -183,8 +182,6 @@ def fit(
     try:
         with fit_progress() if progress else nullcontext() as tell:
             optimum = optimum_of(problem, tell)
-            if not problem.settled and not first_order:
-                optimum = with_exponents(optimum)
             result = FitResult(optimum, first_order=first_order)
     except FitInterrupted as stop:
         raise FitInterrupted(

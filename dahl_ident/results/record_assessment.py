@@ -34,7 +34,6 @@ from dahl_ident.diagnostics.record_errors import (
     record_errors,
     variances,
 )
-from dahl_ident.diagnostics.record_sources import with_exponents
 from dahl_ident.diagnostics.verdicts import Identifiability, ParameterVerdict, Verdict
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError
@@ -309,7 +308,7 @@ class RecordAssessment(Assessment):
         for k, (number, piece) in enumerate(pieces):
             others = problem.like(records=[other for i, (_, other) in enumerate(pieces) if i != k])
             optimum = solve(others, loss=self.optimum.loss, start=start)
-            fit = RecordAssessment(with_exponents(optimum))
+            fit = RecordAssessment(optimum)
             band = fit.predict_record(piece, "fitted")
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
             first, last = float(piece.time[0]), float(piece.time[-1])
