@@ -65,7 +65,7 @@ NOISE_MODELS = ("measured", "relative", "absolute")
 ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
 _AMPLITUDE_STEPS = 40  # a limit for iterations that do not settle
-_AMPLITUDE_TOLERANCE = 1e-10  # of the amplitude's standard deviation
+_AMPLITUDE_TOLERANCE = 1e-7  # of its standard deviation; residuals err by less than the square
 
 
 class Noise(ABC):

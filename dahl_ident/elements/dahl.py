@@ -32,6 +32,7 @@ from dahl_ident.elements.facts import (
     Asymptote,
     Combination,
     HistoryGradient,
+    Orders,
     Path,
     Sine,
     StiffnessGradient,
@@ -200,7 +201,6 @@ class Dahl(Friction):
         every = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
         return {name: every[name][()] for name in chosen}
 
-    @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 at `values` (f_max, sigma, alpha), unchecked.
 
@@ -208,31 +208,48 @@ class Dahl(Friction):
         zero, which no estimate uses.
         """
         f_max, sigma, alpha = values
-        beta, k = sigma * sine.amplitude / f_max, int(sine.harmonic)
-        linear = bool(np.equal(alpha, 1.0).all())
+        if bool(np.equal(alpha, 1.0).all()):
+            return self._settled_linear(values, sine, derivatives)
+        beta, k = sigma * sine.amplitude / f_max, sine.harmonic
         if not derivatives:
-            if linear and k == 1:
+            return StiffnessGradient(sigma * general_dahl.stiffness(beta, alpha, k), _NONE, ())
+        if derivatives == 1:
+            h, by_f_max = general_dahl.stiffness_slope(beta, alpha, k)
+            return StiffnessGradient(sigma * h, _by_amplitude(values, beta, k, by_f_max), ())
+        return self._scaled(values, sine, *general_dahl.stiffness_gradient(beta, alpha, k))
+
+    @each_harmonic
+    def _settled_linear(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        f_max, sigma, alpha = values
+        beta, k = sigma * sine.amplitude / f_max, int(sine.harmonic)
+        if not derivatives:
+            if k == 1:
                 h = linear_dahl.describing_function(beta)
-            elif linear:
-                h = _per(linear_dahl.harmonic(beta, k), beta)
             else:
-                h = general_dahl.stiffness(beta, alpha, k)
+                h = _per(linear_dahl.harmonic(beta, k), beta)
             return StiffnessGradient(sigma * h, _NONE, ())
-        by_alpha = None
-        if linear and k == 1:
+        if k == 1:
             h, by_f_max, by_sigma = linear_dahl.describing_function_gradient(beta)
-        elif linear:
+        else:
             c, rise = linear_dahl.harmonic_gradient(beta, k)
             h, by_f_max, by_sigma = _per(c, beta), _per(c - rise, beta), _per(rise, beta)
-        else:
-            h, by_f_max, by_sigma, by_alpha = general_dahl.stiffness_gradient(beta, alpha, k)
-        by_amplitude = _by_amplitude(values, beta, k, by_f_max)
         if derivatives == 1:
-            return StiffnessGradient(sigma * h, by_amplitude, ())
-        if not self.parameters[2].free:
-            by_alpha = np.zeros(h.shape, dtype=np.complex128)
-        elif by_alpha is None:
+            return StiffnessGradient(sigma * h, _by_amplitude(values, beta, k, by_f_max), ())
+        by_alpha = np.zeros(h.shape, dtype=np.complex128)
+        if self.parameters[2].free:
             by_alpha = general_dahl.stiffness_gradient(beta, alpha, k)[3]
+        return self._scaled(values, sine, h, by_f_max, by_sigma, by_alpha)
+
+    @staticmethod
+    def _scaled(
+        values: Values, sine: Sine, h: ComplexArray, by_f_max: ComplexArray,
+        by_sigma: ComplexArray, by_alpha: ComplexArray,
+    ) -> StiffnessGradient:  # fmt: skip
+        """Return the stiffness from that over sigma, and its derivatives from those over sigma."""
+        f_max, sigma, _ = values
+        by_amplitude = _by_amplitude(
+            values, sigma * sine.amplitude / f_max, sine.harmonic, by_f_max
+        )
         by = (sigma / f_max * by_f_max, by_sigma, sigma * by_alpha)
         return StiffnessGradient(sigma * h, by_amplitude, by)
 
@@ -435,7 +452,7 @@ def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:
 
 
 def _by_amplitude(
-    values: Values, beta: FloatArray, harmonic: int, by_ln_f_max: ComplexArray
+    values: Values, beta: FloatArray, harmonic: Orders, by_ln_f_max: ComplexArray
 ) -> ComplexArray:
     """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
     f_max, sigma, _ = values
@@ -446,12 +463,14 @@ def _by_amplitude(
     return slope
 
 
-def _slope_at_rest(values: Values, harmonic: int, shape: tuple[int, ...]) -> ComplexArray:
+def _slope_at_rest(values: Values, harmonic: Orders, shape: tuple[int, ...]) -> ComplexArray:
     """Return dN/dA at A = 0: the loss grows in proportion to A (Rayleigh), the stiffness does not.
 
     N_k/sigma -> j 4 alpha beta / (pi k (4 - k^2)) for odd k.
     """
     f_max, sigma, alpha = values
-    loss = 4.0 * alpha * sigma**2 / f_max / (np.pi * harmonic * (4 - harmonic**2))
-    slope = 1j * loss if harmonic % 2 else np.zeros(())
+    odd = np.asarray(harmonic) % 2 == 1
+    k = np.where(odd, harmonic, 1)
+    loss = 4.0 * alpha * sigma**2 / f_max / (np.pi * k * (4 - k**2))
+    slope = np.where(odd, 1j * loss, 0.0)
     return np.broadcast_to(slope, shape).astype(np.complex128)

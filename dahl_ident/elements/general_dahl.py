@@ -51,6 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements.facts import Orders
 
 _LEAST_BETA = 1e-200
 """Smaller loops are computed as one of this size, whose curvature underflows to zero."""
@@ -58,11 +59,14 @@ _LEAST_BETA = 1e-200
 _DEEPEST = 44.0
 """Integrals over l end here: exp(-44) is nothing, even over a root where slip sets in."""
 
+_COUNTS = 1, 2, 4
+"""Of what is returned with 0, 1 and 2 derivatives."""
+
 _NODES_PER_BLOCK = 8192
 """Nodes in work at once, so that the scratch arrays stay small and in the cache."""
 
 
-def stiffness(beta: FloatArray, alpha: FloatArray, k: int = 1) -> ComplexArray:
+def stiffness(beta: FloatArray, alpha: FloatArray, k: Orders = 1) -> ComplexArray:
     """Return h_k = N_k/sigma = c_k/beta (Eqns. 51 and 52, for any exponent); 0 for even k.
 
     Parameters
@@ -71,19 +75,19 @@ def stiffness(beta: FloatArray, alpha: FloatArray, k: int = 1) -> ComplexArray:
         sigma A / f_max >= 0; unchecked, broadcast with `alpha`.
     alpha : ndarray
         Exponent of Eqn. 2, > 0; unchecked.
-    k : int, default 1
-        Harmonic.
+    k : int or ndarray of int, default 1
+        Harmonic; broadcast with `beta`.
 
     Examples
     --------
     >>> stiffness(np.array([0.0, 1.0]), np.array(2.0)).round(6)
     array([1.      +0.j      , 0.544039+0.354193j])
     """
-    return _by_blocks(beta, alpha, k, derivatives=False)[0]
+    return _by_blocks(beta, alpha, k, 0)[0]
 
 
 def stiffness_gradient(
-    beta: FloatArray, alpha: FloatArray, k: int = 1
+    beta: FloatArray, alpha: FloatArray, k: Orders = 1
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
     """Return h_k and, over sigma, dN_k/d ln f_max, dN_k/d ln sigma and dN_k/d alpha.
 
@@ -95,8 +99,16 @@ def stiffness_gradient(
     >>> bool(abs(by_f_max + by_sigma - h) < 1e-15)  # N is homogeneous in f_max, sigma at fixed A
     True
     """
-    h, by_ln_f_max, by_ln_sigma, by_alpha = _by_blocks(beta, alpha, k, derivatives=True)
+    h, by_ln_f_max, by_ln_sigma, by_alpha = _by_blocks(beta, alpha, k, 2)
     return h, by_ln_f_max, by_ln_sigma, by_alpha
+
+
+def stiffness_slope(
+    beta: FloatArray, alpha: FloatArray, k: Orders = 1
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return h_k and, over sigma, dN_k/d ln f_max; see :func:`stiffness_gradient`."""
+    h, by_ln_f_max = _by_blocks(beta, alpha, k, 1)
+    return h, by_ln_f_max
 
 
 def turning_force(beta: FloatArray, alpha: FloatArray) -> FloatArray:
@@ -168,14 +180,17 @@ def quadrature_rule(k: int) -> Rule:
 
 
 def _stiffness(
-    beta: FloatArray, alpha: FloatArray, k: int, *, derivatives: bool
+    beta: FloatArray, alpha: FloatArray, k: NDArray[np.int64], derivatives: int
 ) -> tuple[ComplexArray, ...]:
-    """Return h_k of the falling half of loops, (loops, 1), and its derivatives if asked for."""
+    """Return h_k of the falling half of loops, (loops, 1), and its derivatives if asked for.
+
+    1: that with respect to ln f_max; 2: also those with respect to ln sigma and alpha.
+    """
     beta = np.maximum(beta, _LEAST_BETA)
     p, path, length = _close_loop(beta, alpha)
     log_z0 = np.log1p(np.tanh(length / 2.0))
     line = np.exp(alpha * (log_z0 - length))  # C
-    rule = quadrature_rule(k)
+    rule = quadrature_rule(int(k.max(initial=1)))
     reach = np.minimum(length, _DEEPEST)
     depth = reach * rule.rise  # l
     rest = (length - reach) + reach * rule.fall
@@ -187,7 +202,7 @@ def _stiffness(
     curved = z * -np.expm1(-alpha * rest)
     sin = 2.0 * np.sqrt(sin2 * cos2)
     sin_k, cos_k = sin, 1.0 - 2.0 * sin2
-    if k > 1:
+    if (k > 1).any():
         theta = 2.0 * np.arctan2(np.sqrt(sin2), np.sqrt(cos2))
         sin_k, cos_k = np.sin(k * theta), np.cos(k * theta)
     scale = reach / np.pi
@@ -198,7 +213,7 @@ def _stiffness(
         return np.asarray(scale * total / beta)
 
     bent = integral(sin_k * curved, cos_k * curved) / k
-    spring: ComplexArray = np.asarray((line if k == 1 else 0.0 * line) + 0j)
+    spring: ComplexArray = np.where(k == 1, line, 0.0) + 0j
     if not derivatives:
         return (spring + bent,)
 
@@ -212,6 +227,8 @@ def _stiffness(
     # of c_k without C beta; the integral of exp(-j k theta) dtheta is -2j/k
     tilt = 4j / (np.pi * k) * (line * beta * np.tanh(alpha * length / 2.0) / beta)
     by_ln_beta = moved((turn - sin2) * curved) + tilt
+    if derivatives == 1:
+        return spring + bent, bent - by_ln_beta
     finite = np.where(np.isinf(length), 0.0, length)
     whole = turn * (log_z0 + finite * _log_slope(p * finite))
     by_alpha = moved((whole - sin2 * (log_z0 + depth * _log_slope(p * depth))) * z)
@@ -228,16 +245,22 @@ def _log_slope(u: FloatArray) -> FloatArray:
 
 
 def _by_blocks(
-    beta: FloatArray, alpha: FloatArray, k: int, *, derivatives: bool
+    beta: FloatArray, alpha: FloatArray, k: Orders, derivatives: int
 ) -> list[ComplexArray]:
-    """Return what :func:`_stiffness` gives for all loops, a block of loops at a time."""
-    beta, alpha = np.broadcast_arrays(beta, alpha)
-    if k % 2 == 0:
-        return [np.zeros(beta.shape, dtype=np.complex128) for _ in range(4)]
-    b, a = beta.reshape(-1, 1), alpha.reshape(-1, 1)
-    rows = max(1, _NODES_PER_BLOCK // quadrature_rule(k).rise.size)
-    blocks = [
-        _stiffness(b[i : i + rows], a[i : i + rows], k, derivatives=derivatives)
-        for i in range(0, max(1, b.size), rows)
-    ]
-    return [np.concatenate(pieces).reshape(beta.shape) for pieces in zip(*blocks, strict=True)]
+    """Return what :func:`_stiffness` gives for all loops, a block of loops at a time.
+
+    A block has the nodes of its highest harmonic; even harmonics are zero.
+    """
+    shape = np.broadcast_shapes(beta.shape, alpha.shape, np.shape(k))
+    b, a = (np.broadcast_to(v, shape).reshape(-1, 1) for v in (beta, alpha))
+    order = np.broadcast_to(np.asarray(k), shape).reshape(-1, 1)
+    odd = np.flatnonzero(order % 2)
+    odd = odd[np.argsort(order[odd, 0], kind="stable")]
+    rows = max(1, _NODES_PER_BLOCK // quadrature_rule(int(order.max(initial=1))).rise.size)
+    whole = [np.zeros(b.size, dtype=np.complex128) for _ in range(_COUNTS[derivatives])]
+    for i in range(0, odd.size, rows):
+        some = odd[i : i + rows]
+        pieces = _stiffness(b[some], a[some], order[some], derivatives)
+        for target, piece in zip(whole, pieces, strict=True):
+            target[some] = piece[:, 0]
+    return [target.reshape(shape) for target in whole]

@@ -53,6 +53,7 @@ from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
 _STEPS = 80  # of a search; ten are the rule
 _BRIEF = 30  # steps where no limit counts
+_SLIGHT = 1e-5  # fall of the cost, over that of one residual, that is not worth a step there
 _FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
 _PATIENCE = 1000  # steps where friction is so faint that each takes little
 _AT_LIMIT = 1e4  # tolerance factor: so far out, large terms cancel
@@ -292,14 +293,17 @@ class TableSearch:
         return optima(self.problem, ends[-1], scale, self.loss, self.method, evaluations)
 
     def _search(self, begin: Starts, scale: float) -> Ends:
+        coarser, near = self.problem.coarser(), begin
+        several = len(begin.table) > self.problem.n_tables
+        if coarser is not self.problem and (several or not self.limits):
+            search = TableSearch(
+                coarser, self.loss, self.method, self.tolerance, limits=self.limits
+            )
+            near = Starts(np.arange(self.problem.n_tables), search._descend(begin, scale).theta)
+        ends = Ends(self._descend(near, scale))
         if not self.limits:
-            return Ends(self._descend(begin, scale, steps=_BRIEF))
-        coarser = self.problem.coarser()
-        if coarser is not self.problem and len(begin.table) > self.problem.n_tables:
-            search = TableSearch(coarser, self.loss, self.method, self.tolerance)
-            tables = np.arange(self.problem.n_tables)
-            begin = Starts(tables, search._descend(begin, scale).theta)
-        ends = Ends(self._descend(begin, scale))
+            return ends
+        begin = near if self.problem.is_exact else begin  # whose searches far out cost too much
         doubtful = ~ends.minima.converged | (self._friction_error(ends, scale) > DOUBTFUL)
         if doubtful.any() and self.problem.is_exact:
             self._look_wider_by_sine(ends, begin, scale, np.flatnonzero(doubtful))
@@ -327,7 +331,7 @@ class TableSearch:
         chart: Chart | None = None,
         *,
         limit: bool = False,
-        steps: int = _STEPS,
+        steps: int | None = None,
     ) -> Minima:
         """Return the best end of each table's searches, by phi in a chart where one is given."""
         problem, loss, S = self.problem, self.loss, self.problem.n_tables
@@ -377,7 +381,8 @@ class TableSearch:
             inside=None if limit else inside,
             owner=begin.table,
             tolerance_factor=_AT_LIMIT if limit else self.tolerance,
-            steps=steps,
+            enough=None if self.limits else lambda cost: _SLIGHT * cost / self.m,
+            steps=steps or (_STEPS if self.limits else _BRIEF),
             accuracy=problem.accuracy,
             bounds=problem.bounds() if self.bounded and chart is None else None,
         )

@@ -33,6 +33,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.quantities import DEFINITIONS, power_of_s
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
+from dahl_ident.elements.facts import Sine
 from dahl_ident.errors import DataError, argument
 from dahl_ident.problem.space import Space
 from dahl_ident.problem.steady_rows import SteadyRows
@@ -77,7 +78,7 @@ class Nearby:
         self,
         theta: FloatArray,
         *,
-        derivatives: bool = True,
+        derivatives: int = 2,
         amplitude_error: FloatArray | None = None,
     ) -> Prediction:
         """Return what a predictor returns."""
@@ -240,11 +241,12 @@ class Predictor:
         self,
         theta: FloatArray,
         *,
-        derivatives: bool = True,
+        derivatives: int = 2,
         amplitude_error: FloatArray | None = None,
     ) -> Prediction:
         """Return the response and its derivatives at search coordinates, (P,) or (S, P).
 
+        With as many `derivatives` as are asked for: 0 none, 1 that with respect to ln A, 2 all.
         `amplitude_error` is the error of ln A, or of ln of the drive where that is controlled:
         the true one is the measured one over its exponential.
         """
@@ -271,7 +273,7 @@ class Predictor:
         self,
         group: _Group,
         values: list[FloatArray],
-        derivatives: bool,
+        derivatives: int,
         amplitude_error: FloatArray | None,
     ) -> Prediction:
         own, sensed = values[:-3], values[-3:]
@@ -297,7 +299,7 @@ class Predictor:
         self,
         group: _Group,
         values: list[FloatArray],
-        derivatives: bool,
+        derivatives: int,
         amplitude_error: FloatArray | None,
     ) -> Prediction:
         """Return the response by the describing function; it has no harmonics of the motion."""
@@ -311,9 +313,8 @@ class Predictor:
         if not derivatives:
             Z = self._model.stiffness(own, amplitude, group.omega, harmonic)
             return Prediction(factor * _where(found, Z) ** self._exponent, [], _NONE)
-        Z, by_amplitude, by_parameter = self._model.stiffness_gradient(
-            own, amplitude, group.omega, harmonic
-        )
+        sine = Sine(amplitude, group.omega, harmonic)
+        Z, by_amplitude, by_parameter = self._model.settled(own, sine, derivatives)
         Z = _where(found, Z)
         by_ln_amplitude = amplitude * by_amplitude
         response = factor * Z if self._exponent == 1 else factor / Z
@@ -321,14 +322,14 @@ class Predictor:
         stretch = 1.0 / (1.0 + (by_ln_amplitude / Z).real) if group.forced else None
         changes = []
         for (index, _), value, d in zip(self._slots, own, by_parameter, strict=False):
-            if index is None:
+            if index is None or derivatives < 2:
                 continue
             change = d * value if self._space.positive[index] else d
             if stretch is not None:
                 change = change - by_ln_amplitude * ((change / Z).real * stretch)
             changes.append(slope * change)
         by_level = slope * by_ln_amplitude * (1.0 if stretch is None else stretch)
-        if not self._neutral:
+        if not self._neutral and derivatives > 1:
             changes += self._sensor_changes(group, response, by_level)
         return Prediction(response, changes, by_level)
 
@@ -337,7 +338,7 @@ class Predictor:
         group: _Group,
         rows: SteadyRows,
         values: list[FloatArray],
-        derivatives: bool,
+        derivatives: int,
         error: FloatArray | None,
     ) -> Prediction:
         """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X_k)^q."""
@@ -347,18 +348,18 @@ class Predictor:
             sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         free = [i for i, (index, _) in enumerate(self._slots[:-3]) if index is not None]
-        motion = rows.at(own, drive, free if derivatives else [])
+        motion = rows.at(own, drive, free if derivatives > 1 else [])
         response = factor * (motion.displacement / drive) ** -self._exponent
         if not derivatives:
             return Prediction(response, [], _NONE)
         slope = factor / drive if self._exponent == -1 else -response / motion.displacement
         changes = []
-        for place, i in enumerate(free):
+        for place, i in enumerate(free if derivatives > 1 else []):
             positive = self._space.positive[self._slots[i][0]]
             change = motion.by_parameter[..., place]
             changes.append(slope * (change * own[i] if positive else change))
         by_level = slope * drive * motion.by_drive + self._exponent * response
-        if not self._neutral:
+        if not self._neutral and derivatives > 1:
             changes += self._sensor_changes(group, response, by_level)
         return Prediction(response, changes, by_level)
 

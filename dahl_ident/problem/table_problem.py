@@ -158,6 +158,8 @@ class TableProblem(Problem):
         self.priors: dict[str, Prior] = sensors.priors
         self.ranges: dict[str, tuple[float, float]] = {}
 
+    _coarse = False  # whether measured amplitudes are taken as they are
+
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
         self._predictor: Predictor | Nearby = self._predicting(exact=self.is_exact)
@@ -256,11 +258,15 @@ class TableProblem(Problem):
         return other
 
     def coarser(self) -> Self:
-        """Return a problem that costs less and predicts nearly the same; itself where none does."""
+        """Return a problem that costs less and has nearly the same optimum; else itself.
+
+        Measured amplitudes are taken as they are; their noise counts to first order.
+        """
         model = self.model.coarser() if self.is_exact else self.model
-        if model is self.model:
+        if model is self.model and getattr(self._noise, "amplitude", None) is None:
             return self
         other = self.altered("stiffness_data", "obstacle_to_exact", "_shooting", model=model)
+        other._coarse = True
         other._set_rows(self._rows, self.noise)
         return other
 
@@ -338,17 +344,17 @@ class TableProblem(Problem):
             Sensors included; NaN where a driven plant has no steady amplitude.
         """
         theta = self.space.checked(theta)
-        found = self._prediction(theta, derivatives=False)
+        found = self._prediction(theta)
         return np.array(np.broadcast_to(found.value, self._shape(theta)))
 
     fitted = predict
 
     def level_slope(self, theta: FloatArray) -> ComplexArray:
         """Return dR by ln of the amplitude, or of the drive where that is controlled, (n,)."""
-        slope = self._prediction(theta, derivatives=True).by_ln_amplitude
+        slope = self._prediction(theta, 2).by_ln_amplitude
         return np.array(np.broadcast_to(slope, self._shape(theta)))
 
-    def _prediction(self, theta: FloatArray, *, derivatives: bool) -> Prediction:
+    def _prediction(self, theta: FloatArray, derivatives: int = 0) -> Prediction:
         """Return the prediction; judging asks for that at one theta many times."""
         if theta.ndim > 1:
             return self._predictor(theta, derivatives=derivatives)
@@ -364,7 +370,7 @@ class TableProblem(Problem):
     def prediction_and_jacobian(self, theta: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return R, shape (n,) or (S, n), and dR/dtheta, (n, P) or (S, n, P)."""
         theta = self.space.checked(theta)
-        found, shape = self._prediction(theta, derivatives=True), self._shape(theta)
+        found, shape = self._prediction(theta, 2), self._shape(theta)
         changes = [np.broadcast_to(d, shape) for d in found.changes]
         return np.array(np.broadcast_to(found.value, shape)), np.stack(changes, axis=-1)
 
@@ -480,18 +486,22 @@ class TableProblem(Problem):
             if isinstance(noise, Measured):
                 y, changes = self._whitened_by_covariance(noise, theta, derivatives)
                 return bend(y, changes, self._tail) if tails and self._tail else (y, changes)
-            predicted, by, _ = self._prediction(theta, derivatives=derivatives)
+            predicted, by, _ = self._prediction(theta, 2 * derivatives)
             return noise.residual(predicted), [noise.change(predicted, d) for d in by]
 
     def _whitened_by_covariance(
         self, noise: Measured, theta: FloatArray, derivatives: bool
     ) -> tuple[ComplexArray, list[ComplexArray]]:
         if noise.amplitude is None:
-            predicted, by, _ = self._prediction(theta, derivatives=derivatives)
+            predicted, by, _ = self._prediction(theta, 2 * derivatives)
             return noise.residual(predicted), [noise.change(predicted, d) for d in by]
+        if self._coarse:
+            predicted, by, slope = self._prediction(theta, 1 + derivatives)
+            whiten = noise.amplitude.whitening(noise.covariance, slope)
+            return whiten(noise.response - predicted), [-whiten(d) for d in by]
 
         def value_and_slope(error: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-            value, _, slope = self._predictor(theta, amplitude_error=error)
+            value, _, slope = self._predictor(theta, derivatives=1, amplitude_error=error)
             return value, slope
 
         y, whiten, error = correct_amplitude(noise, noise.amplitude, value_and_slope)
@@ -522,7 +532,7 @@ class TableProblem(Problem):
         noise = self._noise
         with np.errstate(divide="ignore", invalid="ignore"):
             if isinstance(noise, Measured) and noise.amplitude is not None:
-                slope = self._prediction(theta, derivatives=True).by_ln_amplitude
+                slope = self._prediction(theta, 2).by_ln_amplitude
                 by = -noise.amplitude.whitening(noise.covariance, slope)(change)
             else:
                 by = noise.change(self.predict(theta), change)

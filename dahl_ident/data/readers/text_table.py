@@ -434,11 +434,18 @@ def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] 
     columns: list[NDArray[Any]] = []
     for i, column in enumerate(zip(*rows, strict=True)):
         cells = [cell.strip() for cell in column]
-        if str(i) not in texts and all(map(_INTEGER.fullmatch, cells)):
+        plain = cells == list(column)
+        if str(i) in texts:
+            if not plain or any(cell[:1] == "'" for cell in cells):
+                return None
+            columns.append(words(cells))
+        elif all(map(_INTEGER.fullmatch, cells)):
             columns.append(np.array([int(cell) for cell in cells]))
-        elif str(i) not in texts and all(map(_FLOAT.fullmatch, cells)):
+        elif all(map(_FLOAT.fullmatch, cells)):
             columns.append(np.array([float(cell) for cell in cells]))
-        elif cells == list(column) and all(map(_WORD.fullmatch, cells)):
+        elif plain and {*cells} <= {"True", "False"}:
+            columns.append(np.array([cell == "True" for cell in cells]))
+        elif plain and all(map(_WORD.fullmatch, cells)):
             columns.append(words(cells))
         else:
             return None
