@@ -218,3 +218,22 @@ def test_the_density_of_a_record_is_that_of_blocks_left_out() -> None:
         spread = np.eye(rows.size) + own @ np.linalg.inv(others.T @ others) @ own.T
         normal = multivariate_normal(own @ estimate, variance * spread)
         assert density == pytest.approx(normal.logpdf(y[rows]), rel=1e-6)
+
+
+def test_a_power_damper_is_found_where_dahl_alone_slips_at_once() -> None:
+    """Friction small against a damper of exponent 0.47, as of magneto-rheological dampers."""
+    rng = np.random.default_rng(2)
+    A, f = np.geomspace(5.7e-3, 12.6e-3, 20), np.tile([0.84, 1.0, 1.2, 0.9], 5)
+    law = Dahl(23.0, 1700.0, alpha=1.0) + PowerDamper(380.0, 0.47)
+    noise = np.exp(0.01 * (rng.standard_normal(20) + 1j * rng.standard_normal(20)))
+    data = FrequencyResponse(f, law.dynamic_stiffness(A, 2 * np.pi * f) * noise, amplitude=A)
+    compared = compare_models(fit(data, Dahl(), throw=False))
+    assert compared.best.name == "power damper added"
+    values = dict(zip(compared.best.optimum.names, compared.best.optimum.values, strict=True))
+    assert values["exponent"] == pytest.approx(0.47, abs=0.1)
+    assert compared.best.density.misfit < 0.02
+    rates = [m for m in compared.models if "Bouc-Wen" in m.name]
+    assert all(abs(v) < 1e8 for m in rates for v in m.optimum.values)  # not 1e13 per metre
+    again = compare_models(fit(data, Dahl() + PowerDamper(), throw=False))
+    assert again.best is again.models[0]
+    assert "share the parameter names exponent" in str(again)

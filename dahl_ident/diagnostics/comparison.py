@@ -118,7 +118,7 @@ class ComparedModel:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the data determine every parameter, to a factor those that are above zero.
+        """Whether the data determine every parameter to a factor, or how near to zero it is.
 
         Not each of a law's like parts, as Maxwell slip has them: their sums are what it says.
         """
@@ -126,10 +126,15 @@ class ComparedModel:
         for element in self.optimum.problem.model.elements:
             labels = {label for part in element.like_parts for label in part}
             parts |= {element.parameter(label).name for label in labels}
+
+        def size(parameter: Parameter) -> float:
+            """Return what a parameter that may be zero is compared with: its unit's size."""
+            may_be_zero = parameter.lower < 0.0
+            sizes = self.optimum.problem.unit_sizes(parameter.dimension)
+            return float(np.median(sizes)) * may_be_zero
+
         return all(
-            np.isfinite(value)
-            and (p.name in parts or np.isfinite(error))
-            and (p.name in parts or p.lower != 0.0 or error < _VAGUE * value)
+            np.isfinite(value) and (p.name in parts or error < _VAGUE * max(abs(value), size(p)))
             for p, value, error in self._of_device
         )
 
@@ -441,10 +446,10 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     if models is None:
         offered = dict(_candidates(optimum, fitted[0].density))
     else:
-        offered = {name: ("", model) for name, model in models.items()}
-    for name, (reason, model) in offered.items():
+        offered = {name: ("", (model,)) for name, model in models.items()}
+    for name, (reason, elements) in offered.items():
         try:
-            other = _solved(optimum, model, own=models is not None)
+            other = _solved(optimum, Model(*elements), own=models is not None)
             density = predictive_density(other, optimum)
             fitted.append(ComparedModel(name, other, density, reason))
         except DahlIdentError as exc:
@@ -454,15 +459,15 @@ def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> Mod
     return ModelComparison(tuple(fitted), failed, None if same else stated)
 
 
-def _solved(optimum: Optimum, model: Element, *, own: bool) -> Optimum:
+def _solved(optimum: Optimum, model: Model, *, own: bool) -> Optimum:
     """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
     return solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
 
 
 def _candidates(
     optimum: Optimum, left: PredictiveDensity
-) -> Iterator[tuple[str, tuple[str, Element]]]:
-    """Yield the name of each candidate, its reason and the model."""
+) -> Iterator[tuple[str, tuple[str, Sequence[Element]]]]:
+    """Yield the name of each candidate, its reason and the model's elements."""
     problem = optimum.problem
     model = problem.model
     values = parameter_values(optimum)
@@ -494,7 +499,7 @@ def _candidates(
             name,
             (
                 reason,
-                Model(*(n for e, o in offers for n in (o[name].elements if name in o else (e,)))),
+                [n for e, o in offers for n in (o[name].elements if name in o else (e,))],
             ),
         )
     f, span = problem.data.frequency_hz if problem.settled else None, misfit
@@ -505,7 +510,7 @@ def _candidates(
     rated: tuple[Element, ...] = ()
     several = f is None or f.max() > _RATES * f.min()
     if several or optimum.loss == "linear":  # else outliers at large amplitudes look like a damper
-        rated = (PowerDamper().started((_force(optimum), 0.5, 1.0)),)
+        rated = (PowerDamper(),)
     if several:  # at one frequency a mass is a spring
         rated = (Mass(), Damper(), *rated)
     if f is not None:
@@ -515,18 +520,8 @@ def _candidates(
             added[f"{element.kind.replace('_', ' ')} added"] = element
     if not several:
         span = f"{misfit}; one frequency, so only the amplitude can tell"
-    base = [e.started([values[p.name] for p in e.parameters]) for e in model.elements]
     for name, element in added.items():
-        started = all(np.isfinite(values[p.name]) for p in model.parameters)
-        yield (
-            name,
-            (
-                misfit if name == "spring added" else span,
-                Model(*base, element)
-                if started and element.kind == "power_damper"
-                else model + element,
-            ),
-        )
+        yield name, (misfit if name == "spring added" else span, (model, element))
 
 
 def _even(optimum: Optimum) -> str:

@@ -47,6 +47,7 @@ _NO_FRICTION = 1e-18  # friction's stiffness over the median one, where it count
 _LEAST_FRICTION = -60.0  # ln of a scale over that of the data that a search may reach
 _EDGES = (1e-14, 1e8)  # a direction over the data's smallest and largest that a search may reach
 _TIED_EDGE = 1e4  # the same where microslip has a limit: short of it
+_FASTEST = 1e4  # a rate that may be negative over the inverse of the smallest amplitude, likewise
 _NUMBERS = (1.0 / 250.0, 25.0)  # a number over the least and most that its law scans, likewise
 _FAR = (1e9, 1e14)
 """How far a length lies above the largest amplitude, and below the smallest, in a limit.
@@ -181,9 +182,13 @@ class Reach:
                 continue
             own = directions(element)
             for direction in own.nonlinear:
-                if not direction.parameter.positive:
-                    continue
                 row, rest = direction.row(problem)
+                if not direction.parameter.positive:
+                    if direction.dimension == (0, -1, 0):
+                        fastest = np.exp(direction.sizes(view).max(axis=-1)) * _FASTEST
+                        rows += [row, -row]
+                        least += [-fastest, -fastest]
+                    continue
                 if direction.is_number:
                     scan = direction.parameter.scan or (0.25, 4.0)
                     low, high = np.log(min(scan) * _NUMBERS[0]), np.log(max(scan) * _NUMBERS[1])
