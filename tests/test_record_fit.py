@@ -428,7 +428,7 @@ def test_command_line(
             assert found["trusted"]
     text = Path(again).read_text("utf-8")
     assert "run.csv, SHA-256" in text
-    assert "Not given: alpha between" in text
+    assert "Not given, so that the uncertainty counts it: alpha, here" in text
 
 
 @pytest.mark.parametrize("ending", ["json", "html"])

@@ -114,32 +114,17 @@ def as_json(result: FitResult) -> dict[str, Any]:
         "message": result.message,
         "findings": [finding.to_dict() for finding in result.findings],
     }
+    budget, assumed = result.stated_budget, [result.params[name] for name in result.assumed]
+    facts |= {
+        "assumed": {p.name: {"value": p.value, "stderr": p.stderr} for p in assumed},
+        "budget": None if budget is None else budget.to_dict(),
+        "determined": [str(c) for c in result.identifiability.combinations],
+        "warnings": list(result.goodness.warnings),
+        **result.assessment.facts,
+    }
     limits = result.conf_interval().at(CONFIDENCE)
-    first = int(not result.problem.settled)  # intervals of tables begin with their level
-    if not result.problem.settled:
-        facts |= {
-            "effective_samples": result.effective_samples,
-            "share_left": result.goodness.share_left,
-        }
-    else:
-        budget, errors = result.stated_budget, result.errors
-        assumed = () if errors is None else errors.assumed
-        facts |= {
-            "assumed": {
-                name: {"value": errors.values[name], "stderr": errors.stderr[name]}
-                for name in assumed
-                if errors is not None
-            },
-            "budget": None if budget is None else budget.to_dict(),
-            "determined": [str(c) for c in result.identifiability.combinations],
-            "warnings": list(result.goodness.warnings),
-            "suspicious": [str(point) for point in result.goodness.suspicious],
-            "noise": result.noise,
-            "scale": result.scale,
-            "redchi": result.redchi,
-        }
     facts["params"] = {
-        name: {**vars(estimate), "interval": limits[name][first:] if estimate.vary else None}
+        name: {**vars(estimate), "interval": limits[name][1:] if estimate.vary else None}
         for name, estimate in result.params.items()
     }
     return facts

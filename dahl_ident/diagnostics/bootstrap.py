@@ -33,13 +33,10 @@ from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, intervals_from_search
 from dahl_ident.errors import FitError, ValidationError
-from dahl_ident.fitting import Optimum, solve_many
-from dahl_ident.fitting.record_search import solve_repetitions
+from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.search import repetitions
 from dahl_ident.fitting.status import Status
-from dahl_ident.problem import ProblemBatch
 
-REPLICATES = 4999  # seven of them lie beyond either limit of the 99.73 % interval
-_OF_RECORDS = 199  # each of which is searched alone: enough for the 95.45 % interval
 _FEWEST = 99  # with fewer a tail of 1 % holds no replicate
 _AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished
 
@@ -56,7 +53,7 @@ class Replicates:
 def replicate(optimum: Optimum, replicates: int | None, seed: int) -> Replicates:
     """Return fits to `replicates` simulated repetitions of the measurement."""
     if replicates is None:
-        replicates = REPLICATES if optimum.problem.settled else _OF_RECORDS
+        replicates = optimum.problem.repetitions
     count = whole_number(replicates, "replicates", _FEWEST)
     if optimum.loss != "linear":
         raise ValidationError(
@@ -65,16 +62,8 @@ def replicate(optimum: Optimum, replicates: int | None, seed: int) -> Replicates
         )
     if optimum.status is Status.NOT_CONVERGED or not np.isfinite(optimum.scale):
         raise FitError("there is no optimum to simulate repetitions from")
-    scale = 1.0 if optimum.scale_known else optimum.scale
-    problem, rng = optimum.problem, np.random.default_rng(whole_number(seed, "seed", 0))
-    if problem.settled:
-        responses = problem.draw(optimum.theta, scale, count, rng)
-        found = solve_many(ProblemBatch.replicates(problem, responses), start=optimum.theta)
-        theta, error = found.theta, np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-        gone = ~(np.isfinite(found.values) & np.isfinite(error) & (error > 0.0))
-    else:
-        theta, error = solve_repetitions(optimum, count, rng)
-        gone = ~(np.isfinite(theta) & np.isfinite(error) & (error > 0.0))
+    theta, error = repetitions(optimum, count, np.random.default_rng(whole_number(seed, "seed", 0)))
+    gone = ~(np.isfinite(theta) & np.isfinite(error) & (error > 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(gone, np.nan, (theta - optimum.theta) / error)
     return Replicates(t, gone)

@@ -357,7 +357,7 @@ def _levels(problem: Problem) -> tuple[FloatArray, FloatArray]:
 def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     """Return what all laws have in common at the values of the parameters, see `ComparedModel`."""
     A, rates = _levels(problem)
-    sizes = np.unique(np.geomspace(A.min(), A.max(), _LEVELS))
+    sizes = np.geomspace(A.min(), A.max(), _LEVELS if A.max() > A.min() else 1)
     omega = np.asarray(np.exp(np.mean(np.log(rates))))
     limit, stiffness, energy = 0.0, 0.0, np.zeros(sizes.size)
     for element in problem.model.elements:

@@ -78,6 +78,11 @@ class RecordGoodness:
     cause: str = ""
 
     @property
+    def rms_misfit(self) -> float:
+        """Root mean square of the residuals over that of the measured output's variation."""
+        return float(np.sqrt(self.share_left))
+
+    @property
     def worst_text(self) -> str:
         """The worst segment in words."""
         which = f" of record {self.worst_record}" if self.n_records > 1 else ""
@@ -90,8 +95,7 @@ class RecordGoodness:
     def details(self) -> list[str]:
         """The numbers as text."""
         return [
-            f"unexplained share of variance {self.share_left:.3g} "
-            f"({percent(self.share_left**0.5)} rms)",
+            f"unexplained share of variance {self.share_left:.3g} ({percent(self.rms_misfit)} rms)",
             f"residuals {self.rms:.3g} rms; {self.worst_text}",
             f"correlation of neighbouring residuals {self.correlation:.2f}",
         ]

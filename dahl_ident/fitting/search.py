@@ -45,7 +45,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
 from dahl_ident.fitting.record_refinement import Tell
-from dahl_ident.fitting.record_search import solve_records
+from dahl_ident.fitting.record_search import solve_records, solve_repetitions
 from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
@@ -218,6 +218,23 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
             own = begin[first : first + at_once]
             parts.append(search.run(Starts(np.arange(len(own)), own), given=True))
     return OptimumBatch.joined(batch, parts)
+
+
+def repetitions(
+    optimum: Optimum, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return search coordinates of repeated measurements that are drawn, and their errors, (S, P).
+
+    NaN where a repetition has no finite optimum.
+    """
+    problem = optimum.problem
+    if not problem.settled:
+        return solve_repetitions(optimum, count, rng)
+    scale = 1.0 if optimum.scale_known else optimum.scale
+    drawn = ProblemBatch.replicates(problem, problem.draw(optimum.theta, scale, count, rng))
+    ends = solve_many(drawn, start=optimum.theta)
+    theta = np.where(np.isfinite(ends.values), ends.theta, np.nan)
+    return theta, np.sqrt(np.diagonal(ends.covariance, axis1=1, axis2=2))
 
 
 def _check(problem: Problem, start: Mapping[str, float]) -> None:

@@ -78,6 +78,8 @@ class Problem(ABC):
     scale_known: bool = False
     gaussian: bool = True
     settled: bool = True
+    repetitions: int = 4999
+    """That are simulated: seven of them lie beyond either limit of the 99.73 % interval."""
 
     @property
     @abstractmethod

@@ -83,6 +83,7 @@ class RecordProblem(Problem):
     arguments = ("records", "model", "output", "excitation", "calibration")
     parts = 1
     settled = False
+    repetitions = 199  # each of which is searched alone: enough for the 95.45 % interval
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ from typing import Any
 
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.laboratory import Metadata
-from dahl_ident.diagnostics.budget import Budget, taken_as_exact
+from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
 from dahl_ident.diagnostics.formatting import listed, with_unit
@@ -36,14 +36,6 @@ from dahl_ident.version import __version__
 
 Result = FitResult | Posterior
 
-NOISE = {
-    "measured": "The covariance of every point is known from the measurement; residuals are in "
-    "its units.",
-    "relative": "The noise has the same relative size at every point: constant variance of the "
-    "logarithm of the gain and of the phase. Its size was estimated from the residuals.",
-    "absolute": "The noise has the same size at every point: constant variance of real and "
-    "imaginary part. Its size was estimated from the residuals.",
-}
 RELATES = "The results relate only to the item that was measured."
 COVERAGE = (
     "The expanded uncertainty U is the combined standard uncertainty u times the coverage factor "
@@ -51,10 +43,6 @@ COVERAGE = (
 )
 _MOST_FILES = 4  # lines of them before the signature
 _FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin
-_OUTPUTS = {
-    "force": "The force is computed from the measured displacement, sample by sample.",
-    "motion": "The equation of motion is integrated under the measured drive.",
-}
 
 
 def document(
@@ -264,24 +252,15 @@ def _assumed(fit: FitResult) -> Iterator[str]:
     sensors = [p.name for p in fit.problem.sensors.parameters]
     held = [p for p in fit.params.values() if not p.vary and p.name not in (*fit.assumed, *sensors)]
     fixed = [f"{p.name} = {p.value:g} {p.unit}".rstrip() for p in held]
-    if not fit.problem.settled:
-        yield _OUTPUTS[fit.problem.output]
     if fixed:
         yield f"Held fixed: {listed(fixed)}."
-    if not fit.problem.settled:
-        for one in fit.errors.assumed:
-            yield f"Not given: {one}; its range counts in the uncertainty."
-        yield f"Taken as exact: {listed(fit.errors.exact)}."
-        if fit.weighted:
-            yield "Residuals are weighted by their spectrum, because slow noise dominates them."
-        return
     for p in (fit.params[name] for name in fit.assumed):
         here = with_unit(p.value, p.stderr, p.unit)
         yield f"Not given, so that the uncertainty counts it: {p.name}, here {here}."
-    if exact := taken_as_exact(fit.optimum):
+    if exact := fit.assessment.exact:
         yield f"Taken as exact: {listed(exact)}."
     yield from (f"Prior of {name}: {text}." for name, text in tables.priors_in_words(fit))
-    yield NOISE[fit.noise]
+    yield f"Noise: {fit.assessment.noise_in_words[0]}."
     for note in provenance.notes(fit.provenances):
         yield f"{note[0].upper()}{note[1:]}."
     yield f"Search: {fit.method}, loss {fit.optimum.loss}."
@@ -298,22 +277,18 @@ def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Se
     if (stated := _stated(fit)) is not None:
         yield section("Sources of uncertainty", tables.budget(stated), budget_picture(stated))
     yield section("Parameters", *_parameters(fit, drawn))
-    if fit.problem.settled:
-        known = fit.identifiability
-        texts = Bullets(tuple(p.text for p in known.parameters.values()))
-        yield section("What the data determine", Paragraph(known.headline), texts)
+    known = fit.identifiability
+    texts = Bullets(tuple(p.text for p in known.parameters.values()))
+    yield section("What the data determine", Paragraph(known.headline), texts)
     yield section("Noise and goodness of fit", *_goodness(fit))
-    if fit.problem.settled:
-        linearization = tables.linearization(fit)
-        blocks = [] if linearization is None else [linearization]
-        yield section("Stiffness and damping over amplitude", *blocks)
+    if (linearization := tables.linearization(fit)) is not None:
+        yield section("Stiffness and damping over amplitude", linearization)
     yield section("More pictures", *(p for p in pictures if not p.name.startswith(_FRONT)))
 
 
 def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
-    fit.conf_interval("wald")
-    if fit.problem.settled and not fit.first_order:  # profiles of records take minutes
-        fit.conf_interval("profile")
+    for method in fit.assessment.quick_methods:
+        fit.conf_interval(method)
     intervals = fit.assessment.intervals_run(CONFIDENCE)
     alike = [one for one in drawn if one.problem.settled == fit.problem.settled]
     yield tables.parameters(fit, intervals, alike)
@@ -327,8 +302,6 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
 
 def _goodness(fit: FitResult) -> Iterator[Block]:
     yield Bullets(tuple(fit.goodness.details))
-    if not fit.problem.settled:
-        return
     yield tables.goodness(fit)
     if not fit.goodness.acceptable:
         compared = compare_models(fit)
@@ -390,7 +363,7 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
 def fit_facts(fit: FitResult) -> dict[str, Any]:
     """Return a fit for machines."""
     intervals = fit.conf_interval().at(CONFIDENCE)
-    facts = {
+    return {
         "model": repr(fit.problem.model),
         "equations": list(in_words(fit.problem.model)),
         "status": str(fit.status),
@@ -409,24 +382,8 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
             for name, e in fit.params.items()
         },
         "budget": None if fit.stated_budget is None else fit.stated_budget.to_dict(),
-    }
-    if not fit.problem.settled:
-        return facts | {
-            "records": len(fit.records),
-            "samples": fit.problem.n_samples,
-            "share_of_variance_left": fit.goodness.share_left,
-        }
-    return facts | {
-        "search": fit.optimum.status.name.lower().replace("_", " "),
-        "noise": fit.noise,
-        "scale": fit.scale,
-        "scale_known": fit.scale_known,
         "priors": tables.priors(fit),
         "determined": [str(c) for c in fit.identifiability.combinations],
-        "suspicious": [str(point) for point in fit.goodness.suspicious],
         "warnings": list(fit.goodness.warnings),
-        "rms_misfit": fit.goodness.rms_misfit,
-        "redchi": fit.redchi,
-        "aic": fit.aic,
-        "bic": fit.bic,
+        **fit.assessment.facts,
     }

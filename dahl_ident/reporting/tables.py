@@ -216,11 +216,11 @@ def linearization(fit: FitResult) -> Table | None:
     friction = any(element.has_memory for element in fit.model.elements)
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
         return None
-    data = fit.data.select(harmonic=1)
-    A = fit.problem.stiffness_data.amplitude[fit.data.harmonic == 1]
-    sizes = np.geomspace(A.min(), A.max(), _LINEARIZATION_ROWS)
-    f = float(np.median(data.frequency_hz))
-    columns = dict([_column("amplitude", sizes, si_unit("displacement", data.motion))])
+    problem = fit.problem
+    A, rates = (problem.unit_sizes(unit) for unit in ((0, 1, 0), (0, 0, -1)))
+    sizes = np.geomspace(A.min(), A.max(), _LINEARIZATION_ROWS if A.max() > A.min() else 1)
+    f = float(np.median(rates)) / (2.0 * np.pi)
+    columns = dict([_column("amplitude", sizes, si_unit("displacement", problem.motion))])
     derived: dict[str, list[DerivedQuantity]] = {}
     for quantity in fit.derived(sizes.tolist(), f):
         if quantity.amplitude is not None:

@@ -50,6 +50,8 @@ class Assessment(ABC):
     problem: Any
     kind: str
     """What was fitted, in words."""
+    quick_methods: tuple[Method, ...] = ("wald",)
+    """Of intervals: those that a report has time for, in addition to the combined ones."""
     instead: str
     """What to do where this kind of data has no answer."""
 
@@ -64,6 +66,39 @@ class Assessment(ABC):
                 f"a fit of {self.kind} has no {_OF_ONE_KIND[name]}; {self.instead}"
             )
         raise AttributeError(name)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stated for machines, apart from parameters, verdict and budget."""
+        optimum = self.optimum
+        return {
+            "search": optimum.status.name.lower().replace("_", " "),
+            "scale": self.estimate.scale,
+            "scale_known": optimum.scale_known,
+            "rms_misfit": self.goodness.rms_misfit,
+            "aic": optimum.aic,
+            "bic": optimum.bic,
+        }
+
+    @property
+    @abstractmethod
+    def goodness(self) -> Any:
+        """Statistics and tests of the residuals."""
+
+    @property
+    @abstractmethod
+    def exact(self) -> tuple[str, ...]:
+        """What is taken as exact, for want of a stated uncertainty."""
+
+    @property
+    @abstractmethod
+    def noise_in_words(self) -> list[str]:
+        """How residuals were weighted."""
+
+    @property
+    @abstractmethod
+    def estimate(self) -> Optimum:
+        """The estimate, as an optimum."""
 
     @property
     @abstractmethod

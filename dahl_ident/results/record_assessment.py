@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -220,6 +221,21 @@ class RecordAssessment(Assessment):
     def weighted(self) -> bool:
         """Whether residuals were weighted by their spectrum."""
         return self.problem.whitening.size > 1
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stated for machines, see ``Assessment``."""
+        return super().facts | {
+            "records": len(self.problem.records),
+            "samples": self.problem.n_samples,
+            "effective_samples": self.errors.effective,
+            "share_of_variance_left": self.goodness.share_left,
+        }
+
+    @property
+    def exact(self) -> tuple[str, ...]:
+        """Inputs without a stated uncertainty."""
+        return self.errors.exact
 
     @property
     def noise_in_words(self) -> list[str]:

@@ -21,7 +21,7 @@ from dahl_ident.diagnostics.bands import (
     predicted_backbone,
     response_band,
 )
-from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget
+from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget, taken_as_exact
 from dahl_ident.diagnostics.checks import assumptions, judgement
 from dahl_ident.diagnostics.confidence_levels import LEVELS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
@@ -51,6 +51,7 @@ class TableAssessment(Assessment):
 
     problem: TableProblem
     kind = "tables"
+    quick_methods = ("wald", "profile")
     instead = "extract the table from the waveforms, or fit the record itself"
 
     @cached_property
@@ -247,6 +248,21 @@ class TableAssessment(Assessment):
     ) -> tuple[DerivedQuantity, ...]:
         """Return x_c, energy per cycle, equivalent stiffness and damping."""
         return tuple(derived(self.optimum, amplitudes, frequency_hz, self.errors))
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stated for machines, see ``Assessment``."""
+        suspicious = [str(point) for point in self.goodness.suspicious]
+        residuals = self.estimate.residuals
+        reduced = float(residuals @ residuals) / self.optimum.dof if self.optimum.dof > 0 else None
+        return super().facts | {
+            "noise": self.problem.noise, "suspicious": suspicious, "redchi": reduced
+        }  # fmt: skip
+
+    @property
+    def exact(self) -> tuple[str, ...]:
+        """Calibrations without a stated uncertainty."""
+        return taken_as_exact(self.optimum)
 
     @property
     def noise_in_words(self) -> list[str]:
