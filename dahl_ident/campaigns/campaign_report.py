@@ -43,7 +43,7 @@ def write_campaign_report(
 ) -> Path:
     """Write the report of a campaign; `reports` is the folder of the fits' reports, for links."""
     from dahl_ident.data.storage import place_of, write_whole
-    from dahl_ident.reporting.html import html
+    from dahl_ident.reporting.pages import html
     from dahl_ident.reporting.pdf import pdf
 
     place = place_of(path, "a campaign's report", FORMATS)

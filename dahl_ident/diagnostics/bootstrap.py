@@ -34,8 +34,8 @@ from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, intervals_from_search
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.optimum import Status
 from dahl_ident.fitting.search import repetitions
-from dahl_ident.fitting.status import Status
 
 _FEWEST = 99  # with fewer a tail of 1 % holds no replicate
 _AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished

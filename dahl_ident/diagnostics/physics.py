@@ -17,7 +17,7 @@ from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
-from dahl_ident.fitting.status import Status
+from dahl_ident.fitting.optimum import Status
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.steady_state import response
 from dahl_ident.units import Motion, engineering, shown_unit

@@ -31,9 +31,8 @@ from dahl_ident.fitting.asymptotes import Chart, microslip_charts
 from dahl_ident.fitting.global_start import edge_starts
 from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.fitting.losses import loss_named
-from dahl_ident.fitting.optimum import inverse
+from dahl_ident.fitting.optimum import Status, inverse
 from dahl_ident.fitting.search import DOUBTFUL
-from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Quadratic
 
 IntArray = NDArray[np.intp]

@@ -19,7 +19,7 @@ from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import FitError
-from dahl_ident.fitting.record_refinement import STEPS, Descent
+from dahl_ident.fitting.record_search import STEPS, RecordSearch
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
@@ -148,7 +148,7 @@ def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float
     free = problem.freed([name])
     place = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
-    end = Descent("lm", "linear").descend(
+    end = RecordSearch("lm", "linear").descend(
         free, free.to_search(np.insert(values, place, value)), STEPS
     )
     if not end.converged[0]:

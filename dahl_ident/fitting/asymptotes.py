@@ -39,8 +39,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Asymptote, Element, Parameter
 from dahl_ident.fitting.directions import Direction, Directions, directions, free_springs
-from dahl_ident.fitting.optimum import DeterminedCombination, blanked
-from dahl_ident.fitting.status import Status
+from dahl_ident.fitting.optimum import DeterminedCombination, Status, blanked
 from dahl_ident.problem import TableProblem
 
 _NO_FRICTION = 1e-18  # friction's stiffness over the median one, where it counts as none

@@ -12,12 +12,12 @@ from dahl_ident.fitting.losses import Loss
 from dahl_ident.fitting.optimum import (
     DeterminedCombination,
     OptimumBatch,
+    Status,
     at_bound,
     estimated_scale,
     information_of,
     inverse,
 )
-from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem
 
 

@@ -34,14 +34,14 @@ from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import (
     ConstraintCost,
     Optimum,
+    Status,
     agreed_scale,
     estimated_scale,
     information_of,
     inverse,
 )
-from dahl_ident.fitting.record_refinement import Tell
+from dahl_ident.fitting.record_search import Tell
 from dahl_ident.fitting.search import solve, starts_of
-from dahl_ident.fitting.status import Status
 from dahl_ident.problem import Problem, Quadratic, TableProblem
 
 _TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows

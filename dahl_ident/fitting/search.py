@@ -44,8 +44,7 @@ from dahl_ident.fitting.levenberg_marquardt import (
 )
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
-from dahl_ident.fitting.record_refinement import Tell
-from dahl_ident.fitting.record_search import solve_records, solve_repetitions
+from dahl_ident.fitting.record_search import Tell, solve_records, solve_repetitions
 from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem

@@ -18,9 +18,8 @@ from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.reporting.document import Block, Document, Picture
-from dahl_ident.reporting.html import html
-from dahl_ident.reporting.markdown import markdown
 from dahl_ident.reporting.overlay import overlay
+from dahl_ident.reporting.pages import html, markdown
 from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import FitResult, Posterior
 

@@ -33,7 +33,7 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
-from dahl_ident.fitting.record_refinement import Tell
+from dahl_ident.fitting.record_search import Tell
 from dahl_ident.problem import Problem, ProblemBatch, TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.fit_batch import FitBatch

@@ -21,8 +21,7 @@ from dahl_ident.data.storage import digest, plain_data, read_text
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError
-from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum
-from dahl_ident.fitting.status import Status
+from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum, Status
 from dahl_ident.problem import Problem, TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import EXACT, Sensors

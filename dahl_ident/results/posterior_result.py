@@ -30,7 +30,6 @@ from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
-from dahl_ident.results.arviz_export import to_arviz
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_checks import (
     PredictiveCheck,
@@ -38,6 +37,7 @@ from dahl_ident.results.posterior_checks import (
     findings_of,
     predictive_checks,
     prior_influences,
+    to_arviz,
 )
 from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
 from dahl_ident.results.result import Estimate, Parameters, Result, part
