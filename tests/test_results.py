@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from scipy import optimize, stats
 
 from dahl_ident import (
+    Backlash,
     Dahl,
     Damper,
     FitResult,
@@ -521,3 +522,17 @@ def test_a_list_of_fits_is_sent_to_the_report() -> None:
         ValidationError, match=r"got several fits; .* di\.report\(\[fit, \.\.\.\]\)"
     ):
         compare_models([found, found])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("ln_f_max", [441.0, -441.0])
+def test_values_beyond_any_parameter_stand_for_infinity_and_zero(ln_f_max: float) -> None:
+    """Where a gap swallows the motion, a search may end at a force limit of 1e191."""
+    A = np.geomspace(2e-5, 4.5e-4, 10)
+    noise = 0.01 * np.random.default_rng(0).standard_normal(10)
+    data = FrequencyResponse(np.ones(10), 10.0 * np.exp(noise), A)
+    found = fit(data, Backlash(Dahl(alpha=1.0), 1e-3) + Spring(), throw=False)
+    far = replace(found.optimum, theta=np.array([ln_f_max, -5.0, np.log(10.0)]))
+    ended = FitResult(far)
+    assert ended.status == "not determined"
+    assert "f_max=1e+90" in repr(ended.model) or "f_max=1e-90" in repr(ended.model)
+    assert "model compared is" in str(compare_models(ended))

@@ -105,7 +105,7 @@ class Element(Behaviour):
         """Return this element with values to start from where it is free."""
         return self.with_bound(
             tuple(
-                replace(p, value=float(v), assumed=False) if p.free else p
+                replace(p, value=p.nearest(v), assumed=False) if p.free else p
                 for p, v in zip(self.parameters, values, strict=True)
             )
         )

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dahl_ident.arrays import finite_number, positive_number
+from dahl_ident.arrays import LARGEST, SMALLEST, finite_number, positive_number
 from dahl_ident.errors import ValidationError
 
 UNITS = {
@@ -100,6 +100,10 @@ class Parameter:
     def positive(self) -> bool:
         """Whether it is above zero, and searched by its logarithm."""
         return self.transform == "log"
+
+    def nearest(self, value: float) -> float:
+        """Return the nearest value that a parameter can have, for one that stands for infinity."""
+        return float(np.clip(value, SMALLEST if self.positive else -LARGEST, LARGEST))
 
     @property
     def is_mechanical(self) -> bool:

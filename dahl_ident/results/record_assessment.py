@@ -122,7 +122,9 @@ class RecordAssessment(Assessment):
     def model(self) -> Model:
         """The model with the estimates put in, fixed."""
         values = dict(zip(self.optimum.names, self.optimum.values.tolist(), strict=True))
-        return self.problem.model.with_fixed({p.name: values[p.name] for p in self.problem.free})
+        return self.problem.model.with_fixed(
+            {p.name: p.nearest(values[p.name]) for p in self.problem.free}
+        )
 
     @cached_property
     def _evaluated(self) -> tuple[list[FloatArray], list[FloatArray]]:

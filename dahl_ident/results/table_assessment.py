@@ -122,12 +122,14 @@ class TableAssessment(Assessment):
     def model(self) -> Model:
         """The model with the estimates put in; parameters stay free or fixed as they were."""
         model = self.problem.model
-        names = {p.name for p in model.parameters}
+        known = {p.name: p for p in model.parameters}
         values = self.problem.to_values(self.optimum.theta).tolist()
         estimates = dict(zip(self.optimum.names, values, strict=True))
         if self.errors is not None:
             estimates = dict(self.errors.values)
-        return model.with_values({name: v for name, v in estimates.items() if name in names})
+        return model.with_values(
+            {name: known[name].nearest(v) for name, v in estimates.items() if name in known}
+        )
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
