@@ -66,6 +66,7 @@ ROUNDING = 2.0**-46  # relative rounding error of a response when its residual i
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
 _AMPLITUDE_STEPS = 40  # a limit for iterations that do not settle
 _AMPLITUDE_TOLERANCE = 1e-7  # of its standard deviation; residuals err by less than the square
+_ROUNDED = 0.01  # likewise: a step below this and not shorter than the last is of rounding
 
 
 class Noise(ABC):
@@ -335,6 +336,7 @@ def correct_amplitude(
     """
     spread = np.sqrt(error.variance)
     found = last = step = np.zeros(noise.response.shape)
+    size, longest = np.where(spread > 0.0, spread, np.inf), np.inf
     for _ in range(_AMPLITUDE_STEPS):
         predicted, slope = predict(found)
         r = noise.response - predicted - slope * found
@@ -342,10 +344,11 @@ def correct_amplitude(
         lever = whitening.solve(r)
         shift = error.cross - error.variance * slope
         new = shift.real * lever.real + shift.imag * lever.imag - found
-        if not np.any(np.abs(new) > _AMPLITUDE_TOLERANCE * spread):
+        before, longest = longest, float(np.max(np.abs(new) / size, initial=0.0))
+        if not longest > _AMPLITUDE_TOLERANCE or _ROUNDED > longest >= before:
             break
         secant = (new - step) / (found - last)  # -1 where one plain step is enough
-        stretch = np.where(secant < -0.1, -1.0 / secant, 1.0)
+        stretch = np.where((-np.inf < secant) & (secant < -0.1), -1.0 / secant, 1.0)
         found, last, step = found + stretch * new, found, new
     return Corrected(whitening(r), whitening, found)
 

@@ -11,6 +11,7 @@ from scipy import optimize, stats
 from dahl_ident import Dahl, FrequencyResponse
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.rows import Rows
+from dahl_ident.elements.facts import Sine, StiffnessGradient, Values
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.noise import Measured, Student, bend, noise_for
@@ -100,6 +101,27 @@ def test_stated_covariances_with_few_degrees_of_freedom_hold() -> None:
     ratio = 2.0 * (batch.quadratic(truth).cost - found.cost)
     covered = np.mean(ratio < stats.chi2(2).ppf(0.95))
     assert abs(covered - 0.95) < 3.0 * np.sqrt(0.95 * 0.05 / 600)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-8])
+def test_few_predictions_find_the_true_amplitudes(rounding: float) -> None:
+    """Also where a law is only known to some digits, as from an integration."""
+    rng, calls = np.random.default_rng(0), 0
+
+    class Rounded(Dahl):
+        def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+            nonlocal calls
+            calls += 1
+            exact = super().settled(values, sine, derivatives)
+            return exact._replace(value=exact.value * (1.0 + rounding * rng.standard_normal(n)))
+
+    data = table(covariance=COVARIANCE, amplitude_std=0.05 * A)
+    problem, exact = (TableProblem(data, law) for law in (Rounded(alpha=1.0), Dahl(alpha=1.0)))
+    theta = problem.to_search([0.12, 25.0])
+    calls = 0
+    found = problem.residuals(theta)
+    assert calls <= 8
+    assert found == pytest.approx(exact.residuals(theta), rel=1e-5, abs=1e-5)
 
 
 def test_amplitude_errors_are_profiled_out() -> None:
