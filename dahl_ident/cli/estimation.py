@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, refuse
+from dahl_ident.cli.console import STANDARD
 from dahl_ident.cli.files import written
 from dahl_ident.cli.options import Writing, one_of
 
@@ -41,17 +41,6 @@ def noise_option(panel: str) -> Any:
         panel,
         "measured|relative|absolute",
     )
-
-
-def for_records(
-    what: str, options: Mapping[str, Any], unset: Mapping[str, Any], taken: Collection[str]
-) -> dict[str, Any]:
-    """Return the options that an estimate from records takes; others that are set are refused."""
-    refuse(
-        [n for n, value in options.items() if n in unset and n not in taken and value != unset[n]],
-        f"together with --record; a {what} of records takes none of them",
-    )
-    return {name: value for name, value in options.items() if name in taken}
 
 
 def is_saved(file: str) -> bool:

@@ -18,7 +18,6 @@ from dahl_ident.cli.estimation import (
     as_json,
     check_reports,
     finish,
-    for_records,
     is_saved,
     noise_option,
     report_also,
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 
 _ESTIMATING = "Estimating"
 _estimating = in_panel(_ESTIMATING)
-_OF_RECORDS = ("model", "free", "fixed", "start", "sensors")
 Predicted = Annotated[
     str | None,
     one_of(
@@ -103,9 +101,9 @@ def fitted(
 
     how = {**model.keywords(), **estimating.keywords()}
     if isinstance(data, list):
-        how = for_records("fit", how, vars(Estimating()), _OF_RECORDS) | {"output": predicted}
+        how |= {"output": predicted, "progress": sys.stderr.isatty()}
         try:
-            return estimate(data, throw=False, progress=sys.stderr.isatty(), **how)
+            return estimate(data, throw=False, **how)
         except FitInterrupted as stop:
             console.write(stop.result.fit_report())
             raise

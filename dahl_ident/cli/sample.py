@@ -15,7 +15,6 @@ from dahl_ident.cli.estimation import (
     ReportPlace,
     check_reports,
     finish,
-    for_records,
     noise_option,
     report_also,
 )
@@ -34,10 +33,6 @@ from dahl_ident.cli.reading import Channels, Files, Reading
 _SAMPLING = "Sampling"
 _sampling = in_panel(_SAMPLING)
 _CHAIN = ("seed", "steps", "max_steps", "ess", "walkers", "ensembles", "resume")
-_OF_RECORDS = (
-    "model", "free", "fixed", "sensors", "start", "priors", "uncertainty", "method",
-    "progress", *_CHAIN,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -91,7 +86,8 @@ class Sampling:
         how["priors"] = dict(prior(text) for text in how.pop("prior") or [])
         if self.seed is None and (self.resume is None or not self.resume.exists()):
             how["seed"] = 1
-        return {**how, "progress": sys.stderr.isatty()}
+        steady = None if self.steady == "exact" else self.steady
+        return {**how, "steady": steady, "progress": sys.stderr.isatty()}
 
     def check(self) -> None:
         """Refuse options of a chain with --method grid."""
@@ -127,7 +123,6 @@ def sample(
     data: Any
     if record:
         data = reading.read_records(files, channels)
-        how = for_records("posterior", how, vars(Sampling()), _OF_RECORDS)
     else:
         channels.refuse()
         data = reading.read(files)

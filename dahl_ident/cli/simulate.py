@@ -48,7 +48,7 @@ _COUNT = 30  # levels: 15 a decade, as in the shipped data sets
 
 
 @dataclass(frozen=True)
-class Plant:
+class PlantOptions:
     """The true plant: friction and the elements in parallel."""
 
     f_max: Annotated[float | None, quantity("Friction force.", "N", MODEL)] = None
@@ -127,7 +127,7 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionOptions:
     """The steady motion of a driven plant."""
 
     steady: Annotated[str, steady_option(_EXCITATION)] = "exact"
@@ -137,10 +137,10 @@ class Motion:
 def simulate(
     general: General,
     laws: Laws,
-    plant: Plant,
+    plant: PlantOptions,
     excitation: Excitation,
     errors: Errors,
-    motion: Motion,
+    motion: MotionOptions,
     writing: Writing,
     experiment: Annotated[
         str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
@@ -182,7 +182,9 @@ def simulate(
     write_data(data, output, overwrite=writing.overwrite)
 
 
-def _experiment(plant: Plant, excitation: Excitation, errors: Errors, motion: Motion) -> Experiment:
+def _experiment(
+    plant: PlantOptions, excitation: Excitation, errors: Errors, motion: MotionOptions
+) -> Experiment:
     from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
 
     truth = plant.built()

@@ -58,7 +58,7 @@ _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
-class Fit(Protocol):
+class ComparableFit(Protocol):
     """A fit whose model is compared with others."""
 
     @property
@@ -398,7 +398,9 @@ def _change(value: float, before: float) -> str:
     return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(abs(ratio))}"
 
 
-def compare_models(fit: Fit, models: Mapping[str, Element] | None = None) -> ModelComparison:
+def compare_models(
+    fit: ComparableFit, models: Mapping[str, Element] | None = None
+) -> ModelComparison:
     """Fit other models to the same data and compare how they predict tests left out.
 
     Parameters

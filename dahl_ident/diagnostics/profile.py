@@ -225,7 +225,9 @@ class Profiler:
         narrow = _NARROW * self._conditional[index]
         return Bracket(target, first, step, furthest, self._logarithmic[index], narrow)
 
-    def _from_best_start(self, index: IntArray, theta: FloatArray, change: FloatArray) -> _Solution:
+    def _from_best_start(
+        self, index: IntArray, theta: FloatArray, change: FloatArray
+    ) -> _ConstrainedOptima:
         """Return constrained optima near theta + change, or far from it where friction is vague."""
         begins, rows = [theta + change], [np.arange(len(index))]
         for edge in self._edges:
@@ -274,7 +276,7 @@ class Profiler:
             known[side], deviance[i] = at.theta[0], at.deviance[0]
         return np.maximum(deviance, 0.0)
 
-    def _constrained(self, index: IntArray, start: FloatArray) -> _Solution:
+    def _constrained(self, index: IntArray, start: FloatArray) -> _ConstrainedOptima:
         """Return the optima with parameter `index` of each row held at its start."""
         rows = np.arange(len(index))
         held = np.zeros(start.shape, dtype=np.bool_)
@@ -287,7 +289,7 @@ class Profiler:
         stretch = self._stretch[index]
         deviance = 2.0 * (cost - self._least) * stretch
         slope = gradient[rows, index] * stretch
-        return _Solution(theta, deviance, slope, _tangent(hessian, index))
+        return _ConstrainedOptima(theta, deviance, slope, _tangent(hessian, index))
 
     def _minimised(self, held: BoolArray, start: FloatArray) -> FloatArray:
         def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
@@ -449,7 +451,7 @@ class _Reach(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Solution:
+class _ConstrainedOptima:
     """Constrained optima: where, deviance, half its slope by the held coordinate, tangent."""
 
     theta: FloatArray
@@ -457,11 +459,11 @@ class _Solution:
     slope: FloatArray
     tangent: FloatArray
 
-    def lowest(self, row: IntArray) -> _Solution:
+    def lowest(self, row: IntArray) -> _ConstrainedOptima:
         """Return the solution of the least deviance for each row, of several that belong to it."""
         order = np.lexsort((self.deviance, row))
         best = order[np.unique(row[order], return_index=True)[1]]
-        return _Solution(*(array[best] for array in vars(self).values()))
+        return _ConstrainedOptima(*(array[best] for array in vars(self).values()))
 
 
 def _along_valley(

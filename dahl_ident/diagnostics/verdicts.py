@@ -71,7 +71,7 @@ class Verdict(Enum):
         return self in (Verdict.IDENTIFIED, Verdict.BY_PRIOR)
 
 
-class Fit(Protocol):
+class JudgedFit(Protocol):
     """A fit that knows what its data determine."""
 
     @property
@@ -114,7 +114,7 @@ class ParameterVerdict:
 
 
 @dataclass(frozen=True)
-class DeterminedCombination:
+class StatedCombination:
     """A combination that is determined although its parts are not."""
 
     expression: str
@@ -134,7 +134,7 @@ class Identifiability:
     ----------
     parameters : mapping of str to ParameterVerdict
         By name.
-    combinations : tuple of DeterminedCombination
+    combinations : tuple of StatedCombination
         Determined combinations of parameters that are not.
     rank : int
         Directions that the data determine at all, to first order.
@@ -153,7 +153,7 @@ class Identifiability:
     """
 
     parameters: Mapping[str, ParameterVerdict]
-    combinations: tuple[DeterminedCombination, ...]
+    combinations: tuple[StatedCombination, ...]
     rank: int
     direction: Mapping[str, float]
     information_shares: Mapping[str, FloatArray]
@@ -214,7 +214,7 @@ class Identifiability:
         return "\n".join(lines)
 
 
-def identifiability(fit: Fit) -> Identifiability:
+def identifiability(fit: JudgedFit) -> Identifiability:
     """Say which parameters, or which combinations of them, the data determine.
 
     Parameters
@@ -456,7 +456,7 @@ def _determined(
     lost: frozenset[str],
     loose: frozenset[str],
     errors: ErrorModel | None,
-) -> tuple[DeterminedCombination, ...]:
+) -> tuple[StatedCombination, ...]:
     """Return the combinations of parameters that are not identified, but are together.
 
     Noise says which; a combination that other sources of error leave vague is not determined.
@@ -467,7 +467,7 @@ def _determined(
     units = {p.name: p.unit for p in optimum.problem.parameters}
     units |= {c.expression: c.unit for c in candidates(optimum)}
     found = [
-        DeterminedCombination(
+        StatedCombination(
             c.expression,
             units.get(c.expression, units.get(c.expression.partition("/")[0], "")),  # f_max/alpha
             c.value,
@@ -493,7 +493,7 @@ def _determined(
         if std < IDENTIFIED_BELOW:
             size = abs(candidate.value) * std
             found.append(
-                DeterminedCombination(candidate.expression, candidate.unit, candidate.value, size)
+                StatedCombination(candidate.expression, candidate.unit, candidate.value, size)
             )
     return tuple(found) if found else _stiffness_seen(optimum, information, loose, errors)
 
@@ -514,14 +514,14 @@ def _stiffness_seen(
     information: Information,
     loose: frozenset[str],
     errors: ErrorModel | None,
-) -> tuple[DeterminedCombination, ...]:
+) -> tuple[StatedCombination, ...]:
     seen = stiffness_seen(optimum)
     if seen is None or not seen.members <= loose or not np.isfinite(seen.value):
         return ()
     std = _combined_std(seen, optimum, errors, float(information.std(seen.direction)))
     if not std < IDENTIFIED_BELOW:
         return ()
-    return (DeterminedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
+    return (StatedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
 
 
 def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> bool:

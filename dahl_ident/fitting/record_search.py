@@ -462,28 +462,12 @@ def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
     FitError
         If the model gives no finite motion.
     """
-    full = started_at(problem, values.tolist())
-    held = values.size
-    theta = problem.to_search(full)
-
-    def evaluate(at: FloatArray, _which: object) -> Quadratic:
-        whole = np.column_stack([np.tile(theta[:held], (len(at), 1)), at])
-        found = problem.quadratic(whole)
-        return Quadratic(found.cost, found.gradient[:, held:], found.hessian[:, held:, held:])
-
-    linear = np.zeros(theta.size - held, dtype=np.bool_)
-    end = minimise(
-        evaluate,
-        theta[None, held:],
-        linear,
-        problem.n_residuals,
-        tolerance_factor=LOOSE,
-        steps=STEPS,
-    )
+    held = problem.held(dict(zip(problem.names, values.tolist(), strict=False)))
+    begin = held.to_search(started_at(held, []))
+    end = RecordSearch("lm", "linear").descend(held, begin, STEPS)
     if not np.isfinite(end.cost[0]):
         raise FitError("at these parameters the motion grows beyond all bounds")
-    full[held:] = end.theta[0]
-    return full
+    return np.concatenate([values, held.to_values(end.theta[0])])
 
 
 def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, float]) -> FloatArray:

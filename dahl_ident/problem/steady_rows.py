@@ -38,7 +38,7 @@ class RowMotion(NamedTuple):
     stable: NDArray[np.bool_]
 
 
-class _Solution(NamedTuple):
+class _SteadyMotions(NamedTuple):
     """Of some points: X_k with derivatives, (points, K, ...), orbits, X_1, multipliers."""
 
     X: ComplexArray
@@ -176,14 +176,14 @@ class SteadyRows:
         *,
         again: bool = True,
         stable: bool = True,
-    ) -> _Solution:
+    ) -> _SteadyMotions:
         """Return the motions of some points of one or more tables."""
         found = self._shooting(
             values, omega, drive, chosen=chosen, harmonics=self._harmonics, starts=starts,
             again=again, stable=stable,
         )  # fmt: skip
         X = [found.harmonics[..., None], found.by_drive[..., None], found.by_parameter]
-        return _Solution(
+        return _SteadyMotions(
             np.concatenate(X, axis=-1), found.starts, found.harmonics[:, 0], found.multiplier
         )
 

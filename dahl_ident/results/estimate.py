@@ -458,9 +458,8 @@ def _refuse_options(
     defaults = signature(of).parameters
     given = [name for name in refused if options[name] != defaults[name].default]
     if given:
-        raise ValidationError(
-            f"{', '.join(given)} given with {kind}, which has no such option; leave it out"
-        )
+        names = ", ".join(argument(name).rstrip("=") for name in given)
+        raise ValidationError(f"{names} given with {kind}, which has no such option; leave it out")
 
 
 def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
