@@ -246,20 +246,20 @@ def joint_prior(
     return JointPrior(tuple(parts))
 
 
-def _checked_prior(parameter: Parameter, given: Any) -> PriorLike:
+def _checked_prior(parameter: Parameter, stated: Any) -> PriorLike:
     """Return a prior as it was given, or raise where it is none for the parameter."""
-    frozen = not hasattr(given, "freeze")  # as those of scipy.stats without parameters have
-    if frozen and all(hasattr(given, name) for name in ("logpdf", "cdf", "ppf")):
-        _check_support(parameter, given)
-        prior: Distribution = given
+    frozen = not hasattr(stated, "freeze")  # as those of scipy.stats without parameters have
+    if frozen and all(hasattr(stated, name) for name in ("logpdf", "cdf", "ppf")):
+        _check_support(parameter, stated)
+        prior: Distribution = stated
         return prior
-    if not isinstance(given, Sequence) or len(given) != 2:
+    if not isinstance(stated, Sequence) or len(stated) != 2:
         raise ValidationError(
-            f"the prior of {parameter.name} is {given!r}; expected a frozen, continuous "
+            f"the prior of {parameter.name} is {stated!r}; expected a frozen, continuous "
             "distribution of one number, such as scipy.stats.norm(1.0, 0.005), or a pair "
             "(low, high)"
         )
-    low, high = finite_array(given, f"prior of {parameter.name}").tolist()
+    low, high = finite_array(stated, f"prior of {parameter.name}").tolist()
     if not low < high or (parameter.positive and low <= 0.0):
         positive = "0 < " if parameter.positive else ""
         raise ValidationError(
@@ -274,19 +274,19 @@ def _checked_prior(parameter: Parameter, given: Any) -> PriorLike:
     return low, high
 
 
-def _check_support(parameter: Parameter, given: Distribution) -> None:
+def _check_support(parameter: Parameter, dist: Distribution) -> None:
     """Refuse a distribution with noticeable probability where the parameter cannot be."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        outside = float(given.cdf(parameter.lower)) + 1.0 - float(given.cdf(parameter.upper))
-        median = float(given.ppf(0.5))
+        outside = float(dist.cdf(parameter.lower)) + 1.0 - float(dist.cdf(parameter.upper))
+        median = float(dist.ppf(0.5))
     if np.isnan([outside, median]).any():
         raise ValidationError(
-            f"the prior of {parameter.name}, {_name(given)}, is not defined: its own "
+            f"the prior of {parameter.name}, {_name(dist)}, is not defined: its own "
             "parameters are outside its allowed range, such as a standard deviation of 0"
         )
     if outside > 1e-3:
         raise ValidationError(
-            f"the prior of {parameter.name}, {_described(given)}, has {outside:.2g} of its "
+            f"the prior of {parameter.name}, {_described(dist)}, has {outside:.2g} of its "
             f"probability outside {parameter.lower:g} to {parameter.upper:g}; use one that lies "
             "inside, such as scipy.stats.lognorm for a positive parameter"
         )

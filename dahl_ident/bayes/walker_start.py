@@ -38,13 +38,13 @@ def optimum_of(problem: Problem) -> Optimum | None:
 
 def _with_normal_priors(problem: Any) -> Any:
     """Return the problem with priors of the sensors replaced by normal ones, for least squares."""
-    given = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
+    sensed = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
     from scipy import stats
 
     normal = {n: stats.norm(p.mean(), p.std()) for n, p in problem.priors.items()}
     if not normal:
         return problem
-    sensors = Sensors(**{**given, **normal})
+    sensors = Sensors(**{**sensed, **normal})
     return problem.like(sensors=sensors)
 
 

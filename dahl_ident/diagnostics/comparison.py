@@ -161,16 +161,16 @@ class ComparedModel:
     def resemblances(self) -> list[str]:
         """Which element these data cannot distinguish from a simpler one, in sentences."""
         problem, values = self.optimum.problem, parameter_values(self.optimum)
-        found = []
+        sentences = []
         for element in problem.model.elements:
-            own = [values[p.name] for p in element.parameters]
-            known = element.resembles(own, *_levels(problem))
+            at_element = [values[p.name] for p in element.parameters]
+            known = element.resembles(at_element, *_levels(problem))
             if known is not None and known[1] < _SEEN * self.density.noise:
-                found.append(
+                sentences.append(
                     f"{self.name}: at these levels it differs from {known[0]} by "
                     f"{percent(known[1])} rms, too little for these data to distinguish the two."
                 )
-        return found
+        return sentences
 
 
 @dataclass(frozen=True)
@@ -214,10 +214,10 @@ class ModelComparison:
     def undetermined(self) -> ComparedModel | None:
         """A physical model that leaves far less than the best, if the data do not determine it."""
         best, every = self._simplest, [m for m in self.models if m.is_physical]
-        found = max(every, key=lambda model: model.density.total)
-        gain, error = found.density.gain_over(best.density)
-        far = found.density.misfit < FAR_LESS * best.density.misfit
-        return found if far and gain > max(error, _BY_CHANCE) else None
+        likeliest = max(every, key=lambda model: model.density.total)
+        gain, error = likeliest.density.gain_over(best.density)
+        far = likeliest.density.misfit < FAR_LESS * best.density.misfit
+        return likeliest if far and gain > max(error, _BY_CHANCE) else None
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
@@ -299,7 +299,7 @@ class ModelComparison:
     def rows(self) -> list[list[str]]:
         """One row a model: misfits, degrees of freedom, changes, log density."""
         first = self.models[0]
-        found = []
+        lines = []
         for m in self.models:
             gain, error = m.density.gain_over(first.density)
             changes = [
@@ -307,12 +307,12 @@ class ModelComparison:
                 for key in ("force limit", "stiffness at zero force")
             ]
             mark = " (best)" if m is self.best else ""
-            found.append([
+            lines.append([
                 m.name, m.reason, percent(m.density.misfit), percent(m.density.harmonic_misfit),
                 str(m.optimum.dof), *changes,
                 ("0" if m is first else f"{gain:+.1f} ± {error:.1f}") + mark,
             ])  # fmt: skip
-        return found
+        return lines
 
     @property
     def common(self) -> list[str]:
@@ -322,9 +322,9 @@ class ModelComparison:
     @property
     def meanings(self) -> list[list[str]]:
         """Quantities common to all laws, one row a model, the stated estimate first."""
-        found = [] if self.stated is None else [(_STATED, self.stated)]
-        found += [(m.name, m.meaning) for m in self.models]
-        return [[name, *(f"{meaning[key]:.3g}" for key in self.common)] for name, meaning in found]
+        pairs = [] if self.stated is None else [(_STATED, self.stated)]
+        pairs += [(m.name, m.meaning) for m in self.models]
+        return [[name, *(f"{meaning[key]:.3g}" for key in self.common)] for name, meaning in pairs]
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a model."""
@@ -363,17 +363,17 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     for element in problem.model.elements:
         if not isinstance(element, Friction):
             continue
-        own = [np.asarray(values[p.name]) for p in element.parameters]
+        at_element = [np.asarray(values[p.name]) for p in element.parameters]
         with np.errstate(all="ignore"):
-            limit += float(np.mean(element.force_limits(own)))
-            contact = float(element.rest_stiffness(own))
+            limit += float(np.mean(element.force_limits(at_element)))
+            contact = float(element.rest_stiffness(at_element))
             if not contact:  # behind a gap
-                contact = float(element.quasi_static_slope(np.zeros(()), 1.0, own))
+                contact = float(element.quasi_static_slope(np.zeros(()), 1.0, at_element))
             stiffness += contact
-            energy += np.pi * sizes**2 * np.imag(element.stiffness(own, sizes, omega))
-    found = {"force limit": limit, "stiffness at zero force": stiffness}
+            energy += np.pi * sizes**2 * np.imag(element.stiffness(at_element, sizes, omega))
+    sizes_in_common = {"force limit": limit, "stiffness at zero force": stiffness}
     unit = si_unit("displacement", problem.motion)
-    return found | {
+    return sizes_in_common | {
         f"energy a cycle at {size:.2g} {unit}": float(e)
         for size, e in zip(sizes, energy, strict=True)
     }
@@ -479,10 +479,10 @@ def _candidates(
     smallest = float(_levels(problem)[0].min())
     offers: list[tuple[Element, dict[str, Alternative]]] = []
     for e in model.elements:
-        own = [values[p.name] for p in e.parameters]
-        known = np.all(np.isfinite(own)) and all(own[:2])
-        stays = e.started(own) if np.all(np.isfinite(own)) else e
-        offers.append((stays, e.alternatives(own, smallest) if known else {}))
+        at_element = [values[p.name] for p in e.parameters]
+        known = np.all(np.isfinite(at_element)) and all(at_element[:2])
+        stays = e.started(at_element) if np.all(np.isfinite(at_element)) else e
+        offers.append((stays, e.alternatives(at_element, smallest) if known else {}))
     shown = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
     if problem.settled:
         shown |= {

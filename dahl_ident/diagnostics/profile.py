@@ -243,13 +243,13 @@ class Profiler:
     @cached_property
     def _edges(self) -> list[FloatArray]:
         """Starts in gross slip, where data with a free spring do not rule out microslip."""
-        sd, found = np.sqrt(np.diagonal(self._optimum.covariance)), []
+        sd, begins = np.sqrt(np.diagonal(self._optimum.covariance)), []
         for chart in self._microslip_charts:
             f_max, sigma = _friction_of(chart)
             if max(sd[f_max], sd[sigma]) > DOUBTFUL:
                 ends = edge_starts(self._problem)
-                found += [e for e in ends if e[f_max] - e[sigma] < self._reach.smallest]
-        return found
+                begins += [e for e in ends if e[f_max] - e[sigma] < self._reach.smallest]
+        return begins
 
     @cached_property
     def _microslip_charts(self) -> list[Chart]:
@@ -311,8 +311,8 @@ class Profiler:
         ).theta
 
     def _quadratic(self, theta: FloatArray) -> Quadratic:
-        found: Quadratic = self._searched.quadratic(theta, self._scale, self._loss)
-        return found
+        at: Quadratic = self._searched.quadratic(theta, self._scale, self._loss)
+        return at
 
     @cached_property
     def _least(self) -> float:
@@ -392,13 +392,13 @@ class Profiler:
         near = position < self._farthest[index]
         columns = dict(zip(self._problem.names, theta.T, strict=True))
         for f_max, sigma in self._friction:
-            own = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
+            of_friction = np.isin(np.array(self._problem.names)[index], (f_max.name, sigma.name))
             ln_f_max, ln_sigma = (np.asarray(columns.get(p.name, _ln(p))) for p in (f_max, sigma))
             ln_x_c = ln_f_max - ln_sigma
             reach = self._reach
             seen = (ln_x_c > reach.least) & (ln_x_c < reach.most) & (ln_sigma > reach.softest)
             cancels = (ln_sigma > reach.stiffest) & (ln_x_c > reach.smallest)
-            near &= ~own | (seen & ~cancels)
+            near &= ~of_friction | (seen & ~cancels)
         return near
 
     @cached_property

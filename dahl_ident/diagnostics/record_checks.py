@@ -262,14 +262,14 @@ def _constraints(fit: JudgedRecords) -> Iterator[Finding]:
 
 def _misfit(fit: JudgedRecords) -> Iterator[Finding]:
     """Yield whether the model describes the records."""
-    far, found = fit.goodness.share_in_band > _FAIRLY, fit.optimum.converged
+    far, converged = fit.goodness.share_in_band > _FAIRLY, fit.optimum.converged
     if far:
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "records_not_described")
-    if not found:
+    if not converged:
         message = {"message": fit.optimum.message}
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "no_optimum", message)
     displaced = all(record.displacement is not None for record in fit.problem.records)
-    if fit.problem.output == "motion" and (far or not found) and displaced:
+    if fit.problem.output == "motion" and (far or not converged) and displaced:
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "motion_may_be_imposed")
     if misses(fit) and not far:
         yield Finding(_DESCRIBED, _APPROXIMATE, "records_misfit")

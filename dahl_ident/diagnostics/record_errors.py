@@ -96,11 +96,11 @@ class RecordErrors:
 
     def dof_for(self, place: int) -> float:
         """Degrees of freedom of one value, by Welch and Satterthwaite."""
-        own = {name: float(C[place, place]) for name, C in self.contributions.items()}
-        if np.isinf(sum(own.values())):  # which an infinite source alone decides
-            return min(self.dof_of(name) for name, u2 in own.items() if np.isinf(u2))
-        loss = sum(u2**2 / self.dof_of(name) for name, u2 in own.items())
-        return sum(own.values()) ** 2 / loss if loss > 0.0 else np.inf
+        by_source = {name: float(C[place, place]) for name, C in self.contributions.items()}
+        if np.isinf(sum(by_source.values())):  # which an infinite source alone decides
+            return min(self.dof_of(name) for name, u2 in by_source.items() if np.isinf(u2))
+        loss = sum(u2**2 / self.dof_of(name) for name, u2 in by_source.items())
+        return sum(by_source.values()) ** 2 / loss if loss > 0.0 else np.inf
 
 
 def record_errors(
@@ -137,23 +137,23 @@ def record_errors(
     white = [problem.filtered(J) for J in jacobians]
     left = [problem.filtered(e) for e in residuals]
     covariance, effective = sandwich(white, left)
-    found = {NOISE: covariance}
+    sources = {NOISE: covariance}
     beyond = between_blocks(white, left, covariance, len(problem.free))
     if beyond is not None:
-        found[MODEL] = beyond
-    so_far = np.asarray(sum(found.values()))
+        sources[MODEL] = beyond
+    so_far = np.asarray(sum(sources.values()))
     scatter = between_records(white, left, so_far, len(problem.free), problem.runs)
     if scatter is not None:
-        found[RUNS] = scatter
+        sources[RUNS] = scatter
     exponents = held_exponents(problem, values, white, left)
     if assumed := [one.contribution for one in exponents if one.assumed]:
-        found[EXPONENT] = np.asarray(sum(assumed))
+        sources[EXPONENT] = np.asarray(sum(assumed))
 
     def count(source: str, contribution: FloatArray) -> None:
         """Count a source that widens the interval of a parameter of the model."""
         matters = contribution.diagonal() > _MATTERS**2 * covariance.diagonal()
         if matters[: len(problem.free)].any():
-            found[source] = contribution
+            sources[source] = contribution
 
     if "delay" not in problem.calibration:
         with suppress(FitError):  # no motion next to the estimate
@@ -168,13 +168,13 @@ def record_errors(
             count(WINDOW, np.outer(change, change))
         if problem.with_memory and not problem.displacement_noise:
             more = noise_at_turns(problem, values, jacobians, residuals)
-            count(TURNS, _beyond(more, found.get(DISPLACEMENT, 0.0 * moved), covariance))
+            count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
             count(SAMPLING, _between_samples(problem, values, jacobians))
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
-    found |= _by_calibration(problem, values, jacobians)
-    exact = [DISPLACEMENT_GAIN] if DISPLACEMENT_GAIN not in found else []
+    sources |= _by_calibration(problem, values, jacobians)
+    exact = [DISPLACEMENT_GAIN] if DISPLACEMENT_GAIN not in sources else []
     by_force = problem.output == "force" or problem.excitation == "force"
     if problem.output == "motion":
         noise = drive_noise([record.force_samples for record in problem.records])
@@ -185,14 +185,14 @@ def record_errors(
             if noise.share > _SLIGHT:
                 more = more + noise.share**2 * np.outer(scale, scale)
             if more.any():
-                found[DRIVE] = more
+                sources[DRIVE] = more
     stated = [r.drive_factor_uncertainty for r in problem.records]
     factor = max((float(u) for u in stated), default=0.0)
     if factor > 0.0 and by_force:
-        found[FORCE] = found.get(FORCE, 0.0) + factor**2 * np.outer(scale, scale)
-    if FORCE not in found:
+        sources[FORCE] = sources.get(FORCE, 0.0) + factor**2 * np.outer(scale, scale)
+    if FORCE not in sources:
         exact.insert(0, FORCE)
-    return RecordErrors(found, effective, tuple(exact), len(set(problem.runs)), exponents)
+    return RecordErrors(sources, effective, tuple(exact), len(set(problem.runs)), exponents)
 
 
 def errors_on_constraints(
@@ -249,12 +249,12 @@ def _by_calibration(
         "displacement_gain": (DISPLACEMENT_GAIN, partial(scaled, 1)),
         "delay": (DELAY, delayed),
     }
-    found = {}
+    contributions = {}
     for name, u in problem.calibration.items():
         source, change_of = ways[name]
         change = u * change_of()
-        found[source] = np.outer(change, change)
-    return found
+        contributions[source] = np.outer(change, change)
+    return contributions
 
 
 def _by_drive(
@@ -390,10 +390,10 @@ def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErro
         rows = []
         for source, covariance in errors.contributions.items():
             kind: Literal["A", "B"] = "A" if source in (NOISE, MODEL, RUNS) else "B"
-            own = float(covariance[i, i])
+            part = float(covariance[i, i])
             dof = errors.dof_of(source)
-            share = float(np.isinf(own)) if np.isinf(u2) else own / u2 if u2 > 0.0 else 0.0
-            rows.append(BudgetRow(source, kind, own**0.5, dof, share))
+            share = float(np.isinf(part)) if np.isinf(u2) else part / u2 if u2 > 0.0 else 0.0
+            rows.append(BudgetRow(source, kind, part**0.5, dof, share))
         dof = errors.dof_for(i)
         rows.sort(key=lambda row: -row.u)
         parameters.append(
@@ -417,8 +417,8 @@ def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     endless = np.isinf(covariance.diagonal())
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    found = np.maximum(np.einsum("ij,jk,ik->i", slopes, finite, slopes), 0.0)
-    return np.where((slopes[:, endless] != 0.0).any(axis=1), np.inf, found)
+    sums = np.maximum(np.einsum("ij,jk,ik->i", slopes, finite, slopes), 0.0)
+    return np.where((slopes[:, endless] != 0.0).any(axis=1), np.inf, sums)
 
 
 def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:
@@ -464,18 +464,20 @@ def record_derived(
             labels.append(("equivalent damping", "N s/m", a))
 
     def quantities(at: FloatArray) -> FloatArray:
-        found, N = [], np.zeros(A.size, dtype=np.complex128)
-        for element, own in problem.model.of(problem.full_values(at)):
+        numbers, N = [], np.zeros(A.size, dtype=np.complex128)
+        for element, at_element in problem.model.of(problem.full_values(at)):
             if element.has_memory:
-                low, high = element.knee([np.asarray(v) for v in own])
-                found.append(float(low) if float(low) == float(high) else np.nan)
+                low, high = element.knee([np.asarray(v) for v in at_element])
+                numbers.append(float(low) if float(low) == float(high) else np.nan)
             if not element.is_linear and A.size:
-                N = N + element.stiffness([np.asarray(v) for v in own], A, np.full(A.size, omega))
+                N = N + element.stiffness(
+                    [np.asarray(v) for v in at_element], A, np.full(A.size, omega)
+                )
         for a, n in zip(A.tolist(), N.tolist(), strict=True):
-            found += [np.pi * a**2 * n.imag, n.real]
+            numbers += [np.pi * a**2 * n.imag, n.real]
             if frequency_hz is not None:
-                found.append(n.imag / omega)
-        return np.array(found)
+                numbers.append(n.imag / omega)
+        return np.array(numbers)
 
     centre = quantities(values)
     count = len(problem.free)

@@ -277,9 +277,9 @@ def between_records(
         return None
     whole: list[tuple[FloatArray, FloatArray]] = []
     for run in sorted(set(runs)):
-        own = [i for i, other in enumerate(runs) if other == run]
-        J, e = ([parts[i] for i in own] for parts in (jacobians, residuals))
-        whole.append((J[0], e[0]) if len(own) == 1 else (np.concatenate(J), np.concatenate(e)))
+        members = [i for i, other in enumerate(runs) if other == run]
+        J, e = ([parts[i] for i in members] for parts in (jacobians, residuals))
+        whole.append((J[0], e[0]) if len(members) == 1 else (np.concatenate(J), np.concatenate(e)))
     return _beyond(whole, known, count, _RUNS_LEVEL)
 
 
@@ -294,9 +294,9 @@ def _beyond(
     if not noise[np.ix_(seen, seen)].any():
         return None
     if seen.size < len(noise):
-        own, inside = [(J[:, seen], e) for J, e in blocks], noise[np.ix_(seen, seen)]
-        found = _beyond(own, inside, int((seen < count).sum()), level)
-        return None if found is None else _embedded(found, seen, len(noise))
+        visible, inside = [(J[:, seen], e) for J, e in blocks], noise[np.ix_(seen, seen)]
+        excess = _beyond(visible, inside, int((seen < count).sum()), level)
+        return None if excess is None else _embedded(excess, seen, len(noise))
     size = np.sqrt(noise.diagonal())
     scores = [(J * size).T @ e for J, e in blocks]
     parts = [(J * size).T @ (J * size) for J, _ in blocks]

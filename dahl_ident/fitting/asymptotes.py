@@ -131,13 +131,13 @@ class Limit:
         lost: NDArray[np.bool_],
     ) -> tuple[DeterminedCombination, ...]:
         """Return what is determined; `slopes` is dtheta/dphi, and the last two are of phi."""
-        found = []
+        determined = []
         for expression, powers in self.kept:
             by_phi = powers @ slopes
             if not by_phi.any() or (lost & (np.abs(by_phi) > 0.0)).any():
                 continue
             value = float(np.exp(powers @ theta))
-            found.append(
+            determined.append(
                 DeterminedCombination(expression, value, value * _spread(by_phi, covariance))
             )
         if self.chart.tied is not None:
@@ -145,8 +145,8 @@ class Limit:
             place = int(np.flatnonzero(self.chart.matrix[spring])[0])
             error = float(np.sqrt(covariance[place, place]))
             text = f"{self.names[sigma]} + {self.names[spring]}"
-            found.append(DeterminedCombination(text, float(phi[place]), error))
-        return tuple(found)
+            determined.append(DeterminedCombination(text, float(phi[place]), error))
+        return tuple(determined)
 
     def spread(
         self, slopes: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
@@ -273,7 +273,7 @@ def microslip_charts(problem: TableProblem) -> list[Chart]:
 
 def stiffness_charts(problem: TableProblem) -> list[Chart]:
     """Return the same for laws whose other scale parameter is given: ln sigma, the sum."""
-    found = []
+    charts = []
     for element, asymptote, spring in _tied(problem):
         if asymptote.follows is None or asymptote.adds_to_spring is None:
             continue
@@ -281,8 +281,8 @@ def stiffness_charts(problem: TableProblem) -> list[Chart]:
         others = [element.parameter(label) for label in asymptote.follows[:2]]
         if tied.free and not all(p.free for p in others):
             place = problem.names.index(tied.name)
-            found.append(_straightened(np.eye(len(problem.parameters)), spring, place))
-    return found
+            charts.append(_straightened(np.eye(len(problem.parameters)), spring, place))
+    return charts
 
 
 def _straightened(matrix: FloatArray, spring: int, sigma: int) -> Chart:
@@ -299,22 +299,22 @@ def limits(problem: TableProblem) -> list[Limit]:
         return []
     springs = free_springs(problem)
     alone = len(problem.model.elements) == 1
-    found: list[Limit] = []
+    every: list[Limit] = []
     for element in problem.model.elements:
-        own = directions(element)
+        axes = directions(element)
         if element.is_linear or not any(p.free for p in element.parameters):
             continue
         declared = _declared(element, problem)
         for asymptote in declared:
             if asymptote.adds_to_spring is None:
-                found += _plain(problem, element, asymptote, bool(springs))
+                every += _plain(problem, element, asymptote, bool(springs))
             else:
-                found += _microslip(problem, element, asymptote, springs)
+                every += _microslip(problem, element, asymptote, springs)
         if not declared:
-            found += _undeclared(problem, own)
+            every += _undeclared(problem, axes)
         if not alone:
-            found += _vanishing(problem, own)
-    return found
+            every += _vanishing(problem, axes)
+    return every
 
 
 def _plain(
@@ -352,21 +352,21 @@ def _microslip(
     if not all(p.free for p in both):
         return []
     sigma = problem.names.index(element.parameter(asymptote.adds_to_spring).name)
-    found = []
+    charts = []
     for parameter in springs:
         spring = problem.names.index(parameter.name)
         follow = both[0].name, both[1].name, np.log(np.asarray(factor))
         plain = _chart(problem, pins, follow, _kept(problem, element, asymptote))
         chart = replace(plain, tied=(spring, sigma))
         limit = _limit(problem, element, asymptote, chart)
-        found.append(replace(limit, extremes={**limit.extremes, parameter.name: -np.inf}))
-    return found
+        charts.append(replace(limit, extremes={**limit.extremes, parameter.name: -np.inf}))
+    return charts
 
 
-def _vanishing(problem: TableProblem, own: Directions) -> list[Limit]:
+def _vanishing(problem: TableProblem, axes: Directions) -> list[Limit]:
     """Return the limit in which the law has no force: its free scale parameters go to zero."""
     view = problem.stiffness_data
-    scale = [p for p in (*own.scale, *own.linear) if p.free and p.positive]
+    scale = [p for p in (*axes.scale, *axes.linear) if p.free and p.positive]
     if not scale:
         return []
     pins: dict[str, FloatArray | float] = {}
@@ -374,18 +374,18 @@ def _vanishing(problem: TableProblem, own: Directions) -> list[Limit]:
         ln_size = Direction(p, None, p.dimension).sizes(view)
         middle = ln_size.min(axis=-1) if len(scale) == 1 else ln_size.mean(axis=-1)
         pins[p.name] = middle + np.log(_NO_FRICTION)
-    for direction in own.nonlinear:
-        if direction.parameter not in own.scale:
+    for direction in axes.nonlinear:
+        if direction.parameter not in axes.scale:
             pins[direction.parameter.name] = _middle(problem, direction)
     gone = dict.fromkeys((p.name for p in scale), 0.0)
     return [Limit(problem.names, Status.NO_FRICTION, "", _chart(problem, pins), gone)]
 
 
-def _undeclared(problem: TableProblem, own: Directions) -> list[Limit]:
+def _undeclared(problem: TableProblem, axes: Directions) -> list[Limit]:
     """Return limits far out in every direction with a unit, on either side of the data."""
     view = problem.stiffness_data
-    found = []
-    for direction in own.nonlinear:
+    places = []
+    for direction in axes.nonlinear:
         if direction.is_number or not direction.parameter.positive:
             continue
         p, over = direction.parameter, direction.over
@@ -401,11 +401,11 @@ def _undeclared(problem: TableProblem, own: Directions) -> list[Limit]:
                 base = 0.0 if over is None else _ln(over)
                 chart = _chart(problem, {p.name: far + base})
                 extremes, kept = {p.name: value}, []
-                if own.is_free and own.reference is not None:
+                if axes.is_free and axes.reference is not None:
                     stuck = large == rising
-                    kept = [_kept_product(problem, own.reference, direction, -1 if stuck else 0)]
+                    kept = [_kept_product(problem, axes.reference, direction, -1 if stuck else 0)]
                     if np.count_nonzero(kept[0][1]) > 1:
-                        extremes[own.reference.name] = np.inf
+                        extremes[axes.reference.name] = np.inf
             else:
                 # of two parameters in a fixed ratio, the one with the unit of the limit remains
                 stiff = over.dimension[1] < p.dimension[1]
@@ -420,10 +420,10 @@ def _undeclared(problem: TableProblem, own: Directions) -> list[Limit]:
             meaning = "no amplitude reaches slip" if large == rising else "every amplitude slips"
             if direction.dimension[2]:
                 meaning = f"the data lie far {'below' if large else 'above'} {p.name}"
-            found.append(
+            places.append(
                 Limit(problem.names, Status.RUNS_AWAY, meaning, chart, extremes, tuple(kept))
             )
-    return found
+    return places
 
 
 def _kept_product(
@@ -508,10 +508,10 @@ def _chart(
     places = dict(pins) if follow is None else {**pins, follow[0]: follow[2]}
     offset = np.stack(np.broadcast_arrays(*(places.get(name, 0.0) for name in names)), axis=-1)
     matrix = np.eye(len(names))[:, [i for i, name in enumerate(names) if name not in places]]
-    own = matrix.T.copy()
+    columns = matrix.T.copy()
     if follow is not None:
         matrix[names.index(follow[0])] = matrix[names.index(follow[1])]
-    rows = np.vstack([_FIRMLY * np.reshape(kept, (-1, len(names))), own])
+    rows = np.vstack([_FIRMLY * np.reshape(kept, (-1, len(names))), columns])
     return Chart(matrix, offset, np.linalg.pinv(rows @ matrix) @ rows)
 
 

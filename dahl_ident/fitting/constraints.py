@@ -104,7 +104,7 @@ def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
     if not callable(constraints):
         raise ValidationError(f"constraints is {constraints!r}; expected a function: {_EXAMPLE}")
     try:
-        found = constraints(symbols)
+        relations = constraints(symbols)
     except RuntimeError as exc:  # casadi's, for the truth value that 0 <= x <= 1 asks for
         if "truth value" not in str(exc):
             raise
@@ -112,11 +112,11 @@ def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
             "a constraint chains comparisons or joins them with 'and'; write each as one item, "
             "such as [p['sigma'] >= 1, p['sigma'] <= 2]"
         ) from None
-    if isinstance(found, ca.SX) or not isinstance(found, Iterable):
+    if isinstance(relations, ca.SX) or not isinstance(relations, Iterable):
         raise ValidationError(
-            f"constraints returned {found!r}; expected a list of comparisons: {_EXAMPLE}"
+            f"constraints returned {relations!r}; expected a list of comparisons: {_EXAMPLE}"
         )
-    return list(found)
+    return list(relations)
 
 
 def _is_comparison(item: Any) -> int | None:

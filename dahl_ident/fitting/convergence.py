@@ -129,11 +129,11 @@ def optima(
             limit, phi, hessian = at
             one = problem.table(table)
             chart = limit.chart.derivative(theta[table])
-            own = hessian
+            information = hessian
             if loss is not None or not problem.gaussian:
-                own = information_of(one, theta[table], scale, loss, int(dof[table]), chart)
+                information = information_of(one, theta[table], scale, loss, int(dof[table]), chart)
             ratio = (final[table] / scale) ** 2
-            small, gone = inverse(own)
+            small, gone = inverse(information)
             small = small * ratio
             combinations[table] = limit.combinations(theta[table], phi, chart, small, gone)
             covariance[table], lost[table] = limit.spread(chart, small, gone)

@@ -125,7 +125,7 @@ def directions(element: Element) -> Directions:
         if label in element.scale_parameters and p not in linear
     )
     reference = _reference(scale)
-    found = []
+    searched = []
     for parameter in element.parameters:
         if not parameter.free or parameter in linear or parameter is reference:
             continue
@@ -134,8 +134,10 @@ def directions(element: Element) -> Directions:
         over = reference if parameter in scale else None
         own, other = parameter.dimension, (0, 0, 0) if over is None else over.dimension
         dimension = own[0] - other[0], own[1] - other[1], own[2] - other[2]
-        found.append(Direction(parameter, over, dimension))
-    return Directions(element, tuple(p for p in linear if p.free), scale, reference, tuple(found))
+        searched.append(Direction(parameter, over, dimension))
+    return Directions(
+        element, tuple(p for p in linear if p.free), scale, reference, tuple(searched)
+    )
 
 
 def is_positive(parameter: Parameter) -> bool:

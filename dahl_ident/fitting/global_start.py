@@ -96,13 +96,13 @@ def own_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
     none where all count alike.
     """
     view = problem.stiffness_data
-    found = _starts(problem, view)
+    begin = _starts(problem, view)
     if not resistant:
-        return found
+        return begin
     size = np.maximum(np.abs(view.stiffness), SMALLEST)
     for weights in (1.0 / size, np.ones(size.shape)):
-        found = found.joined(_starts(problem, replace(view, weights=weights)))
-    return found
+        begin = begin.joined(_starts(problem, replace(view, weights=weights)))
+    return begin
 
 
 def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
@@ -128,19 +128,19 @@ def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
         else:
             theta = grid.theta(coefficients, place)
         theta[np.diff(table, prepend=-1) > 0] = best
-    found = Starts(table, theta)
+    begin = Starts(table, theta)
     if all(p.value is None for p in problem.parameters):
-        return found
+        return begin
     values = problem.to_values(best).reshape(S, -1)
     for index, parameter in enumerate(problem.parameters):
         if parameter.value is not None:
             values[:, index] = parameter.value
-    given = problem.to_search(values)
-    new = ~np.isclose(given, best, rtol=1e-12).all(axis=1)
-    more = Starts(np.flatnonzero(new), given[new])
-    found = found.joined(more)
-    order = np.argsort(found.table, kind="stable")
-    return Starts(found.table[order], found.theta[order])
+    stated = problem.to_search(values)
+    new = ~np.isclose(stated, best, rtol=1e-12).all(axis=1)
+    more = Starts(np.flatnonzero(new), stated[new])
+    begin = begin.joined(more)
+    order = np.argsort(begin.table, kind="stable")
+    return Starts(begin.table[order], begin.theta[order])
 
 
 def _vertices(grid: _Grid, cost: FloatArray, coefficients: FloatArray) -> FloatArray:
@@ -168,12 +168,12 @@ def edge_starts(problem: TableProblem) -> list[FloatArray]:
     """
     grid = _grid(problem, problem.stiffness_data)
     cost, coefficients = grid.solved()
-    found = []
+    edges = []
     for index, curves in enumerate(grid.curves):
         for at in curves.edges:
             there = np.where(at[grid.nodes[:, index]], cost, np.inf)
-            found.append(grid.theta(coefficients, there.argmin(axis=-1)[..., None])[..., 0, :])
-    return found
+            edges.append(grid.theta(coefficients, there.argmin(axis=-1)[..., None])[..., 0, :])
+    return edges
 
 
 def _vertex(cost: FloatArray, theta: FloatArray) -> FloatArray:
@@ -232,9 +232,9 @@ class _Grid:
             cost, coefficients = _solve_one(self.target, curve, self.weights)
         else:
             cost, coefficients = _solve_linear(*self._system())
-        own = coefficients[..., len(self.common) :]
+        separate = coefficients[..., len(self.common) :]
         positive = [c.is_positive for curves in self.curves for c in curves.columns]
-        allowed = ((own > 0.0) | ~np.array(positive, dtype=np.bool_)).all(axis=-1)
+        allowed = ((separate > 0.0) | ~np.array(positive, dtype=np.bool_)).all(axis=-1)
         return np.where(allowed, cost, np.inf), coefficients
 
     def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
@@ -271,20 +271,20 @@ class _Grid:
             chosen = coefficients[places]
         else:
             chosen = np.take_along_axis(coefficients, places[..., None], axis=-2)
-        found: dict[str, FloatArray] = {}
+        by_name: dict[str, FloatArray] = {}
         used = 0
         for column in self.common:
-            _scaled(found, column, chosen[..., used])
+            _scaled(by_name, column, chosen[..., used])
             used += 1
         for index, curves in enumerate(self.curves):
             node = self.nodes[places, index]
-            found.update({name: _taken(v, node) for name, v in curves.values.items()})
+            by_name.update({name: _taken(v, node) for name, v in curves.values.items()})
             for column in curves.columns:
-                _scaled(found, column, chosen[..., used])
+                _scaled(by_name, column, chosen[..., used])
                 used += 1
         theta = np.empty((*places.shape, len(self.problem.parameters)))
         for index, parameter in enumerate(self.problem.parameters):
-            value = found.get(parameter.name, parameter.value)
+            value = by_name.get(parameter.name, parameter.value)
             assert value is not None
             if parameter.positive:
                 value = np.log(np.maximum(np.abs(value), 1e-300))
@@ -435,14 +435,14 @@ def _possible(
 ) -> NDArray[np.bool_]:
     """Return at which nodes nothing speaks against an element physically, or every node."""
     names = [x.parameter.name for x in ordered]
-    found = []
+    possible = []
     for node in index.T:
-        own = {name: float(a[i]) for name, a, i in zip(names, axes, node, strict=True)}
+        by_name = {name: float(a[i]) for name, a, i in zip(names, axes, node, strict=True)}
         numbers = [
-            own.get(p.name, 1.0 if p.value is None else p.value) for p in d.element.parameters
+            by_name.get(p.name, 1.0 if p.value is None else p.value) for p in d.element.parameters
         ]
-        found.append(not d.element.physics(numbers))
-    return np.asarray(found) if any(found) else np.ones(len(found), dtype=np.bool_)
+        possible.append(not d.element.physics(numbers))
+    return np.asarray(possible) if any(possible) else np.ones(len(possible), dtype=np.bool_)
 
 
 def _numbers(direction: Direction) -> FloatArray:
@@ -557,9 +557,9 @@ def _table(
     `at` are the values of the directions at unit length.
     """
     element = d.element
-    given = dict(zip((x.parameter.name for x in ordered), at, strict=True))
+    at_unit = dict(zip((x.parameter.name for x in ordered), at, strict=True))
     values = [
-        np.asarray(given.get(p.name, 1.0 if p.free or p.value is None else p.value), np.float64)
+        np.asarray(at_unit.get(p.name, 1.0 if p.free or p.value is None else p.value), np.float64)
         for p in element.parameters
     ]
     plain = set(vars(element)) <= {"_name", "parameters", "scale_parameters"}
@@ -650,17 +650,19 @@ def _solve_one(
 
 
 def _solve_linear(
-    target: FloatArray, common: list[FloatArray], own: list[FloatArray]
+    target: FloatArray, common: list[FloatArray], separate: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the least sum of squares of target - coefficients times columns, and those.
 
     Columns in `common`, (..., 2 n), are the same at every node; they are projected out first,
-    because those in `own`, (..., C, 2 n), can be hard to tell from them.
+    because those in `separate`, (..., C, 2 n), can be hard to tell from them.
     """
     Q, R = _factors(common, target)
     rest = _projected(target, Q)
     columns = (
-        np.stack(np.broadcast_arrays(*own), axis=-2) if own else rest[..., None, :][..., :0, :]
+        np.stack(np.broadcast_arrays(*separate), axis=-2)
+        if separate
+        else rest[..., None, :][..., :0, :]
     )
     # a hardening law overflows at some nodes: no starts
     usable = np.asarray((np.abs(columns) < _LARGEST).all(axis=(-2, -1)))
@@ -727,14 +729,14 @@ def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]
     order = np.lexsort((flat[table, place], table))
     table, place = table[order], place[order]
     if mixed:
-        found, alike = flat[table, place], np.zeros(table.size, dtype=np.bool_)
-        alike[1:] = (np.diff(table) == 0) & (found[1:] <= (1.0 + _ALIKE) * found[:-1])
+        lows, alike = flat[table, place], np.zeros(table.size, dtype=np.bool_)
+        alike[1:] = (np.diff(table) == 0) & (lows[1:] <= (1.0 + _ALIKE) * lows[:-1])
         alike &= (np.bincount(table[~alike], minlength=S) > 1)[table]
         table, place = table[~alike], place[~alike]
     first = np.searchsorted(table, table)
     rank = np.arange(table.size) - first
-    found = flat[table, place]
-    good = (rank == 0) | ((rank < _MOST_STARTS) & (found <= _HOPELESS * found[first]))
+    lows = flat[table, place]
+    good = (rank == 0) | ((rank < _MOST_STARTS) & (lows <= _HOPELESS * lows[first]))
     return table[good], place[good]
 
 

@@ -125,30 +125,30 @@ def solve_ipopt(
     >>> print(f"{tied.values[1] / tied.values[0]:.6f}")
     250.000000
     """
-    given = problem
+    plain = problem
     if drive_std is not None or drive_covariance is not None:
         problem = _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
     # a start takes no noise of the drive, which takes many times as long; a cost does
-    begin = solve(problem if relations.texts else given, loss=loss, start=start, tell=tell)
-    if begin.status.at_infinity and not relations.texts and problem is given:
+    begin = solve(problem if relations.texts else plain, loss=loss, start=start, tell=tell)
+    if begin.status.at_infinity and not relations.texts and problem is plain:
         return replace(begin, method="ipopt")
     # as the search left it: by a sine where there is no steady motion, freed of a record's delay
-    problem = begin.problem if problem is given else problem.with_steady(begin.problem.steady)
+    problem = begin.problem if problem is plain else problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss)
-    found = _search(target, begin, relations)
+    end = _search(target, begin, relations)
     dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
     if adapts and relations.texts:
 
         def again(scale: float) -> tuple[FloatArray, int]:
-            nonlocal target, found
+            nonlocal target, end
             target = replace(target, scale=scale)
-            found = _descend(target, found.theta, relations, found.evaluations)
-            return found.theta, dof
+            end = _descend(target, end.theta, relations, end.evaluations)
+            return end.theta, dof
 
         agreed_scale(problem, loss_named(loss, problem.parts), again, target.scale)
-    return _ended(target, found, relations, begin)
+    return _ended(target, end, relations, begin)
 
 
 @dataclass(frozen=True)
@@ -200,25 +200,25 @@ def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
     The least-squares optimum is the one start, unless it is not finite or a constraint binds:
     the minimum on a constraint may lie elsewhere.
     """
-    problem, found = target.problem, []
+    problem, ends = target.problem, []
     if np.isfinite(target.at(begin.theta).cost):
-        found.append(_descend(target, begin.theta, relations))
-        held = relations.freedom_lost or any(found[0].active)
-        if begin.success and not found[0].failure and not held:
-            return found[0]
+        ends.append(_descend(target, begin.theta, relations))
+        held = relations.freedom_lost or any(ends[0].active)
+        if begin.success and not ends[0].failure and not held:
+            return ends[0]
     low, high = problem.bounds()
-    found += [
+    ends += [
         _descend(target, theta, relations)
         for theta in np.clip(starts_of(problem)[:_MOST_STARTS], low, high)
         if np.isfinite(target.at(theta).cost)
     ]
-    if not found:
+    if not ends:
         raise FitError("no start has a steady response in every row; give another start")
-    best = min(found, key=lambda end: (bool(end.failure), end.cost))
+    best = min(ends, key=lambda end: (bool(end.failure), end.cost))
     if not best.failure:  # again, in the units of the optimum
-        found.append(_descend(target, best.theta, relations))
-        best = best if found[-1].failure else found[-1]
-    return replace(best, evaluations=sum(end.evaluations for end in found))
+        ends.append(_descend(target, best.theta, relations))
+        best = best if ends[-1].failure else ends[-1]
+    return replace(best, evaluations=sum(end.evaluations for end in ends))
 
 
 def _descend(
@@ -392,44 +392,44 @@ def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArra
     return np.broadcast_to(value, shape)
 
 
-def _ended(target: Target, found: _Found, relations: Relations, begin: Optimum) -> Optimum:
+def _ended(target: Target, end: _Found, relations: Relations, begin: Optimum) -> Optimum:
     """Return the optimum with status, sentence and covariance."""
     problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
-    if found.return_status == "Infeasible_Problem_Detected":
+    if end.return_status == "Infeasible_Problem_Detected":
         raise FitError(
             f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
             "bounds; IPOPT found the least violation elsewhere: relax one of them"
         )
-    words = found.failure
+    words = end.failure
     minima = Minima(
-        found.theta[None],
-        np.array([found.cost]),
-        target.at(found.theta).hessian[None],
+        end.theta[None],
+        np.array([end.cost]),
+        target.at(end.theta).hessian[None],
         np.array([not words]),
-        np.array([begin.nfev + found.evaluations]),
+        np.array([begin.nfev + end.evaluations]),
     )
     result = optima(problem, Ends(minima), target.scale, loss, "ipopt", minima.evaluations)[0]
     if words:
         return replace(result, message=f"{result.message} IPOPT says: {words}.")
     if not relations.texts:
         return result
-    return _constrained(result, target, found, relations, begin)
+    return _constrained(result, target, end, relations, begin)
 
 
 def _constrained(
-    result: Optimum, target: Target, found: _Found, relations: Relations, begin: Optimum
+    result: Optimum, target: Target, end: _Found, relations: Relations, begin: Optimum
 ) -> Optimum:
     """Return `result` as found, not reordered, with the covariance on the constraints."""
     problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
     dof = result.dof + relations.freedom_lost
     scale = target.scale
     if not problem.scale_known and loss is None and not problem.priors:
-        scale = float(estimated_scale(problem, found.cost, dof))
+        scale = float(estimated_scale(problem, end.cost, dof))
     covariance, undetermined = _on_constraints(
-        information_of(problem, found.theta, target.scale, loss, dof),
-        found.slopes[np.array(relations.equal, dtype=np.bool_)],
+        information_of(problem, end.theta, target.scale, loss, dof),
+        end.slopes[np.array(relations.equal, dtype=np.bool_)],
     )
-    active = [text for text, hit in zip(relations.texts, found.active, strict=True) if hit]
+    active = [text for text, hit in zip(relations.texts, end.active, strict=True) if hit]
     status, message = result.status, result.message
     if undetermined.any():
         names = [n for n, lost in zip(problem.names, undetermined, strict=True) if lost]
@@ -446,29 +446,29 @@ def _constrained(
         message = status.value
     return replace(
         result,
-        theta=found.theta,
-        values=problem.to_values(found.theta),
+        theta=end.theta,
+        values=problem.to_values(end.theta),
         covariance=covariance * (scale / target.scale) ** 2,
         scale=scale,
         dof=dof,
         status=status,
         message=message,
-        constraint_cost=_constraint_cost(target, found, relations, begin),
+        constraint_cost=_constraint_cost(target, end, relations, begin),
     )
 
 
 def _constraint_cost(
-    target: Target, found: _Found, relations: Relations, begin: Optimum
+    target: Target, end: _Found, relations: Relations, begin: Optimum
 ) -> ConstraintCost | None:
     """Return what the constraints cost against the least squares without them, `begin`."""
     of_one_scale = target.problem.scale_known or not target.problem.priors
     if target.loss != "linear" or not of_one_scale or begin.is_exact or begin.dof <= 0:
         return None
-    held = zip(relations.texts, relations.equal, found.active, strict=True)
+    held = zip(relations.texts, relations.equal, end.active, strict=True)
     texts = tuple(text for text, equal, active in held if equal or active)
     if not texts:
         return None
-    rise = 2.0 * max(found.cost - begin.cost, 0.0) / begin.scale**2
+    rise = 2.0 * max(end.cost - begin.cost, 0.0) / begin.scale**2
     return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
 
 

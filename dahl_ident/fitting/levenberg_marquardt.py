@@ -107,8 +107,8 @@ class Minima:
 
         Where costs are nearly alike, the one that has converged counts as the lower.
         """
-        own, others = (m.cost * np.where(m.converged, 1.0, 1.0 + NEARLY) for m in (self, other))
-        return self._or(other, others < own)
+        ours, others = (m.cost * np.where(m.converged, 1.0, 1.0 + NEARLY) for m in (self, other))
+        return self._or(other, others < ours)
 
     def _or(self, other: Minima, wins: BoolArray) -> Minima:
         row = wins[:, None]
@@ -235,14 +235,14 @@ def _minimise(
         which = None if active.size == S else active
         if inside is not None:
             lost |= ~inside(at.theta, which)
-        own = owner[active]
-        lost |= (count > _OVERTIME * first[own]) & (at.cost > lowest[own])
+        owners = owner[active]
+        lost |= (count > _OVERTIME * first[owners]) & (at.cost > lowest[owners])
         ended = settled | lost
         if ended.any():
             settled &= ~lost
             converged[active] = settled
-            np.minimum.at(first, own[settled], count)
-            np.minimum.at(lowest, own[settled], at.cost[settled])
+            np.minimum.at(first, owners[settled], count)
+            np.minimum.at(lowest, owners[settled], at.cost[settled])
             ends.put(active, at.moved(settled & (short | unseen), step, predicted))
             keep = ~ended
             active, at = active[keep], at.take(keep)

@@ -395,8 +395,8 @@ class OptimumBatch(Sequence[Optimum]):
             parts.append(f"Involved: {', '.join(names)}.")
         elif status is Status.AT_BOUND:
             hit = at_bound(problem, self.theta[index])
-            found = zip(problem.names, values, hit, strict=True)
-            parts.append(f"At its bound: {', '.join(f'{n} = {v:g}' for n, v, at in found if at)}.")
+            hits = zip(problem.names, values, hit, strict=True)
+            parts.append(f"At its bound: {', '.join(f'{n} = {v:g}' for n, v, at in hits if at)}.")
         return " ".join(parts)
 
 

@@ -101,8 +101,8 @@ def solve_repetitions(
         if end.converged[0]:
             theta[row] = end.theta[0]
             scales[row] = (2.0 * end.cost[0] / again.n_residuals) ** 0.5
-    own = (2.0 * optimum.cost / problem.n_residuals) ** 0.5
-    return theta, np.sqrt(np.diagonal(optimum.covariance)) * scales / own
+    usual = (2.0 * optimum.cost / problem.n_residuals) ** 0.5
+    return theta, np.sqrt(np.diagonal(optimum.covariance)) * scales / usual
 
 
 class RecordSearch:
@@ -485,8 +485,8 @@ def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
     """
     values = problem.to_values(theta)
     limits = {
-        e.start[0] if e.name is None else f"{e.name}_{e.start[0]}": float(e.force_bounds(own)[1])
-        for e, own in problem.model.of([np.asarray(v) for v in problem.full_values(values)])
+        e.start[0] if e.name is None else f"{e.name}_{e.start[0]}": float(e.force_bounds(at)[1])
+        for e, at in problem.model.of([np.asarray(v) for v in problem.full_values(values)])
         if e.has_memory and e.start is Behaviour.start
     }
     return any(

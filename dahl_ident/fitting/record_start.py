@@ -102,7 +102,7 @@ class _Scan:
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
-        found: list[_Start] = []
+        begin: list[_Start] = []
         columns: dict[tuple[int, int], list[FloatArray]] = {}
         for places in product(*(range(len(c)) for c in choices)):
             for e, place in enumerate(places):
@@ -110,14 +110,14 @@ class _Scan:
                     columns[e, place] = self._columns(elements[e], choices[e][place])
             shapes = [choices[e][p] for e, p in enumerate(places)]
             sets = [columns[e, p] for e, p in enumerate(places)]
-            found += self._solve(elements, shapes, sets)
-        if not found:
+            begin += self._solve(elements, shapes, sets)
+        if not begin:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
-            found = [_Start(0.0, values, passive=True)]
-        found.sort(key=lambda start: start.misfit)
+            begin = [_Start(0.0, values, passive=True)]
+        begin.sort(key=lambda start: start.misfit)
         ranks = {True: 0, False: 0}
         kept: dict[tuple[int, bool], list[float]] = {}
-        for start in found:
+        for start in begin:
             rank = ranks[start.passive]
             if rank < count and all(self._apart(start.values, one) for one in kept.values()):
                 kept[rank, not start.passive] = start.values  # by turns, passive ones first
@@ -201,15 +201,15 @@ class _Scan:
         right = normal[:-1, -1] / size
         free = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
         solutions = [free] if (free >= 0.0).all() else [free, _passive(matrix, right)]
-        found = []
+        begin = []
         for solution in solutions:
             values = self._values(elements, shapes, scaled, solution / size)
             if values is not None:
                 misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
-                found.append(_Start(float(misfit), values, passive=solution is not free))
+                begin.append(_Start(float(misfit), values, passive=solution is not free))
         if len(solutions) == 1:
-            found = [start._replace(passive=True) for start in found]
-        return found
+            begin = [start._replace(passive=True) for start in begin]
+        return begin
 
     @staticmethod
     def _values(
@@ -285,11 +285,11 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
     full = np.zeros(len(problem.parameters))
     full[: len(values)] = values
     for number, measured in enumerate(problem.measured):
-        own = problem.own(full, number)
+        of_record = problem.own(full, number)
         if problem.output == "motion":
             x, v, _ = in_band(problem.records[number], measured)
-            own[0], own[1] = x[0], v[0]
+            of_record[0], of_record[1] = x[0], v[0]
         else:
             total = problem.predict(full, number, derivatives=False).output
-            own[-2] = float(np.mean(measured - total))
+            of_record[-2] = float(np.mean(measured - total))
     return full

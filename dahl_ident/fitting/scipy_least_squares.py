@@ -42,11 +42,11 @@ def minimise_by_scipy(
     converged, nfev, cost, at = False, 1, np.inf, start
     if np.isfinite(residuals(start)).all():
         with np.errstate(all="ignore"):
-            found = optimize.least_squares(
+            end = optimize.least_squares(
                 residuals, start, jacobian, bounds=bounds, x_scale="jac",
                 ftol=_COST, xtol=_STEP, gtol=_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
-        at, converged, nfev = np.asarray(found.x), found.status > 0, int(found.nfev)
+        at, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
     theta = at if chart is None else chart.theta(at)
     slopes = None if chart is None else chart.derivative(theta)
     there = problem.quadratic(theta, scale, loss, slopes)

@@ -121,10 +121,10 @@ def solve(
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
     _check(problem, start or {})
-    given: Any = problem
+    either: Any = problem
     if not problem.settled:
-        return solve_records(given, method, loss, start or {}, tell)
-    return _solve_table(given, method, loss, start or {}, limits=limits)
+        return solve_records(either, method, loss, start or {}, tell)
+    return _solve_table(either, method, loss, start or {}, limits=limits)
 
 
 def _solve_table(
@@ -132,15 +132,15 @@ def _solve_table(
 ) -> Optimum:
     """Return the optimum of one table."""
     search = TableSearch(problem, loss_named(loss, problem.parts), method=method, limits=limits)
-    own = [p.value for p in problem.parameters if p.value is not None]
-    if not limits and len(own) == len(problem.parameters):
-        return search.run(Starts(np.zeros(1, np.intp), problem.to_search(own)[None]))[0]
-    found = own_starts(problem, resistant=loss != "linear")
+    stated = [p.value for p in problem.parameters if p.value is not None]
+    if not limits and len(stated) == len(problem.parameters):
+        return search.run(Starts(np.zeros(1, np.intp), problem.to_search(stated)[None]))[0]
+    begin = own_starts(problem, resistant=loss != "linear")
     if start:
-        values = zip(problem.names, problem.to_values(found.theta[0]), strict=True)
-        given = problem.to_search([start.get(name, value) for name, value in values])
-        found = Starts(np.zeros(len(found.theta) + 1, dtype=np.intp), np.vstack([given, found[1]]))
-    optimum = search.run(found)[0]
+        values = zip(problem.names, problem.to_values(begin.theta[0]), strict=True)
+        theta = problem.to_search([start.get(name, value) for name, value in values])
+        begin = Starts(np.zeros(len(begin.theta) + 1, dtype=np.intp), np.vstack([theta, begin[1]]))
+    optimum = search.run(begin)[0]
     if limits and problem.is_exact and not problem.takes_energy(optimum.theta):
         sine = problem.with_steady("describing function")
         other = _solve_table(sine, method, loss, start, limits=True)
@@ -214,8 +214,8 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
         if begin is None:
             parts.append(search.run(own_starts(part)))
         else:
-            own = begin[first : first + at_once]
-            parts.append(search.run(Starts(np.arange(len(own)), own), given=True))
+            some = begin[first : first + at_once]
+            parts.append(search.run(Starts(np.arange(len(some)), some), given=True))
     return OptimumBatch.joined(batch, parts)
 
 
@@ -359,11 +359,11 @@ class TableSearch:
             return which if each else begin.table[which]
 
         def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
-            own = tables(which)
-            part = problem if own is None else problem.take(own)
+            chosen = tables(which)
+            part = problem if chosen is None else problem.take(chosen)
             if chart is None:
                 return part.quadratic(at, scale, loss)
-            shape = chart if own is None else chart.of(own)
+            shape = chart if chosen is None else chart.of(chosen)
             theta = shape.theta(at)
             return part.quadratic(theta, scale, loss, shape.derivative(theta))
 
@@ -373,10 +373,10 @@ class TableSearch:
             phi = (chart if each else chart.of(begin.table)).phi(begin.theta)
 
         def inside(at: FloatArray, which: IntArray | None) -> NDArray[np.bool_]:
-            own = tables(which)
+            chosen = tables(which)
             if chart is not None:
-                at = (chart if own is None else chart.of(own)).theta(at)
-            return self.reach(at, own)
+                at = (chart if chosen is None else chart.of(chosen)).theta(at)
+            return self.reach(at, chosen)
 
         minima = None
         if self.method == "scipy":
@@ -425,11 +425,11 @@ class TableSearch:
         parts = []
         for index, table in enumerate(begin.table):
             one = self.problem.table(int(table))
-            own = None if chart is None else chart.of(np.array([table])).one
-            found = minimise_by_scipy(one, phi[index], scale, self.loss, own)
-            if inside is not None and found.converged[0]:
-                found.converged[:] = inside(found.theta, np.array([index]))
-            parts.append(found)
+            one_chart = None if chart is None else chart.of(np.array([table])).one
+            end = minimise_by_scipy(one, phi[index], scale, self.loss, one_chart)
+            if inside is not None and end.converged[0]:
+                end.converged[:] = inside(end.theta, np.array([index]))
+            parts.append(end)
         return Minima.stacked(parts)
 
     def _look_wider_by_sine(
@@ -447,9 +447,9 @@ class TableSearch:
         lost = doubtful[~ends.minima.converged[doubtful]]
         if lost.size:
             again = Starts(np.arange(lost.size), other.minima.theta[lost])
-            found = self._of(lost)._descend(again, scale)
-            better = np.flatnonzero(found.converged | (found.cost < ends.minima.cost[lost]))
-            ends.put(lost[better], Ends(found.take(better)))
+            further = self._of(lost)._descend(again, scale)
+            better = np.flatnonzero(further.converged | (further.cost < ends.minima.cost[lost]))
+            ends.put(lost[better], Ends(further.take(better)))
         infinite = ~np.isfinite(self._friction_error(ends, scale))
         for table in doubtful.tolist():
             if table in other.limits and (infinite[table] or not ends.minima.converged[table]):
@@ -466,10 +466,10 @@ class TableSearch:
             end = end.better(self._descend(begin, scale))
         begin = Starts(every, end.theta).joined(begin)
         for chart in (*microslip_charts(problem), *stiffness_charts(problem)):
-            found = self._descend(begin, scale, chart)
-            theta = chart.theta(found.theta)
+            there = self._descend(begin, scale, chart)
+            theta = chart.theta(there.theta)
             hessian = problem.quadratic(theta, scale, self.loss).hessian
-            end = end.better(Minima(theta, found.cost, hessian, found.converged, found.evaluations))
+            end = end.better(Minima(theta, there.cost, hessian, there.converged, there.evaluations))
         faint = np.flatnonzero(~end.converged & self.reach(end.theta))
         if faint.size:
             part = self._of(faint)
@@ -485,26 +485,26 @@ class TableSearch:
     def _put_limits(self, ends: Ends, edges: Starts, scale: float) -> None:
         """Let the tables end at the best limit whose cost is no higher than where they are."""
         end = ends.minima
-        found: list[tuple[Limit, Minima]] = []
+        candidates: list[tuple[Limit, Minima]] = []
         for limit in sorted(limits(self.problem), key=lambda lim: lim.chart.matrix.shape[1]):
             there = self._descend(edges, scale, limit.chart, limit=True, steps=_FIRST_LOOK)
             further = np.flatnonzero(~there.converged & (there.cost < _HOPELESS * end.cost))
             if further.size:
-                own = limit.chart.of(further)
-                begin = Starts(np.arange(further.size), own.theta(there.theta[further]))
-                there.put(further, self._of(further)._descend(begin, scale, own, limit=True))
-            found.append((limit, there))
-        if not found:
+                charts = limit.chart.of(further)
+                begin = Starts(np.arange(further.size), charts.theta(there.theta[further]))
+                there.put(further, self._of(further)._descend(begin, scale, charts, limit=True))
+            candidates.append((limit, there))
+        if not candidates:
             return
-        costs = np.array([np.where(m.converged, m.cost, np.inf) for _, m in found])
-        sizes = np.array([limit.chart.matrix.shape[1] for limit, _ in found])[:, None]
+        costs = np.array([np.where(m.converged, m.cost, np.inf) for _, m in candidates])
+        sizes = np.array([limit.chart.matrix.shape[1] for limit, _ in candidates])[:, None]
         alike = (costs <= costs.min(axis=0) * (1.0 + _SAME)) & np.isfinite(costs)
         fewest = np.where(alike, sizes, np.inf).min(axis=0)
         chosen = np.where(alike & (sizes == fewest), costs, np.inf).argmin(axis=0)
         real = end.converged & np.isfinite(self._friction_error(ends, scale))
         ceiling = end.cost * (1.0 + np.where(real, _TIE, NEARLY))
         for table in np.flatnonzero(costs.min(axis=0, initial=np.inf) < np.inf):
-            limit, there = found[chosen[table]]
+            limit, there = candidates[chosen[table]]
             if there.cost[table] <= ceiling[table]:
                 ends.at_limit(int(table), limit, there)
 
@@ -513,10 +513,10 @@ class TableSearch:
         problem, best = self.problem.table(table), ends.minima.take(np.array([table]))
         starts = np.vstack([best.theta, begin.theta[begin.table == table]])
         for start in np.clip(starts, self.low, self.high):
-            found = minimise_by_scipy(problem, start, scale, self.loss)
-            found.converged[:] &= Reach(problem)(found.theta)
-            if found.cost[0] < best.cost[0] or not best.converged[0]:
-                best = found
+            end = minimise_by_scipy(problem, start, scale, self.loss)
+            end.converged[:] &= Reach(problem)(end.theta)
+            if end.cost[0] < best.cost[0] or not best.converged[0]:
+                best = end
         return best
 
     def _friction_error(self, ends: Ends, scale: float) -> FloatArray:

@@ -63,8 +63,8 @@ class ProblemBatch(TableProblem):
     ) -> None:
         self.steady = steady
         if isinstance(data, FrequencyResponse) or not len(data):
-            found = "one table" if isinstance(data, FrequencyResponse) else "empty"
-            raise DataError(f"data is {found}; expected a sequence of at least one")
+            shown = "one table" if isinstance(data, FrequencyResponse) else "empty"
+            raise DataError(f"data is {shown}; expected a sequence of at least one")
         tables = [checked_table(table) for table in data]
         self._set_model(model, sensors, free, fixed, tables[0].motion)
         tables = [as_response(table, self.model) for table in tables]

@@ -82,7 +82,7 @@ class Nearby:
         amplitude_error: FloatArray | None = None,
     ) -> Prediction:
         """Return what a predictor returns."""
-        found = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
+        near = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
         alone, change = self._alone, self._correction
         for place, slope in enumerate(self._slopes):
             change = change + slope * (theta[..., place, None] - self._theta[place])
@@ -90,13 +90,13 @@ class Nearby:
             change = change - self._by_level * amplitude_error
         with np.errstate(over="ignore", invalid="ignore"):
             factor = np.exp(change)
-            value = np.where(alone, change, found.value * factor)
+            value = np.where(alone, change, near.value * factor)
             size = np.where(alone, 1.0, value)
             changes = [
                 np.where(alone, 0.0, d * factor) + size * slope
-                for d, slope in zip(found.changes, self._slopes, strict=False)
+                for d, slope in zip(near.changes, self._slopes, strict=False)
             ]
-            level = found.by_ln_amplitude
+            level = near.by_ln_amplitude
             if derivatives:
                 level = np.where(alone, 0.0, level * factor) + size * self._by_level
         return Prediction(value, changes, level)
@@ -185,7 +185,7 @@ class Predictor:
 
     def unstable_rows(self, theta: FloatArray) -> list[int]:
         """Return the rows whose predicted steady motion is not stable, at theta of shape (P,)."""
-        found: list[int] = []
+        unstable: list[int] = []
         values = [
             constant if index is None else self._space.to_values(theta)[index]
             for index, constant in self._slots
@@ -194,8 +194,8 @@ class Predictor:
             if group.steady is not None and not group.steady.is_linear(values[:-3]).any():
                 drive = self._true_drive(group, values[-3:], None)
                 stable = group.steady.at(values[:-3], drive, []).stable
-                found += np.arange(self._rows.n)[group.rows][~stable].tolist()
-        return found
+                unstable += np.arange(self._rows.n)[group.rows][~stable].tolist()
+        return unstable
 
     def _steady_rows(self, part: slice | NDArray[np.intp]) -> SteadyRows | None:
         rows = self._rows

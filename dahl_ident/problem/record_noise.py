@@ -151,7 +151,7 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     place = np.arange(spectrum.size) / spectrum.size
     spectrum[place > highest] = 0.0
     order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
-    found = []
+    waves = []
     for wanted in range(order, 3):
         factor = s ** (wanted - order)
         wave = np.fft.irfft(spectrum * factor, m)[:n]
@@ -159,7 +159,7 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
             wave = wave + line
         elif wanted == order + 1:
             wave = wave + (y[-1] - y[0]) / record.duration
-        found.append(wave)
+        waves.append(wave)
     if order:
         from scipy.integrate import cumulative_trapezoid
         from scipy.signal import butter, detrend, sosfiltfilt
@@ -167,9 +167,9 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
         cut = min(max(lowest, 1.0 / n), 0.5)
         passed = butter(4, cut, "highpass", output="sos")
         for _ in range(order):
-            wave = cumulative_trapezoid(found[0], dx=1.0 / record.sample_rate, initial=0)
-            found.insert(0, np.asarray(sosfiltfilt(passed, detrend(wave))))
-    return found[0], found[1], found[2]
+            wave = cumulative_trapezoid(waves[0], dx=1.0 / record.sample_rate, initial=0)
+            waves.insert(0, np.asarray(sosfiltfilt(passed, detrend(wave))))
+    return waves[0], waves[1], waves[2]
 
 
 def _power(wave: FloatArray) -> FloatArray:
@@ -235,7 +235,7 @@ def travelled(displacement: FloatArray, noise: float, lead: float = LEADS[1]) ->
     [0.0, 0.0, 0.0, 7.0, 8.0, 8.0]
     """
     half, ahead = _HALF_BAND * noise, lead * noise
-    middle, place, found = float(displacement[0]), float(displacement[0]), []
+    middle, place, path = float(displacement[0]), float(displacement[0]), []
     for x in displacement.tolist():
         if x > middle + half:
             middle = x - half
@@ -243,5 +243,5 @@ def travelled(displacement: FloatArray, noise: float, lead: float = LEADS[1]) ->
         elif x < middle - half:
             middle = x + half
             place = middle - ahead
-        found.append(place)
-    return np.array(found)
+        path.append(place)
+    return np.array(path)

@@ -43,9 +43,9 @@ def force_of(
     x, v, a = problem.motions[number]
     path = x if problem.paths is None else problem.paths[number]
     record = problem.records[number]
-    own = problem.own(values, number)
+    of_record = problem.own(values, number)
     time = record.time - record.time[0]
-    *states, offset, drift = own.tolist()
+    *states, offset, drift = of_record.tolist()
     total = offset + drift * time
     by = np.zeros((x.size, len(problem.parameters) if derivatives else 0))
     start, column = 0, 0
@@ -56,16 +56,16 @@ def force_of(
         in_gap = element.has_memory and element.start is not Behaviour.start
         if derivatives:
             if in_gap:
-                found = _from_middle(element, at, moved, state)
+                history = _from_middle(element, at, moved, state)
             else:
-                found = element.force_history_gradient(at, moved, v, state, acceleration=a)
-            total = total + found.value
-            for parameter, slope in zip(element.parameters, found.by_parameter, strict=True):
+                history = element.force_history_gradient(at, moved, v, state, acceleration=a)
+            total = total + history.value
+            for parameter, slope in zip(element.parameters, history.by_parameter, strict=True):
                 if parameter.free:
                     by[:, column] = slope
                     column += 1
             if element.has_memory:
-                by[:, first + start] = found.by_state
+                by[:, first + start] = history.by_state
         elif in_gap:
             total = total + element.force_history(at, _before(moved, state))[1:]
         else:
@@ -91,24 +91,24 @@ def motion_of(
     """Return the motion of a driven plant at the samples of record `number`."""
     from dahl_ident.engine import march
 
-    own, free = problem.own(values, number), values[: len(problem.free)]
-    starts = own.size - 1
+    of_record, free = problem.own(values, number), values[: len(problem.free)]
+    starts = of_record.size - 1
     at, slopes = (part[0] for part in problem.coefficients(np.array([problem.full_values(values)])))
     slopes = slopes[:, problem.chosen]
     chosen = np.flatnonzero(slopes.any(axis=1)).tolist()
-    first, by_start, by_value = problem.first(own[:starts], at)
+    first, by_start, by_value = problem.first(of_record[:starts], at)
     time, drive = problem.drives[number]
-    found = march(
+    motion = march(
         problem.system, time, drive, time, first, at, chosen=chosen, derivatives=derivatives
     )
-    by = np.zeros((found.output.size, len(problem.parameters) if derivatives else 0))
+    by = np.zeros((motion.output.size, len(problem.parameters) if derivatives else 0))
     if derivatives:
         column = free.size + number * problem.per_record
-        by_number = found.by_parameter + found.by_first @ by_value[:, chosen]
+        by_number = motion.by_parameter + motion.by_first @ by_value[:, chosen]
         by[:, : free.size] = by_number @ slopes[chosen]
-        by[:, column : column + starts] = found.by_first @ by_start
+        by[:, column : column + starts] = motion.by_first @ by_start
         by[:, column + starts] = 1.0
-    return Predicted(found.output + own[starts], by)
+    return Predicted(motion.output + of_record[starts], by)
 
 
 def _before(path: FloatArray, play: float) -> FloatArray:
@@ -124,10 +124,10 @@ def _from_middle(
     That with respect to the place is a central difference.
     """
     step = _PLAY_STEP * float(np.ptp(path))
-    found = element.force_history_gradient(values, _before(path, play))
+    history = element.force_history_gradient(values, _before(path, play))
     high, low = (element.force_history(values, _before(path, play + s)) for s in (step, -step))
     by_play = (high - low)[1:] / (2.0 * step)
-    return HistoryGradient(found.value[1:], by_play, tuple(s[1:] for s in found.by_parameter))
+    return HistoryGradient(history.value[1:], by_play, tuple(s[1:] for s in history.by_parameter))
 
 
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
@@ -135,29 +135,29 @@ _SMALL = 0.1  # of the motion's inverse size: rates below are searched as number
 
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:
     """Return what each record adds: first states, an offset and, for forces, a drift."""
-    found = []
+    unknowns = []
     channel = records[0].motion_channel
     unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]
     for number in range(len(records)):
         tail = f"_{number + 1}" if len(records) > 1 else ""
         if output == "motion":
-            found.append(Parameter(f"initial_displacement{tail}", "m", "at the first sample"))
-            found.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))
+            unknowns.append(Parameter(f"initial_displacement{tail}", "m", "at the first sample"))
+            unknowns.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))
         for element in model.elements:
             name = f"{element.name}_" if element.name else ""
             if element.has_memory:
-                found.append(Parameter(f"{name}{element.start[0]}{tail}", *element.start[1:]))
+                unknowns.append(Parameter(f"{name}{element.start[0]}{tail}", *element.start[1:]))
             else:
-                found += [
+                unknowns += [
                     Parameter(f"{name}state_{i + 1}{tail}", "m", "at the first sample")
                     for i in range(element.n_states)
                 ]
         if output == "force":
-            found.append(Parameter(f"offset{tail}", "N", "constant in the measured force"))
-            found.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
+            unknowns.append(Parameter(f"offset{tail}", "N", "constant in the measured force"))
+            unknowns.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
         else:
-            found.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
-    return found
+            unknowns.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
+    return unknowns
 
 
 def bends(free: Sequence[Parameter], count: int, records: Sequence[Record]) -> FloatArray:
@@ -174,10 +174,10 @@ def bends(free: Sequence[Parameter], count: int, records: Sequence[Record]) -> F
         time = float(np.std(wave)) / steps / records[0].sample_rate
         order = ("displacement", "velocity", "acceleration").index(records[0].motion_channel)
         length = float(np.std(wave)) * time**order
-    found = np.zeros(count)
+    sizes = np.zeros(count)
     for i, p in enumerate(free):
         if not p.positive and not np.isfinite([p.lower, p.upper]).any():
             force, by_length, by_time = p.dimension
             if not force and (by_length or by_time):
-                found[i] = _SMALL * length**by_length * time**by_time
-    return found
+                sizes[i] = _SMALL * length**by_length * time**by_time
+    return sizes

@@ -436,7 +436,7 @@ class RecordProblem(Problem):
         """Times of the samples, and the drive's polynomials between them, of each record."""
         from dahl_ident.engine import band_limited
 
-        found = []
+        waves = []
         for record in self.records:
             time, interval = record.time - record.time[0], 1.0 / record.sample_rate
             drive = band_limited(record.force_samples, interval)
@@ -446,8 +446,8 @@ class RecordProblem(Problem):
                 step = np.clip(np.floor(place).astype(int), 0, time.size - 2)
                 late = np.polynomial.polynomial.polyval(place - step, drive[:, step], tensor=False)
                 drive = band_limited(late, interval)
-            found.append((time, drive))
-        return tuple(found)
+            waves.append((time, drive))
+        return tuple(waves)
 
     def to_search(self, values: ArrayLike) -> FloatArray:
         """Return search coordinates; values that have vanished are as small as numbers can be."""
@@ -482,8 +482,8 @@ class RecordProblem(Problem):
 
     def full_values(self, values: FloatArray) -> list[float]:
         """Return the value of every parameter of the model, fixed ones included."""
-        found = dict(zip(self.names, values.tolist(), strict=True))
-        return [float(found.get(p.name, p.value or 0.0)) for p in self.model.parameters]
+        by_name = dict(zip(self.names, values.tolist(), strict=True))
+        return [float(by_name.get(p.name, p.value or 0.0)) for p in self.model.parameters]
 
     def own(self, values: FloatArray, number: int) -> FloatArray:
         """Return the values that belong to one record alone."""

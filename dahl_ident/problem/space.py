@@ -161,8 +161,8 @@ class Interchangeable:
         ]
         self._parts = []
         for element in model.elements:
-            own = dict(zip(element.labels, element.parameters, strict=True))
-            parts = [[own[label] for label in part] for part in element.like_parts]
+            by_label = dict(zip(element.labels, element.parameters, strict=True))
+            parts = [[by_label[label] for label in part] for part in element.like_parts]
             if parts and all(p.free for part in parts for p in part):
                 self._parts.append(np.array([[names.index(p.name) for p in q] for q in parts]))
 

@@ -344,8 +344,8 @@ class TableProblem(Problem):
             Sensors included; NaN where a driven plant has no steady amplitude.
         """
         theta = self.space.checked(theta)
-        found = self._prediction(theta)
-        return np.array(np.broadcast_to(found.value, self._shape(theta)))
+        prediction = self._prediction(theta)
+        return np.array(np.broadcast_to(prediction.value, self._shape(theta)))
 
     fitted = predict
 
@@ -370,9 +370,9 @@ class TableProblem(Problem):
     def prediction_and_jacobian(self, theta: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
         """Return R, shape (n,) or (S, n), and dR/dtheta, (n, P) or (S, n, P)."""
         theta = self.space.checked(theta)
-        found, shape = self._prediction(theta, 2), self._shape(theta)
-        changes = [np.broadcast_to(d, shape) for d in found.changes]
-        return np.array(np.broadcast_to(found.value, shape)), np.stack(changes, axis=-1)
+        prediction, shape = self._prediction(theta, 2), self._shape(theta)
+        changes = [np.broadcast_to(d, shape) for d in prediction.changes]
+        return np.array(np.broadcast_to(prediction.value, shape)), np.stack(changes, axis=-1)
 
     def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
         """Return the size of a unit in each row, by powers of force, displacement and time."""

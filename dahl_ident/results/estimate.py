@@ -161,10 +161,10 @@ def fit(
     by_ipopt = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
     }  # fmt: skip
-    given = [name for name, value in by_ipopt.items() if value is not None]
-    if given and method != "ipopt":
+    of_ipopt = [name for name, value in by_ipopt.items() if value is not None]
+    if of_ipopt and method != "ipopt":
         raise ValidationError(
-            f"{' and '.join(given)} given; only {argument('method', 'ipopt')} takes that"
+            f"{' and '.join(of_ipopt)} given; only {argument('method', 'ipopt')} takes that"
         )
 
     def optimum_of(problem: Problem, tell: Tell | None) -> Optimum:
@@ -399,16 +399,16 @@ def posterior(
     """
     options = {**locals()}
     one_of(method, "method", METHODS)
-    given = data if isinstance(data, FitResult) else None
-    settled = isinstance(data, FrequencyResponse) if given is None else given.problem.settled
+    source = data if isinstance(data, FitResult) else None
+    settled = isinstance(data, FrequencyResponse) if source is None else source.problem.settled
     if not settled:
         _refuse_options(posterior, "a posterior of records", options, _NOT_OF_RECORDS)
     _refuse_options(posterior, argument("method", method), options, _NOT_OF_METHODS[method])
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
-    if given is not None:
-        _refuse_with_a_fit(given, options)
+    if source is not None:
+        _refuse_with_a_fit(source, options)
 
     def chain(density: LogDensity, start: Start) -> ChainSample:
         settings = ChainSettings.of(
@@ -422,7 +422,7 @@ def posterior(
             )
 
     if isinstance(data, FitResult):
-        problem, fitted = data.problem, given
+        problem, fitted = data.problem, source
     else:
         problem = _problem(data, _checked(model), free, fixed, sensors, noise, steady or "exact")
         optimum = optimum_of(problem)
@@ -456,20 +456,20 @@ def _refuse_options(
 ) -> None:
     """Refuse options that a kind of estimate does not have, unless they are left as they are."""
     defaults = signature(of).parameters
-    given = [name for name in refused if options[name] != defaults[name].default]
-    if given:
-        names = ", ".join(argument(name).rstrip("=") for name in given)
+    named = [name for name in refused if options[name] != defaults[name].default]
+    if named:
+        names = ", ".join(argument(name).rstrip("=") for name in named)
         raise ValidationError(f"{names} given with {kind}, which has no such option; leave it out")
 
 
 def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
     """Refuse what a fit has already."""
     names = ("model", "noise", "sensors", "fixed", "steady")
-    given = [name for name in names if options[name] is not None]
-    given += ["free"] if tuple(options["free"]) else []
-    if given:
+    named = [name for name in names if options[name] is not None]
+    named += ["free"] if tuple(options["free"]) else []
+    if named:
         raise ValidationError(
-            f"{', '.join(given)} is given together with a FitResult, which has its own; pass the "
+            f"{', '.join(named)} is given together with a FitResult, which has its own; pass the "
             "data instead"
         )
     if fit.first_order:
@@ -512,12 +512,12 @@ def _density(
     """Return the density with every source of error, or noise alone, and where to start from."""
     from scipy import stats
 
-    given, optimum = dict(priors or {}), None if fit is None else fit.optimum
+    stated, optimum = dict(priors or {}), None if fit is None else fit.optimum
     if fit is not None and not problem.settled:
         return _record_density(fit, priors, uncertainty), optimum
     if fit is None or optimum is None or uncertainty == "noise":
         values = None if optimum is None else optimum.values
-        return Density(problem, joint_prior(problem, given, values), likelihood), optimum
+        return Density(problem, joint_prior(problem, stated, values), likelihood), optimum
     _, assumed = with_assumed(problem)
     wider = problem.like(free=assumed) if assumed else problem
     errors = fit.errors_of_combinations
@@ -531,6 +531,6 @@ def _density(
         for name, one in assumed.items()
     }
     shared = None if errors is None else row_errors(errors)
-    prior = joint_prior(wider, given, wider.to_values(theta), of_assumed)
+    prior = joint_prior(wider, stated, wider.to_values(theta), of_assumed)
     density = Density(wider, prior, likelihood, shared)
     return density, replace(optimum, problem=wider, theta=theta)

@@ -250,13 +250,13 @@ def _constraint_cost(stored: Mapping[str, Any] | None) -> ConstraintCost | None:
     return ConstraintCost(tuple(stored["texts"]), float(stored["rise"]), float(stored["dof"]))
 
 
-def _describe_channel(given: Any) -> Any:
-    if given is None or isinstance(given, float):
-        return given
-    kind = getattr(getattr(given, "dist", None), "name", type(given).__name__)
+def _describe_channel(channel: Any) -> Any:
+    if channel is None or isinstance(channel, float):
+        return channel
+    kind = getattr(getattr(channel, "dist", None), "name", type(channel).__name__)
     if kind != "norm":
         raise DataError(f"a prior of kind {kind} cannot be written to a file; only norm can")
-    return {"norm": [float(given.mean()), float(given.std())]}
+    return {"norm": [float(channel.mean()), float(channel.std())]}
 
 
 def _channel(content: Any) -> Any:
