@@ -9,7 +9,7 @@ takes them into account (:mod:`dahl_ident.diagnostics.prediction_error`); else n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from dahl_ident.diagnostics.prediction_error import prediction_error, stated_noi
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem import TableProblem
+from dahl_ident.problem import Problem, TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.units import shown_unit
 
@@ -261,6 +261,37 @@ def friction_and_slopes(
             if parameter.free:
                 by[..., names.index(parameter.name)] += slope * slopes[parameter.name]
     return N, by
+
+
+def quantities(
+    problem: Problem,
+    by_name: Mapping[str, FloatArray],
+    amplitudes: Sequence[float],
+    frequency_hz: float | None,
+) -> Iterator[tuple[str, str, float | None, FloatArray]]:
+    """Yield name, unit, amplitude and values of what :func:`derived` has, without errors.
+
+    At (n,) values of the free parameters, by name.
+    """
+    motion, size = problem.motion, len(next(iter(by_name.values())))
+    friction = [
+        (e, [by_name.get(p.name, np.asarray(p.value)) for p in e.parameters])
+        for e in problem.model.elements
+        if e.has_memory
+    ]
+    for element, at in friction:
+        low, high = (np.broadcast_to(k, size) for k in element.knee(at))
+        if np.array_equal(low, high):
+            label = "x_c" if element.name is None else f"{element.name}_x_c"
+            yield label, shown_unit("m", motion), None, low
+    omega = 2.0 * np.pi * float(positive_array(1.0 if frequency_hz is None else frequency_hz, "f"))
+    for A in positive_array(amplitudes, "amplitudes").ravel().tolist():
+        sine = np.full(size, A), np.full(size, omega)
+        N = sum((e.stiffness(at, *sine) for e, at in friction), np.zeros(size, np.complex128))
+        yield ENERGY, "J", A, np.pi * A**2 * N.imag
+        yield "equivalent stiffness", shown_unit("N/m", motion), A, N.real
+        if frequency_hz is not None:
+            yield "equivalent damping", shown_unit("N s/m", motion), A, N.imag / omega
 
 
 def derived(

@@ -10,8 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray, positive_array
-from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.error_sources import RUNS
@@ -436,60 +435,4 @@ def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:
         parts.append("a single run")
     return Finding(
         Question.ASSUMED, VerdictStatus.TRUSTED, "records_assumed", {"parts": tuple(parts)}
-    )
-
-
-def record_derived(
-    problem: RecordProblem,
-    values: FloatArray,
-    covariance: FloatArray,
-    amplitudes: Sequence[float],
-    frequency_hz: float | None,
-) -> tuple[DerivedQuantity, ...]:
-    """Return x_c of each law that has one, and at each amplitude stiffness, loss and damping.
-
-    Of the laws that depend on amplitude, as for settled sines; slopes by central differences.
-    """
-    A = positive_array(amplitudes, "amplitudes").ravel() if len(amplitudes) else np.zeros(0)
-    omega = 2.0 * np.pi * (frequency_hz or 1.0)
-    labels: list[tuple[str, str, float | None]] = []
-    for element in problem.model.elements:
-        if element.has_memory:
-            name = "x_c" if element.name is None else f"{element.name}_x_c"
-            labels.append((name, "m", None))
-    for a in A.tolist():
-        labels.append(("energy lost in a cycle", "J", a))
-        labels.append(("equivalent stiffness", "N/m", a))
-        if frequency_hz is not None:
-            labels.append(("equivalent damping", "N s/m", a))
-
-    def quantities(at: FloatArray) -> FloatArray:
-        numbers, N = [], np.zeros(A.size, dtype=np.complex128)
-        for element, at_element in problem.model.of(problem.full_values(at)):
-            if element.has_memory:
-                low, high = element.knee([np.asarray(v) for v in at_element])
-                numbers.append(float(low) if float(low) == float(high) else np.nan)
-            if not element.is_linear and A.size:
-                N = N + element.stiffness(
-                    [np.asarray(v) for v in at_element], A, np.full(A.size, omega)
-                )
-        for a, n in zip(A.tolist(), N.tolist(), strict=True):
-            numbers += [np.pi * a**2 * n.imag, n.real]
-            if frequency_hz is not None:
-                numbers.append(n.imag / omega)
-        return np.array(numbers)
-
-    centre = quantities(values)
-    count = len(problem.free)
-    slopes = np.zeros((centre.size, count))
-    for i in range(count):
-        step = np.zeros(values.size)
-        step[i] = _STEP * abs(values[i])
-        if step[i] > 0.0:
-            slopes[:, i] = (quantities(values + step) - quantities(values - step)) / (2 * step[i])
-    errors = np.sqrt(variances(slopes, covariance[:count, :count]))
-    return tuple(
-        DerivedQuantity(name, unit, a, float(v), float(e))
-        for (name, unit, a), v, e in zip(labels, centre, errors, strict=True)
-        if np.isfinite(v)
     )

@@ -25,7 +25,7 @@ from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.bayes.sample import ChainSample, PointSample, Sample
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import plain_data
-from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at
+from dahl_ident.diagnostics.bands import DerivedQuantity, problem_at, quantities
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.judgement import Judgement
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
@@ -39,7 +39,7 @@ from dahl_ident.results.posterior_checks import (
     prior_influences,
     to_arviz,
 )
-from dahl_ident.results.posterior_prediction import PredictiveBand, derived_at_draws
+from dahl_ident.results.posterior_prediction import PredictiveBand
 from dahl_ident.results.result import Estimate, Parameters, Result, part
 from dahl_ident.units import Quantity
 
@@ -490,7 +490,10 @@ class Posterior(Result):
         tuple of DerivedQuantity
         """
         by_name = dict(zip(self.names, self.draws(RULE_DRAWS).T, strict=True))
-        return tuple(derived_at_draws(self.problem, by_name, amplitudes, frequency_hz))
+        return tuple(
+            DerivedQuantity(name, unit, A, float(draws.mean()), float(draws.std(ddof=1)))
+            for name, unit, A, draws in quantities(self.problem, by_name, amplitudes, frequency_hz)
+        )
 
     def plot(self, kind: str | None = None, ax: Any = None) -> Any:
         """Draw the posterior.

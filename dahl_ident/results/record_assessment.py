@@ -12,7 +12,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import Record
 from dahl_ident.data.record import cut
-from dahl_ident.diagnostics.bands import DerivedQuantity
+from dahl_ident.diagnostics.bands import DerivedQuantity, quantities
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.formatting import percent, table
@@ -31,7 +31,6 @@ from dahl_ident.diagnostics.record_errors import (
     errors_on_constraints,
     record_assumptions,
     record_budget,
-    record_derived,
     record_errors,
     variances,
 )
@@ -45,6 +44,8 @@ from dahl_ident.fitting.record_search import hold_model
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.results.assessment import Assessment
 from dahl_ident.units import shown_unit
+
+_STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 
 
 @dataclass(frozen=True)
@@ -251,20 +252,25 @@ class RecordAssessment(Assessment):
     def budget(self) -> Budget:
         """Return the uncertainty budget."""
         stated = record_budget(self.problem, self.optimum.values, self.errors)
-        parameters = tuple(replace(p, unit=self._shown(p.unit)) for p in stated.parameters)
-        return replace(stated, parameters=parameters)
-
-    def _shown(self, unit: str) -> str:
-        """Return a unit as it is written for the records' motion."""
-        return shown_unit(unit, self.problem.motion)
+        motion = self.problem.motion
+        shown = tuple(replace(p, unit=shown_unit(p.unit, motion)) for p in stated.parameters)
+        return replace(stated, parameters=shown)
 
     def derived(
         self, amplitudes: Sequence[float], frequency_hz: float | None
     ) -> tuple[DerivedQuantity, ...]:
         """Return x_c, energy per cycle, equivalent stiffness and damping."""
-        values = self.optimum.values
-        quantities = record_derived(self.problem, values, self.covar, amplitudes, frequency_hz)
-        return tuple(replace(quantity, unit=self._shown(quantity.unit)) for quantity in quantities)
+        count = self.problem.n_reported
+        values = self.optimum.values[:count]
+        steps = _STEP * np.maximum(np.abs(values), 1e-300)
+        points = np.vstack([values, values + np.diag(steps), values - np.diag(steps)])
+        by_name = dict(zip(self.problem.names, points.T, strict=False))
+        numbers = []
+        for name, unit, A, at in quantities(self.problem, by_name, amplitudes, frequency_hz):
+            slopes = (at[1 : count + 1] - at[count + 1 :]) / (2.0 * steps)
+            (variance,) = variances(slopes[None], self.covar[:count, :count])
+            numbers.append(DerivedQuantity(name, unit, A, float(at[0]), float(variance) ** 0.5))
+        return tuple(numbers)
 
     def predict_record(self, record: Record, initial: str) -> RecordBand:
         """Return what another record should show."""
