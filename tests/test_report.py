@@ -404,3 +404,16 @@ def test_of_several_fits_each_verdict_names_its_model(fit: di.FitResult, tmp_pat
     for one in (fit, with_spring):
         trust = f"{one.status.capitalize()}. "
         assert f"{one.problem.model!r}: {trust}" in head.replace("\\", "")
+
+
+def test_a_fit_with_constraints_is_reported(tmp_path: Path) -> None:
+    """Without profiles, which would not keep them."""
+    fit = di.fit(
+        di.load_dataset("noisy"),
+        di.Dahl(alpha=1.0),
+        method="ipopt",
+        constraints=lambda p: [p["sigma"] == 300 * p["f_max"]],
+    )
+    text = di.report(fit, tmp_path / "report.md").read_text("utf-8")
+    assert "Wald 95.45 %" in text
+    assert "profile" not in text.split("## Parameters")[1].split("## ")[0]

@@ -287,7 +287,7 @@ def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Se
 
 
 def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
-    for method in fit.assessment.quick_methods:
+    for method in ("wald",) if fit.first_order else fit.assessment.quick_methods:
         fit.conf_interval(method)
     intervals = fit.assessment.intervals_run(CONFIDENCE)
     alike = [one for one in drawn if one.problem.settled == fit.problem.settled]
