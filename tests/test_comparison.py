@@ -27,6 +27,7 @@ from dahl_ident import (
 )
 from dahl_ident.diagnostics.comparison import _candidates
 from dahl_ident.diagnostics.predictive_density import predictive_density
+from dahl_ident.errors import FitError
 from tests.command_line import Runner
 from tests.friction_tables import FRICTION, table
 
@@ -237,3 +238,17 @@ def test_a_power_damper_is_found_where_dahl_alone_slips_at_once() -> None:
     again = compare_models(fit(data, Dahl() + PowerDamper(), throw=False))
     assert again.best is again.models[0]
     assert "share the parameter names exponent" in str(again)
+
+
+def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere() -> None:
+    A = np.geomspace(1e-3, 1e-1, 12)
+    exact = Dahl(0.1, 30.0, alpha=30.0).describing_function(A)
+    noise = 0.003 * np.random.default_rng(1).standard_normal((2, A.size)).T @ [1.0, 1.0j]
+    data = FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
+    alone = compare_models(fit(data, Dahl(alpha=None), throw=False), {})
+    assert not alone.best.is_physical  # an exponent of 30
+    assert alone.best is alone.models[0]
+    optimum = fit(data, BoucWen(), throw=False).optimum
+    wild = replace(optimum, theta=optimum.problem.to_search([30.0, -1e6, 300.0]))
+    with pytest.raises(FitError, match="no finite response"):
+        predictive_density(wild)

@@ -16,6 +16,7 @@ from dahl_ident import (
     FrequencyResponse,
     Iwan,
     Mass,
+    PowerDamper,
     Spring,
     compare_models,
     extract,
@@ -80,6 +81,19 @@ class TestDamper:
         linear = fit(data, Dahl(alpha=1.0)).goodness
         (trend,) = (t for t in linear.trends if t.covariate == "frequency")
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
+
+    def test_runs_deviate_within_the_bounds_of_parameters(self) -> None:
+        """A power damper that these data do not ask for, its exponent at zero."""
+        files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
+        every = [
+            extract(
+                read_record(f, displacement="displacement", force="friction force"),
+                harmonics=[1, 3, 5, 7, 9],
+            )
+            for f in files
+        ]
+        found = fit(FrequencyResponse.concatenate(every), Dahl() + PowerDamper(), throw=False)
+        assert str(found.status) == "not determined"
 
     def test_other_models_are_compared_as_well(self, damper: FrequencyResponse) -> None:
         found = fit(damper.select(rows=np.arange(damper.n) % 3 == 0), Dahl())

@@ -213,7 +213,8 @@ class ModelComparison:
     @cached_property
     def undetermined(self) -> ComparedModel | None:
         """A physical model that leaves far less than the best, if the data do not determine it."""
-        best, every = self._simplest, [m for m in self.models if m.is_physical]
+        best = self._simplest
+        every = [model for model in self.models if model.is_physical or model is best]
         likeliest = max(every, key=lambda model: model.density.total)
         gain, error = likeliest.density.gain_over(best.density)
         far = likeliest.density.misfit < FAR_LESS * best.density.misfit

@@ -25,6 +25,7 @@ from dahl_ident.diagnostics.estimate import tests_of
 from dahl_ident.diagnostics.mixed_model import MixedModel, State
 from dahl_ident.diagnostics.record_sources import blocks_of
 from dahl_ident.diagnostics.residual_space import orthonormal
+from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import RecordProblem
 
@@ -78,6 +79,11 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     fitted : Optimum, optional
         The one it is compared with, which weighs the residuals of records for both.
 
+    Raises
+    ------
+    FitError
+        If the model has no finite response at the optimum.
+
     Examples
     --------
     >>> import dahl_ident as di
@@ -100,6 +106,8 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     size = np.where(size > 0.0, size, size.max())  # a row of nothing counts as the largest
     predicted = problem.predict(optimum.theta)
     missed = (data.response - predicted) / size
+    if not np.isfinite(missed).all():
+        raise FitError("the search ended where the model has no finite response")
     fundamental = owner == np.arange(data.n)
     y = _parts(missed)
     J = problem.prediction_jacobian(optimum.theta) / size[:, None]

@@ -78,7 +78,8 @@ def linearization(problem: TableProblem, theta: FloatArray, runs: RunDeviations)
         rows = labels == label
         deviation = gain + 1j * phase * problem.data.harmonic[rows]
         part = problem.part(rows, problem.data.response[rows] * np.exp(-deviation))
-        there, both = theta + shift, np.repeat(rows, 2)
+        there = np.clip(theta + shift, *problem.bounds())
+        both = np.repeat(rows, 2)
         at, by = part.residuals_and_jacobian(there, tails=False)
         at, by = at[: part.n_residuals], by[: part.n_residuals]
         predicted[rows] = part.predict(there)
