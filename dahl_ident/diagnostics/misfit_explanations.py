@@ -24,7 +24,7 @@ from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
-from dahl_ident.fitting.global_start import starts
+from dahl_ident.fitting.global_start import own_starts
 from dahl_ident.problem import TableProblem
 
 _LEVEL = 0.01  # false-alarm rate, of the worst of all points
@@ -238,7 +238,9 @@ def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum],
         try:
             problem = optimum.problem.like(data=turn(optimum.problem.data))
             # single rows near a resonance may miss at a start: the median is not bent by them
-            first = float(np.median(_misfit(problem, problem.predict(starts(problem)[0]))))
+            first = float(
+                np.median(_misfit(problem, problem.predict(own_starts(problem).theta[0])))
+            )
         except DahlIdentError:
             continue
         if first * _PROMISING < middle:

@@ -80,17 +80,10 @@ class Starts(NamedTuple):
         return Starts(np.searchsorted(tables, self.table[chosen]), self.theta[chosen])
 
 
-def starts(problem: TableProblem) -> FloatArray:
-    """Return the search coordinates of one table's best starts, best first, shape (starts, P).
-
-    Values that the user gave to free parameters make one more start, the last.
-    """
-    return own_starts(problem).theta
-
-
 def own_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
     """Return the best starts of every table of a problem, best first.
 
+    Values that the user gave to free parameters make one more start, the last.
     `resistant` ones have an outlier rule some of them, but not all: by other weights as well. A
     response far too large has no say where errors count relative to it, one far too small has
     none where all count alike.

@@ -34,7 +34,7 @@ from dahl_ident.fitting.asymptotes import (
     stiffness_charts,
 )
 from dahl_ident.fitting.convergence import Ends, optima
-from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts, starts
+from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts
 from dahl_ident.fitting.levenberg_marquardt import (
     NEARLY,
     IntArray,
@@ -152,7 +152,7 @@ def _solve_table(
 def starts_of(problem: Problem) -> FloatArray:
     """Return the search coordinates of global starts."""
     one: Any = problem
-    return starts(one) if problem.settled else one.to_search(record_starts(one))
+    return own_starts(one).theta if problem.settled else one.to_search(record_starts(one))
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
