@@ -135,18 +135,13 @@ def _comparison(differences: Sequence[_Difference]) -> Section:
             estimate = fit.params[change.parameter]
             value, error = rounded(estimate.value, estimate.stderr or 0.0)
             estimates.append(Cell(f"{value} \u00b1 {error}", estimate.value))
-        value, error = rounded(change.change, change.u)
-        usable = math.isfinite(change.p)
         says = "disagree" if _disagree(change, differences) else "agree"
         rows.append(
             (
                 Cell(change.parameter),
                 *estimates,
-                Cell(value, change.change, struck=not usable),
-                Cell(error, change.u if math.isfinite(change.u) else None, struck=not usable),
-                Cell(change.unit or "-"),
-                Cell(change.p_text, change.p if usable else None),
-                Cell(says if usable else "cannot be compared"),
+                *_sizes(change, change.p_text),
+                Cell(says if math.isfinite(change.p) else "cannot be compared"),
             )
         )
     header = (
@@ -158,23 +153,25 @@ def _comparison(differences: Sequence[_Difference]) -> Section:
     return Section("Table and waveforms", (table, Paragraph(_HOW_BOTH)))
 
 
+def _sizes(change: Change, p: str) -> list[Cell]:
+    """Return a change, its uncertainty, their unit and p as written; struck if not usable."""
+    value, error = rounded(change.change, change.u)
+    usable = math.isfinite(change.p)
+    return [
+        Cell(value, change.change, struck=not usable),
+        Cell(error, change.u if math.isfinite(change.u) else None, struck=not usable),
+        Cell(change.unit or "-"),
+        Cell(p, change.p if usable else None),
+    ]
+
+
 def changes_section(changed: Sequence[Change]) -> Section:
     """Return the table of changes, and how it is made."""
     rows = []
     for c in changed:
-        value, error = rounded(c.change, c.u)
-        usable = math.isfinite(c.p)
-        rows.append(
-            (
-                Cell(c.parameter),
-                Cell(f"{c.before} to {c.after}"),
-                Cell(value, c.change, struck=not usable),
-                Cell(error, c.u if math.isfinite(c.u) else None, struck=not usable),
-                Cell(c.unit or "-"),
-                Cell(c.p_number if usable else "-", c.p if usable else None),
-                Cell(c.significance),
-            )
-        )
+        p = c.p_number if math.isfinite(c.p) else "-"
+        between = Cell(f"{c.before} to {c.after}")
+        rows.append((Cell(c.parameter), between, *_sizes(c, p), Cell(c.significance)))
     header = (
         "parameter", "between", "change", "standard uncertainty u", "unit", "p", "significance"
     )  # fmt: skip
