@@ -16,8 +16,8 @@ from benchmarks.uncertainty import (
     SEED,
     Cell,
     Draw,
+    several_days,
     shared_by_level,
-    three_days,
     unmodelled,
     wrong_exponent,
 )
@@ -38,8 +38,8 @@ def cells() -> list[Cell]:
     return [
         Cell("the model is right, exponent given", right(), model=LINEAR),
         Cell("the model is right", right()),
-        Cell("three days, f_max off by 2 %", three_days("f_max", 0.02), model=LINEAR),
-        Cell("three days, gain off by 2 %", three_days("gain", 0.02), model=LINEAR),
+        Cell("three days, f_max off by 2 %", several_days("f_max", 0.02), model=LINEAR),
+        Cell("three days, gain off by 2 %", several_days("gain", 0.02), model=LINEAR),
         Cell("eight levels with errors in common", shared_by_level, model=LINEAR),
         Cell("exponent 0.8", wrong_exponent(0.8, 0.1, 10.0)),
         Cell("mass worth 0.3 % of sigma", unmodelled("mass", 0.003), model=LINEAR),

@@ -186,7 +186,7 @@ class TestBeam:
         data = beam.select(level=levels)
         data = data.select(rows=np.arange(data.n) % 8 == 0)
         found = fit(data, Iwan(ratio=1.0) + Mass() + Damper(), throw=False)
-        assert found.verdict.startswith("Not determined.")  # eight tests, a misfit of 37 %
+        assert found.verdict.startswith("Not described.")  # a misfit of 37 %
         assert "because of jackknife over tests" in found.verdict
         check = found.cross_validation
         assert check is not None

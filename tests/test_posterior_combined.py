@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 import dahl_ident as di
-from benchmarks.uncertainty import three_days
+from benchmarks.uncertainty import several_days
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.priors import joint_prior
 from dahl_ident.diagnostics.error_sources import NOISE
@@ -20,7 +20,7 @@ Q = (0.02275, 0.97725)
 
 
 def days(seed: int, rows: int = 1) -> di.FrequencyResponse:
-    data, _ = three_days("f_max", 0.02)(np.random.default_rng(seed))
+    data, _ = several_days("f_max", 0.02)(np.random.default_rng(seed))
     return di.FrequencyResponse.concatenate([data] * rows) if rows > 1 else data
 
 

@@ -74,13 +74,23 @@ class Judged(Protocol):
         """The check of the bands."""
 
     @property
-    def fundamentals(self) -> Judged | None:
-        """The fit to the fundamentals alone; None where there are no other harmonics."""
+    def with_less(self) -> Judged | None:
+        """The fit without harmonics, or without a covariance; None where there is neither."""
 
 
 def judgement(fit: Judged) -> Judgement:
-    """Return the findings of every check, and with them the status."""
-    return Judgement(finding for check in CHECKS for finding in check(fit))
+    """Return the findings of every check, and with them the status.
+
+    Neither harmonics nor a covariance hide what the fundamentals show without them.
+    """
+    found = [finding for check in CHECKS for finding in check(fit)]
+    if fit.with_less is not None:
+        worst = max((f.severity.rank for f in found if f.question is _DESCRIBED), default=0)
+        every = judgement(fit.with_less).findings
+        hidden = [f for f in every if f.question is _DESCRIBED and f.severity.rank > worst]
+        replaced = {"noise", *(f.code for f in hidden)} if hidden else set()
+        found = [f for f in found if f.code not in replaced] + hidden
+    return Judgement(found)
 
 
 # Determined?
@@ -158,17 +168,12 @@ def _bands(fit: Judged) -> Iterator[Finding]:
     if check is None:
         return
     enough = check.count >= _ENOUGH_HELD_OUT
-    # harmonics that the model misses widen the bands, which then cover any misfit of fundamentals
-    for part in (fit, fit.fundamentals):
-        own = None if part is None else part.cross_validation
-        if part is None or part.errors is None or own is None:
-            continue
-        if own.count >= _ENOUGH_HELD_OUT:
-            misfit = _misfit_within_runs(part.errors)
-            if own.width < misfit:  # misfits inside a band have an rms below its half width
-                values = {"width": own.width, "misfit": misfit}
-                yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
-                return
+    if enough and fit.errors is not None:
+        misfit = _misfit_within_runs(fit.errors)
+        if check.width < misfit:  # misfits inside a band have an rms below its half width
+            values = {"width": check.width, "misfit": misfit}
+            yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
+            return
     outside = enough and check.inside < _FEWEST_INSIDE * check.count
     yield check.finding(_NOT_DESCRIBED if outside else _TRUSTED)
 

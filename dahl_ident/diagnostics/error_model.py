@@ -29,9 +29,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import special
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, TINY, ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_sources import (
     LEVELS,
     MODEL_ERROR,
@@ -67,6 +66,7 @@ from dahl_ident.problem import TableProblem
 _FEWEST_TESTS = 5  # of which each is left out in turn
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
+_KINDS = 2  # of model error that were looked for, of which the more likely one counts
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _CALIBRATIONS = {
     "force_gain": "force calibration",
@@ -137,7 +137,8 @@ class ErrorModel:
         """The estimates by name."""
         values = self.problem.to_values(self.theta)
         for i, p in enumerate(self.problem.parameters):  # beyond a bound by rounding
-            values[i] = min(max(values[i], p.lower), p.upper)
+            least = SMALLEST if p.positive else -1.0 / SMALLEST
+            values[i] = np.clip(values[i], max(p.lower, least), min(p.upper, 1.0 / SMALLEST))
         return dict(zip(self.names, values.tolist(), strict=True))
 
     @cached_property
@@ -290,14 +291,18 @@ class ErrorModel:
 
     @cached_property
     def structure_by_chance(self) -> float:
-        """Probability that noise alone makes as large a model error, by the likelihood's ratio."""
+        """Probability that noise, and what groups of rows share, alone make it as large."""
         own = [k for k, source in enumerate(self.sources) if source.name == MODEL_ERROR]
         if not own:
             return 1.0
-        others = self.state.model.without(own)
-        alone = others.reml(np.ones(len(self.sources) - len(own)))
-        rise = 2.0 * (self.state.log_likelihood - alone.log_likelihood)
-        return float(0.5 * special.chdtrc(len(own), max(rise, 0.0)))
+        model = self.state.model
+        shared = [k for k, source in enumerate(self.sources) if source.own]
+        null = model.without(set(range(len(self.sources))) - set(shared))
+        variances = np.zeros(model.count)
+        kept = [*range(model.noises), *(model.noises + k for k in shared)]
+        variances[kept] = null.reml(np.ones(len(shared))).variances
+        alone, known = model.at(variances), self.problem.scale_known
+        return min(1.0, _KINDS * min(alone.chance_of(k, known=known) for k in own))
 
     def rms(self, name: str) -> float:
         """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.

@@ -39,9 +39,14 @@ HARMONICS = "model error of harmonics"
 APART = "suspicious points"
 TESTS = "jackknife over tests"
 
-_OFTEN = 0.15  # of tables in which noise alone may look like a model error or noisy levels
-_SOMETIMES = 0.02  # the same for what a level has in common: at 1 % it is missed too often
-_SELDOM = 0.01  # the same for suspicious points
+# Share of tables in which noise alone may look like a source. Together they are below a half, so
+# that most tables of a right model have intervals of noise alone.
+_SMOOTH_ERROR = 0.25  # most wrong models look like one, and so does correlated noise
+_RATE = 0.1  # a change with speed that is missed moves f_max by many uncertainties
+_PARALLEL = 0.05
+_NOISY_LEVELS = 0.03  # of each of two kinds
+_SHARED_LEVELS = 0.02  # of three kinds together
+_SELDOM = 0.01  # of suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
 _MOST_NOISY = 100  # levels with a noise of their own: the cost is cubic in their number
@@ -260,7 +265,7 @@ def error_sources(
     return tuple(
         source
         for sources in (
-            _model_error(estimate, further), _changes_with_speed(estimate), _harmonics(estimate),
+            _model_error(estimate, further), _changes_with_speed(estimate),
             _runs(estimate), _levels(estimate),
         )
         for source in sources
@@ -281,15 +286,26 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
     left = float(np.mean(np.abs(missed) ** 2)) if some.any() else 0.0
     stiffness = np.where(first, view.stiffness, np.inf)
     for shape in (Shapes.of(every, parallel=False), Shapes.of(every, parallel=True, unit=unit)):
-        changes, absorbed = shape.changes(there, stiffness), None
+        changes, absorbed = shape.changes(there, stiffness) * first, None
         square, made = _mean_square(changes), estimate.changed(changes * size)
         if shape.parallel:
             absorbed = _absorbed(problem, estimate.jacobian, made)
             made = made + estimate.jacobian @ absorbed
         most = 0.5 * _MOST_DEPARTURE**2 * left / square
         yield Source(
-            MODEL_ERROR, made, square, shape, largest=most, absorbed=absorbed, chance=_OFTEN
+            MODEL_ERROR,
+            made,
+            square,
+            shape,
+            largest=most,
+            absorbed=absorbed,
+            chance=_PARALLEL if shape.parallel else _SMOOTH_ERROR,
         )
+    orders = np.unique(view.harmonic[~first])
+    if len(orders) > 0 and first.any():
+        smooth = Shapes.of(there, parallel=False).changes(there, stiffness)
+        changes = np.concatenate([smooth * (view.harmonic == k) for k in orders])
+        yield Source(HARMONICS, estimate.changed(changes * size), 0.0, chance=_SMOOTH_ERROR)
 
 
 def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
@@ -303,17 +319,7 @@ def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
     for i in _scattering_parameters(estimate.problem):
         column = -(estimate.jacobian[:, i] * change)[:, None]
         rate_of = (estimate.problem.names[i], centre)
-        yield Source(MODEL_ERROR, column, 0.0, rate_of=rate_of, chance=_OFTEN)
-
-
-def _harmonics(estimate: WeightedEstimate) -> Iterator[Source]:
-    """Yield gain and phase of each harmonic: a misfit in them is not one of the fundamental."""
-    orders = np.unique(estimate.problem.data.harmonic)
-    orders = orders[orders != 1]
-    if len(orders) > 0 and (estimate.problem.data.harmonic == 1).any():
-        share = (estimate.problem.data.harmonic == orders[:, None]) * estimate.predicted
-        columns = estimate.changed(np.concatenate([share, 1j * share]))
-        yield Source(HARMONICS, columns, 0.0)
+        yield Source(MODEL_ERROR, column, 0.0, rate_of=rate_of, chance=_RATE)
 
 
 def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
@@ -350,13 +356,13 @@ def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
             share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
             square = 0.5 * float(np.mean(np.abs(share) ** 2))
             columns = estimate.changed(np.diag(change))
-            yield Source(NOISE, columns, square, largest=most**2, chance=_OFTEN)
+            yield Source(NOISE, columns, square, largest=most**2, chance=_NOISY_LEVELS)
     in_common = rows_of_levels(data)
     if len(in_common) >= FEWEST_TESTS:
         kinds = (predicted, by_level, by_both)
         for change in kinds:
             columns = estimate.changed(in_common * change)
-            yield Source(LEVELS, columns, 0.5, own="gain", chance=_SOMETIMES / len(kinds))
+            yield Source(LEVELS, columns, 0.5, own="gain", chance=_SHARED_LEVELS / len(kinds))
     repeated = repeats(repeated_levels(data), data.harmonic == 1)
     if len(repeated) >= _FEWEST:
         shared = np.concatenate([repeated, 1j * repeated])

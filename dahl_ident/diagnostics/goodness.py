@@ -63,7 +63,8 @@ from dahl_ident.fitting import Optimum
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
 _HINT = 0.05  # the same of hints, which doubt nothing
 _FAR_MORE = 2.0  # scatter over what was measured
-_NO_SENSOR = 0.3  # noise over the response
+_NO_SENSOR = 0.15  # noise over the response
+_MEDIAN_SQUARE = 2.0 * np.log(2.0)  # of two normal numbers' sum of squares
 _CLOSE = 0.8  # of the misfit: a bound above shows that no such law helps
 _OF_ONE_DEVICE = 0.25  # u of a logarithm: 95 % within a factor of 1.6, see verdicts.py
 _WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
@@ -557,15 +558,20 @@ def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
 
 
 def _noise_share(optimum: Optimum) -> float | None:
-    """Return the estimated noise over the size of the response, 0 where it is rounding."""
+    """Return the estimated noise over the size of the response, 0 where it is rounding.
+
+    That of most rows, where some stand apart.
+    """
     if optimum.scale_known:
         return None
     if optimum.is_exact:
         return 0.0
-    size = 1.0
-    if optimum.problem.noise == "absolute":
-        size = float(np.sqrt(np.mean(np.abs(optimum.problem.data.response) ** 2)))
-    return optimum.scale / size
+    problem, size = optimum.problem, 1.0
+    if problem.noise == "absolute":
+        size = float(np.sqrt(np.mean(np.abs(problem.data.response) ** 2)))
+    y = problem.residuals_and_jacobian(optimum.theta)[0][: problem.n_residuals]
+    middle = float(np.median(np.sum(y.reshape(-1, 2) ** 2, axis=1)))
+    return min(optimum.scale, float(np.sqrt(middle / _MEDIAN_SQUARE))) / size
 
 
 def _scatter(optimum: Optimum) -> Scatter | None:

@@ -31,7 +31,7 @@ from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import with_unit
@@ -44,7 +44,9 @@ IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
 _NEARLY_LINEAR = 0.15  # u of every logarithm: below it, profiles differ in the second digit
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
-_BY_RANGE = 0.1  # u of a logarithm that the exponent's assumed range makes, not the data
+# u of a logarithm that what is assumed makes, not the data: the exponent's range, and how smooth a
+# model error is
+_MOST_BY = {EXPONENT: 0.1, MODEL_ERROR: IDENTIFIED_BELOW}
 _MEASURE = "measure more points, or use a model that misses less"
 _REMEDY = {
     EXPONENT: "give it if it is known, or measure on both sides of the knee",
@@ -327,8 +329,9 @@ def _lost_beyond_noise(
         parts = {n: float(C[i, i]) for n, C in errors.contributions.items()}
         u = sum(parts.values()) ** 0.5 / size
         source = max(parts, key=lambda n: parts[n])
-        ranged = source == EXPONENT and u > _BY_RANGE and parts[source] > 0.5 * (u * size) ** 2
-        if verdicts[name] is not Verdict.NOT_IDENTIFIED and (u > NOT_IDENTIFIED_ABOVE or ranged):
+        most = _MOST_BY.get(source, NOT_IDENTIFIED_ABOVE)
+        most = most if parts[source] > 0.5 * (u * size) ** 2 else NOT_IDENTIFIED_ABOVE
+        if verdicts[name] is not Verdict.NOT_IDENTIFIED and u > most:
             found[name] = f"because of {source}: {_REMEDY.get(source, _MEASURE)}"
     return found
 

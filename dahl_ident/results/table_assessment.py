@@ -189,13 +189,21 @@ class TableAssessment(Assessment):
         return check
 
     @cached_property
-    def fundamentals(self) -> TableAssessment | None:
-        """The same fit to the fundamentals alone; None where there are no other harmonics."""
-        first = self.problem.data.harmonic == 1
-        if first.all() or not first.any() or self.first_order:
+    def with_less(self) -> TableAssessment | None:
+        """The same fit to the fundamentals alone; of these, without a covariance they contradict.
+
+        None where there is nothing to leave out.
+        """
+        problem, first = self.problem, self.problem.data.harmonic == 1
+        if self.first_order or not first.any():
             return None
         try:
-            problem = self.problem.like(data=self.problem.data.select(rows=first))
+            if not first.all():
+                problem = problem.like(data=problem.data.select(rows=first))
+            elif problem.scale_known and self.goodness.objections:
+                problem = problem.like(noise="relative")
+            else:
+                return None
             return TableAssessment(solve(problem, loss=self.optimum.loss))
         except DahlIdentError:
             return None
