@@ -41,7 +41,7 @@ TESTS = "jackknife over tests"
 
 # Share of tables in which noise alone may look like a source. Together they are below a half, so
 # that most tables of a right model have intervals of noise alone.
-_SMOOTH_ERROR = 0.25  # most wrong models look like one, and so does correlated noise
+_SMOOTH_ERROR = 0.15  # most wrong models look like one, and so does correlated noise
 _RATE = 0.1  # a change with speed that is missed moves f_max by many uncertainties
 _PARALLEL = 0.05
 _NOISY_LEVELS = 0.03  # of each of two kinds

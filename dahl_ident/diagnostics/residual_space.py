@@ -207,10 +207,11 @@ class ResidualSpace(_Space):
 
         The size of the latter's misfit is itself an estimate, as an unknown scale is.
         """
-        widened = weights is not None and weights.misfit > 0.0
-        self._optimum = optimum
-        self._problem = weights.problem if widened and weights is not None else optimum.problem
-        self._scale_known = optimum.scale_known and not widened
+        self._widened = weights is not None and weights.misfit > 0.0
+        self._optimum, self._problem = optimum, optimum.problem
+        if weights is not None and self._widened:
+            self._problem = weights.problem
+        self._scale_known = optimum.scale_known and not self._widened
         self.dof = optimum.dof
         m = optimum.problem.n_residuals
         scale = optimum.scale
@@ -269,6 +270,8 @@ class ResidualSpace(_Space):
             return np.nan
         if self._scale_known:
             return float(special.chdtrc(k, explained))
+        if self._widened and (self._problem.data.harmonic != 1).any():
+            total = max(total, float(dof))  # what fundamentals weigh down does not show small noise
         if dof <= k or total <= explained:
             return np.nan
         return float(special.fdtrc(k, dof - k, explained / k / ((total - explained) / (dof - k))))
