@@ -282,25 +282,35 @@ class Profiler:
         rows = np.arange(len(index))
         held = np.zeros(start.shape, dtype=np.bool_)
         held[rows, index] = True
-        theta = self._minimised(held, start)
+        theta, at = self._minimised(held, start)
         beyond = ((theta < self._low) | (theta > self._high)) & ~held
         if beyond.any():
-            theta = self._minimised(held | beyond, np.clip(theta, self._low, self._high))
-        cost, gradient, hessian = self._quadratic(theta)
+            inside = np.clip(theta, self._low, self._high)
+            theta, at = self._minimised(held | beyond, inside)
         stretch = self._stretch[index]
-        deviance = 2.0 * (cost - self._least) * stretch
-        slope = gradient[rows, index] * stretch
-        return _ConstrainedOptima(theta, deviance, slope, _tangent(hessian, index))
+        deviance = 2.0 * (at.cost - self._least) * stretch
+        slope = at.gradient[rows, index] * stretch
+        return _ConstrainedOptima(theta, deviance, slope, _tangent(at.hessian, index))
 
-    def _minimised(self, held: BoolArray, start: FloatArray) -> FloatArray:
+    def _minimised(self, held: BoolArray, start: FloatArray) -> tuple[FloatArray, Quadratic]:
+        """Return the constrained optima, and the cost there: beyond the last step, as predicted."""
+        S, P = start.shape
+        theta, lowest = start.copy(), Quadratic(*(np.empty((S, *(P,) * k)) for k in range(3)))
+        lowest.cost[:] = np.inf
+
         def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
             cost, gradient, hessian = self._quadratic(at)
+            rows = np.arange(S) if which is None else which
+            lower = ~(cost > lowest.cost[rows])
+            theta[rows[lower]] = at[lower]
+            for known, new in zip(lowest, (cost, gradient, hessian), strict=True):
+                known[rows[lower]] = new[lower]
             fixed = held if which is None else held[which]
             gradient = np.where(fixed, 0.0, gradient)
             either = fixed[:, :, None] | fixed[:, None, :]
             return Quadratic(cost, gradient, np.where(either, 0.0, hessian))
 
-        return minimise(
+        ends = minimise(
             evaluate,
             start,
             self._logarithmic,
@@ -310,6 +320,11 @@ class Profiler:
             steps=_SEARCH_STEPS,
             accuracy=self._problem.accuracy,
         ).theta
+        step = ends - theta
+        moved = step.any(axis=1, keepdims=True)  # else a cost may be infinite
+        turn = np.where(moved, np.einsum("sij,sj->si", lowest.hessian, step), 0.0)
+        change = np.where(moved, (lowest.gradient + 0.5 * turn) * step, 0.0).sum(axis=1)
+        return ends, Quadratic(lowest.cost + change, lowest.gradient + turn, lowest.hessian)
 
     def _quadratic(self, theta: FloatArray) -> Quadratic:
         at: Quadratic = self._searched.quadratic(theta, self._scale, self._loss)

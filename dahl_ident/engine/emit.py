@@ -131,9 +131,14 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
 
     def power(a: Any, b: Any) -> Any:  # rest on a kink has no slope
         at_zero = as_number(builder.fcmp_ordered("==", b, zero))
-        return builder.select(
-            builder.fcmp_ordered("==", a, zero), at_zero, call("llvm.pow.f64", a, b)
-        )
+        positive = call("llvm.exp.f64", builder.fmul(b, logarithm(a)))  # shares the logarithm
+        before = builder.block
+        with builder.if_then(builder.fcmp_ordered("<", a, zero), likely=False):
+            negative, there = call("llvm.pow.f64", a, b), builder.block
+        result = builder.phi(number)
+        result.add_incoming(positive, before)
+        result.add_incoming(negative, there)
+        return builder.select(builder.fcmp_ordered("==", a, zero), at_zero, result)
 
     def logarithm(a: Any) -> Any:  # finite at 0, where a power's slope multiplies it by 0
         least = ir.Constant(number, float(np.finfo(np.float64).tiny))

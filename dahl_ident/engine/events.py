@@ -15,8 +15,9 @@ from dahl_ident.engine.radau import (
     evaluate,
     put,
     put_place,
-    put_stage,
+    read_stage,
     shorten,
+    signal_at,
     solve_stages,
 )
 
@@ -157,8 +158,7 @@ def step_to_event(
     for _ in range(_REPEATS):
         if not solve_stages(f, solved, followers, signal, t, length, y, w, at, matrix, columns):
             return 0.0, False
-        put_stage(y, STAGES - 1, w, at)
-        evaluate(f, signal, t + length, 1.0, w, at)
+        read_stage(f, solved, followers, 1, STAGES - 1, y, w, at)
         value, slope = w[2] if e == 0 else w[at.outputs + at.n + e], slope_of(e, w, at)
         if value == 0.0:
             return length, True
@@ -202,6 +202,7 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
             w[at.jump + r] = w[o + r]
         w[at.late : at.late + q] = 0.0
         slope, row = slope_of(e, w, at), o + m * (1 + n) + (n + e) * (1 + at.P)
+        along = np.cos(signal.omega * t) if signal.sine else signal_at(signal, t, w, at)[1]
         for z in range(q if slope != 0.0 else 0):
             value = 0.0
             if e == 0:
@@ -211,8 +212,8 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
                     value += w[o + m + (n + e) * n + b] * S[b, z]
                 if z > first:
                     value += w[row + 1 + chosen[z - first - 1]]
-                elif z == first and signal.sine and not at.held:
-                    value += w[row] * np.cos(signal.omega * t)
+                elif z == first and not at.held:
+                    value += w[row] * along
             w[at.late + z] = -value / slope
     if e > 0:  # others may be zero here too, such as y < a and y >= a
         slope_at(f, signal, t, y, e, w, at)

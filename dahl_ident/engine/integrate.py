@@ -27,13 +27,14 @@ from dahl_ident.engine.radau import (
     keep_interval,
     put,
     put_place,
-    put_stage,
     read_stage,
     sensitivities,
+    signal_at,
     solve_stages,
 )
 
 _SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
+_TURNING = 10.0  # errors next to a turning point, where laws are least smooth, count as so many
 _FAILED = 0.25  # of a step whose stages were not found
 _SMALLEST = 1e-14  # of the span: a shorter step cannot advance the time
 _DENSE = 1e-2  # of the tolerance: the same for a polynomial that is read between its ends
@@ -134,6 +135,8 @@ def write_samples(f, signal, t, h, y, S, first, chosen, samples, i, output, by, 
                     value += w[slopes + b] * change
             if z > first:
                 value += w[drives + 1 + chosen[z - first - 1]]
+            elif z == first and not at.held:
+                value += w[drives] * signal_at(signal, samples[i], w, at)[1]
             by[i, z] = value
         i += 1
     return i
@@ -215,6 +218,8 @@ def advance(
                 return 0.0
             continue
         error = error_of(f, solved, followers, dense, read, signal, t, h, y, w, at) / tolerance
+        if turned:
+            error *= _TURNING
         factor = _GROW
         if error > 0.0:
             factor = min(_GROW, max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))))
@@ -239,6 +244,8 @@ def advance(
                 step, last = 0.5 * where * whole, 0.0
                 continue
             error = error_of(f, solved, followers, dense, read, signal, t, h, y, w, at) / tolerance
+            if which == 0:
+                error *= _TURNING
             if error * tolerance > allowed and h > LOCATED * span:
                 step, last = h * max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
                 continue
@@ -255,9 +262,7 @@ def advance(
                 return 0.0
         elif harmonics.size:
             for i in range(STAGES):
-                put_stage(y, i, w, at)
-                evaluate(f, signal, t + NODES[i] * h, 0.0, w, at)
-                read_stage(solved, followers, 0, i, w, at)
+                read_stage(f, solved, followers, 0, i, y, w, at)
         if harmonics.size:
             add_harmonics(signal, t, h, S, first, chosen, harmonics, sums, w, at)
         if samples.size:

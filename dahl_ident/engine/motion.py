@@ -20,7 +20,8 @@ from dahl_ident.engine.translate import System
 from dahl_ident.errors import FitError
 
 _SETTLED = 1e-6  # error of a step's polynomial; that of harmonics is then below 1e-10
-_SAMPLED = 1e-6  # the same where motions end at samples; a hundredth of it between
+_SAMPLED = 1e-5  # the same where motions end at samples; a hundredth of it between
+_HELD = 10.0  # finer, where the displacement is held: forces to 1e-9, and motions to 1e-8
 _LOOP = 1e-6  # the same for loops of laws with one state, over the local force
 _RATED = 10.0  # finer, where the law depends on the speed: it changes most near rest
 _CYCLES = 4  # before Newton's method, from rest: a plant is then near its settled motion
@@ -84,6 +85,8 @@ class Motion(NamedTuple):
     output : ndarray, shape (n,)
     by_first : ndarray, shape (n, order)
         Derivatives of the output with respect to the first state.
+    by_delay : ndarray, shape (n,)
+        With respect to the time by which the drive comes later; zero where the motion is held.
     by_parameter : ndarray, shape (n, chosen)
     states : ndarray, shape (n, order)
     map : ndarray, shape (order, order)
@@ -92,6 +95,7 @@ class Motion(NamedTuple):
 
     output: FloatArray
     by_first: FloatArray
+    by_delay: FloatArray
     by_parameter: FloatArray
     states: FloatArray
     map: FloatArray
@@ -228,14 +232,15 @@ def march(
         kernels("samples").march,
         system.function, system.sizes, system.solved, system.followers, _numbers(knots),
         _numbers(coefficients), _numbers(samples), _numbers(first), _numbers(parameters),
-        np.asarray(chosen, dtype=np.int64), int(derivatives), _SAMPLED / finer,
+        np.asarray(chosen, dtype=np.int64), int(derivatives),
+        _SAMPLED / finer / (_HELD if system.held else 1.0),
     )  # fmt: skip
     if not found or not np.isfinite(output).all():
         raise FitError(
             f"the motion grows beyond all bounds at the parameters {parameters.tolist()}"
         )
     n = system.order
-    return Motion(output, by[:, :n], by[:, n + 1 :], states, last[:, :n])
+    return Motion(output, by[:, :n], -by[:, n : n + 1].ravel(), by[:, n + 1 :], states, last[:, :n])
 
 
 def _run(kernel: Callable[..., Any], *arguments: Any) -> Any:

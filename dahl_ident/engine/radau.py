@@ -13,8 +13,9 @@ sections IV.5 and IV.8.
 
 In the functions below `w` is one array of numbers and `at` says where in it each quantity begins
 (:class:`Layout`): numba takes longer to pass twenty arrays than to compute with them. `y` are the
-states, `S` their sensitivities, one column each: with respect to initial states, to the signal's
-amplitude (column `first`), and to the parameters `chosen`.
+states, `S` their sensitivities, one column each: with respect to initial states, to the amplitude
+of a sine or to the time by which another drive comes earlier (column `first`), and to the
+parameters `chosen`.
 """
 
 from __future__ import annotations
@@ -89,8 +90,8 @@ of shape (degree + 1, n - 1).
 Layout = namedtuple(
     "Layout",
     "n k P held rated degree outputs values rates state_slopes drive_slopes solved_slopes coupling "
-    "follow follow_slopes stages last changes scale sides before output weights jump late interval "
-    "length",
+    "follow follow_slopes stages last changes scale sides before output weights jump late signal "
+    "interval length",
 )
 """Numbers of states, switches, parameters; then where each quantity begins in `w`."""
 
@@ -119,12 +120,14 @@ def layout(sizes, columns, degree):
     weights = output + 1  # of the stages in a polynomial's value, (s)
     jump = weights + s  # rates before an event, (n)
     late = jump + n  # derivatives of its time, (columns)
-    interval = late + columns  # the signal's: number, begin, end, 1 where pinned, coefficients
+    signal = late + columns  # value, rate and second derivative at the stages, (s, 3)
+    interval = signal + 3 * s  # the signal's: number, begin, end, 1 where pinned, coefficients
     length = interval + 4 + degree + 1
     return Layout(
         n, k, P, sizes[3], sizes[4], degree, outputs, values, rates, state_slopes, drive_slopes,
         solved_slopes, coupling, follow, follow_slopes, stages, last, changes, scale, sides,
-        before, output, weights, jump, late, interval, length,
+        before, output, weights, jump, late, signal,
+        interval, length,
     )  # fmt: skip
 
 
@@ -179,8 +182,14 @@ def signal_at(signal, t, w, at):
 @inlined
 def evaluate(f, signal, t, level, w, at):
     """Evaluate the function at time t and the states in the inputs; held motion is put in."""
-    n = at.n
     value, rate, second = signal_at(signal, t, w, at)
+    call(f, value, rate, second, level, w, at)
+
+
+@inlined
+def call(f, value, rate, second, level, w, at):
+    """Evaluate the function at the states in the inputs, with the signal's value and slopes."""
+    n = at.n
     if at.held:
         w[1] = value
         w[2] = rate
@@ -203,13 +212,6 @@ def put(y, w):
 
 
 @compiled
-def put_stage(y, i, w, at):
-    """Put the state at stage i into the inputs."""
-    for q in range(at.n):
-        w[1 + q] = y[q] + w[at.stages + i * at.n + q]
-
-
-@compiled
 def put_place(y, place, w, at):
     """Put the state at a place of the step, 0 to 1, into the inputs."""
     weigh(place, w, at)
@@ -229,6 +231,14 @@ def weigh(place, w, at):
             if k != j:
                 value *= place - NODES[k]
         w[at.weights + j] = value
+
+
+@inlined
+def add(target, place, factor, array, first, count):
+    """Add a multiple of some numbers of one array to as many of another."""
+    to, numbers = target[place : place + count], array[first : first + count]
+    for z in range(count):
+        to[z] += factor * numbers[z]
 
 
 @compiled
@@ -304,14 +314,21 @@ def shorten(share, w, at):
 
 
 @compiled
-def complete_stages(followers, signal, t, h, y, w, at):
+def keep_signal(signal, t, h, w, at):
+    """Keep the signal at the stages."""
+    for i in range(STAGES):
+        there = at.signal + 3 * i
+        w[there], w[there + 1], w[there + 2] = signal_at(signal, t + NODES[i] * h, w, at)
+
+
+@compiled
+def complete_stages(followers, h, y, w, at):
     """Set displacement and followers at the stages from the velocity, or from the held motion."""
     n, z = at.n, at.stages
     for i in range(STAGES):
         if at.held:
-            value, rate, _ = signal_at(signal, t + NODES[i] * h, w, at)
-            w[z + i * n] = value - y[0]
-            w[z + i * n + 1] = rate - y[1]
+            w[z + i * n] = w[at.signal + 3 * i] - y[0]
+            w[z + i * n + 1] = w[at.signal + 3 * i + 1] - y[1]
         else:
             moved = 0.0
             for k in range(STAGES):
@@ -322,13 +339,17 @@ def complete_stages(followers, signal, t, h, y, w, at):
 
 
 @compiled
-def read_stage(solved, followers, level, i, w, at):
-    """Keep the outputs at stage i."""
+def read_stage(f, solved, followers, level, i, y, w, at):
+    """Evaluate the function at stage i, and keep its outputs."""
     n, P, R, o = at.n, at.P, solved.size, at.outputs
     m = n + 1 + at.k
+    for q in range(n):
+        w[1 + q] = y[q] + w[at.stages + i * n + q]
+    there = at.signal + 3 * i
+    call(f, w[there], w[there + 1], w[there + 2], level, w, at)
     for r in range(m):
         w[at.values + i * m + r] = w[o + r]
-    for a in range(R):
+    for a in range(R if level else 0):
         row = o + m + solved[a] * n
         for b in range(R):
             w[at.solved_slopes + (i * R + a) * R + b] = w[row + solved[b]]
@@ -371,12 +392,11 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
     """Solve for the stages of a step from a guess of them; False if they are not found."""
     n, R, z = at.n, solved.size, at.stages
     m = n + 1 + at.k
-    complete_stages(followers, signal, t, h, y, w, at)
+    keep_signal(signal, t, h, w, at)
+    complete_stages(followers, h, y, w, at)
     for _ in range(_NEWTON):
         for i in range(STAGES):
-            put_stage(y, i, w, at)
-            evaluate(f, signal, t + NODES[i] * h, 1.0, w, at)
-            read_stage(solved, followers, 1, i, w, at)
+            read_stage(f, solved, followers, 1, i, y, w, at)
         if R == 0:
             return True
         for i in range(STAGES):
@@ -401,7 +421,7 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
                 return False
             if change > 0.0:
                 largest = max(largest, change / size)
-        complete_stages(followers, signal, t, h, y, w, at)
+        complete_stages(followers, h, y, w, at)
         if largest < _SOLVED:
             return True
     return False
@@ -453,68 +473,59 @@ def sensitivities(
     n, P, R, q, held = at.n, at.P, solved.size, S.shape[1], at.held
     m, d = n + 1 + at.k, at.changes
     for i in range(STAGES):
-        put_stage(y, i, w, at)
-        evaluate(f, signal, t + NODES[i] * h, 2.0, w, at)
-        read_stage(solved, followers, 2, i, w, at)
+        read_stage(f, solved, followers, 2, i, y, w, at)
+    w[d : d + STAGES * n * q] = 0.0
     for i in range(STAGES):  # first what does not depend on the solved states
-        phase = signal.omega * (t + NODES[i] * h)
-        for z in range(q):
-            row = d + i * n * q + z
-            moved = h * NODES[i] * S[1, z]
-            if held:
-                moved = -S[0, z]
-                w[row + q] = -S[1, z]
-                if z == first and signal.sine:
-                    moved += np.cos(phase)
-                    w[row + q] -= signal.omega * np.sin(phase)
-            w[row] = moved
-            for b in followers:
-                value = w[at.follow + b] * moved
-                if z > first:
-                    c = 1 + chosen[z - first - 1]
-                    value += w[at.follow_slopes + b * (1 + P) + c] * w[at.stages + i * n]
-                w[row + b * q] = value
-    for j in range(STAGES):
-        phase = signal.omega * (t + NODES[j] * h)
+        row, phase = d + i * n * q, signal.omega * (t + NODES[i] * h)
+        if held:
+            add(w, row, -1.0, S[0], 0, q)
+            add(w, row + q, -1.0, S[1], 0, q)
+            if signal.sine:
+                w[row + first] += np.cos(phase)
+                w[row + q + first] -= signal.omega * np.sin(phase)
+        else:
+            add(w, row, h * NODES[i], S[1], 0, q)
+        for b in followers:
+            add(w, row + b * q, w[at.follow + b], w, row, q)
+            for z in range(chosen.size):
+                slope = w[at.follow_slopes + b * (1 + P) + 1 + chosen[z]]
+                w[row + b * q + first + 1 + z] += slope * w[at.stages + i * n]
         for a in range(R):
-            slopes = at.state_slopes + (j * m + solved[a]) * n
-            drives = at.drive_slopes + (j * m + solved[a]) * (1 + P)
-            for z in range(q):
-                row, value = d + j * n * q + z, 0.0
-                for b in range(n):
-                    value += w[slopes + b] * S[b, z]
-                value += w[slopes] * w[row]
-                if held:
-                    value += w[slopes + 1] * w[row + q]
-                for b in followers:
-                    value += w[slopes + b] * w[row + b * q]
-                if z > first:
-                    value += w[drives + 1 + chosen[z - first - 1]]
-                elif z == first and signal.sine and not held:
-                    value += w[drives] * np.cos(phase)
-                w[row + solved[a] * q] = value
+            own = row + solved[a] * q
+            slopes = at.state_slopes + (i * m + solved[a]) * n
+            drives = at.drive_slopes + (i * m + solved[a]) * (1 + P)
+            for b in range(n):
+                add(w, own, w[slopes + b], S[b], 0, q)
+            add(w, own, w[slopes], w, row, q)
+            if held:
+                add(w, own, w[slopes + 1], w, row + q, q)
+            for b in followers:
+                add(w, own, w[slopes + b], w, row + b * q, q)
+            for z in range(chosen.size):
+                w[own + first + 1 + z] += w[drives + 1 + chosen[z]]
+            if not held:
+                along = np.cos(phase) if signal.sine else w[at.signal + 3 * i + 1]
+                w[own + first] += w[drives] * along
     if R:
+        columns[:] = 0.0
         for i in range(STAGES):
             for a in range(R):
-                for z in range(q):
-                    value = 0.0
-                    for j in range(STAGES):
-                        value += MATRIX[i, j] * w[d + (j * n + solved[a]) * q + z]
-                    columns[i * R + a, z] = h * value
+                for j in range(STAGES):
+                    row = d + (j * n + solved[a]) * q
+                    add(columns[i * R + a], 0, h * MATRIX[i, j], w, row, q)
         fill_matrix(R, h, w, at, matrix)
         if not eliminate(matrix, columns, STAGES * R, q):
             return False
         for i in range(STAGES):
             for a in range(R):
-                for z in range(q):
-                    w[d + (i * n + solved[a]) * q + z] = columns[i * R + a, z]
+                row = d + (i * n + solved[a]) * q
+                w[row : row + q] = 0.0
+                add(w, row, 1.0, columns[i * R + a], 0, q)
     if not held:
         for i in range(STAGES):
-            for z in range(q):
-                moved = 0.0
-                for k in range(STAGES):
-                    moved += MATRIX[i, k] * w[d + (k * n + 1) * q + z]
-                w[d + i * n * q + z] += h * moved
+            for k in range(STAGES):
+                factor, row = h * MATRIX[i, k], d + (k * n + 1) * q
+                add(w, d + i * n * q, factor, w, row, q)
                 for b in followers:
-                    w[d + (i * n + b) * q + z] += w[at.follow + b] * h * moved
+                    add(w, d + (i * n + b) * q, w[at.follow + b] * factor, w, row, q)
     return True

@@ -33,8 +33,8 @@ def march(
 
     Last are the derivatives of the state at the last sample.
 
-    The signal is polynomials between knots. Derivatives with respect to the initial states, where
-    `initial` is 1, and the parameters `chosen`; one column between them is zero.
+    The signal is polynomials between knots. Derivatives, where `initial` is 1, with respect to the
+    initial states, the time by which a drive comes earlier, and the parameters `chosen`.
     """
     n, N = sizes[0], samples.size
     q = n + 1 + chosen.size if initial else 0

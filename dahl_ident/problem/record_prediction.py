@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,10 +30,13 @@ class Predicted:
         Predicted samples.
     by : ndarray, shape (n, P)
         Derivatives with respect to the problem's values; P = 0 where they were not asked for.
+    by_delay : ndarray, shape (n,) or (0,)
+        With respect to the delay, of a motion.
     """
 
     output: FloatArray
     by: FloatArray
+    by_delay: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def force_of(
@@ -108,7 +111,7 @@ def motion_of(
         by[:, : free.size] = by_number @ slopes[chosen]
         by[:, column : column + starts] = motion.by_first @ by_start
         by[:, column + starts] = 1.0
-    return Predicted(motion.output + of_record[starts], by)
+    return Predicted(motion.output + of_record[starts], by, motion.by_delay)
 
 
 def _before(path: FloatArray, play: float) -> FloatArray:

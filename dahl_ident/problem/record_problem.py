@@ -209,7 +209,7 @@ class RecordProblem(Problem):
     def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
         """Return the same problem with other values of parameters that are fixed."""
         model = self.model.with_values(values)  # equations are shorter where a value is 0 or 1
-        return self.altered("system", "coefficients", "first", model=model)
+        return self.altered("system", "coefficients", "first", "latest", model=model)
 
     def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
         """Return the same problem, the displacement's noise not counted as travel.
@@ -222,10 +222,13 @@ class RecordProblem(Problem):
 
     def delayed(self, delay: float) -> RecordProblem:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
-        return self.altered("motions", "drives", delay=delay).without_noise(self.displacement_noise)
+        other = self.altered("motions", "drives", "latest", delay=delay)
+        return other.without_noise(self.displacement_noise)
 
     def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
         """Return the derivatives of each record's output with respect to the delay, per s."""
+        if self.output == "motion":
+            return [self.predict(values, i).by_delay for i in range(len(self.records))]
         step = _DELAY_STEP / self.records[0].sample_rate
         low, high = (self.delayed(self.delay + d).outputs(values) for d in (-step, step))
         return [(b - a) / (2.0 * step) for a, b in zip(low, high, strict=True)]
@@ -421,7 +424,7 @@ class RecordProblem(Problem):
             (time, drive + band_limited(std * rng.standard_normal(time.size), 1.0 / r.sample_rate))
             for (time, drive), r, std in zip(self.drives, self.records, stds, strict=True)
         )
-        return self.altered(drives=drives)
+        return self.altered("latest", drives=drives)
 
     @cached_property
     def system(self) -> System:
@@ -494,7 +497,16 @@ class RecordProblem(Problem):
         """Return what the samples of record `number` should be."""
         if self.output == "force":
             return force_of(self, values, number, derivatives=derivatives)
-        return motion_of(self, values, number, derivatives=derivatives)
+        key, known = values.tobytes(), self.latest.get(number)
+        if known is None or known[0] != key or (derivatives and not known[1].by.size):
+            known = key, motion_of(self, values, number, derivatives=derivatives)
+            self.latest[number] = known
+        return known[1]
+
+    @cached_property
+    def latest(self) -> dict[int, tuple[bytes, Predicted]]:
+        """The last motion of each record, and its values: it is asked for more than once."""
+        return {}
 
     @cached_property
     def chosen(self) -> list[int]:
