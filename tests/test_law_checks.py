@@ -57,6 +57,17 @@ WRONG: dict[str, tuple[Slope, str]] = {
     ),
     "nan": (lambda _, F, d, v, p: F * np.nan, r"is nan at force = 0 N"),
     "infinite": (lambda _, F, d, v, p: p[1] / np.abs(F), r"is inf at force = 0 N"),
+    "infinite at full slip": (
+        lambda _, F, d, v, p: p[1] / (1.0 - d * F / p[0]), r"is inf at force = 0\.2 N, direction"
+    ),
+    "infinite between": (
+        lambda _, F, d, v, p: p[1] * (1.0 - d * F / p[0]) / (d * F / p[0] - 0.503) ** 2,
+        r"is inf at force = 0\.1006 N, direction = \+1",
+    ),
+    "infinite from a force on": (
+        lambda _, F, d, v, p: np.where(d * F > 0.5 * p[0], np.inf, p[1] * (1.0 - d * F / p[0])),
+        r"is inf at force = 0\.1 N, direction = \+1",
+    ),
     "negative": (lambda _, F, d, v, p: -dahl(_, F, d, v, p), r"is -3 N/m at force = 0 N"),
     "zero": (lambda _, F, d, v, p: 0.0 * F, r"is 0 N/m at force = 0 N.* expected a positive slope"),
     "negative after reversal": (

@@ -32,6 +32,7 @@ _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
 _LINE = 201  # forces between those of full slip
 _BEYOND = 1.001  # of the force of full slip: integrators pass it by rounding and by a stage
 _OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
+_CLOSER = 8  # looks at the largest slope, each 64 times as close: forces differ by rounding then
 _CHANGED = 0.1  # of the slope at rest: the force at which it has changed so much is its scale
 _ROUNDING = 1e-9  # of the largest slope
 _TO_SLIP = 0.98  # of the force of full slip: the largest loop
@@ -236,7 +237,7 @@ class _Trial:
         low, high = np.zeros(self._count), np.full(self._count, np.inf)
         for row in range(self._count):
             with np.errstate(invalid="ignore"):
-                stops = np.flatnonzero(~(wide[row, rest:] > 0.0))
+                stops = np.flatnonzero(~((wide[row, rest:] > 0.0) & (wide[row, rest:] < np.inf)))
                 far = wide[row, rest : rest + stops[0]] if stops.size else wide[row, rest:]
             if stops.size and not (far.size and far[-1] > _OVERFLOW * far[0]):
                 low[row], high[row] = size[max(rest, rest + stops[0] - 1)], size[rest + stops[0]]
@@ -266,6 +267,8 @@ class _Trial:
             slopes = self._slope(direction * size, direction)
             passed = self._slope(direction * _BEYOND * own[:, None], direction)
             size, slopes = np.c_[size, _BEYOND * own], np.c_[slopes, passed]
+            place, peak = self._peak(size, slopes, direction)
+            size, slopes = np.c_[place, size], np.c_[peak, slopes]
             for row in range(self._count):
                 found[row] = found[row] or (
                     self._not_finite(row, size[row], slopes[row], direction)
@@ -273,6 +276,22 @@ class _Trial:
                     or self._not_positive(row, size[row, :-1], slopes[row, :-1], direction)
                 )
         return found
+
+    def _peak(
+        self, size: FloatArray, slopes: FloatArray, direction: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return where each slope is largest, looked at more and more closely, and its size there.
+
+        Infinite where it grows beyond all bounds.
+        """
+        bounds, step = size[:, [0, -1]].T[..., None], (size[:, 1] - size[:, 0])[:, None]
+        most = np.sort(np.abs(slopes), axis=1)[:, [-2]]  # the largest may be at a pole
+        for _ in range(_CLOSER):
+            largest = np.argmax(np.abs(slopes), axis=1)[:, None]
+            place, peak = (np.take_along_axis(a, largest, axis=1) for a in (size, slopes))
+            size = np.clip(place + step * np.linspace(-1.0, 1.0, 129), *bounds)
+            slopes, step = self._slope(direction * size, direction), step / 64.0
+        return place, np.where(np.abs(peak) > _OVERFLOW * most, np.inf, peak)
 
     def _not_finite(self, row: int, size: FloatArray, slopes: FloatArray, direction: float) -> str:
         wrong = np.flatnonzero(~np.isfinite(slopes))

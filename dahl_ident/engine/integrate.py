@@ -60,6 +60,7 @@ def begin(f, followers, signal, t, y, w, at):
             for z in range(1 + at.P):
                 slope = w[o + m * (1 + n) + b * (1 + at.P) + z]
                 w[at.follow_slopes + b * (1 + at.P) + z] = slope
+    w[at.stiff] = 0.0
     put(y, w)
     evaluate(f, signal, t, 0.0, w, at)
     for q in range(n):

@@ -29,7 +29,9 @@ from numpy.polynomial import legendre
 from dahl_ident.arrays import FloatArray
 
 STAGES = 5
-_NEWTON = 12  # iterations of the stages; two are the rule
+_ITERATIONS = 20  # of the stages; two of Newton's method are the rule
+_NEAR, _FAST = 1e-2, 0.2  # first change of a fixed-point iteration, and its fall, at most
+_EXACT = 1e-11  # its last change, of which a tenth is left
 _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is no pivot
 _SOLVED = 1e-7  # change of the stages, over the states' sizes, whose square is rounding
 
@@ -91,7 +93,7 @@ Layout = namedtuple(
     "Layout",
     "n k P held rated degree outputs values rates state_slopes drive_slopes solved_slopes coupling "
     "follow follow_slopes stages last changes scale sides before output weights jump late signal "
-    "interval length",
+    "stiff interval length",
 )
 """Numbers of states, switches, parameters; then where each quantity begins in `w`."""
 
@@ -121,13 +123,14 @@ def layout(sizes, columns, degree):
     jump = weights + s  # rates before an event, (n)
     late = jump + n  # derivatives of its time, (columns)
     signal = late + columns  # value, rate and second derivative at the stages, (s, 3)
-    interval = signal + 3 * s  # the signal's: number, begin, end, 1 where pinned, coefficients
+    stiff = signal + 3 * s  # 1 where fixed-point iterations did not converge, until an event
+    interval = stiff + 1  # the signal's: number, begin, end, 1 where pinned, coefficients
     length = interval + 4 + degree + 1
     return Layout(
         n, k, P, sizes[3], sizes[4], degree, outputs, values, rates, state_slopes, drive_slopes,
         solved_slopes, coupling, follow, follow_slopes, stages, last, changes, scale, sides,
         before, output, weights, jump, late, signal,
-        interval, length,
+        stiff, interval, length,
     )  # fmt: skip
 
 
@@ -231,6 +234,14 @@ def weigh(place, w, at):
             if k != j:
                 value *= place - NODES[k]
         w[at.weights + j] = value
+
+
+@inlined
+def copy(w, place, first, count):
+    """Copy some numbers to another place."""
+    to, numbers = w[place : place + count], w[first : first + count]
+    for z in range(count):
+        to[z] = numbers[z]
 
 
 @inlined
@@ -347,8 +358,7 @@ def read_stage(f, solved, followers, level, i, y, w, at):
         w[1 + q] = y[q] + w[at.stages + i * n + q]
     there = at.signal + 3 * i
     call(f, w[there], w[there + 1], w[there + 2], level, w, at)
-    for r in range(m):
-        w[at.values + i * m + r] = w[o + r]
+    copy(w, at.values + i * m, o, m)
     for a in range(R if level else 0):
         row = o + m + solved[a] * n
         for b in range(R):
@@ -358,10 +368,8 @@ def read_stage(f, solved, followers, level, i, y, w, at):
             value += w[row + b] * w[at.follow + b]
         w[at.coupling + i * R + a] = value
     if level == 2:
-        for r in range(m * n):
-            w[at.state_slopes + i * m * n + r] = w[o + m + r]
-        for r in range(m * (1 + P)):
-            w[at.drive_slopes + i * m * (1 + P) + r] = w[o + m * (1 + n) + r]
+        copy(w, at.state_slopes + i * m * n, o + m, m * n)
+        copy(w, at.drive_slopes + i * m * (1 + P), o + m * (1 + n), m * (1 + P))
 
 
 @compiled
@@ -389,14 +397,18 @@ def fill_matrix(R, h, w, at, matrix):
 
 @compiled
 def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
-    """Solve for the stages of a step from a guess of them; False if they are not found."""
+    """Solve for the stages of a step from a guess of them; False if they are not found.
+
+    By fixed-point iterations where these converge fast, which few steps tell; else by Newton's.
+    """
     n, R, z = at.n, solved.size, at.stages
     m = n + 1 + at.k
     keep_signal(signal, t, h, w, at)
     complete_stages(followers, h, y, w, at)
-    for _ in range(_NEWTON):
+    newton, before = w[at.stiff] > 0.0, _NEAR / _FAST
+    for count in range(_ITERATIONS):
         for i in range(STAGES):
-            read_stage(f, solved, followers, 1, i, y, w, at)
+            read_stage(f, solved, followers, 1 if newton else 0, i, y, w, at)
         if R == 0:
             return True
         for i in range(STAGES):
@@ -405,24 +417,32 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
                 for j in range(STAGES):
                     value += h * MATRIX[i, j] * w[at.values + j * m + solved[a]]
                 columns[i * R + a, 0] = value
-        fill_matrix(R, h, w, at, matrix)
-        if not eliminate(matrix, columns, STAGES * R, 1):
-            return False
-        largest = 0.0
+        if newton:
+            fill_matrix(R, h, w, at, matrix)
+            if not eliminate(matrix, columns, STAGES * R, 1):
+                return False
+        largest, total = 0.0, 0.0
         for a in range(R):
             r = solved[a]
-            size, change, total = max(w[at.scale + r], abs(y[r])), 0.0, 0.0
+            size, change = max(w[at.scale + r], abs(y[r])), 0.0
             for i in range(STAGES):
-                w[z + i * n + r] += columns[i * R + a, 0]
                 change = max(change, abs(columns[i * R + a, 0]))
                 total += abs(columns[i * R + a, 0])
-                size = max(size, abs(w[z + i * n + r]))
-            if not total < np.inf:  # nor not a number, which a maximum does not show
-                return False
+                size = max(size, abs(w[z + i * n + r] + columns[i * R + a, 0]))
             if change > 0.0:
                 largest = max(largest, change / size)
+        if not newton and not (largest <= _FAST * before and total < np.inf):
+            newton = True
+            w[at.stiff] = 1.0 if count else 0.0
+            continue
+        if not total < np.inf:  # nor not a number, which a maximum does not show
+            return False
+        before = largest
+        for i in range(STAGES):
+            for a in range(R):
+                w[z + i * n + solved[a]] += columns[i * R + a, 0]
         complete_stages(followers, h, y, w, at)
-        if largest < _SOLVED:
+        if largest < (_SOLVED if newton else _EXACT):
             return True
     return False
 
