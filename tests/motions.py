@@ -38,10 +38,11 @@ class Driven:
         values: Sequence[float] | FloatArray = (),
         *,
         derivatives: bool = False,
+        finer: float = 1.0,
     ) -> Motion:
         return march(
             self.system, self.time, self._drive, self.time, np.asarray(first, dtype=np.float64),
-            self.all_values(values), chosen=self.free, derivatives=derivatives,
+            self.all_values(values), chosen=self.free, derivatives=derivatives, finer=finer,
         )  # fmt: skip
 
     def first(
@@ -63,7 +64,10 @@ def slopes(driven: Driven, starts: FloatArray, values: FloatArray) -> tuple[Floa
 def differences(
     driven: Driven, starts: FloatArray, values: FloatArray, step: float
 ) -> list[FloatArray]:
-    """Return the derivatives with respect to starts and free values by differences."""
+    """Return the derivatives with respect to starts and free values by differences.
+
+    Of motions with finer steps, whose errors the step divides.
+    """
     point, found = np.concatenate([starts, values]), []
     for i in range(point.size):
         h = np.zeros(point.size)
@@ -71,7 +75,7 @@ def differences(
 
         def at(p: FloatArray) -> FloatArray:
             own = p[starts.size :]
-            return driven.motion(driven.first(p[: starts.size], own)[0], own).output
+            return driven.motion(driven.first(p[: starts.size], own)[0], own, finer=10.0).output
 
         near = (at(point + h) - at(point - h)) / (2.0 * h[i])
         far = (at(point + 2.0 * h) - at(point - 2.0 * h)) / (4.0 * h[i])

@@ -139,7 +139,7 @@ def cycles(
                 if abs(columns[i, 0]) > _AGREED * w[at.scale + begin + i]:
                     found[row] = 0
                 y[begin + i] += columns[i, 0]
-            if found[row] or not held:
+            if found[row]:
                 break
         if not found[row]:
             continue

@@ -32,6 +32,7 @@ STAGES = 5
 _ITERATIONS = 20  # of the stages; two of Newton's method are the rule
 _NEAR, _FAST = 1e-2, 0.2  # first change of a fixed-point iteration, and its fall, at most
 _EXACT = 1e-11  # its last change, of which a tenth is left
+_HARDLY = 1e-6  # of the displacement: a follower that has moved less is no scale for errors
 _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is no pivot
 _SOLVED = 1e-7  # change of the stages, over the states' sizes, whose square is rounding
 
@@ -467,6 +468,8 @@ def error_of(f, solved, followers, dense, read, signal, t, h, y, w, at):
             r = solved[a] if a < R else followers[a - R]
             change = -h * (w[at.outputs + r] if i >= 0 else w[at.rates + r])
             size = max(w[at.scale + r], abs(y[r]))
+            if a >= R:  # it takes the displacement's rounding
+                size = max(size, _HARDLY * abs(w[at.follow + r]) * max(w[at.scale], abs(y[0])))
             for j in range(STAGES):
                 moved = w[at.stages + j * at.n + r]
                 change += (SLOPE_CHECKED[i, j] if i >= 0 else SLOPE_BEFORE[j]) * moved
