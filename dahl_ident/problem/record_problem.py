@@ -266,7 +266,7 @@ class RecordProblem(Problem):
         parameters = (*free, *self.parameters[self.n_reported :])
         inside = np.array([p.name not in ranges for p in parameters])
         space = Space(parameters, bends(free, len(parameters), self.records), inside=inside)
-        stale = ("system", "coefficients", "first", "chosen")
+        stale = ("system", "coefficients", "first", "chosen", "latest")
         return self.altered(*stale, model=model, free=free, space=space, ranges=ranges)
 
     def _prior_rows(self, theta: FloatArray) -> FloatArray:
