@@ -61,6 +61,20 @@ def test_sensitivities_are_derivatives() -> None:
         assert error < 2e-6, i
 
 
+def test_the_slope_of_a_delay_is_a_difference_of_later_drives() -> None:
+    wave, drive = multisine(192)
+    t, h, first = np.arange(wave.size) / RATE, 1e-6, np.array([1e-4, 0.01, 2.0])
+    found = Driven(BOUC_WEN, wave, RATE).motion(first, BOUC_WEN_VALUES, derivatives=True)
+    early, late = (
+        Driven(BOUC_WEN, np.array([drive(at - d) for at in t]), RATE)
+        .motion(first, BOUC_WEN_VALUES, finer=10.0)
+        .output
+        for d in (-h, h)
+    )
+    expected = (late - early) / (2.0 * h)
+    assert np.abs(found.by_delay - expected).max() < 1e-4 * np.abs(expected).max()
+
+
 @pytest.mark.parametrize(
     ("law", "values", "start"),
     [
