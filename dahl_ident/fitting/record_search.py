@@ -166,7 +166,7 @@ class RecordSearch:
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
             self.evaluations += int(end.evaluations[0])
             return end
-        return minimise(
+        end = minimise(
             lambda at, _which: self.evaluated(problem, at),
             np.clip(begin, *bounds),
             problem.space.relative,
@@ -177,6 +177,9 @@ class RecordSearch:
             bounds=within,
             unseen=False,
         )
+        if end.cost[0] < EXACT * problem.n_residuals:  # by a last step that may lead nowhere
+            end = replace(end, cost=self.evaluated(problem, end.theta).cost)
+        return end
 
     def refined(self, problem: RecordProblem, end: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate with everything taken out that the residuals ask for."""
