@@ -39,12 +39,10 @@ HARMONICS = "model error of harmonics"
 APART = "suspicious points"
 TESTS = "jackknife over tests"
 
-# Share of tables in which noise alone may look like a source. Together they are below a half, so
-# that most tables of a right model have intervals of noise alone.
-_SMOOTH_ERROR = 0.15  # most wrong models look like one, and so does correlated noise
-_RATE = 0.1  # a change with speed that is missed moves f_max by many uncertainties
-_PARALLEL = 0.05
-_NOISY_LEVELS = 0.03  # of each of two kinds
+# Share of tables in which noise alone may look like a model error, or like noisy levels: with less,
+# a spring or an amplifier's gain that is off is overlooked, with more, intervals of a right model
+# are too long.
+_OFTEN = 0.15
 _SHARED_LEVELS = 0.02  # of three kinds together
 _SELDOM = 0.01  # of suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
@@ -299,13 +297,13 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
             shape,
             largest=most,
             absorbed=absorbed,
-            chance=_PARALLEL if shape.parallel else _SMOOTH_ERROR,
+            chance=_OFTEN,
         )
     orders = np.unique(view.harmonic[~first])
     if len(orders) > 0 and first.any():
         smooth = Shapes.of(there, parallel=False).changes(there, stiffness)
         changes = np.concatenate([smooth * (view.harmonic == k) for k in orders])
-        yield Source(HARMONICS, estimate.changed(changes * size), 0.0, chance=_SMOOTH_ERROR)
+        yield Source(HARMONICS, estimate.changed(changes * size), 0.0, chance=_OFTEN)
 
 
 def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
@@ -319,7 +317,7 @@ def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
     for i in _scattering_parameters(estimate.problem):
         column = -(estimate.jacobian[:, i] * change)[:, None]
         rate_of = (estimate.problem.names[i], centre)
-        yield Source(MODEL_ERROR, column, 0.0, rate_of=rate_of, chance=_RATE)
+        yield Source(MODEL_ERROR, column, 0.0, rate_of=rate_of, chance=_OFTEN)
 
 
 def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
@@ -356,7 +354,7 @@ def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
             share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
             square = 0.5 * float(np.mean(np.abs(share) ** 2))
             columns = estimate.changed(np.diag(change))
-            yield Source(NOISE, columns, square, largest=most**2, chance=_NOISY_LEVELS)
+            yield Source(NOISE, columns, square, largest=most**2, chance=_OFTEN)
     in_common = rows_of_levels(data)
     if len(in_common) >= FEWEST_TESTS:
         kinds = (predicted, by_level, by_both)
