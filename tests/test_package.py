@@ -64,7 +64,7 @@ PUBLIC_NAMES = [
 # of numpy, pandas and the standard library, protocols, aliases, and what functions return
 USUAL = {
     *("Any", "ArrayLike", "Callable", "DataFrame", "Iterable", "Mapping", "Path", "PathLike"),
-    *("Sequence", "Fit", "Result", "RecordResult", "Records"),
+    *("Sequence", "ComparableFit", "Result", "Records"),
 }
 
 
