@@ -283,8 +283,7 @@ class State:
     def variances_covariance(self) -> FloatArray:
         """Covariance of the variances, zero for those at zero.
 
-        No number between 0 and its bound has a standard deviation above half the bound (Popoviciu),
-        and no variance has less than one degree of freedom.
+        No number between 0 and its bound has a standard deviation above half the bound (Popoviciu).
         """
         found = np.zeros_like(self.information)
         every = np.sqrt(np.maximum(np.diagonal(self.information), 0.0))
@@ -293,8 +292,7 @@ class State:
         units = np.outer(size, size)
         inverse = np.linalg.pinv(self.information[part] / units, hermitian=True) / units
         std = np.sqrt(np.maximum(np.diagonal(inverse), TINY))
-        one_degree = np.sqrt(2.0) * self.variances[kept]
-        least = np.minimum(1.0, np.minimum(0.5 * self.model.most[kept], one_degree) / std)
+        least = np.minimum(1.0, 0.5 * self.model.most[kept] / std)
         found[part] = inverse * np.outer(least, least)
         return found
 
