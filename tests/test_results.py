@@ -329,7 +329,7 @@ class TestReport:
 
     def test_repr_is_one_line(self, result: FitResult) -> None:
         assert repr(result) == (
-            "<FitResult: f_max = 0.09957 ± 0.00038 N, sigma = 30.016 ± 0.067 N/m; converged>"
+            "<FitResult: f_max = 0.09957 ± 0.00039 N, sigma = 30.016 ± 0.063 N/m; converged>"
         )
 
     def test_frame(self, result: FitResult) -> None:
