@@ -3,7 +3,8 @@
 ``python -m benchmarks.uncertainty`` draws tables whose truth is known, fits each with the default
 model, and counts in how many of those with a usable status (trusted or approximate) the combined
 95.45 % intervals hold the truth. A cell holds where that is 91 to 99 %, or where at most 5 % of
-its tables are usable; every cell that was ordered is judged. Where the model is right, at least
+its tables are usable; with fewer than 100 tables, where chance (two standard errors) explains the
+rest. Every cell that was ordered is judged. Where the model is right, at least
 95 % of the tables must be trusted, and the intervals at most 1.5 times as long as from noise
 alone, the exponent held (median); in a plant the exponent itself matters more, and length is not
 judged. Truth where it is not one number: the mean over days, the mean of the two limits,
