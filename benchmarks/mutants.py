@@ -77,7 +77,7 @@ def _change(node: ast.AST) -> bool:
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in _SWAPPED:
             node.op = _SWAPPED[type(op)]()  # type: ignore[assignment]  # of one kind each
         case ast.Compare(ops=[op, *_]) if type(op) in _SWAPPED:
-            node.ops[0] = _SWAPPED[type(op)]()  # type: ignore[call-overload]
+            node.ops[0] = _SWAPPED[type(op)]()  # type: ignore[call-overload]  # as above
         case ast.If(test=test) | ast.IfExp(test=test) | ast.While(test=test):
             node.test = ast.UnaryOp(ast.Not(), test)
         case ast.UnaryOp(op=ast.USub()):

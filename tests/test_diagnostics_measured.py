@@ -83,7 +83,7 @@ class TestDamper:
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
 
     def test_runs_deviate_within_the_bounds_of_parameters(self) -> None:
-        """A power damper that these data do not ask for, its exponent at zero."""
+        """A power damper that does not improve the fit, its exponent at zero."""
         files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
         every = [
             extract(

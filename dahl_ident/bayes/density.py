@@ -135,7 +135,7 @@ class Density(LogDensity):
     errors: RowErrors | None = None
 
     @property
-    def counted(self) -> tuple[str, ...]:  # type: ignore[override]
+    def counted(self) -> tuple[str, ...]:  # type: ignore[override]  # others keep it
         """The sources of error that the likelihood counts."""
         return ("noise",) if self.errors is None else tuple(self.errors.counted)
 

@@ -587,9 +587,3 @@ def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
     if not least < FAR_LESS * left.misfit:
         return ""
     return f"parallel Jenkins elements would leave {percent(least)} of the fundamental"
-
-
-def _force(optimum: Optimum) -> float:
-    """Return a tenth of the typical force, where a damper starts."""
-    force = optimum.problem.unit_sizes((1, 0, 0))
-    return 0.1 * float(np.sqrt(np.mean(force**2)))  # not the median, which may be zero

@@ -30,7 +30,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dahl_ident.arrays import SMALLEST, TINY, ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.diagnostics.error_sources import (
     LEVELS,
     MODEL_ERROR,
@@ -137,8 +137,7 @@ class ErrorModel:
         """The estimates by name."""
         values = self.problem.to_values(self.theta)
         for i, p in enumerate(self.problem.parameters):  # beyond a bound by rounding
-            least = SMALLEST if p.positive else -1.0 / SMALLEST
-            values[i] = np.clip(values[i], max(p.lower, least), min(p.upper, 1.0 / SMALLEST))
+            values[i] = np.clip(p.nearest(values[i]), p.lower, p.upper)
         return dict(zip(self.names, values.tolist(), strict=True))
 
     @cached_property

@@ -291,13 +291,7 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
             made = made + estimate.jacobian @ absorbed
         most = 0.5 * _MOST_DEPARTURE**2 * left / square
         yield Source(
-            MODEL_ERROR,
-            made,
-            square,
-            shape,
-            largest=most,
-            absorbed=absorbed,
-            chance=_OFTEN,
+            MODEL_ERROR, made, square, shape, largest=most, absorbed=absorbed, chance=_OFTEN
         )
     orders = np.unique(view.harmonic[~first])
     if len(orders) > 0 and first.any():

@@ -44,11 +44,11 @@ class HeldValue:
     std : float
         Of its logarithm, by the records and its range together.
     asked, by_records : float
-        Logarithm of what the records alone ask for, also outside the range, over `value`, and its
-        standard deviation.
+        Logarithm of the ratio of the estimate by the records alone, which may be outside the
+        range, to `value`, and its standard deviation.
     contribution : ndarray, shape (P, P)
         Covariance of the estimate through it: as if it were estimated too, and at least as much
-        as what the records ask for moves the estimate.
+        as the value estimated from the records moves it.
     assumed : bool
         Whether nobody stated it.
     """
@@ -65,12 +65,12 @@ class HeldValue:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the records ask for another value."""
+        """Whether the records contradict the value."""
         return abs(self.asked) > _CONTRADICTED * self.by_records
 
     @property
     def found(self) -> str:
-        """What the records ask for, in words."""
+        """The estimate by the records alone, in words."""
         value = self.value * np.exp(self.asked)
         return with_unit(value, value * self.by_records, self.unit)
 
@@ -144,7 +144,7 @@ def _exponent_slopes(
 
 
 def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float, float] | None:
-    """Return the logarithm of an exponent that the records ask for, over its value, and its std."""
+    """Return the logarithm of an exponent's estimate over its value, and its standard deviation."""
     free = problem.freed([name])
     place = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
@@ -202,7 +202,7 @@ def _counted(
 ) -> tuple[float, float, FloatArray]:
     """Return the std of a held value, its std by the records alone, and what it moves.
 
-    `mean` is what the records ask for, `s` the standard deviation of what is known beforehand.
+    `mean` is the estimate by the records, `s` the standard deviation of what is known beforehand.
     """
     u2, std = _variance(jacobians, residuals, place), s
     if np.isfinite(u2):

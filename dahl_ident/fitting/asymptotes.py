@@ -352,15 +352,15 @@ def _microslip(
     if not all(p.free for p in both):
         return []
     sigma = problem.names.index(element.parameter(asymptote.adds_to_spring).name)
-    charts = []
+    in_microslip = []
     for parameter in springs:
         spring = problem.names.index(parameter.name)
         follow = both[0].name, both[1].name, np.log(np.asarray(factor))
         plain = _chart(problem, pins, follow, _kept(problem, element, asymptote))
         chart = replace(plain, tied=(spring, sigma))
         limit = _limit(problem, element, asymptote, chart)
-        charts.append(replace(limit, extremes={**limit.extremes, parameter.name: -np.inf}))
-    return charts
+        in_microslip.append(replace(limit, extremes={**limit.extremes, parameter.name: -np.inf}))
+    return in_microslip
 
 
 def _vanishing(problem: TableProblem, axes: Directions) -> list[Limit]:
@@ -384,7 +384,7 @@ def _vanishing(problem: TableProblem, axes: Directions) -> list[Limit]:
 def _undeclared(problem: TableProblem, axes: Directions) -> list[Limit]:
     """Return limits far out in every direction with a unit, on either side of the data."""
     view = problem.stiffness_data
-    places = []
+    far_out = []
     for direction in axes.nonlinear:
         if direction.is_number or not direction.parameter.positive:
             continue
@@ -420,10 +420,10 @@ def _undeclared(problem: TableProblem, axes: Directions) -> list[Limit]:
             meaning = "no amplitude reaches slip" if large == rising else "every amplitude slips"
             if direction.dimension[2]:
                 meaning = f"the data lie far {'below' if large else 'above'} {p.name}"
-            places.append(
+            far_out.append(
                 Limit(problem.names, Status.RUNS_AWAY, meaning, chart, extremes, tuple(kept))
             )
-    return places
+    return far_out
 
 
 def _kept_product(

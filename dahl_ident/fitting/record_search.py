@@ -182,7 +182,7 @@ class RecordSearch:
         return end
 
     def refined(self, problem: RecordProblem, end: Minima) -> tuple[RecordProblem, Minima]:
-        """Return the estimate with everything taken out that the residuals ask for."""
+        """Return the estimate without noise and delay that the residuals show, weighted if slow."""
         if problem.output == "force":
             problem, end = self.without_noise(problem, end)
         problem, end = self.aligned(problem, end)
@@ -191,7 +191,7 @@ class RecordSearch:
         return problem, end
 
     def aligned(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
-        """Return the estimate with the delay between the channels that the residuals ask for.
+        """Return the estimate with the delay between the channels that the residuals show.
 
         Steps of the delay with all values free, as long as each explains more than chance does.
         Where it explains little, or what remains is not noise, it may as well stand for a part of
@@ -222,7 +222,7 @@ class RecordSearch:
         return late, end
 
     def without_noise(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
-        """Return the estimate without the displacement's noise, where the residuals ask for it.
+        """Return the estimate without the displacement's noise, where the residuals improve by it.
 
         Noise that counts as travel moves the friction where the device rests. The dead band doubles
         as long as a Gauss-Newton step then leaves smaller residuals, to four times the estimate at

@@ -224,15 +224,16 @@ class Problem(ABC):
         more = np.zeros((*rows.shape[:-1], self.n_priors))
         values = self.space.to_values(theta)
         slopes = self.space.slopes(values)
-        priors = self.priors.items()
-        known = [(name, *_normal_moments(name, prior), values, slopes) for name, prior in priors]
-        logarithms = np.log(np.abs(values)) if self.ranges else values
-        known += [(n, *moments, logarithms, slopes / values) for n, moments in self.ranges.items()]
-        for place, (name, mean, std, at, slope) in enumerate(known):
+        known = [(name, _normal_moments(name, prior)) for name, prior in self.priors.items()]
+        known += self.ranges.items()
+        for place, (name, (mean, std)) in enumerate(known):
             index = self.names.index(name)
-            more[..., 0, place] = (at[..., index] - mean) / std
+            at, slope = values[..., index], slopes[..., index]
+            if name in self.ranges:
+                at, slope = np.log(np.abs(at)), slope / at
+            more[..., 0, place] = (at - mean) / std
             if rows.shape[-2] > 1:
-                more[..., 1 + index, place] = slope[..., index] / std
+                more[..., 1 + index, place] = slope / std
         return np.concatenate([rows, more], axis=-1)
 
     @property

@@ -144,7 +144,7 @@ class SteadyRows:
     def _within_reach(self, values: Sequence[FloatArray]) -> list[FloatArray]:
         """Return values with the stiffness of friction that slips at once brought within reach."""
         smallest = np.nanmin(np.abs(self._measured), axis=-1, keepdims=True)
-        amplitudes = []
+        reachable = []
         for element, own in self._model.of(values):
             kept = list(own)
             if not element.is_linear:
@@ -153,8 +153,8 @@ class SteadyRows:
                 for i, parameter in enumerate(element.parameters):
                     if parameter.dimension == _STIFFNESS and (share < 1.0).any():
                         kept[i] = own[i] * np.where(share < 1.0, share, 1.0)
-            amplitudes += kept
-        return amplitudes
+            reachable += kept
+        return reachable
 
     def _is_unique(self, values: Sequence[FloatArray], shape: tuple[int, ...]) -> NDArray[np.bool_]:
         """Return where the response is unique: no part of the plant feeds energy in."""

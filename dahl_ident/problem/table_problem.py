@@ -106,6 +106,7 @@ class TableProblem(Problem):
     arguments = ("data", "model", "noise", "sensors", "steady")
     output_in_words = "the fundamental"
     _orbits: dict[int, FloatArray]
+    _coarse = False  # whether measured amplitudes are taken as they are
 
     def __init__(
         self,
@@ -157,8 +158,6 @@ class TableProblem(Problem):
         self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
         self.ranges: dict[str, tuple[float, float]] = {}
-
-    _coarse = False  # whether measured amplitudes are taken as they are
 
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
@@ -79,6 +80,12 @@ class Assessment(ABC):
             "aic": optimum.aic,
             "bic": optimum.bic,
         }
+
+    @property
+    def redchi(self) -> float:
+        """Sum of squared residuals over degrees of freedom, NaN where there are none."""
+        residuals, dof = self.estimate.residuals, self.optimum.dof
+        return float(residuals @ residuals) / dof if dof > 0 else math.nan
 
     @property
     @abstractmethod

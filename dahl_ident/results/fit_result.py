@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -204,7 +203,7 @@ class FitResult(Result):
     @property
     def redchi(self) -> float:
         """`chisqr` over `nfree`; the squared scale where that was estimated."""
-        return self.chisqr / self.nfree if self.nfree > 0 else math.nan
+        return self.assessment.redchi
 
     @property
     def scale(self) -> float:

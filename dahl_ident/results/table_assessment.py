@@ -263,10 +263,8 @@ class TableAssessment(Assessment):
     def facts(self) -> dict[str, Any]:
         """What is stated for machines, see ``Assessment``."""
         suspicious = [str(point) for point in self.goodness.suspicious]
-        residuals = self.estimate.residuals
-        reduced = float(residuals @ residuals) / self.optimum.dof if self.optimum.dof > 0 else None
         return super().facts | {
-            "noise": self.problem.noise, "suspicious": suspicious, "redchi": reduced
+            "noise": self.problem.noise, "suspicious": suspicious, "redchi": self.redchi
         }  # fmt: skip
 
     @property
