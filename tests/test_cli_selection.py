@@ -34,7 +34,8 @@ def kept(run: Runner, *options: str) -> di.FrequencyResponse:
     table().save("t.csv", overwrite=True)
     fit = ("fit", "t.csv", "--noise", "absolute", "--save", "f.json", "--overwrite")
     assert run(*fit, *options).status in (0, 3)
-    return di.FitResult.load("f.json").data
+    data: di.FrequencyResponse = di.FitResult.load("f.json").data
+    return data
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers() -> No
     with pytest.warns(DataWarning, match=r"nothing is known from 1\.995 to 3\.5 s"):
         fit = di.fit(record, case.model)
     assert fit.trusted
-    assert [part.n for part in fit.records] == [400, 1300]
+    assert [part.n for part in fit.data] == [400, 1300]
     assert "a single run" in fit.verdict
     for parameter in case.truth.parameters:
         found = fit.params[parameter.name]
@@ -91,7 +91,7 @@ def test_a_gap_is_bridged_where_nothing_remembers() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", DataWarning)
         fit = di.fit(di.Record(t, displacement=x, force=force), di.Spring(), throw=False)
-    assert fit.records[0].n == t.size
+    assert fit.data[0].n == t.size
     assert fit.params["stiffness"].value == pytest.approx(50.0, rel=0.01)
 
 
@@ -102,9 +102,9 @@ def test_short_parts_are_left_out_and_uneven_times_are_no_gaps() -> None:
     t[490:] += 1.0
     with pytest.warns(DataWarning, match="one part is used.*; 10 samples in shorter parts"):
         fit = di.fit(di.Record(t, displacement=x, force=force), di.Dahl(), throw=False)
-    assert fit.records[0].n == 490
+    assert fit.data[0].n == 490
     uneven = np.cumsum(np.exp(2.0 * np.random.default_rng(2).standard_normal(500)))
     with warnings.catch_warnings():
         warnings.simplefilter("error", DataWarning)
         fit = di.fit(di.Record(uneven, displacement=x, force=force), di.Dahl(), throw=False)
-    assert fit.records[0].n == 500
+    assert fit.data[0].n == 500

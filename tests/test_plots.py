@@ -512,5 +512,5 @@ def test_residuals_of_a_fit_over_amplitude_frequency_and_velocity() -> None:
         drawn = next(line for line in axis.lines if line.get_label() == "ln gain")
         np.testing.assert_allclose(np.asarray(drawn.get_xdata()), x)
     with pytest.raises(ValidationError, match="against is 'time'; expected one of amplitude"):
-        fit.plot_residuals(against="time")  # type: ignore[arg-type]
+        fit.plot_residuals(against="time")
     plt.close("all")

@@ -468,9 +468,9 @@ class TestUnderstood:
         assert "not evenly spaced" in fit.verdict
         assert "nothing is known from 0.99 to 1.4 s" in fit.verdict
         with pytest.warns(DataWarning, match="2 parts are fitted"):
-            parts = di.fit(record, di.Dahl(alpha=1.0), throw=False).records
+            parts = di.fit(record, di.Dahl(alpha=1.0), throw=False).data
         assert [part.n for part in parts] == [99, 458]
-        assert di.fit(record, di.Spring(), throw=False).records[0].n == kept.size
+        assert di.fit(record, di.Spring(), throw=False).data[0].n == kept.size
 
     def test_a_table_without_a_frequency(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -174,7 +174,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
     measured = drive + 1e-2 * rng.standard_normal(samples) + 5e-5 * slow
     record = di.Record(t, displacement=x, force=measured)
     fit = di.fit(record, di.Dahl() + di.Mass() + di.Damper() + di.Spring(), start=truth)
-    assert fit.weighted
+    assert fit.noise == "spectrum"
     assert fit.trusted, fit.verdict
     for name, value in truth.items():
         found = fit.params[name]
@@ -453,18 +453,16 @@ def test_report(tmp_path: Path, ending: str) -> None:
 
 def test_what_records_cannot_do_is_refused_by_name() -> None:
     fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
-    with pytest.raises(ValidationError, match="likelihood given with a posterior of records"):
-        di.posterior(fit.records[0], di.Dahl(), likelihood="student_t")
+    with pytest.raises(ValidationError, match=r"likelihood is given with records: .*robust"):
+        di.posterior(fit.data[0], di.Dahl(), likelihood="student_t")
     with pytest.raises(ValidationError, match="steps given with method='grid'"):
-        di.posterior(fit.records[0], di.Dahl(), method="grid", steps=100)
+        di.posterior(fit.data[0], di.Dahl(), method="grid", steps=100)
     with pytest.raises(ValidationError, match="together with a FitResult"):
         di.posterior(fit, di.Dahl())
     with pytest.raises(ModelError, match="there is no model"):
-        di.posterior(fit.records[0])
+        di.posterior(fit.data[0])
     with pytest.raises(ModelError, match="a prior for drift"):
         di.posterior(fit, priors={"drift": (0.0, 1.0)})
-    with pytest.raises(ValidationError, match="predicts a Record"):
-        fit.predict(2.0, amplitude=1e-3)
 
 
 def test_derived_quantities_follow_from_the_estimate() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 import dahl_ident as di
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ModelError, ValidationError
 
 RNG = np.random.default_rng(0)
 X = 1e-3 * np.cumsum(RNG.standard_normal(2000))
@@ -131,7 +131,7 @@ def test_constraints() -> None:
     ],
 )
 def test_options_of_the_other_kind_are_refused(data: Any, option: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError, match=r"given with a fit of (records|tables), which has"):
+    with pytest.raises(ValidationError, match=r"is given with (records|a table): .*leave it out"):
         di.fit(data, MODEL, **option)
 
 
@@ -151,9 +151,46 @@ def test_a_table_and_a_record_answer_the_same_questions(fit: di.FitResult) -> No
 
 def test_what_one_kind_alone_has_is_refused_in_one_way(fit: di.FitResult) -> None:
     table = di.fit(di.load_dataset("noisy"), MODEL)
-    with pytest.raises(ValidationError, match="a fit of tables has no prediction of a record"):
+    with pytest.raises(ValidationError, match="a fit of a table has no prediction of a record"):
         table.predict(record(TRUE))
-    with pytest.raises(ValidationError, match="a fit of records has no response at other freq"):
-        fit.predict(1.0, amplitude=1e-3)
-    with pytest.raises(ValidationError, match="a fit of records has no backbone"):
+    with pytest.raises(ValidationError, match="against is 'frequency'; expected time or"):
+        fit.plot_residuals(against="frequency")
+    with pytest.raises(ModelError, match="has no mass"):
         fit.backbone(1e-3)
+
+
+def test_a_fit_of_records_predicts_responses_to_sines(fit: di.FitResult) -> None:
+    A = np.array([1e-3, 4e-3])
+    band, truth = fit.describing_function(A), di.Dahl(0.1, 30.0).describing_function(A)
+    np.testing.assert_allclose(band.response, fit.model.dynamic_stiffness(A, 1.0), rtol=1e-9)
+    for (low, high), true in ((band.real(), truth.real), (band.imag(), truth.imag)):
+        assert ((low < true) & (true < high)).all()
+    u = [q.stderr / q.value for q in fit.derived(A.tolist()) if q.name.startswith("energy")]
+    np.testing.assert_allclose(band.imag_std / band.response.imag, u, rtol=1e-4)
+    predicted = fit.predict([1.0, 1.0], amplitude=A, quantity="receptance")
+    np.testing.assert_allclose(predicted.response, 1.0 / band.response)
+    drawn = di.posterior(fit, seed=1, steps=80).predict([1.0, 1.0], amplitude=A)
+    np.testing.assert_allclose(drawn.response, band.response, rtol=1e-2)
+    np.testing.assert_allclose(drawn.draws.real.std(axis=0), band.real_std, rtol=0.2)
+
+
+def test_a_fit_of_a_driven_record_has_a_backbone() -> None:
+    mass, stiffness, friction = 0.5, 200.0, di.Dahl(0.1, 30.0, alpha=1.0)
+    t, tones = np.arange(1500)[:, None] / 200.0, np.array([4.0, 9.1, 15.7])
+    waves = 8e-3 * np.sin(tones * t)
+    x, acceleration = waves.sum(axis=1), (-(tones**2) * waves).sum(axis=1)
+    force = mass * acceleration + stiffness * x + friction.force(x)
+    force += 1e-3 * np.random.default_rng(3).standard_normal(x.size)
+    driven = di.Record(t[:, 0], displacement=x, force=force)
+    fit = di.fit(driven, di.Mass(mass) + di.Spring() + di.Dahl(alpha=1.0), output="force")
+    A = np.array([5e-3, 2e-2])
+    backbone, N = fit.backbone(A), stiffness + friction.describing_function(A)
+    omega = np.sqrt(N.real / mass)
+    ratio = N.imag / (2.0 * mass * omega**2)
+    away = np.stack([backbone.response.imag - ratio, backbone.frequency_hz - omega / 2.0 / np.pi])
+    assert backbone.covariance is not None
+    u = np.sqrt(backbone.covariance[:, [1, 0], [1, 0]].T)
+    assert (np.abs(away) < 3.0 * u).all()
+    assert (u < [[0.01], [0.1]]).all()
+    top, bottom = fit.predict([1.0, 3.0], drive=0.5).gain()
+    assert (top < bottom).all()

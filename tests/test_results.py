@@ -503,7 +503,7 @@ class TestPictures:
         data = table()
         C = (0.02 * data.gain)[:, None, None] ** 2 * np.eye(2)
         top, _ = fit(replace(data, covariance=C), Dahl()).plot_fit()
-        segments = top.collections[-1].get_segments()  # type: ignore[attr-defined]  # error bars
+        segments = top.collections[-1].get_segments()  # error bars
         heights = [np.ptp(s[:, 1]) for s in segments]
         np.testing.assert_allclose(heights, 0.04 * data.gain, rtol=1e-6)
 

@@ -31,9 +31,9 @@ def optimum_of(problem: Problem) -> Optimum | None:
     try:
         return solve(_with_normal_priors(problem))
     except FitError:
-        if problem.settled:
-            return None
-        raise
+        if problem.around_optimum:
+            raise
+        return None
 
 
 def _with_normal_priors(problem: Any) -> Any:

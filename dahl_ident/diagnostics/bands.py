@@ -186,7 +186,7 @@ def _measured(there: TableProblem, R: ComplexArray, known: NDArray[np.bool_]) ->
 
 
 def problem_at(
-    problem: TableProblem,
+    problem: Problem,
     frequency_hz: ArrayLike,
     amplitude: ArrayLike | None,
     drive: ArrayLike | None,
@@ -206,16 +206,18 @@ def problem_at(
             f"frequency_hz has shape {f.shape} and {name} {given.shape}; expected one shape, or "
             "one number for all"
         ) from None
+    measured = problem.response
+    usual = "dynamic_stiffness" if measured is None else measured.quantity
     grid = FrequencyResponse(
         f,
         np.ones(f.shape),
         None if amplitude is None else given,
         None if drive is None else given,
         controlled="displacement" if drive is None else "force",
-        quantity=problem.data.quantity if quantity is None else quantity,
-        motion=problem.data.motion,
+        quantity=quantity or usual,
+        motion=problem.motion,
     )
-    return problem.like(data=grid, noise="absolute")
+    return problem.at(grid)
 
 
 def describing_function_band(

@@ -485,7 +485,7 @@ def _candidates(
         stays = e.started(at_element) if np.all(np.isfinite(at_element)) else e
         offers.append((stays, e.alternatives(at_element, smallest) if known else {}))
     shown = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
-    if problem.settled:
+    if problem.response is not None:
         shown |= {
             "asymmetry": _even(optimum),
             "speed": _falling_force(optimum),
@@ -505,7 +505,8 @@ def _candidates(
                 [n for e, o in offers for n in (o[name].elements if name in o else (e,))],
             ),
         )
-    f, span = problem.data.frequency_hz if problem.settled else None, misfit
+    f = None if problem.response is None else problem.response.frequency_hz
+    span = misfit
     added: dict[str, Element] = {}
     if not any(is_spring(e) for e in model.elements):
         added["spring added"] = Spring()

@@ -95,7 +95,7 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     >>> one.total > other.total
     True
     """
-    if not optimum.problem.settled:
+    if optimum.problem.response is None:
         return _of_records(optimum, (fitted or optimum).problem)
     problem, data = optimum.problem, optimum.problem.data
     test, owner = tests_of(data)

@@ -254,7 +254,7 @@ class Profiler:
 
     @cached_property
     def _microslip_charts(self) -> list[Chart]:
-        return microslip_charts(self._problem) if self._problem.settled else []
+        return [] if self._problem.response is None else microslip_charts(self._problem)
 
     def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
         """Return the change of theta along its tangent, in logarithms of bearable length."""
@@ -351,15 +351,16 @@ class Profiler:
 
         That of a robust loss has one; that of residuals correlated in time one a parameter.
         """
-        if self._loss is None and self._problem.settled:
+        in_time = self._problem.response is None
+        if self._loss is None and not in_time:
             return np.ones(len(self._optimum.theta))
         expected = np.diagonal(inverse(self._at_optimum.hessian)[0])
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = expected / np.diagonal(self._optimum.covariance)
         known = np.isfinite(ratio) & (ratio > 0.0)
-        if self._problem.settled:
+        if not in_time:
             ratio = np.full(ratio.shape, np.median(ratio[known]) if known.any() else 1.0)
-        return np.where(known | self._problem.settled, ratio, 1.0)
+        return np.where(known if in_time else True, ratio, 1.0)
 
     # Where a search begins and where it gives up
 
@@ -421,7 +422,7 @@ class Profiler:
     def _friction(self) -> list[tuple[Parameter, Parameter]]:
         """Force limit and stiffness of every law that they scale together."""
         pairs: list[tuple[Parameter, Parameter]] = []
-        for element in self._problem.model.elements if self._problem.settled else ():
+        for element in self._problem.model.elements if self._problem.response is not None else ():
             scale = {element.parameter(s).dimension: s for s in element.scale_parameters}
             if element.has_memory and {*scale} == {_FORCE, _STIFFNESS}:
                 force, stiffness = scale[_FORCE], scale[_STIFFNESS]

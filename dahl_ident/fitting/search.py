@@ -122,7 +122,7 @@ def solve(
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
     _check(problem, start or {})
     either: Any = problem
-    if not problem.settled:
+    if problem.kind == "records":
         return solve_records(either, method, loss, start or {}, tell)
     return _solve_table(either, method, loss, start or {}, limits=limits)
 
@@ -152,7 +152,7 @@ def _solve_table(
 def starts_of(problem: Problem) -> FloatArray:
     """Return the search coordinates of global starts."""
     one: Any = problem
-    return own_starts(one).theta if problem.settled else one.to_search(record_starts(one))
+    return one.to_search(record_starts(one)) if problem.kind == "records" else own_starts(one).theta
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
@@ -227,7 +227,7 @@ def repetitions(
     NaN where a repetition has no finite optimum.
     """
     problem = optimum.problem
-    if not problem.settled:
+    if problem.kind == "records":
         return solve_repetitions(optimum, count, rng)
     scale = 1.0 if optimum.scale_known else optimum.scale
     drawn = ProblemBatch.replicates(problem, problem.draw(optimum.theta, scale, count, rng))

@@ -143,7 +143,7 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
             f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
             "posterior"
         )
-    if not problem.settled:
+    if problem.response is None:
         fit, values = (source.fit, source.draws(_MANY, seed)) if sampled else (source, None)
         return _of_records(fit, values, ranges, draws, rng)
     if sampled:

@@ -22,7 +22,7 @@ from dahl_ident.plots.responses import (
     plot_backbone,
     plot_frequency_response,
 )
-from dahl_ident.plots.waveforms import plot_cycles, plot_waveforms
+from dahl_ident.plots.waveforms import plot_cycles, plot_sample_residuals, plot_waveforms
 
 __all__ = [
     "Axes",
@@ -45,6 +45,7 @@ __all__ = [
     "plot_profile",
     "plot_recorded_loops",
     "plot_residuals",
+    "plot_sample_residuals",
     "plot_trace",
     "plot_universal_curve",
     "plot_waveforms",

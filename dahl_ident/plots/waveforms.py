@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
-from dahl_ident.plots.friction import plot_recorded_loops
 
 
 @style.house_style()
@@ -129,61 +128,41 @@ def plot_cycles(
     return top, bottom
 
 
-KINDS = ("time", "loop", "residuals", "residuals_displacement")
-
-
 @style.house_style()
-def draw_record_fit(fit: Any, kind: str, number: int, ax: Axes | None = None) -> Axes:
-    """Draw one record of a fit.
+def plot_sample_residuals(
+    x: ArrayLike,
+    residuals: ArrayLike,
+    *,
+    x_label: str = "time [s]",
+    channel: str = "force",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the residuals of a record, sample by sample.
 
     Parameters
     ----------
-    fit : FitResult
-        Of records.
-    kind : {"time", "loop", "residuals", "residuals_displacement"}
-    number : int
-        Which record.
+    x, residuals : array_like, shape (n,)
+        Time or displacement, and measured minus fitted samples.
+    x_label : str
+        Axis label with unit.
+    channel : str, default "force"
+        What was fitted.
     ax : Axes, optional
-        To draw residuals into.
+        New where left out.
 
     Returns
     -------
-    matplotlib Axes
+    Axes
+        With the residuals' root mean square as title.
 
-    Raises
-    ------
-    ValidationError
-        If displacement is wanted that the record does not have.
+    Examples
+    --------
+    >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title()
+    '3 rms'
     """
-    record, residual = fit.records[number], fit.residuals[number]
-    measured = fit.problem.measured[number]
-    labels = {name.partition(" ")[0]: str(name) for name in record.to_frame().columns}  # with units
-    channel = "force" if fit.problem.output == "force" else record.motion_channel
-    if kind == "time":
-        axes = plot_waveforms(record.time, [(channel, measured)], fitted=[measured - residual])
-        axis: Axes = axes[0]
-        return axis
-    if kind == "loop":
-        if record.displacement is None:
-            raise ValidationError("a loop needs displacement, which the record does not have")
-        force = record.force_samples
-        fitted = measured - residual if fit.problem.output == "force" else None
-        return plot_recorded_loops(
-            record.displacement,
-            force,
-            fitted=fitted,
-            displacement_label=labels["displacement"],
-            force_label=labels.get("force", "force"),
-        )
-    over, label = record.time, "time [s]"
-    if kind != "residuals":
-        if record.displacement is None:
-            raise ValidationError("the record has no displacement to draw residuals against")
-        over, label = record.displacement, labels["displacement"]
     axis = ax or style.new_axes(1, 1, size=(6.4, 3.0), sharex=True)[0, 0]
-    axis.plot(over, residual, color=style.BLUE, lw=0.6)
+    axis.plot(x, residuals, color=style.BLUE, lw=0.6)
     axis.axhline(0.0, color="0.5", lw=0.6)
-    axis.set_xlabel(label)
-    axis.set_ylabel(f"measured minus fitted {channel}")
-    axis.set_title(f"{np.sqrt(np.mean(residual**2)):.3g} rms")
+    axis.set(xlabel=x_label, ylabel=f"measured minus fitted {channel}")
+    axis.set_title(f"{np.sqrt(np.mean(np.square(residuals))):.3g} rms")
     return axis

@@ -5,18 +5,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import ValidationError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.space import Space
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.units import Motion
+
+if TYPE_CHECKING:
+    from dahl_ident.problem.table_problem import TableProblem
 
 EXPLICIT = 1e-13
 """Relative error of predictions in closed form or by roots."""
@@ -53,8 +57,16 @@ class Problem(ABC):
         Whether the residuals have unit variance as they are.
     gaussian : bool
         Whether residuals are Gaussian; not where a covariance has few degrees of freedom.
-    settled : bool
-        Whether the data are settled sines, in tables; else records of any motion.
+    kind : {"table", "records"}
+        What was measured.
+    called : str
+        The same in a sentence.
+    refused : mapping of str to str
+        Options of estimates that such data do not take, and why.
+    response : FrequencyResponse or None
+        The table, where the data are one: settled sines.
+    around_optimum : bool
+        Whether a posterior is that around the least-squares optimum, which has to exist.
     n_residuals : int
         Residuals of the data; those of priors come on top.
     n_numbers : int
@@ -65,6 +77,10 @@ class Problem(ABC):
 
     arguments: ClassVar[tuple[str, ...]]
     """Names of those of the class, each an attribute as well."""
+    kind: ClassVar[str]
+    called: ClassVar[str]
+    refused: ClassVar[Mapping[str, str]]
+    around_optimum: ClassVar[bool] = False
     model: Model
     space: Space
     motion: Motion
@@ -77,9 +93,21 @@ class Problem(ABC):
     ranges: Mapping[str, tuple[float, float]] = {}
     scale_known: bool = False
     gaussian: bool = True
-    settled: bool = True
     repetitions: int = 4999
     """That are simulated: seven of them lie beyond either limit of the 99.73 % interval."""
+
+    @property
+    def response(self) -> FrequencyResponse | None:
+        """The table, where the data are one."""
+        return None
+
+    @abstractmethod
+    def at(self, table: FrequencyResponse) -> TableProblem:
+        """Return what model and sensors predict for a table, its covariance left out."""
+
+    def unpredicted(self, residuals: FloatArray) -> str:
+        """Return why residuals are not finite; nothing where they are."""
+        return ""
 
     @property
     @abstractmethod

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import Record
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
 from dahl_ident.elements import Element, Friction, Model, Parameter
@@ -30,6 +30,7 @@ from dahl_ident.problem.base import Problem, Quadratic
 from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
 from dahl_ident.problem.record_prediction import Predicted, bends, force_of, motion_of, nuisance
 from dahl_ident.problem.space import Space
+from dahl_ident.problem.table_problem import TableProblem
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
@@ -82,7 +83,16 @@ class RecordProblem(Problem):
 
     arguments = ("records", "model", "output", "excitation", "calibration")
     parts = 1
-    settled = False
+    kind, called = "records", "records"
+    refused: ClassVar[Mapping[str, str]] = {
+        "noise": "their noise is estimated from the residuals",
+        "steady": "any motion is predicted, sample by sample",
+        "drive_std": "noise of the drive is estimated from the record, and counted",
+        "drive_covariance": "noise of the drive is estimated from the record, and counted",
+        "likelihood": "their posterior is that around the fit; fit with a robust loss",
+        "pool": "their posterior needs no predictions",
+    }
+    around_optimum = True
     repetitions = 199  # each of which is searched alone: enough for the 95.45 % interval
 
     def __init__(
@@ -172,6 +182,20 @@ class RecordProblem(Problem):
                 f"{why}, so that the motion determines only the ratios of masses, forces, dampers "
                 "and springs; give one of them, such as the mass: Mass(1.0), --mass 1.0"
             )
+
+    @property
+    def data(self) -> tuple[Record, ...]:
+        """The records."""
+        return self.records
+
+    @property
+    def noise(self) -> str:
+        """What the residuals are taken for: "white", or filtered by their "spectrum"."""
+        return "spectrum" if self.whitening.size > 1 else "white"
+
+    def at(self, table: FrequencyResponse) -> TableProblem:
+        """Return what the model predicts for a table."""
+        return TableProblem(table, self.model, noise="absolute")
 
     def shortened(self, samples: int) -> RecordProblem:
         """Return the problem with about `samples` samples in all.

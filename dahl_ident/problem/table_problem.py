@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,7 +15,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.frequency_response import fundamental_alone
-from dahl_ident.data.rows import Rows
+from dahl_ident.data.rows import Rows, row_names
 from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
@@ -104,6 +104,11 @@ class TableProblem(Problem):
     """
 
     arguments = ("data", "model", "noise", "sensors", "steady")
+    kind, called = "table", "a table"
+    refused: ClassVar[Mapping[str, str]] = {
+        "output": "rows say what was controlled, by which they are predicted",
+        "excitation": "rows are responses to a force",
+    }
     output_in_words = "the fundamental"
     _orbits: dict[int, FloatArray]
     _coarse = False  # whether measured amplitudes are taken as they are
@@ -205,6 +210,29 @@ class TableProblem(Problem):
             f"<{type(self).__name__}: {self._rows.n} rows of {self._rows.quantity}, "
             f"{self.noise} noise, free {', '.join(self.names)}>"
         )
+
+    @property
+    def response(self) -> FrequencyResponse:
+        """The table."""
+        return self.data
+
+    def at(self, table: FrequencyResponse) -> TableProblem:
+        """Return what model and sensors predict for another table."""
+        return self.like(data=table, noise="absolute")
+
+    def unpredicted(self, residuals: FloatArray) -> str:
+        """Return why residuals are not finite, with what to do; nothing where they are."""
+        lost = np.flatnonzero(~np.isfinite(residuals))
+        if not lost.size:
+            return ""
+        (name,) = row_names(self.data, [int(lost[0]) // 2])
+        cause = "the model has no finite response there; give a start, or another model"
+        if (self.data.controlled == "force").any():
+            cause = (
+                "the drive moves the model without bound; add the mass, damper or spring that "
+                "friction is in parallel, or give a start"
+            )
+        return f"No parameters that were tried predict {name}: {cause}"
 
     # Steady motion
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
 from pathlib import Path
@@ -33,6 +33,15 @@ _HOW = (
 )
 
 
+KINDS = {"table": "Table", "records": "Waveforms"}
+"""How reports call what was measured."""
+
+
+def of_kind(kind: str, results: Iterable[Any]) -> list[Any]:
+    """Return the results on one kind of data."""
+    return [result for result in results if result.problem.kind == kind]
+
+
 @dataclass(frozen=True)
 class Compared:
     """What a report says of fits of different measurements, compared with each other."""
@@ -45,9 +54,10 @@ class Compared:
 
 def comparison_of(fits: Sequence[FitResult]) -> Compared:
     """Return what changed between fits of records, or between a table and its waveforms."""
-    if len({fit.problem.settled for fit in fits}) > 1:
+    of_records = of_kind("records", fits)
+    if 0 < len(of_records) < len(fits):
         return _of_both(fits)
-    changed = _between_records([fit for fit in fits if not fit.problem.settled])
+    changed = _between_records(of_records)
     if not changed:
         return Compared()
     facts = {"changes": [change.to_dict() for change in changed]}
@@ -56,7 +66,7 @@ def comparison_of(fits: Sequence[FitResult]) -> Compared:
 
 def _between_records(fits: Sequence[FitResult]) -> list[Change]:
     """Return the changes between fits to different records; none between models of the same."""
-    firsts = [fit.records[0] for fit in fits]
+    firsts = [fit.data[0] for fit in fits]
     channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
     for a, b in pairwise(firsts):
         if all(np.array_equal(getattr(a, name), getattr(b, name)) for name in channels):
@@ -88,9 +98,7 @@ _Difference = tuple[Change, FitResult, FitResult]
 
 def _differences(results: Sequence[FitResult]) -> Iterator[_Difference]:
     """Yield the differences of the parameters that a table and waveforms both determine."""
-    tables = [one for one in results if one.problem.settled]
-    records = [one for one in results if not one.problem.settled]
-    for fit, other in product(tables, records):
+    for fit, other in product(of_kind("table", results), of_kind("records", results)):
         for change in changes({"table": fit, "waveforms": other}):
             yield change, fit, other
 

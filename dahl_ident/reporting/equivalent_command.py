@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dahl_ident.elements.law_checks import is_of_package
 from dahl_ident.elements.law_files import own_laws, source_path
 from dahl_ident.problem import TableProblem
+from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.tables import prior_text
 from dahl_ident.results import FitResult, Posterior
@@ -28,16 +29,16 @@ _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 
 def equivalent_command(results: Sequence[FitResult | Posterior]) -> str | None:
     """Return the commands, one per line; None if no options describe data or model."""
-    of_tables = [result for result in results if result.problem.settled]
-    if len(of_tables) < len(results):
+    table = results[0].problem.response
+    if table is None or len(of_kind("table", results)) < len(results):
         return None
-    source = _source(of_tables[0].data)
-    elements = (e for result in of_tables for e in result.problem.model.elements)
+    source = _source(table)
+    elements = (e for result in results for e in result.problem.model.elements)
     if source is None or not all(_has_text(element) for element in elements):
         return None
     before, files = source
     lines = []
-    for result in of_tables:
+    for result in results:
         words = _fit(result) if isinstance(result, FitResult) else _sample(result)
         lines.append(
             " | ".join([*before, shlex.join(["dahl-ident", words[0], *files, *words[1:]])])

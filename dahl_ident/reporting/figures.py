@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,7 +38,7 @@ _LOOP_POINTS = 73  # of a measured loop, every 5 degrees; one in six of the mode
 
 def pictures_of(fit: FitResult) -> Iterator[Picture]:
     """Yield the pictures of a fit."""
-    return (_of_table if fit.problem.settled else _of_records)(fit)
+    return _PICTURES[fit.problem.kind](fit)
 
 
 def _of_table(fit: FitResult) -> Iterator[Picture]:
@@ -64,26 +64,32 @@ def _of_table(fit: FitResult) -> Iterator[Picture]:
 def _of_records(fit: FitResult) -> Iterator[Picture]:
     """Yield the figures of the record that a fit describes worst."""
     worst = fit.goodness.worst_record - 1
-    of = f" of record {worst + 1}, which is described worst" if len(fit.records) > 1 else ""
+    of = f" of record {worst + 1}, which is described worst" if len(fit.data) > 1 else ""
     share = percent(fit.goodness.share_left**0.5)
-    shown = {
-        "time": f"Measured and fitted {fit.problem.output}",
-        "residuals": "Residuals over time",
+    over = partial(fit.plot_residuals, record=worst)
+    shown: dict[str, tuple[str, Callable[[], Any]]] = {
+        "time": (f"Measured and fitted {fit.problem.output}", partial(fit.plot_fit, record=worst)),
+        "residuals": ("Residuals over time", over),
     }
-    if fit.records[worst].displacement is not None:
-        shown["loop"] = "Force over displacement"
-        shown["residuals_displacement"] = "Residuals over displacement"
-    for kind, caption in shown.items():
+    if fit.data[worst].displacement is not None:
+        shown["loop"] = "Force over displacement", partial(fit.plot, "loop", record=worst)
+        shown["residuals_displacement"] = (
+            "Residuals over displacement", partial(over, against="displacement")
+        )  # fmt: skip
+    for kind, (caption, draw) in shown.items():
         yield Picture(
             f"record_{kind}",
             f"{caption}{of}.",
             f"{caption}{of}: the residuals are {share} rms of the measured signal.",
-            partial(_of_record, fit, kind, worst),
+            partial(_figure, draw),
         )
 
 
-def _of_record(fit: FitResult, kind: str, record: int) -> Figure:
-    return figure_of(fit.plot(kind, record=record))
+def _figure(draw: Callable[[], Any]) -> Figure:
+    return figure_of(draw())
+
+
+_PICTURES = {"table": _of_table, "records": _of_records}
 
 
 def budget_picture(budget: Budget) -> Picture:

@@ -17,6 +17,7 @@ from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
 from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
 from dahl_ident.errors import DataError, ValidationError, argument
+from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.pages import html, markdown
@@ -106,7 +107,7 @@ def report(
     _check(listed)
     _check_calibrations(listed, known)
     how: dict[str, Any] = {"title": title, "command": command, "metadata": known}
-    of_tables = [one for one in listed if one.problem.settled]
+    of_tables = of_kind("table", listed)
     if record is not None and not of_tables:
         raise ValidationError(
             f"{argument('record', option='waveforms')} is given, the waveforms of a table, but no "

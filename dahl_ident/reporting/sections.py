@@ -16,7 +16,7 @@ from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.reporting import posterior_sections, provenance, tables
-from dahl_ident.reporting.comparison import comparison_of
+from dahl_ident.reporting.comparison import KINDS, comparison_of, of_kind
 from dahl_ident.reporting.document import (
     MARKS,
     Block,
@@ -42,6 +42,7 @@ COVERAGE = (
     f"k, for a coverage of about {level_text(CONFIDENCE)}."
 )
 _MOST_FILES = 4  # lines of them before the signature
+_FACTS = {"table": "fits", "records": "record_fits"}  # names of fits in JSON, by kind of data
 _FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin
 
 
@@ -55,9 +56,9 @@ def document(
 ) -> Document:
     """Return the report on fits and posteriors of one table, of records, or of both."""
     drawn = [result for result in results if isinstance(result, Posterior)]
-    around = [one.fit for one in drawn if one.fit is not None and not one.problem.settled]
+    around = [one.fit for one in drawn if one.fit is not None and one.problem.around_optimum]
     fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
-    tables_first = sorted(results, key=lambda result: not result.problem.settled)
+    tables_first = sorted(results, key=lambda result: result.problem.response is None)
     first, known = tables_first[0], metadata or Metadata()
     repeated = command or equivalent_command(results)
     compared = comparison_of(fits)
@@ -70,10 +71,10 @@ def document(
         front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
         details += _details(fit, drawn, of)
     for one in drawn:
-        if not fits or not one.problem.settled:
+        if not fits or one.problem.around_optimum:
             front.append(Section("Posterior", tuple(posterior_sections.answer(one))))
         details += posterior_sections.sections(one)
-    data = first.problem.data if first.problem.settled else None
+    data = first.problem.response
     return Document(
         title=title or known.title or title_of(first),
         status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=RANK),
@@ -99,8 +100,7 @@ def document(
             ),
         ),
         facts={
-            "fits": [fit_facts(fit) for fit in fits if fit.problem.settled],
-            "record_fits": [fit_facts(fit) for fit in fits if not fit.problem.settled],
+            **{name: list(map(fit_facts, of_kind(kind, fits))) for kind, name in _FACTS.items()},
             "posteriors": [one.to_dict() for one in drawn],
             "metadata": known.facts(),
             **compared.facts,
@@ -113,10 +113,10 @@ def document(
 
 def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
     """Return what distinguishes a fit from the others of a report, for headings."""
-    alike = [other for other in fits if other.problem.settled == fit.problem.settled]
+    alike = of_kind(fit.problem.kind, fits)
     parts = [repr(fit.problem.model)] if len(alike) > 1 else []
-    if len(alike) < len(fits) and not fit.problem.settled:
-        parts.append("waveforms")
+    if len(alike) < len(fits):
+        parts.append(KINDS[fit.problem.kind].lower())
     return f": {', '.join(parts)}" if parts else ""
 
 
@@ -210,9 +210,8 @@ def in_words(model: Element) -> Iterator[str]:
 
 def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
     """Yield a fit's statements; where there are several fits, model and status come first."""
-    kinds = {other.problem.settled for other in fits}
-    before = "" if len(kinds) < 2 else "Table: " if fit.problem.settled else "Waveforms: "
-    alike = sum(other.problem.settled == fit.problem.settled for other in fits)
+    alike = len(of_kind(fit.problem.kind, fits))
+    before = "" if alike == len(fits) else f"{KINDS[fit.problem.kind]}: "
     if alike > 1:
         first, *others = fit.statements
         lines = [f"{fit.problem.model!r}: {first}", *others]
@@ -290,7 +289,7 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     for method in ("wald",) if fit.first_order else fit.assessment.quick_methods:
         fit.conf_interval(method)
     intervals = fit.assessment.intervals_run(CONFIDENCE)
-    alike = [one for one in drawn if one.problem.settled == fit.problem.settled]
+    alike = of_kind(fit.problem.kind, drawn)
     yield tables.parameters(fit, intervals, alike)
     by_note: dict[str, list[str]] = {}
     for one in intervals:

@@ -24,15 +24,11 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
 _OF_ONE_KIND = {
-    "predict_response": "response at other frequencies",
-    "backbone": "backbone",
-    "describing_function": "band of its describing function",
     "cross_validation": "held-out tests",
     "errors_of_combinations": "errors of combinations",
     "predict_record": "prediction of a record",
     "record_at_draws": "prediction of a record",
     "residuals": "residuals sample by sample",
-    "weighted": "weights by spectrum",
 }
 """What one kind of data alone has, in words."""
 
@@ -49,8 +45,6 @@ class Assessment(ABC):
     """
 
     problem: Any
-    kind: str
-    """What was fitted, in words."""
     quick_methods: tuple[Method, ...] = ("wald",)
     """Of intervals: those that a report has time for, in addition to the combined ones."""
     instead: str
@@ -64,7 +58,7 @@ class Assessment(ABC):
     def __getattr__(self, name: str) -> Any:
         if name in _OF_ONE_KIND:
             raise ValidationError(
-                f"a fit of {self.kind} has no {_OF_ONE_KIND[name]}; {self.instead}"
+                f"a fit of {self.problem.called} has no {_OF_ONE_KIND[name]}; {self.instead}"
             )
         raise AttributeError(name)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,19 +23,15 @@ from dahl_ident.bayes.walker_start import (
     optimum_of,
     starting_points,
 )
-from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.columns import one_of
-from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.estimate import EXPONENT, with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
-from dahl_ident.elements.element import as_model
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.fitting.record_search import Tell
-from dahl_ident.problem import Problem, ProblemBatch, TableProblem
-from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem import Problem, ProblemBatch, kind_of, problem_of, refuse_options
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
@@ -46,6 +42,7 @@ from dahl_ident.steady_state import Steady
 if TYPE_CHECKING:
     import pandas as pd
 
+    from dahl_ident.data import FrequencyResponse, Record
     from dahl_ident.elements.equations import Excitation
     from dahl_ident.fitting.constraints import Constraints
     from dahl_ident.problem.record_problem import Output
@@ -152,10 +149,7 @@ def fit(
     >>> result.params["f_max"].value.__round__(9), result.success
     (0.1, True)
     """
-    if hasattr(data, "iloc"):  # a table in memory, without the import of pandas
-        data = read_frequency_response(cast("pd.DataFrame", data))
-    kind = "tables" if isinstance(data, FrequencyResponse) else "records"
-    _refuse_options(fit, f"a fit of {kind}", locals(), _NOT_OF_FITS[kind])
+    refuse_options(kind_of(data), locals(), fit)
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
     by_ipopt = {
@@ -177,7 +171,10 @@ def fit(
             drive_std=drive_std, drive_covariance=drive_covariance,
         )  # fmt: skip
 
-    problem = _problem(data, model, free, fixed, sensors, noise, steady, output, excitation)
+    problem = problem_of(
+        data, model, free=free, fixed=fixed, sensors=sensors, noise=noise, steady=steady,
+        output=output, excitation=excitation,
+    )  # fmt: skip
     first_order = constraints is not None
     try:
         with fit_progress() if progress else nullcontext() as tell:
@@ -188,49 +185,11 @@ def fit(
             f"{stop}; this exception's `result` holds the best values so far",
             FitResult(stop.result),
         ) from stop
-    if problem.settled and not np.isfinite(result.optimum.residuals).all():
-        raise FitError(_no_prediction(result.optimum))
+    if cause := problem.unpredicted(optimum.residuals):
+        raise FitError(cause)
     if throw and not result.success:
         raise FitError(f"{result.goodness.cause} {result.message}".strip(), result)
     return result
-
-
-def _problem(
-    data: FrequencyResponse | Record | Sequence[Record],
-    model: Element,
-    free: Iterable[str],
-    fixed: Mapping[str, float] | None,
-    sensors: Sensors | None,
-    noise: str | None = None,
-    steady: Steady = "exact",
-    output: Output | None = None,
-    excitation: Excitation = "force",
-) -> Any:
-    """Return the problem of a table or of records."""
-    if isinstance(data, FrequencyResponse):
-        return TableProblem(
-            data, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
-        )
-    return RecordProblem(
-        [data] if isinstance(data, Record) else list(data),
-        as_model(model).with_free(free).with_fixed(fixed or {}),
-        output=output,
-        excitation=excitation,
-        calibration=(sensors or Sensors()).stated_uncertainties(),
-    )
-
-
-def _no_prediction(optimum: Optimum) -> str:
-    """Return what to do where no values tried predict a finite response in every row."""
-    data = optimum.problem.data
-    (name,) = row_names(data, [int(np.flatnonzero(~np.isfinite(optimum.residuals))[0]) // 2])
-    cause = "the model has no finite response there; give a start, or another model"
-    if (data.controlled == "force").any():
-        cause = (
-            "the drive moves the model without bound; add the mass, damper or spring that friction "
-            "is in parallel, or give a start"
-        )
-    return f"No parameters that were tried predict {name}: {cause}"
 
 
 def fit_many(
@@ -400,10 +359,8 @@ def posterior(
     options = {**locals()}
     one_of(method, "method", METHODS)
     source = data if isinstance(data, FitResult) else None
-    settled = isinstance(data, FrequencyResponse) if source is None else source.problem.settled
-    if not settled:
-        _refuse_options(posterior, "a posterior of records", options, _NOT_OF_RECORDS)
-    _refuse_options(posterior, argument("method", method), options, _NOT_OF_METHODS[method])
+    refuse_options(kind_of(data) if source is None else type(source.problem), options, posterior)
+    _refuse_for_method(method, options)
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
@@ -421,10 +378,14 @@ def posterior(
                 density, start, settings, seed=seed, resume=resume, pool=pool, listeners=listeners
             )
 
-    if isinstance(data, FitResult):
-        problem, fitted = data.problem, source
+    fitted: FitResult | None = source
+    if source is not None:
+        problem = source.problem
     else:
-        problem = _problem(data, _checked(model), free, fixed, sensors, noise, steady or "exact")
+        problem = problem_of(
+            data, _checked(model), free=free, fixed=fixed, sensors=sensors, noise=noise,
+            steady=steady or "exact",
+        )  # fmt: skip
         optimum = optimum_of(problem)
         fitted = None if optimum is None else FitResult(optimum)
     if fitted is None or likelihood != "gaussian":
@@ -440,26 +401,22 @@ def posterior(
     return result
 
 
-_NOT_OF_RECORDS = ("noise", "steady", "likelihood", "pool")
-_NOT_OF_FITS = {
-    "tables": ("output", "excitation"),
-    "records": ("noise", "drive_std", "drive_covariance", "steady"),
-}
 _NOT_OF_METHODS = {
     "mcmc": ("tolerance",),
     "grid": ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool"),
 }
 
 
-def _refuse_options(
-    of: Callable[..., Any], kind: str, options: Mapping[str, Any], refused: Sequence[str]
-) -> None:
-    """Refuse options that a kind of estimate does not have, unless they are left as they are."""
-    defaults = signature(of).parameters
-    named = [name for name in refused if options[name] != defaults[name].default]
-    if named:
+def _refuse_for_method(method: str, options: Mapping[str, Any]) -> None:
+    """Refuse options of the other method, unless they are left as they are."""
+    defaults = signature(posterior).parameters
+    refused = _NOT_OF_METHODS[method]
+    if named := [name for name in refused if options[name] != defaults[name].default]:
         names = ", ".join(argument(name).rstrip("=") for name in named)
-        raise ValidationError(f"{names} given with {kind}, which has no such option; leave it out")
+        raise ValidationError(
+            f"{names} given with {argument('method', method)}, which has no such option; leave it "
+            "out"
+        )
 
 
 def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
@@ -476,7 +433,7 @@ def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
         raise ValidationError(
             "the fit had constraints, which a posterior does not take; pass the data instead"
         )
-    if not fit.problem.settled and fit.optimum.loss != "linear":
+    if fit.problem.around_optimum and fit.optimum.loss != "linear":
         raise ValidationError(
             "the fit of records had a robust loss, which a posterior does not take; pass the "
             "records instead"
@@ -503,7 +460,7 @@ def _record_density(
 
 
 def _density(
-    problem: TableProblem,
+    problem: Any,
     fit: FitResult | None,
     priors: Mapping[str, PriorLike] | None,
     likelihood: str,
@@ -513,7 +470,7 @@ def _density(
     from scipy import stats
 
     stated, optimum = dict(priors or {}), None if fit is None else fit.optimum
-    if fit is not None and not problem.settled:
+    if fit is not None and problem.around_optimum:
         return _record_density(fit, priors, uncertainty), optimum
     if fit is None or optimum is None or uncertainty == "noise":
         values = None if optimum is None else optimum.values

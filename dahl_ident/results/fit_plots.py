@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse, curves
+from dahl_ident.data import FrequencyResponse, Record, curves
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError, choices
-from dahl_ident.plots import Axes, Curve, plot_budget, plot_residuals
-from dahl_ident.plots.waveforms import KINDS as OF_RECORDS
-from dahl_ident.plots.waveforms import draw_record_fit
+from dahl_ident.plots import (
+    Axes,
+    Curve,
+    plot_budget,
+    plot_recorded_loops,
+    plot_residuals,
+    plot_sample_residuals,
+    plot_waveforms,
+)
 from dahl_ident.units import si_unit
 
 if TYPE_CHECKING:
@@ -27,15 +32,20 @@ _POINTS = 200  # of a curve that looks smooth
 def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
     """Draw a fit in one of the kinds that its data have; the first where none is given."""
     kinds: dict[str, Callable[[], Any]] = {
-        "fit": lambda: draw_fit(fit, ax),
-        "residuals": lambda: draw_residuals(fit, None, ax),
+        "fit": lambda: _FIT[fit.problem.kind](fit, ax, record),
+        "residuals": lambda: draw_residuals(fit, None, ax, record),
+        "budget": lambda: _draw_budget(fit.budget(), ax),
     }
-    if not fit.problem.settled:
-        kinds = {k: partial(draw_record_fit, fit, k, record, ax) for k in OF_RECORDS}
-    kinds["budget"] = lambda: _draw_budget(fit.budget(), ax)
+    if fit.problem.response is None:
+        kinds["loop"] = lambda: _draw_loop(fit, ax, record)
     if kind is not None and kind not in kinds:
         raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
-    return kinds[kind or next(iter(kinds))]()
+    return kinds[kind or "fit"]()
+
+
+def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None, record: int) -> Axes:
+    """Draw residuals over a quantity, by default the one that suits the data."""
+    return _RESIDUALS[fit.problem.kind](fit, against, ax, record)
 
 
 def _draw_budget(budget: Budget, ax: Any) -> Axes:
@@ -43,7 +53,7 @@ def _draw_budget(budget: Budget, ax: Any) -> Axes:
     return plot_budget(shares, ax=ax)
 
 
-def draw_fit(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
+def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None, _record: int) -> tuple[Axes, Axes]:
     """Draw data with error bars and fit with its band, over amplitude or over frequency."""
     return curves.draw(
         fit.data,
@@ -64,7 +74,7 @@ def standardized_residuals(fit: FitResult) -> FloatArray:
     return residuals
 
 
-def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None) -> Axes:
+def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None, _record: int) -> Axes:
     """Draw both residuals of every row over a quantity, by default the one that suits the table."""
     data = fit.data
     if against is None:
@@ -125,3 +135,61 @@ def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Cur
         frequency, drive=held if forced else None, amplitude=None if forced else held
     )
     return Curve(grid, band.response, band.gain(), band.phase())
+
+
+def _fit_of_record(fit: FitResult, ax: Axes | None, record: int) -> Axes:
+    """Draw the measured and the fitted output of a record over time."""
+    measured, _, channel = _output(fit, record)
+    waves, axes = [(channel, measured)], None if ax is None else [ax]
+    fitted = [fit.best_fit[record]]
+    axis: Axes = plot_waveforms(fit.data[record].time, waves, fitted=fitted, ax=axes)[0]
+    return axis
+
+
+def _draw_loop(fit: FitResult, ax: Axes | None, record: int) -> Axes:
+    """Draw force over displacement, measured and, where it was predicted, fitted."""
+    one = fit.data[record]
+    x, labels = _displacement(one), _labels(one)
+    fitted = fit.best_fit[record] if fit.problem.output == "force" else None
+    return plot_recorded_loops(
+        x, one.force_samples, fitted=fitted, ax=ax, displacement_label=labels["displacement"],
+        force_label=labels.get("force", "force"),
+    )  # fmt: skip
+
+
+def _residuals_of_record(fit: FitResult, against: str | None, ax: Axes | None, record: int) -> Axes:
+    """Draw measured minus fitted output of a record over time or displacement."""
+    one = fit.data[record]
+    _, residual, channel = _output(fit, record)
+    over, label = one.time, "time [s]"
+    if against == "displacement":
+        over, label = _displacement(one), _labels(one)["displacement"]
+    elif against not in (None, "time"):
+        raise ValidationError(f"against is {against!r}; expected time or displacement")
+    return plot_sample_residuals(over, residual, x_label=label, channel=channel, ax=ax)
+
+
+def _output(fit: FitResult, record: int) -> tuple[FloatArray, FloatArray, str]:
+    """Return what was measured and fitted, its residuals and the name of the channel."""
+    channel = "force" if fit.problem.output == "force" else fit.data[record].motion_channel
+    return fit.problem.measured[record], fit.residuals[record], channel
+
+
+def _displacement(record: Record) -> FloatArray:
+    if record.displacement is None:
+        raise ValidationError(
+            f"the record has {record.motion_channel} and no displacement to draw over; draw the "
+            "fit or its residuals over time"
+        )
+    return np.asarray(record.displacement)
+
+
+def _labels(record: Record) -> dict[str, str]:
+    """Return the labels of a record's channels with units."""
+    return {name.partition(" ")[0]: str(name) for name in record.to_frame().columns}
+
+
+_FIT: Mapping[str, Callable[..., Any]] = {"table": _fit_of_table, "records": _fit_of_record}
+_RESIDUALS: Mapping[str, Callable[..., Axes]] = {
+    "table": _residuals_of_table, "records": _residuals_of_record
+}  # fmt: skip

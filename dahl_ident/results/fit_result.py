@@ -39,6 +39,11 @@ if TYPE_CHECKING:
     from dahl_ident.plots import Axes
 
 
+_ASSESSMENTS: Mapping[str, type[TableAssessment | RecordAssessment]] = {
+    "table": TableAssessment, "records": RecordAssessment
+}  # fmt: skip
+
+
 class FitResult(Result):
     """The result of a fit: estimates, their errors, and whether to trust them.
 
@@ -73,7 +78,7 @@ class FitResult(Result):
     @cached_property
     def assessment(self) -> TableAssessment | RecordAssessment:
         """What the data tell of the estimate."""
-        kind = TableAssessment if self.problem.settled else RecordAssessment
+        kind = _ASSESSMENTS[self.problem.kind]
         return kind(self.optimum, first_order=self.first_order)
 
     problem: Any = part("optimum.problem", "Data, model, noise, sensors as fitted.")
@@ -103,9 +108,12 @@ class FitResult(Result):
 
     # What was fitted
 
-    data: FrequencyResponse = part("problem.data", "The table that was fitted.")
-    noise: str = part("problem.noise", "The noise model of a table.")
-    records: tuple[Record, ...] = part("problem.records", "The records that were fitted.")
+    data: Any = part("problem.data", "What was fitted: the table, or a tuple of the records.")
+    noise: str = part(
+        "problem.noise",
+        "The noise model of a table; of records, whether residuals count as they are, as white "
+        'noise ("white"), or filtered by their spectrum ("spectrum").',
+    )
 
     # What the data tell
 
@@ -145,10 +153,6 @@ class FitResult(Result):
     )
     residuals: tuple[FloatArray, ...] = part(
         "assessment.residuals", "Of records: measured minus predicted, record by record."
-    )
-    weighted: bool = part(
-        "assessment.weighted",
-        "Of records: whether residuals were weighted by their spectrum: slow noise prevails.",
     )
     effective_samples: float = part(
         "errors.effective", "Of records: white samples that would tell as much as the residuals."
@@ -496,10 +500,10 @@ class FitResult(Result):
         Parameters
         ----------
         kind : str, optional
-            "budget": shares of the uncertainty as bars. Of a table: "fit" (the default), see
-            :meth:`plot_fit`, or "residuals", see :meth:`plot_residuals`. Of records: "time" (the
-            default), "loop", "residuals" over time, or "residuals_displacement".
-        ax : matplotlib Axes, or two of them for "fit", optional
+            "fit" (the default), see :meth:`plot_fit`; "residuals", see :meth:`plot_residuals`;
+            "budget": shares of the uncertainty as bars; of records also "loop": force over
+            displacement.
+        ax : matplotlib Axes, or two of them for the "fit" of a table, optional
             New ones where left out.
         record : int, default 0
             Which record.
@@ -512,37 +516,42 @@ class FitResult(Result):
 
         return draw(self, kind, ax, record)
 
-    def plot_fit(self, ax: Sequence[Axes] | None = None) -> tuple[Axes, Axes]:
-        """Draw data and fit, gain above phase, over amplitude or frequency.
+    def plot_fit(self, ax: Any = None, *, record: int = 0) -> Any:
+        """Draw data and fit: gain above phase, over amplitude or frequency, or a record over time.
 
         Parameters
         ----------
-        ax : sequence of two matplotlib Axes, optional
+        ax : matplotlib Axes, or two of them for a table, optional
             New ones where left out.
+        record : int, default 0
+            Which record.
 
         Returns
         -------
-        tuple of Axes
+        Axes, or two of them for a table
         """
-        from dahl_ident.results.fit_plots import draw_fit
-
-        return draw_fit(self, ax)
+        return self.plot("fit", ax, record=record)
 
     def plot_residuals(
         self,
         ax: Axes | None = None,
         *,
-        against: Literal["amplitude", "frequency", "velocity"] | None = None,
+        against: Literal["amplitude", "frequency", "velocity", "time", "displacement"]
+        | None = None,
+        record: int = 0,
     ) -> Axes:
-        """Draw the residuals of every row, suspicious points ringed.
+        """Draw the residuals: of every row, suspicious points ringed, or of every sample.
 
         Parameters
         ----------
-        against : {"amplitude", "frequency", "velocity"}, optional
-            What to draw them over: the amplitude of displacement, the frequency, or the amplitude
-            of velocity. By default amplitude or frequency, as suits the table.
         ax : matplotlib Axes, optional
             New where left out.
+        against : str, optional
+            What to draw them over. Rows of a table: the "amplitude" of displacement, the
+            "frequency", or the amplitude of "velocity"; left out, amplitude or frequency, as
+            suits the table. Samples: "time", the default, or "displacement".
+        record : int, default 0
+            Which record.
 
         Returns
         -------
@@ -550,7 +559,7 @@ class FitResult(Result):
         """
         from dahl_ident.results.fit_plots import draw_residuals
 
-        return draw_residuals(self, against, ax)
+        return draw_residuals(self, against, ax, record)
 
     # Storage
 

@@ -8,7 +8,7 @@ intervals and verdicts are computed when asked for, by whatever version loads th
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
-TABLE, RECORDS = "dahl_ident.fit_result", "dahl_ident.record_fit"
+_SCHEMAS = {"table": "dahl_ident.fit_result", "records": "dahl_ident.record_fit"}
 VERSION = 4  # of the layout; others are refused
 _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
@@ -48,17 +48,16 @@ def to_json(optimum: Optimum, first_order: bool) -> str:
     """Return a fit as JSON text, numbers that JSON does not know as text, such as "inf"."""
     problem = optimum.problem
     facts = {
-        "schema": TABLE if problem.settled else RECORDS,
+        "schema": _SCHEMAS[problem.kind],
         "schema_version": VERSION,
         "dahl_ident_version": __version__,
         "model": describe_model(problem.model),
         "laws": describe_laws(problem.model.elements),
-        **(_describe_table if problem.settled else _describe_records)(problem),
+        **_DESCRIBED[problem.kind](problem),
         "optimum": describe_optimum(optimum) | {"first_order": first_order},
     }
     content = plain_data(facts, not_finite=str)
-    # samples of records would stand on a line each
-    indent = 1 if problem.settled else None
+    indent = None if problem.response is None else 1  # samples would stand on a line each
     return json.dumps({**content, "digest": digest(content)}, allow_nan=False, indent=indent)
 
 
@@ -69,9 +68,8 @@ def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
     except json.JSONDecodeError as exc:
         raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
     _check(content, source)
-    problem_of = _table_problem if content["schema"] == TABLE else _record_problem
     try:
-        optimum = optimum_from(problem_of(content), content["optimum"])
+        optimum = optimum_from(_BUILT[content["schema"]](content), content["optimum"])
         first_order, laws = content["optimum"]["first_order"], content["laws"]
     except (KeyError, TypeError) as exc:
         raise DataError(
@@ -94,8 +92,8 @@ def load(path: str | Path) -> tuple[Optimum, bool]:
 def _check(content: Any, source: str) -> None:
     """Refuse what is not a fit of the version that is known, as it was written."""
     stated = content.get("schema") if isinstance(content, Mapping) else None
-    if stated not in (TABLE, RECORDS):
-        expected = f"{TABLE!r} or {RECORDS!r}"
+    if stated not in _BUILT:
+        expected = " or ".join(map(repr, _BUILT))
         raise DataError(f"{source} has the schema {stated!r}; expected {expected}, a saved fit")
     version = content.get("schema_version")
     if type(version) is not int or version != VERSION:
@@ -173,6 +171,14 @@ def _record_problem(content: Mapping[str, Any]) -> RecordProblem:
     problem.runs = tuple(content["runs"])
     problem = problem.weighted(_floats(content["whitening"]))
     return problem.delayed(content["delay"]).without_noise(content["displacement_noise"])
+
+
+_DESCRIBED: Mapping[str, Callable[[Any], dict[str, Any]]] = {
+    "table": _describe_table, "records": _describe_records
+}  # fmt: skip
+_BUILT: Mapping[str, Callable[[Mapping[str, Any]], Problem]] = {
+    _SCHEMAS["table"]: _table_problem, _SCHEMAS["records"]: _record_problem
+}  # fmt: skip
 
 
 def describe_optimum(optimum: Optimum) -> dict[str, Any]:

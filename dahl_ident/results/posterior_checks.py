@@ -219,7 +219,7 @@ def _objections(posterior: Posterior) -> Iterator[Finding]:
 def _misfits(posterior: Posterior) -> tuple[Finding, ...]:
     """Return where the data contradict the model."""
     fit = posterior.fit
-    if fit is None or (posterior.counted_fit is None and posterior.problem.settled):
+    if fit is None or (posterior.counted_fit is None and posterior.normalised):
         lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
         failed = (check for check in posterior.checks if not check.passed)
         return tuple(Finding(*lost, "predictive_check", {"text": str(c)}) for c in failed)

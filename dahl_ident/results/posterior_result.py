@@ -465,13 +465,12 @@ class Posterior(Result):
         -------
         PredictiveBand or RecordBand
         """
-        if self.problem.settled:
-            there = problem_at(self.problem, at, amplitude, drive, quantity)
-            theta = self._drawn(1000 if size is None else size, seed)
-            return PredictiveBand(there.predict(theta[:, : len(there.names)]))
-        assert self.fit is not None
         if not isinstance(at, Record):
-            return self.fit.predict(at)  # says what can be predicted
+            there = problem_at(self.problem, at, amplitude, drive, quantity)
+            values = self.draws(1000 if size is None else size, seed)
+            return PredictiveBand(there.predict(there.to_search(values[:, : len(there.names)])))
+        if self.fit is None:
+            raise FitError("there are too few data for a least-squares fit of the record's start")
         draws = self.draws(100 if size is None else whole_number(size, "size", 2), seed)
         return self.fit.assessment.record_at_draws(at, initial, draws)
 

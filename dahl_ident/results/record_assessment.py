@@ -8,11 +8,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, whole_number
-from dahl_ident.data import Record
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
-from dahl_ident.diagnostics.bands import DerivedQuantity, quantities
+from dahl_ident.diagnostics.bands import (
+    DerivedQuantity,
+    ResponseBand,
+    describing_function_band,
+    predicted_backbone,
+    quantities,
+    response_band,
+)
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.formatting import percent, table
@@ -41,10 +49,12 @@ from dahl_ident.fitting import solve
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.record_search import hold_model
-from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.results.assessment import Assessment
 from dahl_ident.units import shown_unit
 
+_LEAST = 1e-100  # of a positive value, or of a share of the response
+_UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
 _STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 
 
@@ -88,11 +98,7 @@ class RecordAssessment(Assessment):
     """A fit of records, with its errors source by source."""
 
     problem: RecordProblem
-    kind = "records"
-    instead = (
-        "it predicts a Record; for settled sines ask its model, such as "
-        "fit.model.dynamic_stiffness(amplitude, frequency_hz)"
-    )
+    instead = "it has errors, residuals and hold_out() of the samples"
 
     @property
     def provenances(self) -> tuple[Mapping[str, object] | None, ...]:
@@ -221,11 +227,6 @@ class RecordAssessment(Assessment):
         return (record_assumptions(self.problem, self.errors),)
 
     @property
-    def weighted(self) -> bool:
-        """Whether residuals were weighted by their spectrum."""
-        return self.problem.whitening.size > 1
-
-    @property
     def facts(self) -> dict[str, Any]:
         """What is stated for machines, see ``Assessment``."""
         return super().facts | {
@@ -243,10 +244,10 @@ class RecordAssessment(Assessment):
     @property
     def noise_in_words(self) -> list[str]:
         """How residuals were weighted."""
-        weighted = "weighted by their spectrum" if self.weighted else "of constant variance"
+        weighted = {"spectrum": "weighted by their spectrum", "white": "of constant variance"}
         return [
-            f"residuals {weighted}; worth {self.errors.effective:.3g} independent samples of "
-            f"{self.problem.n_samples}"
+            f"residuals {weighted[self.problem.noise]}; worth {self.errors.effective:.3g} "
+            f"independent samples of {self.problem.n_samples}"
         ]
 
     def budget(self) -> Budget:
@@ -271,6 +272,47 @@ class RecordAssessment(Assessment):
             (variance,) = variances(slopes[None], self.covar[:count, :count])
             numbers.append(DerivedQuantity(name, unit, A, float(at[0]), float(variance) ** 0.5))
         return tuple(numbers)
+
+    @cached_property
+    def device(self) -> Optimum:
+        """The estimate as that of a table of one row; its noise is what the model misses."""
+        one = FrequencyResponse([1.0], [1.0], [1.0], motion=self.problem.motion)
+        problem: TableProblem = self.problem.at(one).like(noise="relative")
+        count = self.problem.n_reported
+        values = self.optimum.values[:count]
+        least = np.where(problem.space.positive, _LEAST, -np.inf)
+        theta = problem.to_search(np.maximum(values, least))
+        slopes = problem.value_slopes(theta)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            covariance = self.covar[:count, :count] / np.outer(slopes, slopes)
+        unknown = ~np.isfinite(covariance)
+        covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
+        share = (0.5 * self.goodness.share_left) ** 0.5 if misses(self) else _LEAST
+        return replace(
+            self.optimum, problem=problem, theta=theta, values=values, covariance=covariance,
+            scale=share, dof=int(self.errors.dof),
+        )  # fmt: skip
+
+    def predict_response(
+        self,
+        frequency_hz: ArrayLike,
+        amplitude: ArrayLike | None,
+        drive: ArrayLike | None,
+        quantity: Any,
+        *,
+        noise: bool,
+    ) -> ResponseBand:
+        """Return the response to a sine; of one more test, what the model misses included."""
+        at = frequency_hz, amplitude, drive, quantity
+        return response_band(self.device, *at, of_a_test=noise)
+
+    def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
+        """Return natural frequency and damping ratio of the estimate against amplitude."""
+        return predicted_backbone(self.device, self.model, amplitude)
+
+    def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
+        """Return N(A) of the friction alone."""
+        return describing_function_band(self.device, amplitude)
 
     def predict_record(self, record: Record, initial: str) -> RecordBand:
         """Return what another record should show."""

@@ -50,7 +50,6 @@ class TableAssessment(Assessment):
     """A fit of a table, with its error model."""
 
     problem: TableProblem
-    kind = "tables"
     quick_methods = ("wald", "profile")
     instead = "extract the table from the waveforms, or fit the record itself"
 

@@ -1,21 +1,72 @@
-"""Many tables of one shape as one problem: fits and bootstrap replicates by the thousand."""
+"""The problem of whatever was measured: of a table, of records, of many tables of one shape."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import signature
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
-from dahl_ident.errors import DataError
+from dahl_ident.elements.element import as_model
+from dahl_ident.errors import DataError, ValidationError, argument
+from dahl_ident.problem.base import Problem
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.stiffness import as_response, checked_table
 from dahl_ident.problem.table_problem import TableProblem
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
+
+if TYPE_CHECKING:
+    from dahl_ident.elements.equations import Excitation
+    from dahl_ident.problem.record_problem import Output
+
+
+def kind_of(data: object) -> type[TableProblem] | type[RecordProblem]:
+    """Return the class of the problem that data make."""
+    is_table = isinstance(data, FrequencyResponse) or hasattr(data, "iloc")  # without pandas
+    return TableProblem if is_table else RecordProblem
+
+
+def refuse_options(kind: type[Problem], options: Mapping[str, Any], of: Callable[..., Any]) -> None:
+    """Refuse options that a kind of data does not take, unless they are as they are in `of`."""
+    usual = signature(of).parameters
+    for name, reason in kind.refused.items():
+        if name in options and options[name] != usual[name].default:
+            named = argument(name).rstrip("=")
+            raise ValidationError(f"{named} is given with {kind.called}: {reason}; leave it out")
+
+
+def problem_of(
+    data: Any,
+    model: Element,
+    *,
+    free: Iterable[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    sensors: Sensors | None = None,
+    noise: str | None = None,
+    steady: Steady = "exact",
+    output: Output | None = None,
+    excitation: Excitation = "force",
+) -> Any:
+    """Return the problem of a table, in memory of pandas too, of a record or of several."""
+    if kind_of(data) is TableProblem:
+        table = data if isinstance(data, FrequencyResponse) else read_frequency_response(data)
+        return TableProblem(
+            table, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
+        )
+    return RecordProblem(
+        [data] if isinstance(data, Record) else list(data),
+        as_model(model).with_free(free).with_fixed(fixed or {}),
+        output=output,
+        excitation=excitation,
+        calibration=(sensors or Sensors()).stated_uncertainties(),
+    )
 
 
 class ProblemBatch(TableProblem):
