@@ -300,7 +300,6 @@ class TestSelection:
             full_table(harmonic=1, quantity="mobility"),
             full_table(dof=None),
             full_table(level=3.0),
-            full_table(quality={}),
             full_table(motion="rotation"),
         ],
     )

@@ -378,3 +378,19 @@ def test_an_open_parameter_has_one_limit_and_no_expanded_uncertainty() -> None:
     assert f"f_max: at least {limits.lower:.3g} N" in str(identifiability(result))
     assert f"at least {limits.lower:.3g}" in str(result.budget())
     assert result.budget().to_dict()["parameters"]["f_max"]["U"] is None
+
+
+@pytest.mark.parametrize("runs", [2, 3])
+def test_an_interval_is_no_narrower_than_the_means_of_few_runs_say(runs: int) -> None:
+    """However well they agree: the textbook's t interval of their means covers as often."""
+    rng, size = np.random.default_rng(8), 10
+    for _ in range(4):
+        Z = 5.0 + 0.1 * rng.standard_normal((2, runs * size)).T @ np.array([1.0, 1.0j])
+        run = np.repeat(np.arange(runs), size).astype(str)
+        data = FrequencyResponse(np.ones(Z.size), Z, np.tile(np.geomspace(1e-3, 1.0, size), runs),
+                                 run=run)  # fmt: skip
+        limits = fit(data, Spring(), noise="absolute").conf_interval()["stiffness"][1]
+        means = Z.real.reshape(runs, size).mean(axis=1)
+        error = np.std(means, ddof=1) / np.sqrt(runs)
+        least = stats.t.ppf(0.97725, runs - 1) * error
+        assert limits.upper - limits.lower > 1.99 * least

@@ -209,6 +209,19 @@ def test_units_at_the_end_of_names(tmp_path: Path) -> None:
     np.testing.assert_allclose(known(record.displacement), [1e-6, 2e-6])
 
 
+def test_columns_without_a_role_are_covariates(tmp_path: Path) -> None:
+    others = {"tension": [10, 20, 20], "gap": [1.0, np.nan, 2.0], "note": ["a", "b", "c"]}
+    data = read({**RECTANGULAR, **others})
+    assert list(data.quality) == ["tension"]  # of numbers, all of them finite
+    np.testing.assert_array_equal(data.quality["tension"], [10, 20, 20], strict=True)
+    assert "columns not used: gap, note" in repr(data)
+    data.save(tmp_path / "saved.csv")
+    again = read_frequency_response(tmp_path / "saved.csv")
+    np.testing.assert_array_equal(again.quality["tension"], [10, 20, 20], strict=True)
+    plain = read(RECTANGULAR)
+    assert not FrequencyResponse.concatenate([data, plain]).quality
+
+
 class TestErrors:
     def test_standard_deviations(self) -> None:
         n = len(STIFFNESS)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from dahl_ident import (
@@ -274,6 +274,20 @@ class TestNamed:
         expected = "the runs differ (gain by" if column == "run" else f"gain differs with {column}:"
         assert expected in found.verdict
         assert "parallel Jenkins" not in found.verdict
+
+    @pytest.mark.parametrize(
+        ("order", "seen"),
+        [(np.arange(12), False), (np.arange(12)[::-1], False), (np.arange(12) * 5 % 12, True)],
+    )
+    def test_a_drift_that_cannot_be_told_from_the_amplitude_is_named(
+        self, order: NDArray[np.intp], seen: bool
+    ) -> None:
+        A = (np.geomspace(0.1, 10.0, 12) * X_C)[order]
+        N = FRICTION.describing_function(A) * relative_noise(12, 0.01, 3)
+        (assumed,) = (t for t in fit(FrequencyResponse(np.ones(12), N, A), Dahl()).verdict.split(
+            ". ") if t.startswith("Assumed"))  # fmt: skip
+        assert assumed.endswith("a single run." if seen else "a single run without drift.")
+        assert len(assumed.split()) <= 25
 
     def test_gains_and_phases_that_were_held_out(self) -> None:
         found = fit(_scattered(22, 1.1), Dahl())

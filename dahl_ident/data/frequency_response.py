@@ -662,7 +662,9 @@ def _combined(
         if getattr(parts[0], name) is not None
     }
     columns["quality"] = {
-        name: combine([part.quality[name] for part in parts]) for name in parts[0].quality
+        name: combine([part.quality[name] for part in parts])
+        for name in parts[0].quality
+        if all(name in part.quality for part in parts)
     }
     return columns
 
@@ -673,4 +675,4 @@ def _shape_of(data: FrequencyResponse) -> set[str]:
     columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
     if data.level is not None:
         columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")
-    return columns | set(data.quality) | {data.quantity, data.motion}
+    return columns | {data.quantity, data.motion}

@@ -225,7 +225,7 @@ class _Table(Binding):
             quantity=quantity,
             motion=self.motion(),
             drive_factor_uncertainty=self.factor_uncertainty or float(saved or 0.0),
-            quality=self._quality(),
+            quality=self._quality(len(response)),
             **errors,
         )
         if quantity != "backbone":
@@ -491,12 +491,19 @@ class _Table(Binding):
         self.notes.append(f"controlled: {word}, as the table does not say")
         return word
 
-    def _quality(self) -> dict[str, NDArray[Any]]:
-        """Return the verdicts that an earlier save listed, in the types they had."""
+    def _quality(self, n: int) -> dict[str, NDArray[Any]]:
+        """Return columns without a role, as covariates: those of an earlier save in their types."""
         kinds = self.source.metadata.get("quality", {})
-        channels = {name: self.source.find(name) for name in kinds}
-        self.used |= {channel.name for channel in channels.values()}
-        return {name: _typed(channels[name].values, kind) for name, kind in kinds.items()}
+        found = {name: _typed(self.source.find(name).values, kind) for name, kind in kinds.items()}
+        for channel in self.source.channels:
+            other = channel.name in self.used or channel.short is not None  # of another level
+            if other or channel.name in found or channel.content.shape != (n,):
+                continue
+            numeric = channel.kind in "biuf" and np.isfinite(channel.values).all()
+            if numeric and not any(map(channel.is_called, RESPONSE_COLUMNS.values())):
+                found[channel.name] = channel.values
+        self.used |= found.keys()
+        return found
 
 
 def _per_drive(text: str) -> tuple[str, str, int] | None:

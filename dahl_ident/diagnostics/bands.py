@@ -52,8 +52,9 @@ class ResponseBand:
         Standard deviations of real and imaginary part, in the response's unit.
     log_gain_std, phase_std : ndarray, shape (n,)
         Standard deviations of ln gain and of the phase, rad.
-    dof : ndarray, shape (n,)
-        Degrees of freedom of the standard deviations, for the factor of Student's t.
+    dof : ndarray, shape (2, n)
+        Degrees of freedom of the standard deviations of ln gain and phase, for the factor of
+        Student's t; those of real and imaginary part are the smaller ones.
     scores : ndarray, shape (k,)
         Deviations of measured tests from their predictions without them, over their standard
         deviations; where more of them are large than Student's t makes, bands of one more test
@@ -71,28 +72,28 @@ class ResponseBand:
 
     def gain(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the gain at each point."""
-        factor = np.exp(self._threshold(level) * self.log_gain_std)
+        factor = np.exp(self._threshold(level, self.dof[0]) * self.log_gain_std)
         size = np.abs(self.centre)
         return size / factor, size * factor
 
     def phase(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the phase at each point, rad."""
-        width = self._threshold(level) * self.phase_std
+        width = self._threshold(level, self.dof[1]) * self.phase_std
         centre = np.angle(self.centre)
         return centre - width, centre + width
 
     def real(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the real part at each point."""
-        width = self._threshold(level) * self.real_std
+        width = self._threshold(level, self.dof.min(axis=0)) * self.real_std
         return self.centre.real - width, self.centre.real + width
 
     def imag(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the imaginary part at each point."""
-        width = self._threshold(level) * self.imag_std
+        width = self._threshold(level, self.dof.min(axis=0)) * self.imag_std
         return self.centre.imag - width, self.centre.imag + width
 
-    def _threshold(self, level: float) -> FloatArray:
-        return band_factor(self.scores, self.dof, float(checked_levels([level])[0]))
+    def _threshold(self, level: float, dof: FloatArray) -> FloatArray:
+        return band_factor(self.scores, dof, float(checked_levels([level])[0]))
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,8 @@ def response_band(
     R, by = there.predict(theta), there.prediction_jacobian(theta)
     known = np.isfinite(R) & (R != 0.0)
     if not known.any():
-        return ResponseBand(R, R, *np.full((5, R.size), np.nan))
+        real, imag = gain, phase = nothing = np.full((2, R.size), np.nan)
+        return ResponseBand(R, R, real, imag, gain, phase, nothing)
     seen = _measured(there, R, known)
     if errors is None:
         own = np.zeros((R.size, 2, 2))
@@ -228,9 +230,8 @@ def describing_function_band(
     N, by = friction_and_slopes(*_estimate(optimum, errors), A)
     if errors is None:
         return _noise_band(optimum, N, by)
-    shape = A.shape
     band = _combined_band(errors, *_flat(N, by), np.isfinite(N.ravel()), A.ravel(), _omega(errors))
-    parts = {k: np.reshape(v, shape) for k, v in vars(band).items() if k != "scores"}
+    parts = {k: v.reshape(*v.shape[:-1], *A.shape) for k, v in vars(band).items() if k != "scores"}
     return ResponseBand(**parts)
 
 
@@ -376,7 +377,7 @@ def _noise_band(
     if own is not None:
         parts = [np.hypot(a, b) for a, b in zip(parts, _parts_std(R, own), strict=True)]
     real, imag, gain, phase = parts
-    return ResponseBand(R, R, real, imag, gain, phase, np.full(R.shape, dof))
+    return ResponseBand(R, R, real, imag, gain, phase, np.full((2, *R.shape), dof))
 
 
 def _parts_std(R: ComplexArray, covariance: FloatArray) -> list[FloatArray]:
@@ -404,15 +405,14 @@ def _combined_band(
     of_a_test: bool = False,
 ) -> ResponseBand:
     """Return the band of responses (n,); places of the `known` ones, NaN for the others."""
-    found, parts = R[known], np.full((5, R.size), np.nan)
+    found, parts, dof = R[known], np.full((4, R.size), np.nan), np.full((2, R.size), np.nan)
     made = prediction_error(
         errors, by[known] / found[:, None], amplitude, omega, stiffness, of_a_test=of_a_test
     )
-    parts[:4, known] = _parts_std(found, made.covariance)
-    parts[4, known] = made.dof
+    parts[:, known], dof[:, known] = _parts_std(found, made.covariance), made.dof.T
     centre = R.copy()
     centre[known] *= np.exp(made.departure @ np.array([1.0, 1.0j]))
     left_out = errors.left_out if of_a_test else None
     scores = np.empty(0) if left_out is None else left_out.scores
-    real, imag, gain, phase, dof = parts
+    real, imag, gain, phase = parts
     return ResponseBand(R, centre, real, imag, gain, phase, dof, scores)

@@ -15,6 +15,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_sources import in_order_of_level
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.held_out import CrossValidation
 from dahl_ident.diagnostics.information import parameter_values
@@ -378,7 +379,7 @@ def _assumed(fit: Judged) -> Iterator[Finding]:
 
 def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding]:
     """Yield one finding with the assumptions that these data cannot test."""
-    ranges, stated = [], {}
+    ranges, stated, data = [], {}, optimum.problem.data
     for parameter in optimum.problem.model.parameters:
         name = parameter.name
         if parameter.prior is None or parameter.free:
@@ -402,7 +403,8 @@ def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding
         "stated": stated,
         "constraints": () if cost is None else tuple(cost.texts),
         "exact": tuple(taken_as_exact(optimum)),
-        "single_run": len(optimum.problem.data.runs or ()) < 2,
+        "single_run": len(data.runs or ()) < 2,
+        "no_drift": in_order_of_level(data),
         "noise_alone": errors is None,
     }
     if any(values.values()):

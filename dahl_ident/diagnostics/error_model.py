@@ -27,10 +27,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.error_sources import (
     LEVELS,
     MODEL_ERROR,
@@ -40,6 +43,7 @@ from dahl_ident.diagnostics.error_sources import (
     Source,
     error_sources,
     own_errors,
+    rows_of,
     rows_of_tests,
 )
 from dahl_ident.diagnostics.estimate import (
@@ -66,6 +70,7 @@ from dahl_ident.problem import TableProblem
 _FEWEST_TESTS = 5  # of which each is left out in turn
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
+_UPPER = 0.5 * (1.0 + CONFIDENCE)
 _KINDS = 2  # of model error that were looked for, of which the more likely one counts
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
 _CALIBRATIONS = {
@@ -73,6 +78,13 @@ _CALIBRATIONS = {
     "displacement_gain": "displacement calibration",
     "delay": "delay",
 }
+
+
+class RunJackknife(NamedTuple):
+    """What runs say of the estimate with nothing but their own scatter."""
+
+    covariance: FloatArray  # (Q, Q): of theta, by leaving out each run
+    runs: int
 
 
 @dataclass(frozen=True)
@@ -91,6 +103,7 @@ class ErrorModel:
     assumed: tuple[str, ...]
     limit: FloatArray
     """Factor of each parameter's uncertainty by the model error: tests left out limit it."""
+    by_runs: RunJackknife | None
 
     @property
     def theta(self) -> FloatArray:
@@ -177,7 +190,8 @@ class ErrorModel:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
-        less than 1. `sources` leaves only these; infinite where all variances are known.
+        less than 1; fewer where the interval would be narrower than that of the runs alone.
+        `sources` leaves only these; infinite where all variances are known.
         """
         direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
         every = self._levers[0 if sources is None else 1]
@@ -191,9 +205,11 @@ class ErrorModel:
             total += own
             if name == TESTS:
                 spread += 2.0 * own**2 / (self.tests - 1)
-        if not spread > 0.0:
-            return np.inf
-        return max(1.0, 2.0 * total**2 / spread)
+        dof = max(1.0, 2.0 * total**2 / spread) if spread > 0.0 else np.inf
+        if self.by_runs is None or sources is not None:
+            return dof
+        of_runs = float(direction @ self.by_runs.covariance @ direction)
+        return float(no_narrower(dof, total, of_runs, self.by_runs.runs))
 
     @cached_property
     def at_estimate(self) -> Optimum:
@@ -369,6 +385,10 @@ def _with_sources(
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
         limit = _limit_of_model_error(sources, state, levers[0], by_tests)
     every, given = (_by_source(estimate, assumed, sources, state, one, limit) for one in levers)
+    by_runs = None
+    if estimate.basis is None and len(problem.data.runs or ()) > 1:
+        runs = rows_of(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
+        by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     ranged = any(one.source == EXPONENT for one in assumed.values())
     if estimate.basis is None and ranged:
         whole, others = (np.asarray(sum(parts.values())) for parts in (every, given))
@@ -377,8 +397,9 @@ def _with_sources(
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)
     return ErrorModel(
-        optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed), limit
-    )
+        optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed), limit,
+        by_runs,
+    )  # fmt: skip
 
 
 def _standing_apart(optimum: Optimum) -> list[int]:
@@ -480,6 +501,26 @@ def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[s
     if not (wider > 1.0).any():
         return contributions
     return {**contributions, TESTS: _positive(C * np.outer(wider, wider) - C)}
+
+
+def no_narrower(
+    dof: FloatArray | float, variance: FloatArray | float, of_runs: FloatArray | float, runs: int
+) -> FloatArray:
+    """Return the degrees of freedom by which an interval is no narrower than that of runs alone.
+
+    The mean of a few runs has Student's t of one less, whatever their scatter; its variance by
+    `of_runs` is that of their own means. Satterthwaite's formula is too sure of a scatter that
+    happens to be small among few of them.
+
+    Examples
+    --------
+    >>> no_narrower(np.inf, 1.0, np.array([0.1, 1.0]), 2).round(2).tolist()
+    [2.1, 1.0]
+    """
+    least = special.stdtrit(runs - 1.0, _UPPER) * np.sqrt(np.divide(of_runs, variance))
+    narrow = least > np.where(np.isinf(dof), special.ndtri(_UPPER), special.stdtrit(dof, _UPPER))
+    fewer = special.stdtridf(_UPPER, np.where(narrow, least, 3.0))  # 3: any above 2
+    return np.where(narrow, np.maximum(fewer, 1.0), dof)
 
 
 def _distinguishes_noise(problem: TableProblem, assumed: Collection[str]) -> bool:

@@ -79,6 +79,18 @@ def _held(data: FrequencyResponse) -> FloatArray:
     return held
 
 
+def in_order_of_level(data: FrequencyResponse) -> bool:
+    """Return whether every run goes from level to level in one direction, the same for all.
+
+    A drift along the rows is then a change with the level, and nothing tells them apart.
+    """
+    runs = np.zeros(data.n) if data.run is None else data.run
+    first, held = data.harmonic == 1, _held(data)
+    steps = [np.diff(held[first & (runs == run)]) for run in np.unique(runs)]
+    way = np.sign(np.concatenate(steps))
+    return bool(np.abs(way).sum() > 1 and abs(way.sum()) == np.abs(way).sum())
+
+
 def repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
     """Return which rows belong to each level that was measured more than once, (levels, n).
 
@@ -110,11 +122,12 @@ def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
         if labels is not None:
             names, which = np.unique(labels, return_inverse=True)
             if FEWEST_TESTS <= len(names) < data.n:
-                return _rows_of(which)
-    return _rows_of(repeated_levels(data))
+                return rows_of(which)
+    return rows_of(repeated_levels(data))
 
 
-def _rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return the rows of each number."""
     return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
 
 

@@ -229,14 +229,12 @@ class WeightedEstimate:
         """
         Q, R = np.linalg.qr(self.jacobian)
         moves = []
-        for size in {len(rows) for rows in tests}:
-            rows = np.array([rows for rows in tests if len(rows) == size])
-            own = (2 * rows[:, :, None] + np.arange(2)).reshape(len(rows), -1)
-            left, turn = np.linalg.eigh(np.eye(2 * size) - Q[own] @ Q[own].swapaxes(1, 2))
-            along = np.einsum("bij,bi->bj", turn, self.y[own])
-            along = along / np.sqrt(np.maximum(left, _LEAST_LEFT))
-            moves.append(np.einsum("biq,bij,bj->bq", Q[own], turn, along))
-        each = np.linalg.solve(R, np.concatenate(moves).T).T
+        for rows in tests:
+            own = (2 * rows[:, None] + np.arange(2)).ravel()
+            left, turn = np.linalg.eigh(np.eye(len(R)) - Q[own].T @ Q[own])
+            along = turn.T @ (Q[own].T @ self.y[own])
+            moves.append(turn @ (along / np.sqrt(np.maximum(left, _LEAST_LEFT))))
+        each = np.linalg.solve(R, np.array(moves).T).T
         each = np.clip(each, *(bound - self.theta for bound in self.problem.bounds()))
         return np.asarray(each.T @ each)
 

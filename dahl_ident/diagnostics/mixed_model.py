@@ -329,17 +329,17 @@ class State:
     def prediction_variance(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariance of the errors of X [delta, u], and its derivatives.
 
-        For X (n, r, c): (n, r, r), and the derivatives of the trace with respect to each variance,
-        (count, n).
+        For X (n, r, c): (n, r, r), and the derivatives of its diagonal with respect to each
+        variance, (count, n, r).
         """
         model, XK = self.model, X @ self.K
-        slopes = np.zeros((model.count, len(X)))
+        slopes = np.zeros((model.count, *X.shape[:2]))
         for g in range(model.noises):
             A = model.grams[g][:-1, :-1]
-            slopes[g] = self.weights[g] ** 2 * np.sum((XK @ A) * XK, axis=(1, 2))
+            slopes[g] = self.weights[g] ** 2 * np.sum((XK @ A) * XK, axis=2)
         for k, s in enumerate(self.variances[model.noises :].tolist()):
             if s > 0.0:
-                slopes[model.noises + k] = np.sum(XK[..., model.columns(k)] ** 2, (1, 2)) / s**2
+                slopes[model.noises + k] = np.sum(XK[..., model.columns(k)] ** 2, 2) / s**2
         return XK @ X.swapaxes(1, 2), slopes
 
 

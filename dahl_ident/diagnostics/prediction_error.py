@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
 from dahl_ident.diagnostics.error_sources import (
     MODEL_ERROR,
     NOISE,
@@ -38,7 +38,7 @@ _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
 
 
 class PredictionError(NamedTuple):
-    """Of ln gain and phase at n points: departure, (n, 2), covariance, (n, 2, 2), dof, (n,)."""
+    """Of ln gain and phase at n points: departure, (n, 2), covariance, (n, 2, 2), dof, (n, 2)."""
 
     departure: FloatArray
     covariance: FloatArray
@@ -64,7 +64,7 @@ def prediction_error(
         made = source.changes(names, slopes, where, stiffness)
         if made is not None:
             X[..., model.columns(k)] = made
-    covariance, trace_slopes = state.prediction_variance(X)
+    covariance, by_variance = state.prediction_variance(X)
     if TESTS in errors.contributions:
         covariance = covariance + own @ errors.contributions[TESTS] @ own.swapaxes(1, 2)
     if of_a_test:
@@ -72,11 +72,11 @@ def prediction_error(
             if source.own:
                 drawn = np.broadcast_to(source.drawn(names, slopes), covariance.shape)
                 covariance = covariance + errors.variances[k] * drawn
-                trace_slopes[model.noises + k] += np.trace(drawn, axis1=1, axis2=2)
+                by_variance[model.noises + k] += _diagonal(drawn)
         near = _nearest(errors.problem, amplitude, omega)
         noise = _row_noise(errors.estimate.relative_units[near])
         covariance = covariance + errors.noises[0] * noise
-        trace_slopes[0] += np.trace(noise, axis1=1, axis2=2)
+        by_variance[0] += _diagonal(noise)
         for k, source in enumerate(errors.sources):
             if source.name == NOISE:
                 rows = source.columns[: errors.problem.n_residuals].reshape(
@@ -84,14 +84,24 @@ def prediction_error(
                 )
                 drawn = _row_noise(errors.estimate.relative_units[near] @ rows[near])
                 covariance = covariance + errors.variances[k] * drawn
-                trace_slopes[model.noises + k] += np.trace(drawn, axis1=1, axis2=2)
-    total = np.trace(covariance, axis1=1, axis2=2)
-    spread = np.einsum("kn,kl,ln->n", trace_slopes, state.variances_covariance, trace_slopes)
+                by_variance[model.noises + k] += _diagonal(drawn)
+    total = _diagonal(covariance)
+    spread = np.einsum("kni,kl,lni->ni", by_variance, state.variances_covariance, by_variance)
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
+    if errors.by_runs is not None:  # a new run scatters about the mean of the others
+        mean, runs = (
+            _diagonal(own @ errors.by_runs.covariance @ own.swapaxes(1, 2)),
+            errors.by_runs.runs,
+        )
+        dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
     if basis is not None:
         covariance[~basis.holds(own).all(axis=1)] = np.inf
     return PredictionError(X @ state.predicted, covariance, np.maximum(dof, _LEAST_DOF))
+
+
+def _diagonal(covariance: FloatArray) -> FloatArray:
+    return np.diagonal(covariance, axis1=1, axis2=2)
 
 
 def _row_noise(units: FloatArray) -> FloatArray:

@@ -292,6 +292,7 @@ def _assumed(
     constraints: Sequence[str],
     exact: Sequence[str],
     single_run: bool,
+    no_drift: bool,
     noise_alone: bool,
 ) -> str:
     parts = [
@@ -302,7 +303,8 @@ def _assumed(
     parts += [f"{name} = {value:g} exactly" for name, value in stated.items()]
     parts += [f"the constraint {listed(constraints)}"] if constraints else []
     parts += [f"{listed(exact)} exact"] if exact else []
-    parts += ["a single run"] if single_run else []
+    drift = " without drift" if no_drift else ""
+    parts += [f"a single run{drift}"] if single_run else [f"runs{drift}"] * no_drift
     if noise_alone:
         parts.append("no error but noise (stated uncertainties are from noise alone)")
     return f"Assumed: {'; '.join(parts)}."
