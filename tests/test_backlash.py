@@ -186,8 +186,8 @@ def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None
             slope = (ends[0] - ends[1]) / (2e-5 * values[j])
             np.testing.assert_allclose(found.by_parameter[j], slope, atol=1e-7)
     if start:
-        ends = [law.force_history(values, x, state=start + s) for s in (1e-6, -1e-6)]
-        np.testing.assert_allclose(found.by_state, (ends[0] - ends[1]) / 2e-6, atol=1e-7)
+        ends = [law.force_history(values, x, state=start + s) for s in (1e-5, -1e-5)]
+        np.testing.assert_allclose(found.by_state, (ends[0] - ends[1]) / 2e-5, atol=1e-7)
 
 
 def test_the_element_behind_a_gap_is_written_on_the_command_line(run: Runner) -> None:

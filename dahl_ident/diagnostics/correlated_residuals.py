@@ -27,7 +27,9 @@ _CORRECTIONS = 4  # each changes less, by the ratio of parameters to samples
 
 
 def sandwich(
-    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    noise: Sequence[FloatArray] | None = None,
 ) -> tuple[FloatArray, float]:
     """Return the covariance of a least-squares estimate, and the effective number of samples.
 
@@ -37,6 +39,8 @@ def sandwich(
         Derivatives of each record's prediction by the P parameters.
     residuals : sequence of ndarray, shape (n_i,)
         Measured minus predicted.
+    noise : sequence of ndarray, optional
+        Autocovariances of each record's noise, estimated if left out.
 
     Returns
     -------
@@ -60,10 +64,12 @@ def sandwich(
     variance = total / max(samples - P, 1)
     normal = np.asarray(sum(J.T @ J for J in jacobians))
     middle = np.zeros((P, P))
-    for J, e in zip(jacobians, residuals, strict=True):
+    if noise is None:
+        noise = noise_in(jacobians, residuals)
+    for J, known in zip(jacobians, noise, strict=True):
         own = np.flatnonzero((J != 0.0).any(axis=0))  # other records' states and offsets are not
         involved = J if own.size == P else J[:, own]
-        smooth = correlated(involved, autocovariances(e, involved))
+        smooth = correlated(involved, known)
         middle[np.ix_(own, own)] += involved.T @ smooth
     size = np.sqrt(normal.diagonal())
     size = np.where(size > 0.0, size, 1.0)
@@ -189,6 +195,14 @@ def autocovariances(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
         if not matters[m // 4 :].any():
             break
     return covariance[: int(np.flatnonzero(matters).max(initial=0)) + 1][: residual.size]
+
+
+def noise_in(
+    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return the autocovariances of the noise in the residuals of each record."""
+    pairs = zip(jacobians, residuals, strict=True)
+    return [autocovariances(e, J[:, (J != 0.0).any(axis=0)]) for J, e in pairs]
 
 
 def correlated(waves: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -230,9 +230,11 @@ class Profiler:
         self, index: IntArray, theta: FloatArray, change: FloatArray
     ) -> _ConstrainedOptima:
         """Return constrained optima near theta + change, or far from it where friction is vague."""
-        begins, rows = [theta + change], [np.arange(len(index))]
+        moved, held = theta + change, np.arange(theta.shape[1]) == index[:, None]
+        inside = np.clip(moved, self._low, self._high)  # a change beyond all bounds says nothing
+        begins, rows = [np.where((inside == moved) | held, inside, theta)], [np.arange(len(index))]
         for edge in self._edges:
-            begins.append(np.where(np.arange(theta.shape[1]) == index[:, None], begins[0], edge))
+            begins.append(np.where(held, begins[0], edge))
             rows.append(rows[0])
         for chart in self._microslip_charts:
             bent, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
@@ -282,11 +284,7 @@ class Profiler:
         rows = np.arange(len(index))
         held = np.zeros(start.shape, dtype=np.bool_)
         held[rows, index] = True
-        theta, at = self._minimised(held, start)
-        beyond = ((theta < self._low) | (theta > self._high)) & ~held
-        if beyond.any():
-            inside = np.clip(theta, self._low, self._high)
-            theta, at = self._minimised(held | beyond, inside)
+        theta, at = self._minimised(held, np.clip(start, self._low, self._high))
         stretch = self._stretch[index]
         deviance = 2.0 * (at.cost - self._least) * stretch
         slope = at.gradient[rows, index] * stretch
@@ -319,6 +317,7 @@ class Profiler:
             enough=lambda _: _ENOUGH,
             steps=_SEARCH_STEPS,
             accuracy=self._problem.accuracy,
+            bounds=(self._low, self._high),
         ).theta
         step = ends - theta
         moved = step.any(axis=1, keepdims=True)  # else a cost may be infinite

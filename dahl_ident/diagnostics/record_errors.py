@@ -12,7 +12,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
-from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
+from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import listed
@@ -135,7 +135,8 @@ def record_errors(
     """
     white = [problem.filtered(J) for J in jacobians]
     left = [problem.filtered(e) for e in residuals]
-    covariance, effective = sandwich(white, left)
+    noise = noise_in(white, left)
+    covariance, effective = sandwich(white, left, noise)
     sources = {NOISE: covariance}
     beyond = between_blocks(white, left, covariance, len(problem.free))
     if beyond is not None:
@@ -144,7 +145,7 @@ def record_errors(
     scatter = between_records(white, left, so_far, len(problem.free), problem.runs)
     if scatter is not None:
         sources[RUNS] = scatter
-    exponents = held_exponents(problem, values, white, left)
+    exponents = held_exponents(problem, values, white, left, noise)
     if assumed := [one.contribution for one in exponents if one.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
 
@@ -156,7 +157,7 @@ def record_errors(
 
     if "delay" not in problem.calibration:
         with suppress(FitError):  # no motion next to the estimate
-            count(DELAY, by_delay(problem, values, white, left))
+            count(DELAY, by_delay(problem, values, white, left, noise))
     if problem.output == "force":
         moved = _by_displacement(problem, values, jacobians, residuals)
         count(DISPLACEMENT, moved)
@@ -166,7 +167,7 @@ def record_errors(
             change = change_of([b - a for a, b in zip(plain, other, strict=True)])
             count(WINDOW, np.outer(change, change))
         if problem.with_memory and not problem.displacement_noise:
-            more = noise_at_turns(problem, values, jacobians, residuals)
+            more = noise_at_turns(problem, values, white, left, noise)
             count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
             count(SAMPLING, _between_samples(problem, values, jacobians))
     scale = np.zeros(values.size)
@@ -176,13 +177,13 @@ def record_errors(
     exact = [DISPLACEMENT_GAIN] if DISPLACEMENT_GAIN not in sources else []
     by_force = problem.output == "force" or problem.excitation == "force"
     if problem.output == "motion":
-        noise = drive_noise([record.force_samples for record in problem.records])
-        if noise is None:
+        of_drive = drive_noise([record.force_samples for record in problem.records])
+        if of_drive is None:
             exact.insert(0, "the drive (its noise cannot be estimated)")
         else:
-            more = _by_drive(problem, values, jacobians, covariance, noise.stds)
-            if noise.share > _SLIGHT:
-                more = more + noise.share**2 * np.outer(scale, scale)
+            more = _by_drive(problem, values, jacobians, covariance, of_drive.stds)
+            if of_drive.share > _SLIGHT:
+                more = more + of_drive.share**2 * np.outer(scale, scale)
             if more.any():
                 sources[DRIVE] = more
     stated = [r.drive_factor_uncertainty for r in problem.records]
@@ -360,7 +361,7 @@ def _between_samples(
         farther = x.copy()
         farther[1:-1][turns] -= middle[turns] ** 2 / (4.0 * bend[turns])
         motions.append((farther, v, a))
-    plain, other = problem.outputs(values), problem.altered(motions=tuple(motions)).outputs(values)
+    plain, other = problem.outputs(values), problem.altered("latest", motions=tuple(motions)).outputs(values)
     change = _change_of(problem, jacobians)([b - a for a, b in zip(plain, other, strict=True)])
     return np.outer(change, change)
 

@@ -85,6 +85,7 @@ def held_exponents(
     values: FloatArray,
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
+    noise: Sequence[FloatArray],
 ) -> tuple[HeldValue, ...]:
     """Return what the records say of each exponent that the fit holds, stated or not.
 
@@ -99,6 +100,8 @@ def held_exponents(
         The estimate.
     jacobians, residuals : sequence of ndarray
         Of each record, filtered as the estimate weighs them.
+    noise : sequence of ndarray
+        Autocovariances of the residuals' noise.
 
     Returns
     -------
@@ -118,7 +121,9 @@ def held_exponents(
         low, high = min(low, 0.0), max(high, 0.0)
         asked, s = float(step[place]), (high - low) / 12.0**0.5
         mean = float(np.clip(asked, low, high))
-        std, by_records, contribution = _counted(joint, residuals, place, mean, s, moved)
+        std, by_records, contribution = _counted(
+            joint, residuals, noise, place, mean, s, moved
+        )
         if abs(asked) > max(_LONG, _CONTRADICTED * by_records):
             asked, by_records = _asked(problem, p.name, values) or (asked, by_records)
         held.append(
@@ -166,6 +171,7 @@ def by_delay(
     values: FloatArray,
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
+    noise: Sequence[FloatArray],
 ) -> FloatArray:
     """Return the covariance of the estimate through the delay, which nobody stated.
 
@@ -177,7 +183,7 @@ def by_delay(
     slopes = [problem.filtered(slope * sample) for slope in problem.delay_slopes(values)]
     joint = [np.insert(J, place, s, axis=1) for J, s in zip(jacobians, slopes, strict=True)]
     step, moved = _freed(joint, residuals, place)
-    return _counted(joint, residuals, place, float(step[place]), 1.0, moved)[-1]
+    return _counted(joint, residuals, noise, place, float(step[place]), 1.0, moved)[-1]
 
 
 def _freed(
@@ -195,6 +201,7 @@ def _freed(
 def _counted(
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
+    noise: Sequence[FloatArray],
     place: int,
     mean: float,
     s: float,
@@ -204,7 +211,7 @@ def _counted(
 
     `mean` is the estimate by the records, `s` the standard deviation of what is known beforehand.
     """
-    u2, std = _variance(jacobians, residuals, place), s
+    u2, std = _variance(jacobians, residuals, place, noise), s
     if np.isfinite(u2):
         s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
         weight = s**2 / (s**2 + u2)
@@ -216,10 +223,13 @@ def _counted(
 
 
 def _variance(
-    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray], place: int
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    place: int,
+    noise: Sequence[FloatArray] | None = None,
 ) -> float:
     """Return the variance of one value by noise and by scatter between blocks."""
-    covariance, _ = sandwich(jacobians, residuals)
+    covariance, _ = sandwich(jacobians, residuals, noise)
     beyond = between_blocks(jacobians, residuals, covariance, place + 1)
     return float((covariance if beyond is None else covariance + beyond)[place, place])
 

@@ -9,14 +9,13 @@ lines, is hidden by the motion, but not in the residuals after each reversal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, special
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.correlated_residuals import autocovariances, correlated, inverse_normal
+from dahl_ident.diagnostics.correlated_residuals import correlated, inverse_normal
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -33,6 +32,7 @@ def noise_at_turns(
     values: FloatArray,
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
+    noise: Sequence[FloatArray],
 ) -> FloatArray:
     """Return the covariance of an estimate by errors of the displacement at its turning points.
 
@@ -48,6 +48,8 @@ def noise_at_turns(
         The estimate.
     jacobians, residuals : sequence of ndarray
         Derivatives of the prediction and measured minus predicted, of each record.
+    noise : sequence of ndarray
+        Autocovariances of the residuals' noise.
 
     Returns
     -------
@@ -56,13 +58,12 @@ def noise_at_turns(
     inverse = inverse_normal(jacobians)
     excess, strength, scatter = 0.0, 0.0, 0.0
     moved = np.zeros((values.size, values.size))
-    for number, (J, e) in enumerate(zip(jacobians, residuals, strict=True)):
+    for number, (J, e, covariance) in enumerate(zip(jacobians, residuals, noise, strict=True)):
         pattern, first, turns = _patterns(problem, values, number)
         if not first.size:
             continue
         sums = np.add.reduceat(pattern[:, None] * J[first[0] :], first - first[0])
         change = sums @ inverse  # of the estimate with each turn, (k, P)
-        covariance = autocovariances(e, J[:, (J != 0.0).any(axis=0)])
         smooth = correlated(J, covariance)
         crossed = np.add.reduceat(pattern[:, None] * smooth[first[0] :], first - first[0])
         mixed = crossed @ change.T
@@ -95,7 +96,7 @@ def _patterns(
     samples = stretches(x).samples
     turns = (np.cumsum(samples) - samples)[1:]
     chosen = turns[np.unique(np.linspace(0, turns.size - 1, min(_MOST, turns.size)).astype(int))]
-    step, other, pattern = _STEP * float(np.ptp(x)), copy(problem), x[:0]
+    step, pattern = _STEP * float(np.ptp(x)), x[:0]
     while chosen.size:
         ends = []
         for sign in (1.0, -1.0):
@@ -103,7 +104,7 @@ def _patterns(
             path[chosen] += sign * step
             motions = list(problem.motions)
             motions[number] = path, v, a
-            other.motions = tuple(motions)
+            other = problem.altered("latest", motions=tuple(motions))
             ends.append(other.predict(values, number, derivatives=False).output[chosen[0] :])
         pattern = (ends[0] - ends[1]) / (2.0 * step)
         size = np.abs(pattern)

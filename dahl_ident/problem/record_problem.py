@@ -242,7 +242,7 @@ class RecordProblem(Problem):
         """
         x = self._displacements if noise else []
         paths = tuple(travelled(wave, noise, lead) for wave in x) or None
-        return self.altered(displacement_noise=noise, paths=paths)
+        return self.altered("latest", displacement_noise=noise, paths=paths)
 
     def delayed(self, delay: float) -> RecordProblem:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
@@ -299,7 +299,7 @@ class RecordProblem(Problem):
 
     def differentiated_in(self, window: float) -> RecordProblem:
         """Return the same problem, displacements differentiated in a window of other length."""
-        return self.altered("motions", window=window)
+        return self.altered("motions", "latest", window=window)
 
     @property
     def noise_travel(self) -> float:
@@ -437,7 +437,7 @@ class RecordProblem(Problem):
         """Return the same problem, white noise added to the displacements."""
         rng = np.random.default_rng(draw)
         noisy = [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
-        return self.altered(motions=self._motions_of(noisy))
+        return self.altered("latest", motions=self._motions_of(noisy))
 
     def with_noisier_drive(self, stds: Sequence[float], draw: int) -> RecordProblem:
         """Return the same problem, white noise added to the drive of each record."""
@@ -519,17 +519,16 @@ class RecordProblem(Problem):
 
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
         """Return what the samples of record `number` should be."""
-        if self.output == "force":
-            return force_of(self, values, number, derivatives=derivatives)
+        predicted = force_of if self.output == "force" else motion_of
         key, known = values.tobytes(), self.latest.get(number)
         if known is None or known[0] != key or (derivatives and not known[1].by.size):
-            known = key, motion_of(self, values, number, derivatives=derivatives)
+            known = key, predicted(self, values, number, derivatives=derivatives)
             self.latest[number] = known
         return known[1]
 
     @cached_property
     def latest(self) -> dict[int, tuple[bytes, Predicted]]:
-        """The last motion of each record, and its values: it is asked for more than once."""
+        """The last prediction of each record, and its values: it is asked for more than once."""
         return {}
 
     @cached_property
