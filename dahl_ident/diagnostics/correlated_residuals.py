@@ -197,9 +197,7 @@ def autocovariances(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
     return covariance[: int(np.flatnonzero(matters).max(initial=0)) + 1][: residual.size]
 
 
-def noise_in(
-    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]
-) -> list[FloatArray]:
+def noise_in(jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> list[FloatArray]:
     """Return the autocovariances of the noise in the residuals of each record."""
     pairs = zip(jacobians, residuals, strict=True)
     return [autocovariances(e, J[:, (J != 0.0).any(axis=0)]) for J, e in pairs]

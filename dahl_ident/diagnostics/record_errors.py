@@ -38,8 +38,9 @@ _DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
 _BENT = 6.0  # times the displacement's noise: what a second difference has by chance once in 100
 _OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
-_STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 _NOT_FOUND = ", though it was not given: with another no motion was found"
+RELATIVE_STEP = 1e-5
+"""Of parameters, for slopes of what follows from them."""
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 TURNS = "displacement at turning points"
@@ -232,9 +233,9 @@ def _by_calibration(
         for name, p in known.items():
             low, high = (
                 problem.with_fixed({name: (p.value or 0.0) * (1.0 + step)}).outputs(values)
-                for step in (-_STEP, _STEP)
+                for step in (-RELATIVE_STEP, RELATIVE_STEP)
             )
-            slope = [(b - a) / (2.0 * _STEP) for a, b in zip(low, high, strict=True)]
+            slope = [(b - a) / (2.0 * RELATIVE_STEP) for a, b in zip(low, high, strict=True)]
             change = change + p.dimension[place] * moved(slope)
         return change
 
@@ -361,7 +362,10 @@ def _between_samples(
         farther = x.copy()
         farther[1:-1][turns] -= middle[turns] ** 2 / (4.0 * bend[turns])
         motions.append((farther, v, a))
-    plain, other = problem.outputs(values), problem.altered("latest", motions=tuple(motions)).outputs(values)
+    plain, other = (
+        problem.outputs(values),
+        problem.altered("latest", motions=tuple(motions)).outputs(values),
+    )
     change = _change_of(problem, jacobians)([b - a for a, b in zip(plain, other, strict=True)])
     return np.outer(change, change)
 

@@ -121,9 +121,7 @@ def held_exponents(
         low, high = min(low, 0.0), max(high, 0.0)
         asked, s = float(step[place]), (high - low) / 12.0**0.5
         mean = float(np.clip(asked, low, high))
-        std, by_records, contribution = _counted(
-            joint, residuals, noise, place, mean, s, moved
-        )
+        std, by_records, contribution = _counted(joint, residuals, noise, place, mean, s, moved)
         if abs(asked) > max(_LONG, _CONTRADICTED * by_records):
             asked, by_records = _asked(problem, p.name, values) or (asked, by_records)
         held.append(

@@ -293,7 +293,7 @@ class RecordSearch:
         slope = np.concatenate([problem.filtered(wave / -problem.sizes[0]) for wave in waves])
         columns = np.column_stack([jacobian, np.pad(slope, (0, len(residual) - len(slope)))])
         normal, right = columns.T @ columns, columns.T @ residual
-        self.evaluations += 3
+        self.evaluations += 1 if problem.output == "motion" else 3
         size = np.sqrt(normal.diagonal())
         size[size == 0.0] = 1.0
         inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)

@@ -35,6 +35,7 @@ from dahl_ident.diagnostics.record_checks import (
 )
 from dahl_ident.diagnostics.record_errors import (
     NOISE,
+    RELATIVE_STEP,
     RecordErrors,
     errors_on_constraints,
     record_assumptions,
@@ -55,7 +56,6 @@ from dahl_ident.units import shown_unit
 
 _LEAST = 1e-100  # of a positive value, or of a share of the response
 _UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
-_STEP = 1e-5  # relative, of parameters, for slopes of derived quantities
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ class RecordAssessment(Assessment):
         """Return x_c, energy per cycle, equivalent stiffness and damping."""
         count = self.problem.n_reported
         values = self.optimum.values[:count]
-        steps = _STEP * np.maximum(np.abs(values), 1e-300)
+        steps = RELATIVE_STEP * np.maximum(np.abs(values), 1e-300)
         points = np.vstack([values, values + np.diag(steps), values - np.diag(steps)])
         by_name = dict(zip(self.problem.names, points.T, strict=False))
         numbers = []
