@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.engine.radau import (
+    NEAR,
     NODES,
     STAGES,
     compiled,
@@ -21,8 +22,9 @@ from dahl_ident.engine.radau import (
     solve_stages,
 )
 
-NEAR = 1e-10  # of a switching function's largest value: zero, to rounding
 LOCATED = 1e-13  # of the span: shorter steps, and times that differ by less, are none
+DECADE, LEFT = 0.1, 1e-11  # of the distance to a limit: left after a step; at the end
+FADED = 0.6  # of a slope after a step that comes so near
 _BISECTIONS = 60
 _REPEATS = 12  # of a step that is shortened to an event; two are the rule
 PLACES = np.concatenate(
@@ -140,6 +142,23 @@ def first_event(f, signal, t, h, y, w, at):
                 which, where = e, high
             break
     return which, where
+
+
+@compiled
+def fades(solved, y, w, at):
+    """Return whether a rate dies away with a switching function by more than a step resolves.
+
+    Where a force comes to its limit as a power of the distance left, errors stay.
+    """
+    n, late = at.n, (STAGES - 2) * (at.n + 1 + at.k)
+    one, other = y[1] + w[at.stages + 1], y[1] + w[at.stages + (STAGES - 2) * n + 1]
+    for e in range(1, at.k + 1):
+        row, side = at.values + n + e, w[at.sides + e]
+        old, new = w[row] * side, w[row + late] * side
+        for r in solved if old > LEFT * w[at.scale + n + e] and new < DECADE * old else solved[:0]:
+            if abs(w[at.values + late + r] * one) < FADED * abs(w[at.values + r] * other):
+                return True
+    return False
 
 
 @compiled

@@ -10,6 +10,7 @@ import numpy as np
 from dahl_ident.engine.events import (
     LOCATED,
     choose_branch,
+    fades,
     first_event,
     pass_event,
     passed_another,
@@ -228,6 +229,9 @@ def advance(
             step, last = h * factor, 0.0
             continue
         which, where = first_event(f, signal, t, h, y, w, at)
+        if at.held and h > LOCATED * span and fades(solved, y, w, at):
+            step, last = 0.5 * h, 0.0
+            continue
         if which >= 0 and where * h <= LOCATED * span:
             stuck += 1
             if stuck > 2 * (at.k + 2):

@@ -18,13 +18,15 @@ from collections import namedtuple
 import numpy as np
 from numba import boolean, complex128, float64, njit, types
 
-from dahl_ident.engine.events import NEAR, PLACES, WITHIN
+from dahl_ident.engine.events import PLACES, WITHIN
 from dahl_ident.engine.radau import (
     CHECKED,
     FUNCTION,
     MATRIX,
+    NEAR,
     NODES,
     NUMBERS,
+    SIDED,
     SLOPE_CHECKED,
     STAGES,
     TABLE,
@@ -35,7 +37,6 @@ from dahl_ident.engine.radau import (
 )
 
 _NEWTON, _SOLVED = 15, 1e-7  # iterations of the stages; the change whose square is rounding
-_SIDED = 0.1  # change of a switching function over itself, whose sign is then known
 _SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
 _LOCATED = 1e-14  # rad: shorter steps are none
 _MOST = 4000  # steps of a half cycle
@@ -148,7 +149,7 @@ def _solve(f, psi, h, F, at):
                 change = at.turns[i, e] * at.columns[i, 0]
                 at.functions[i, e] += change
                 value = max(abs(at.functions[i, e]), NEAR * at.scale[e])
-                sided = sided and abs(change) <= _SIDED * value
+                sided = sided and abs(change) <= SIDED * value
             largest = max(largest, abs(at.columns[i, 0]))
             size = max(size, abs(F + at.stages[i]))
         if not total < np.inf:  # nor not a number

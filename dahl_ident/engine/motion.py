@@ -20,7 +20,7 @@ from dahl_ident.engine.translate import System
 from dahl_ident.errors import FitError
 
 _SETTLED = 1e-6  # error of a step's polynomial; that of harmonics is then below 1e-10
-_SAMPLED = 1e-5  # the same where motions end at samples; a hundredth of it between
+_SAMPLED = 5e-6  # the same where motions end at samples; a hundredth of it between
 _HELD = 10.0  # finer, where the displacement is held: forces to 1e-9, and motions to 1e-8
 _LOOP = 1e-6  # the same for loops of laws with one state, over the local force
 _RATED = 10.0  # finer, where the law depends on the speed: it changes most near rest

@@ -34,6 +34,8 @@ _NEAR, _FAST = 1e-2, 0.2  # first change of a fixed-point iteration, and its fal
 _EXACT = 1e-11  # its last change, of which a tenth is left
 _HARDLY = 1e-6  # of the displacement: a follower that has moved less is no scale for errors
 _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is no pivot
+NEAR = 1e-10  # of a switching function's largest value: zero, to rounding
+SIDED = 0.1  # change over a switching function, whose sign is then known
 _SOLVED = 1e-7  # change of the stages, over the states' sizes, whose square is rounding
 
 
@@ -443,7 +445,13 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
             for a in range(R):
                 w[z + i * n + solved[a]] += columns[i * R + a, 0]
         complete_stages(followers, h, y, w, at)
-        if largest < (_SOLVED if newton else _EXACT):
+        done = largest < (_SOLVED if newton else _EXACT)
+        for e in range(at.k if done and newton else 0):  # laws bend most next to a switch
+            size = w[at.scale + n + 1 + e]
+            for i in range(STAGES):
+                value = max(abs(w[at.values + i * m + n + 1 + e]), NEAR * size)
+                done = done and largest * size <= SIDED * value
+        if done:
             return True
     return False
 
