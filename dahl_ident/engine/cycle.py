@@ -27,6 +27,7 @@ _ITERATIONS = 40  # of shooting; five are the rule
 _CONVERGED = 1e-4  # change of the first state over the largest one; its square is corrected
 _FAR = 1.0  # the same; a longer Newton step is replaced by a cycle
 _AGREED = 1e-3  # change by the last cycle; where it is more, rounding decides: nothing settles
+_UNDECIDED = 1e-9  # change of all states by a cycle that is an error of its steps
 _DARING = 4  # but not every fourth: in a sharp resonance cycles alone take too long
 _COARSE = 300.0  # errors of steps while shooting, over those of the last cycle
 _SHORTEST = 12.0  # steps of a cycle, and of one of the highest harmonic, at least
@@ -126,7 +127,9 @@ def cycles(
             if step <= 0.0:
                 found[row] = 0
                 continue
+            largest = 0.0
             for i in range(free):
+                largest = max(largest, abs(1.0 - sign * S[begin + i, i]))
                 for j in range(free):
                     maps[row, begin + i, begin + j] = S[begin + i, j]
                     matrix[i, j] = (1.0 if i == j else 0.0) - sign * S[begin + i, j]
@@ -135,6 +138,8 @@ def cycles(
                 columns[i, 0] = sign * x[begin + i] - y[begin + i]
             if not eliminate(matrix, columns, free, 2 + chosen.size):
                 columns[:] = np.inf
+            if free and largest < _UNDECIDED:
+                found[row] = 0
             for i in range(free):
                 if abs(columns[i, 0]) > _AGREED * w[at.scale + begin + i]:
                     found[row] = 0
