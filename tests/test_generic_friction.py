@@ -201,6 +201,17 @@ def test_derivatives_of_the_force_over_time_are_those_of_the_closed_form() -> No
         assert np.max(np.abs(one - other)) < 1e-7 * np.max(np.abs(other))
 
 
+@pytest.mark.parametrize("alpha", [0.3, 0.5, 0.9])
+def test_a_force_that_reaches_its_limit_is_that_of_the_closed_form(alpha: float) -> None:
+    """Where the slope's own slope is infinite."""
+    for seed in range(25):
+        x = np.cumsum(np.random.default_rng(seed).standard_normal(200))
+        ours, exact = (
+            law.force(x) for law in (SlopeOfDahl(1.0, 1.0, alpha), Dahl(1.0, 1.0, alpha))
+        )
+        assert np.max(np.abs(ours - exact)) < 1e-9
+
+
 @pytest.mark.parametrize("gap", [1e-7, 1e-9, 1e-11])
 def test_a_narrow_gap_hardly_changes_the_force_over_time(gap: float) -> None:
     x = 0.5 * np.sin(np.linspace(0.0, 40.0, 900))
