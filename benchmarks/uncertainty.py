@@ -65,8 +65,8 @@ _SMOOTH = (
     "the intervals of sigma are longer than needed."
 )
 _DRIFT = (
-    "rows in order of the amplitude cannot tell a drift from a change with amplitude; that there "
-    "is none is assumed."
+    "rows in order of the amplitude cannot tell a drift from a change with amplitude; the verdict "
+    "names that there is none as an assumption."
 )
 REASONS = {
     "noise along the rows, 0.7": (
@@ -77,6 +77,7 @@ REASONS = {
         "a change with speed and a part in parallel are looked for in addition: with less of it, "
         "a spring of 0.3 % is overlooked."
     ),
+    "exponent 0.5, beta 5.0 to 100.0": "at the end of the range assumed, and hardly seen.",
     "exponent 2.0, beta 0.02 to 1.0": "at the end of the range assumed, and hardly seen.",
     "sigma falls by 5 % along the rows": _DRIFT,
     "harmonics: sigma falls by 5 % along the rows": _DRIFT,

@@ -220,12 +220,18 @@ class State:
         """Return how often noise alone makes a source as likely as it is here, where it has none.
 
         By the ratio of restricted likelihoods, which has no distribution of a simple form for few
-        rows: it is drawn. Source: Crainiceanu and Ruppert, J. Royal Statistical Society B 66 (2004)
-        165.
+        rows: it is drawn. Rows of a known variance, such as priors, do not show an unknown scale:
+        what the parameters leave of them is no degree of freedom. Source: Crainiceanu and Ruppert,
+        J. Royal Statistical Society B 66 (2004) 165.
         """
-        own, rank = self.model.columns(k), len(self.model.y) - self.model.parameters
+        own, model = self.model.columns(k), self.model
+        sure = np.flatnonzero(model.group >= model.noises)
+        left_of_sure = float(
+            np.sum(np.diagonal(self.block(sure)) / self.weights[model.group[sure]])
+        )
+        rank = len(model.y) - model.parameters - (0.0 if known else left_of_sure)
         values, vectors = np.linalg.eigh(self._Q[own, own])
-        kept = np.flatnonzero(values > _ALIKE * values[-1])[-rank:]
+        kept = np.flatnonzero(values > _ALIKE * values[-1])[-max(int(rank), 1) :]
         values = values[kept]
         seen = (vectors[:, kept].T @ self._Q[-1, own]) ** 2 / values
         rest = max(float(self._Q[-1, -1] - seen.sum()), 0.0)
