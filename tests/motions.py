@@ -8,7 +8,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Excitation, FirstState, Model, plant_equations
-from dahl_ident.engine import Motion, band_limited, march, translate
+from dahl_ident.engine import Marched, band_limited, march, translate
 
 
 class Driven:
@@ -39,7 +39,7 @@ class Driven:
         *,
         derivatives: bool = False,
         finer: float = 1.0,
-    ) -> Motion:
+    ) -> Marched:
         return march(
             self.system, self.time, self._drive, self.time, np.asarray(first, dtype=np.float64),
             self.all_values(values), chosen=self.free, derivatives=derivatives, finer=finer,

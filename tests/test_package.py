@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,13 @@ USUAL = {
 
 def test_public_names_are_frozen() -> None:
     assert sorted(di.__all__) == PUBLIC_NAMES
+
+
+def test_no_two_classes_share_a_name() -> None:
+    files = (ROOT / "dahl_ident").rglob("*.py")
+    nodes = (node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8"))))
+    names = Counter(n.name.lstrip("_") for n in nodes if isinstance(n, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_rooms_are_reached_through_the_package() -> None:

@@ -15,7 +15,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.reporting.document import Cell, Document, Section, Table
+from dahl_ident.reporting.document import Cell, Document, Section, TextTable
 from dahl_ident.reporting.pdf import pdf
 from dahl_ident.results import Posterior
 from tests.browser import CHROMIUM, Page, chromium
@@ -153,7 +153,11 @@ def test_headings_and_captions_in_pdf_stay_with_what_they_head() -> None:
     sections = tuple(
         Section(
             f"heading {i}.",
-            (Table(f"caption {i}.", ("x",), tuple((Cell(f"row {i}.{j}."),) for j in range(i))),),
+            (
+                TextTable(
+                    f"caption {i}.", ("x",), tuple((Cell(f"row {i}.{j}."),) for j in range(i))
+                ),
+            ),
         )
         for i in range(1, 25)
     )

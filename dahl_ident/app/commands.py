@@ -30,14 +30,14 @@ REPORTS = ("report.html", "report.pdf", "report.md")
 
 
 @dataclass(frozen=True)
-class Step:
+class JobStep:
     """A command of a job: what it does, and its words after ``dahl-ident``."""
 
     title: str
     words: tuple[str, ...]
 
 
-def fit_steps(work: Mapping[str, Any], folder: Path, run: str, *, metadata: bool) -> list[Step]:
+def fit_steps(work: Mapping[str, Any], folder: Path, run: str, *, metadata: bool) -> list[JobStep]:
     """Return the commands of a fit and its report, in the folder of the work."""
     source, before = _source(work, folder, run)
     laws = [word for file in work["laws"] for word in ("--laws", file)]
@@ -45,16 +45,20 @@ def fit_steps(work: Mapping[str, Any], folder: Path, run: str, *, metadata: bool
     reports = [word for name in REPORTS for word in ("-o", f"{run}/{name}")]
     saved = f"{run}/fit.json"
     fit = ("fit", *source, *laws, *_model_words(work["model"]), *known, "--save", saved)
-    return [*before, Step("Fit", fit), Step("Report", ("report", saved, *laws, *known, *reports))]
+    return [
+        *before,
+        JobStep("Fit", fit),
+        JobStep("Report", ("report", saved, *laws, *known, *reports)),
+    ]
 
 
-def compare_step(steps: Sequence[Mapping[str, Any]]) -> Step:
+def compare_step(steps: Sequence[Mapping[str, Any]]) -> JobStep:
     """Return the command that compares the model of a fit with others."""
     fit = next(step["words"] for step in steps if step["title"] == "Fit")
-    return Step("Comparison", (*fit[: fit.index("--save")], "--compare"))
+    return JobStep("Comparison", (*fit[: fit.index("--save")], "--compare"))
 
 
-def plan_step(run: str, form: Mapping[str, str], place: str, laws: Sequence[str]) -> Step:
+def plan_step(run: str, form: Mapping[str, str], place: str, laws: Sequence[str]) -> JobStep:
     """Return the command that plans the next measurement from a saved fit."""
     words = ["plan", f"{run}/fit.json", *(word for file in laws for word in ("--laws", file))]
     words += _options(form, ("frequency", "displacement", "force", "time", "controlled"))
@@ -63,10 +67,10 @@ def plan_step(run: str, form: Mapping[str, str], place: str, laws: Sequence[str]
     words += ["--table", f"{place}/plan.csv", "--picture", f"{place}/plan.png"]
     if form.get("sample_rate"):
         words += ["--sample-rate", form["sample_rate"], "--waveform", f"{place}/waveform.csv"]
-    return Step("Plan", tuple(words))
+    return JobStep("Plan", tuple(words))
 
 
-def _source(work: Mapping[str, Any], folder: Path, run: str) -> tuple[list[str], list[Step]]:
+def _source(work: Mapping[str, Any], folder: Path, run: str) -> tuple[list[str], list[JobStep]]:
     """Return files with the options for reading them, and an extraction that comes before."""
     reading = work["reading"]
     kind = reading.get("kind", "")
@@ -76,7 +80,7 @@ def _source(work: Mapping[str, Any], folder: Path, run: str) -> tuple[list[str],
     if kind == "extract":
         words = ["extract", *files, *common, *_options(reading, (*OF_RECORDS, "controlled"))]
         points = f"{run}/points.csv"
-        return [points], [Step("Extraction", (*words, "-o", points))]
+        return [points], [JobStep("Extraction", (*words, "-o", points))]
     if kind == "record":
         return [*files, "--record", *common, *_options(reading, OF_RECORDS)], []
     return [*files, *common, *_options(reading, OF_TABLES)], []

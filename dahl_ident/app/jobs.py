@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from dahl_ident.app.commands import Step
+from dahl_ident.app.commands import JobStep
 from dahl_ident.data.storage import write_whole
 
 _USABLE = (0, 3)  # exit status of commands whose output says whether the result may be used
@@ -29,7 +29,7 @@ class Jobs:
         self._lock = threading.Lock()
         self._seconds: dict[tuple[str, ...], float] = {}
 
-    def start(self, folder: Path, steps: Sequence[Step], directory: Path) -> None:
+    def start(self, folder: Path, steps: Sequence[JobStep], directory: Path) -> None:
         """Begin the commands of a job, in a directory; what becomes of them stands in a folder."""
         job = {
             "status": _RUNNING, "step": 0, "began": time.time(), "error": "",

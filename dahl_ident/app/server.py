@@ -27,7 +27,7 @@ from starlette.staticfiles import StaticFiles
 
 from dahl_ident import reporting
 from dahl_ident.app import commands
-from dahl_ident.app.commands import Step
+from dahl_ident.app.commands import JobStep
 from dahl_ident.app.guard import Guard
 from dahl_ident.app.jobs import Jobs, output
 from dahl_ident.app.pages import blocks, laws, loop_of
@@ -172,7 +172,7 @@ class App:
         self.jobs.start(folder, steps, work.folder)
         return _to(f"/{work.name}/{folder.name}")
 
-    def _commands(self, work: Work, state: dict[str, Any], run: str) -> tuple[list[Step], str]:
+    def _commands(self, work: Work, state: dict[str, Any], run: str) -> tuple[list[JobStep], str]:
         state["laws"] = self.laws
         metadata = bool(commands.report_toml(state["report"]))
         steps = commands.fit_steps(state, work.folder, run, metadata=metadata)
@@ -198,7 +198,7 @@ class App:
             parts.append((part.name, one, text, self._files(part)))
         return self._page(
             "run", work=work, state=work.state, folder=folder, job=job, blocks=found, parts=parts,
-            typed=_typed([Step(one["title"], tuple(one["words"])) for one in job["steps"]]),
+            typed=_typed([JobStep(one["title"], tuple(one["words"])) for one in job["steps"]]),
             program=(folder / "program.py").read_text("utf-8"), files=self._files(folder),
             failed=work.in_users_words(job["error"]), exports=_EXPORTS,
             is_table=_is_table(folder), busy=self.jobs.is_running(folder),
@@ -302,7 +302,7 @@ def _knowledge(form: Mapping[str, str]) -> dict[str, dict[str, str]]:
     return {"model": model, "report": {n: t for n, t in form.items() if n.startswith(kept)}}
 
 
-def _typed(steps: Sequence[Step]) -> str:
+def _typed(steps: Sequence[JobStep]) -> str:
     """Return commands as they are typed."""
     return "".join(f"{shlex.join(('dahl-ident', *step.words))}\n" for step in steps)
 

@@ -116,7 +116,7 @@ def integrate(
     most: int = 2**18,
 ) -> WeightedPoints:
     """Return a density as weighted points, with its integral."""
-    target = _Target(log_density, prior, decorrelation)
+    target = _Integrand(log_density, prior, decorrelation)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         mixture = _fitted(target, centre, covariance)
         return _repeated(target, mixture, tolerance, most)
@@ -142,7 +142,7 @@ class _Batch:
 
 
 @dataclass
-class _Target:
+class _Integrand:
     """The density over phi, in which volumes are those of theta."""
 
     log_density: Function
@@ -182,7 +182,7 @@ class _Mixture:
         count, D = self.means.shape
         return [qmc.Sobol(D, seed=np.random.default_rng([seed, k])) for k in range(count + 1)]
 
-    def draw(self, target: _Target, sequences: list[qmc.Sobol], size: int) -> _Batch:
+    def draw(self, target: _Integrand, sequences: list[qmc.Sobol], size: int) -> _Batch:
         """Return `size` more points of each component."""
         *uniform, of_prior = (sequence.random(size) for sequence in sequences)
         t = stdtrit(_DOF, np.array(uniform))
@@ -203,7 +203,7 @@ class _Mixture:
         return np.asarray(total - np.log(count + 1))
 
 
-def _fitted(target: _Target, centre: FloatArray, covariance: FloatArray) -> _Mixture:
+def _fitted(target: _Integrand, centre: FloatArray, covariance: FloatArray) -> _Mixture:
     """Return a mixture that resembles the density."""
     std = np.sqrt(np.diagonal(covariance))
     root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
@@ -255,7 +255,7 @@ def _root(x: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(std[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(len(std))))
 
 
-def _repeated(target: _Target, mixture: _Mixture, tolerance: float, most: int) -> WeightedPoints:
+def _repeated(target: _Integrand, mixture: _Mixture, tolerance: float, most: int) -> WeightedPoints:
     """Return points from one mixture, doubled in number until their error is small enough."""
     D = mixture.means.shape[1]
     sequences = [mixture.sequences(_ROUNDS + number) for number in range(_REPEATS)]

@@ -18,7 +18,7 @@ from dahl_ident.reporting.document import (
     Paragraph,
     Picture,
     Section,
-    Table,
+    TextTable,
     figure_of,
     number,
     words,
@@ -81,12 +81,12 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     label = f"{p.name} [{p.unit}]" if p.unit else p.name
     measured = f"ln {p.name}" if p.logarithmic else label
     scatters = {"devices": p.between_devices, "runs": p.between_runs}
-    yield Table(
+    yield TextTable(
         f"{measured} at the mean of the covariates, and its change per unit of each",
         ("coefficient", "value", "standard uncertainty"),
         tuple((words(k)[0], number(v), number(u, 2)) for k, (v, u) in p.coefficients.items()),
     )
-    yield Table(
+    yield TextTable(
         f"Scatter of {measured}",
         ("source", "median", "2.3 %", "97.7 %"),
         tuple(
@@ -169,7 +169,7 @@ def _all(table: pd.DataFrame, folder: str) -> Iterator[Block]:
     units = {c: f" [{table[f'unit_{c}'].dropna().iloc[0]}]" if f"unit_{c}" in table else ""
              for c in names}  # fmt: skip
     header = [h for c in names for h in (f"{c}{units[c]}", "u")]
-    yield Table("Estimates and combined standard uncertainties", (*labels, "status", *header),
+    yield TextTable("Estimates and combined standard uncertainties", (*labels, "status", *header),
                 tuple(rows))  # fmt: skip
     if len(table) > _LISTED:
         yield Paragraph(f"{len(table) - _LISTED} more fits are in the table of results.")

@@ -362,7 +362,7 @@ def _one(
     p, outlying = _outlying(whole)
     inside = ~outlying[device]
     X[:, 1:] -= X[inside, 1:].mean(axis=0)
-    posterior = _Posterior.of(whole.only(inside))
+    posterior = _Averages.of(whole.only(inside))
     tau, omega = posterior.scatters
     own = whole.sums(y / u**2) / whole.sums(u**-2)
     w = 1.0 / (omega[0] ** 2 + u**2)
@@ -403,7 +403,7 @@ def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
 
 
-class _Posterior(NamedTuple):
+class _Averages(NamedTuple):
     """Averages over the posterior of tau and omega under flat priors."""
 
     b: FloatArray
@@ -413,7 +413,7 @@ class _Posterior(NamedTuple):
     scatters: list[tuple[float, float, float]]
 
     @classmethod
-    def of(cls, data: _Fits) -> _Posterior:
+    def of(cls, data: _Fits) -> _Averages:
         """Return means and covariances, and median and 95.45 % limits of tau and omega."""
         mode = _reml(data)
         repeated = len(data.y) > data.devices

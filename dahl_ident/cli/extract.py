@@ -92,11 +92,11 @@ def extract(
     Example: dahl-ident datasets plant_recording -o - | dahl-ident extract - --controlled force
     """
     from dahl_ident.data.readers import groups_in_name, run_names
-    from dahl_ident.extraction.sources import Task, extract_all
+    from dahl_ident.extraction.sources import FileTask, extract_all
 
     writing.check([output, plot], files, json=general.json)
     tasks = [
-        Task(file, None, groups_in_name(file, level_from_name).get("level"), vars(reading))
+        FileTask(file, None, groups_in_name(file, level_from_name).get("level"), vars(reading))
         for file in files
     ]
     data = extract_all(tasks, extracting.keywords(), jobs, run_names(files))

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, non_negative_number, positive_number
 from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, RECORD_COLUMNS, FileColumn, one_of
-from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
 from dahl_ident.data.storage import read_text
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import (
@@ -197,7 +197,7 @@ class Binding:
     `columns` are those that are looked for; `doubts` are the warnings that were shown.
     """
 
-    source: Source
+    source: RawFile
     map: ColumnMap
     columns: Mapping[str, FileColumn]
     motions: dict[str, Motion] = field(default_factory=dict)
@@ -225,18 +225,18 @@ class Binding:
         """Return what the column map says of a role."""
         return self.map.roles.get(role, MappedColumn())
 
-    def named(self, role: str) -> list[Channel]:
+    def named(self, role: str) -> list[RawChannel]:
         """Return the columns that are called what the role is, or said to be it by the format."""
         return [c for c in self.source.channels if c.is_called(self.columns[role])]
 
-    def channel(self, role: str) -> Channel | None:
+    def channel(self, role: str) -> RawChannel | None:
         """Return the channel of a role, or None where the file has none."""
         channel = self._find(role)
         if channel is not None:
             self.used.add(channel.name)
         return channel
 
-    def _find(self, role: str) -> Channel | None:
+    def _find(self, role: str) -> RawChannel | None:
         column = self.mapped(role).column
         if column is not None:
             return self.source.find(column)
@@ -267,7 +267,7 @@ class Binding:
         """Return whether a role is present."""
         return self.channel(role) is not None
 
-    def required(self, role: str) -> Channel:
+    def required(self, role: str) -> RawChannel:
         """Return the channel of a required role."""
         channel = self.channel(role)
         if channel is None:
@@ -278,7 +278,7 @@ class Binding:
             )
         return channel
 
-    def numbers(self, role: str, channel: Channel) -> FloatArray:
+    def numbers(self, role: str, channel: RawChannel) -> FloatArray:
         """Return finite numbers with the map's sign and factor, in the file's unit."""
         mapped = self.mapped(role)
         return scaled(self.source.numbers(channel), mapped.sign * mapped.factor)
@@ -304,7 +304,7 @@ class Binding:
             factor = factor_to(unit, si, f"{self.source.name}: column {channel.name!r}")
         return scaled(values, factor * unit.to_peak)
 
-    def unit(self, role: str, channel: Channel) -> Unit:
+    def unit(self, role: str, channel: RawChannel) -> Unit:
         """Return the unit: the map's, the header's, the one in the name, or another column's."""
         declared = self.columns[role]
         text = self.mapped(role).unit or channel.unit
@@ -411,7 +411,7 @@ class Binding:
             more = f" and {marked.size - _SHOWN} more" if marked.size > _SHOWN else ""
             self.doubt(f"{message}: {names}{more}")
 
-    def same_length(self, roles: Mapping[str, Channel]) -> None:
+    def same_length(self, roles: Mapping[str, RawChannel]) -> None:
         """Refuse columns of different lengths."""
         sizes = {role: channel.size for role, channel in roles.items()}
         if len(set(sizes.values())) > 1:
@@ -426,7 +426,7 @@ def scaled(values: FloatArray, factor: float) -> FloatArray:
     return values if factor == 1.0 else values * factor
 
 
-def by_level(source: Source, columns: ColumnMap) -> dict[str | None, ColumnMap]:
+def by_level(source: RawFile, columns: ColumnMap) -> dict[str | None, ColumnMap]:
     """Resolve ``*`` in paths: one column map for each level, or the map itself."""
     starred = {r: c for r, c in columns.roles.items() if c.column and "*" in c.column}
     if not starred:

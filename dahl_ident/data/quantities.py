@@ -17,7 +17,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.units import Quantity
 
 
-class Definition(NamedTuple):
+class QuantityForm(NamedTuple):
     """A quantity R = s^power Z^exponent."""
 
     power: int
@@ -29,13 +29,13 @@ class Definition(NamedTuple):
         return -self.power * self.exponent
 
 
-DEFINITIONS: dict[Quantity, Definition] = {
-    "receptance": Definition(0, -1),
-    "mobility": Definition(1, -1),
-    "accelerance": Definition(2, -1),
-    "dynamic_stiffness": Definition(0, 1),
-    "mechanical_impedance": Definition(-1, 1),
-    "apparent_mass": Definition(-2, 1),
+DEFINITIONS: dict[Quantity, QuantityForm] = {
+    "receptance": QuantityForm(0, -1),
+    "mobility": QuantityForm(1, -1),
+    "accelerance": QuantityForm(2, -1),
+    "dynamic_stiffness": QuantityForm(0, 1),
+    "mechanical_impedance": QuantityForm(-1, 1),
+    "apparent_mass": QuantityForm(-2, 1),
 }
 COMPLIANCES = tuple(name for name, of in DEFINITIONS.items() if of.exponent < 0)
 """Motion over force."""

@@ -72,7 +72,7 @@ class Stored:
 
 
 @dataclass(frozen=True)
-class Channel:
+class RawChannel:
     """One named array of a file.
 
     `role` is set where the format itself says what the channel is (UFF does), in the words of
@@ -100,7 +100,7 @@ class Channel:
         """Kind of numbers, as in ``dtype.kind``; nothing is read."""
         return self.content.dtype.kind
 
-    def part(self, rows: slice) -> Channel:
+    def part(self, rows: slice) -> RawChannel:
         """Return some of the values, and read no others."""
         return replace(self, content=self.content[rows])
 
@@ -137,7 +137,7 @@ TRACE = "analyser's trace"
 
 
 @dataclass(frozen=True)
-class Source:
+class RawFile:
     """All channels of one file.
 
     `row_name` turns the index of a value into the words that find it in the file. `decimal` is
@@ -149,7 +149,7 @@ class Source:
 
     name: str
     format: str
-    channels: tuple[Channel, ...]
+    channels: tuple[RawChannel, ...]
     sha256: str | None = None
     headerless: bool = False
     decimal: str = "."
@@ -161,7 +161,7 @@ class Source:
     options: Mapping[str, Any] = field(default_factory=dict)
     stated: Mapping[str, str] = field(default_factory=dict)
 
-    def rows(self, keep: NDArray[np.bool_]) -> Source:
+    def rows(self, keep: NDArray[np.bool_]) -> RawFile:
         """Return the rows to `keep` of every channel that has this length."""
         kept = np.flatnonzero(keep)
         channels = tuple(
@@ -170,11 +170,11 @@ class Source:
         )
         return replace(self, channels=channels, row_name=lambda i: self.row_name(int(kept[i])))
 
-    def where(self, channel: Channel, index: int) -> str:
+    def where(self, channel: RawChannel, index: int) -> str:
         """Return file, row and column of a value."""
         return f"{self.name}, {self.row_name(index)}, column {channel.name!r}"
 
-    def find(self, text: str) -> Channel:
+    def find(self, text: str) -> RawChannel:
         """Return the one channel that `text` names, with or without its unit in brackets.
 
         The last part of a path is enough where it is the only one of its name; ``column 2`` is the
@@ -209,7 +209,7 @@ class Source:
         close = difflib.get_close_matches(text, names, 3) or names
         raise DataError(f"{self.name}: no column is called {text!r}; there are {listed(close, 20)}")
 
-    def matching(self, pattern: str) -> dict[str, Channel]:
+    def matching(self, pattern: str) -> dict[str, RawChannel]:
         """Return the channels that a path with ``*`` matches, by the part that varies."""
         start = re.search(r"[^./]*\*", pattern)
         end = re.search(r"\*[^.*/]*(?=[./][^*]*$|$)", pattern)
@@ -226,7 +226,7 @@ class Source:
             )
         return channels
 
-    def numbers(self, channel: Channel, *, infinite: bool = False) -> FloatArray:
+    def numbers(self, channel: RawChannel, *, infinite: bool = False) -> FloatArray:
         """Return a channel's numbers, finite unless said, or name the cell that holds another."""
         values = channel.values
         if values.dtype.kind == "c":
@@ -254,7 +254,7 @@ class Source:
             )
         return values
 
-    def complex_numbers(self, channel: Channel) -> ComplexArray:
+    def complex_numbers(self, channel: RawChannel) -> ComplexArray:
         """Return a channel's complex numbers, also those written as text, such as ``5+1i``."""
         values = np.atleast_1d(channel.values)
         if values.dtype.kind == "U":
@@ -275,7 +275,7 @@ class Source:
         self.require(np.abs(values) < LARGEST, channel, "finite numbers")
         return values.astype(np.complex128)
 
-    def require(self, good: NDArray[np.bool_], channel: Channel, expected: str) -> None:
+    def require(self, good: NDArray[np.bool_], channel: RawChannel, expected: str) -> None:
         """Raise a DataError that names the first cell that is not `good`."""
         bad = np.flatnonzero(~good)
         if bad.size:
@@ -285,7 +285,7 @@ class Source:
                 f"cells); expected {expected}"
             )
 
-    def from_text(self, channel: Channel) -> FloatArray:
+    def from_text(self, channel: RawChannel) -> FloatArray:
         """Return the numbers in cells of text, NaN for empty ones, or name the cell without one."""
         numbers = np.empty(channel.values.size)
         comma, thousands = self.decimal[0] == ",", self.decimal[1:]

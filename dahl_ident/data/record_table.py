@@ -12,7 +12,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data.column_map import Binding, ColumnMap, scaled
 from dahl_ident.data.columns import RECORD_COLUMNS
 from dahl_ident.data.plausibility import record_doubts
-from dahl_ident.data.raw_columns import Channel, Source, missing_marks
+from dahl_ident.data.raw_columns import RawChannel, RawFile, missing_marks
 from dahl_ident.data.record import DriveUnit, Record, is_even
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError, argument
@@ -26,7 +26,7 @@ _DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
 
 
 def record_from(
-    source: Source, columns: ColumnMap, missing: Literal["error", "drop"] = "error"
+    source: RawFile, columns: ColumnMap, missing: Literal["error", "drop"] = "error"
 ) -> Record:
     """Return the record that a source holds."""
     bound = Binding(source, columns, RECORD_COLUMNS)
@@ -82,12 +82,12 @@ _FEWEST_STAMPS = 16  # fewer, with some missing, may look like rounded ones
 _PLANNED = {"step", "measured"}  # columns of a waveform that a plan wrote
 
 
-def record_size(source: Source, columns: ColumnMap) -> int:
+def record_size(source: RawFile, columns: ColumnMap) -> int:
     """Return how many samples the record of a source has; nothing is read."""
     return next(iter(_channels(Binding(source, columns, RECORD_COLUMNS)).values())).size
 
 
-def _channels(bound: Binding) -> dict[str, Channel]:
+def _channels(bound: Binding) -> dict[str, RawChannel]:
     """Return the channels of the roles that the record has, exactly one motion among them."""
     roles = bound.map.roles
     motions = [kind for kind in MOTION_KINDS if kind in roles]
@@ -120,14 +120,14 @@ def _channels(bound: Binding) -> dict[str, Channel]:
     return channels
 
 
-def _numeric(channel: Channel) -> FloatArray:
+def _numeric(channel: RawChannel) -> FloatArray:
     """Return the numbers of a channel for finding gaps; text counts as present."""
     if channel.values.dtype.kind in "fiu":
         return channel.values.astype(np.float64)
     return np.array([np.nan if not str(v).strip() else 0.0 for v in channel.values])
 
 
-def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
+def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:
     """Return SI samples; for a drive in V or A, volts or amperes."""
     if role == "time" and is_stamped(channel):
         return _seconds(bound, channel)
@@ -148,12 +148,12 @@ def _samples(bound: Binding, role: str, channel: Channel) -> FloatArray:
     return samples
 
 
-def is_stamped(channel: Channel) -> bool:
+def is_stamped(channel: RawChannel) -> bool:
     """Return whether a channel holds time stamps, which need no unit."""
     return channel.kind == "U" and _STAMP.match(str(channel.values.flat[0])) is not None
 
 
-def _seconds(bound: Binding, channel: Channel) -> FloatArray:
+def _seconds(bound: Binding, channel: RawChannel) -> FloatArray:
     """Return the time since the first stamp: ISO 8601, or times of one day."""
     nanoseconds = np.empty(channel.size, dtype=np.int64)
     for i, cell in enumerate(channel.values.flat):
@@ -195,7 +195,7 @@ def _without_rounding(bound: Binding, time: FloatArray) -> FloatArray:
     return np.asarray(grid)
 
 
-def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
+def _drive(bound: Binding, channel: RawChannel) -> dict[str, Any]:
     kind, _ = bound.kind("drive", bound.unit("drive", channel))
     bound.refuse_idle_factor(kind)
     if kind == "force":
@@ -210,7 +210,7 @@ def _drive(bound: Binding, channel: Channel) -> dict[str, Any]:
     return values
 
 
-def _require_increasing(source: Source, channel: Channel, time: FloatArray) -> None:
+def _require_increasing(source: RawFile, channel: RawChannel, time: FloatArray) -> None:
     back = np.flatnonzero(~(time[1:] > time[:-1]))
     if back.size:
         i = int(back[0]) + 1

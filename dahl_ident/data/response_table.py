@@ -29,7 +29,7 @@ from dahl_ident.data.plausibility import (
     check_phase_size,
     check_phase_unit,
 )
-from dahl_ident.data.raw_columns import TRACE, Channel, Source, plain
+from dahl_ident.data.raw_columns import TRACE, RawChannel, RawFile, plain
 from dahl_ident.data.tabular import ASSUMED, listed
 from dahl_ident.errors import ANY, DataError, UnitError, ValidationError, argument, spelled
 from dahl_ident.units import (
@@ -74,7 +74,7 @@ class ResponseOptions:
 
 
 def response_from(
-    source: Source, columns: ColumnMap, options: ResponseOptions
+    source: RawFile, columns: ColumnMap, options: ResponseOptions
 ) -> FrequencyResponse:
     """Return the frequency response that a source holds, all its levels in one table."""
     source = replace(source, channels=tuple(map(_as_gain, source.channels)))
@@ -101,7 +101,7 @@ def response_from(
         if label is not None:
             options = replace(options, level=label)
         named = source if label is None else replace(source, name=f"{source.name}, level {label}")
-        table = _Table(named, one, options)
+        table = _TableBinding(named, one, options)
         try:
             parts.append(table.response())
         except ValidationError as exc:
@@ -115,7 +115,7 @@ def response_from(
     return replace(data, provenance=whole.provenance() | assumed)
 
 
-def _as_gain(channel: Channel) -> Channel:
+def _as_gain(channel: RawChannel) -> RawChannel:
     """Return an "amplitude" in the unit of a response as what it is, a gain."""
     named = plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names
     if named and RESPONSE_COLUMNS["gain"].measures(channel.unit, channel.name):
@@ -124,8 +124,8 @@ def _as_gain(channel: Channel) -> Channel:
 
 
 def _with_stated(
-    source: Source, columns: ColumnMap, options: ResponseOptions
-) -> tuple[Source, ResponseOptions]:
+    source: RawFile, columns: ColumnMap, options: ResponseOptions
+) -> tuple[RawFile, ResponseOptions]:
     """Take the level that the file's header states, where neither a column nor the user does."""
     levels = [RESPONSE_COLUMNS[role] for role in ("drive", "amplitude")]
     known = {"drive", "amplitude"} & columns.roles.keys() or any(
@@ -159,10 +159,10 @@ def _swept(sweep: str, rows: int) -> FloatArray:
     return (np.geomspace if log else np.linspace)(first, last, rows)
 
 
-class _Table(Binding):
+class _TableBinding(Binding):
     """One table with one column for each role."""
 
-    def __init__(self, source: Source, columns: ColumnMap, options: ResponseOptions) -> None:
+    def __init__(self, source: RawFile, columns: ColumnMap, options: ResponseOptions) -> None:
         super().__init__(source, columns, RESPONSE_COLUMNS)
         self.options = options
         self.level = options.drive if options.level is None else options.level
@@ -276,7 +276,7 @@ class _Table(Binding):
                 f"{argument(option, text)} is given, and column {known.name!r} holds the {role} "
                 "too; leave out one of them"
             )
-        channels = (*self.source.channels, Channel(str(text), values, unit, role))
+        channels = (*self.source.channels, RawChannel(str(text), values, unit, role))
         self.source = replace(self.source, channels=channels)
 
     def _refuse_waveforms(self) -> None:

@@ -56,7 +56,7 @@ from dahl_ident.diagnostics.estimate import (
 )
 from dahl_ident.diagnostics.held_out import HeldOut, held_out
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood, suspicious_points
-from dahl_ident.diagnostics.mixed_model import MixedModel, State, shares
+from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState, shares
 from dahl_ident.diagnostics.residual_space import (
     ResidualSpace,
     RunDeviations,
@@ -96,7 +96,7 @@ class ErrorModel:
     problem: TableProblem
     estimate: WeightedEstimate  # weighted least squares
     sources: tuple[Source, ...]  # random errors that rows share, those that the residuals show
-    state: State  # the mixed model of the residuals at the variances of noise and sources
+    state: MixedState  # the mixed model of the residuals at the variances of noise and sources
     contributions: Mapping[str, FloatArray]  # (Q, Q): covariance of theta by source, type A first
     tests: int  # number of tests, of which each may have been left out
     # names of parameters that were assumed: exponents, the force gain for a drive factor
@@ -447,7 +447,7 @@ def _by_source(
     estimate: WeightedEstimate,
     assumed: Mapping[str, Assumption],
     sources: Sequence[Source],
-    state: State,
+    state: MixedState,
     lever: FloatArray,
     limit: FloatArray,
 ) -> dict[str, FloatArray]:
@@ -466,7 +466,7 @@ def _by_source(
 
 
 def _limited_shares(
-    sources: Sequence[Source], state: State, lever: FloatArray, limit: FloatArray
+    sources: Sequence[Source], state: MixedState, lever: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return shares of the covariance, those of the model error by its `limit` of parameters."""
     each, known = shares(state, lever)
@@ -476,7 +476,7 @@ def _limited_shares(
 
 
 def _limit_of_model_error(
-    sources: Sequence[Source], state: State, lever: FloatArray, by_tests: FloatArray
+    sources: Sequence[Source], state: MixedState, lever: FloatArray, by_tests: FloatArray
 ) -> FloatArray:
     """Return the factors, (Q,), that bring the model error to what tests left out make likely."""
     each, _ = shares(state, lever)

@@ -36,7 +36,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.error_sources import FEWEST_TESTS, rows_of_tests
 from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
-from dahl_ident.diagnostics.mixed_model import State
+from dahl_ident.diagnostics.mixed_model import MixedState
 
 _MOST_TESTS = 100  # left out one at a time: the share inside is then known to 2 %
 _PRIOR_SCORES = 10.0  # values that Student's t counts for: a table's own 5 % are known from more
@@ -94,7 +94,7 @@ def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray
     return np.asarray(np.maximum(least, best))
 
 
-def held_out(estimate: WeightedEstimate, state: State) -> HeldOut | None:
+def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
     """Return the tests left out in turn; None with fewer than three."""
     data = estimate.problem.data
     tests = rows_of_tests(data)

@@ -85,9 +85,9 @@ class MixedModel:
         most = self.most[self.noises :]
         return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
 
-    def at(self, variances: FloatArray) -> State:
+    def at(self, variances: FloatArray) -> MixedState:
         """Return the model at these variances."""
-        return State(self, variances)
+        return MixedState(self, variances)
 
     def information_of_parameters(self, variances: FloatArray) -> FloatArray:
         """Return J' V^-1 J, (P, P), where the parameters need not be determined."""
@@ -99,7 +99,7 @@ class MixedModel:
         inner = np.eye(len(root)) + root[:, None] * Z[P:]
         return np.asarray(M[:P, :P] - Z[:P] @ np.linalg.solve(inner, Z[:P].T))
 
-    def reml(self, chance: FloatArray) -> State:
+    def reml(self, chance: FloatArray) -> MixedState:
         """Return the state of the highest restricted likelihood."""
         G = self.noises
         free = np.where(np.concatenate([np.ones(G), chance]) < 1.0, 0.0, self.most)
@@ -128,7 +128,7 @@ class MixedModel:
 
     def _highest(
         self, s: FloatArray, least: FloatArray, most: FloatArray, price: FloatArray
-    ) -> State:
+    ) -> MixedState:
         """Return the state of the highest likelihood less price . s, from s on."""
         state = self.at(s)
         for _ in range(_STEPS):
@@ -149,7 +149,7 @@ class MixedModel:
         return state
 
 
-class State:
+class MixedState:
     """A mixed model at given variances."""
 
     def __init__(self, model: MixedModel, variances: FloatArray) -> None:
@@ -349,7 +349,7 @@ class State:
         return XK @ X.swapaxes(1, 2), slopes
 
 
-def shares(state: State, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
+def shares(state: MixedState, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return what each variance adds to the covariance of lever . y at 1, and known noise as it is.
 
     For a lever (P, m): (count, P, P), and (groups, P, P).

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.estimate import tests_of
-from dahl_ident.diagnostics.mixed_model import MixedModel, State
+from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.record_sources import blocks_of
 from dahl_ident.diagnostics.residual_space import orthonormal
 from dahl_ident.errors import FitError
@@ -203,7 +203,7 @@ def _stated(optimum: Optimum, size: FloatArray) -> FloatArray:
 
 
 def _densities(
-    state: State, test: NDArray[np.intp], unit: FloatArray, *, robust: bool
+    state: MixedState, test: NDArray[np.intp], unit: FloatArray, *, robust: bool
 ) -> FloatArray:
     """Return the log density of each test by what all others say."""
     found = np.empty(int(test.max()) + 1)

@@ -429,11 +429,11 @@ class Profiler:
         return pairs
 
     @cached_property
-    def _reach(self) -> _Reach:
+    def _reach(self) -> _Distances:
         view = self._problem.stiffness_data
         stiffness = view.typical_stiffness
         has_spring = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
-        return _Reach(
+        return _Distances(
             float(np.log(view.amplitude.min() * _LEAST_X_C)),
             float(
                 np.log(view.amplitude.max() * (_MOST_X_C_WITH_SPRING if has_spring else _MOST_X_C))
@@ -452,7 +452,7 @@ class Profiler:
         return np.where(self._logarithmic, logarithms, far)
 
 
-class _Reach(NamedTuple):
+class _Distances(NamedTuple):
     """Range of ln x_c and ln sigma outside of which friction is its own limit.
 
     Stiffer than `stiffest` with an x_c beyond the `smallest` amplitude, it is all but cancelled

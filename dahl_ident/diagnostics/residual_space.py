@@ -118,7 +118,7 @@ class Coefficient(NamedTuple):
     stderr: float
 
 
-class _Space(ABC):
+class _Complement(ABC):
     """Residuals orthogonal to the Jacobian's columns, and columns to compare them with."""
 
     residuals: FloatArray
@@ -161,7 +161,7 @@ class _Space(ABC):
         """Standard deviation of one residual."""
 
 
-class RelativeSpace(_Space):
+class RelativeSpace(_Complement):
     """ln(R/R_model) of fundamentals, neither 0, all rows alike: for the size of a departure.
 
     Whatever the noise model, the weights here do not depend on it, so that a departure of 30 %
@@ -192,7 +192,7 @@ class RelativeSpace(_Space):
         return float(np.sqrt(self.residuals @ self.residuals / max(dof, 1)))
 
 
-class ResidualSpace(_Space):
+class ResidualSpace(_Complement):
     """The residuals of an optimum in units of the noise: for whether a departure is one."""
 
     scale = 1.0

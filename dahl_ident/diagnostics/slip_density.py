@@ -149,7 +149,7 @@ def least_misfit(data: FrequencyResponse, model: Element) -> float:
     return _solved(_system(data, [e for e in as_model(model).elements if e.is_linear]), 0.0)[1]
 
 
-class _System(NamedTuple):
+class _SlipSystem(NamedTuple):
     """Non-negative coefficients times the columns of `matrix` should give `right`, relatively."""
 
     slip: FloatArray  # of the first columns; the next is a spring, the others are `names`
@@ -159,7 +159,7 @@ class _System(NamedTuple):
     signs: list[float]
 
 
-def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _System:
+def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _SlipSystem:
     rows = data.harmonic == 1
     if rows.sum() < 3:
         raise DataError(f"{int(rows.sum())} rows are fundamentals; a density needs at least three")
@@ -189,10 +189,10 @@ def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _System:
                 names.append(p.name)
                 signs.append(sign)
     matrix: ComplexArray = np.concatenate(columns, axis=1) / np.abs(Z)[:, None]
-    return _System(slip, matrix, target / np.abs(Z), names, signs)
+    return _SlipSystem(slip, matrix, target / np.abs(Z), names, signs)
 
 
-def _solved(system: _System, smoothing: float) -> tuple[FloatArray, float]:
+def _solved(system: _SlipSystem, smoothing: float) -> tuple[FloatArray, float]:
     """Return non-negative coefficients and the misfit; densities may not vary freely."""
     matrix, right, n = system.matrix, system.right, system.slip.size
     size = np.linalg.norm(matrix, axis=0)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dahl_ident.engine.differentiation import differentiated
 from dahl_ident.engine.drive import band_limited
-from dahl_ident.engine.motion import Loops, Motion, Settled, loops, march, settled
+from dahl_ident.engine.motion import Loops, Marched, Settled, loops, march, settled
 from dahl_ident.engine.translate import Equations, System, translate
 
 __all__ = [
     "Equations",
     "Loops",
-    "Motion",
+    "Marched",
     "Settled",
     "System",
     "band_limited",

@@ -77,7 +77,7 @@ class Loops(NamedTuple):
     decays: FloatArray
 
 
-class Motion(NamedTuple):
+class Marched(NamedTuple):
     """A motion along samples.
 
     Attributes
@@ -201,7 +201,7 @@ def march(
     chosen: Sequence[int] = (),
     derivatives: bool = False,
     finer: float = 1.0,
-) -> Motion:
+) -> Marched:
     """Return the motion of a system whose drive, or held displacement, is polynomials in time.
 
     Parameters
@@ -240,7 +240,9 @@ def march(
             f"the motion grows beyond all bounds at the parameters {parameters.tolist()}"
         )
     n = system.order
-    return Motion(output, by[:, :n], -by[:, n : n + 1].ravel(), by[:, n + 1 :], states, last[:, :n])
+    return Marched(
+        output, by[:, :n], -by[:, n : n + 1].ravel(), by[:, n + 1 :], states, last[:, :n]
+    )
 
 
 def _run(kernel: Callable[..., Any], *arguments: Any) -> Any:

@@ -171,13 +171,13 @@ def extract(
     reading = {} if columns is None else {"columns": columns}
     named = _named(records)
     if isinstance(records, Mapping):
-        return extract_all([Task(r, name, level, reading) for name, r in named], how, jobs)
-    tasks = [Task(source, None, level, reading) for _, source in named]
+        return extract_all([FileTask(r, name, level, reading) for name, r in named], how, jobs)
+    tasks = [FileTask(source, None, level, reading) for _, source in named]
     return extract_all(tasks, how, jobs, [str(name) for name, _ in named])
 
 
 @dataclass(frozen=True)
-class Task:
+class FileTask:
     """One record or file, the labels of its points, and the words with which it is read."""
 
     source: Record | PathLike
@@ -187,7 +187,7 @@ class Task:
 
 
 def extract_all(
-    tasks: Sequence[Task], how: Mapping[str, Any], jobs: int = 1, names: Sequence[str] = ()
+    tasks: Sequence[FileTask], how: Mapping[str, Any], jobs: int = 1, names: Sequence[str] = ()
 ) -> FrequencyResponse:
     """Return the points of all tasks in one table; `how` holds the other words of `extract`.
 
@@ -213,7 +213,7 @@ def extract_all(
     return data if how.get("harmonics") is not None else _without_needless_rows(data)
 
 
-def _extracted_apart(task: Task, settings: Settings) -> tuple[FrequencyResponse, list[str]]:
+def _extracted_apart(task: FileTask, settings: Settings) -> tuple[FrequencyResponse, list[str]]:
     """Return the points of a task and its warnings, which another process cannot show."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
@@ -221,7 +221,7 @@ def _extracted_apart(task: Task, settings: Settings) -> tuple[FrequencyResponse,
     return data, [str(warning.message) for warning in shown]
 
 
-def _extracted(task: Task, settings: Settings) -> FrequencyResponse:
+def _extracted(task: FileTask, settings: Settings) -> FrequencyResponse:
     if isinstance(task.source, Record):
         records: Iterable[Record] = [task.source]
     else:

@@ -180,7 +180,7 @@ def _vertex(cost: FloatArray, theta: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Column:
+class _LinearPart:
     """A linear coefficient of one element: which parameters it multiplies, and its curve."""
 
     parameters: tuple[Parameter, ...]
@@ -197,7 +197,7 @@ class _Curves:
 
     values: dict[str, FloatArray]
     """Nonlinear parameters, and those that a column multiplies at 1: (K,) or (S, K)."""
-    columns: list[_Column]
+    columns: list[_LinearPart]
     known: ComplexArray | None
     """What does not depend on any coefficient, (..., K, n)."""
     edges: list[NDArray[np.bool_]]
@@ -214,7 +214,7 @@ class _Grid:
     shape: tuple[int, ...]
     target: ComplexArray  # weighted, (..., n)
     weights: FloatArray  # (..., n)
-    common: list[_Column]  # the same at every node, curves of shape (..., n)
+    common: list[_LinearPart]  # the same at every node, curves of shape (..., n)
     mixed: bool  # nodes of several directions follow each other: neighbours need not be near
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
@@ -285,7 +285,7 @@ class _Grid:
         return theta
 
 
-def _scaled(values: dict[str, FloatArray], column: _Column, coefficient: FloatArray) -> None:
+def _scaled(values: dict[str, FloatArray], column: _LinearPart, coefficient: FloatArray) -> None:
     size = np.abs(coefficient) if column.is_positive else coefficient
     for p in column.parameters:
         values[p.name] = values.get(p.name, np.ones(())) * size
@@ -306,7 +306,7 @@ def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
     counts = [_size(c) for c in curves]
     nodes = np.indices(counts).reshape(len(counts), math.prod(counts)).T
     rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
-    common: list[_Column] = []
+    common: list[_LinearPart] = []
     for d in every:
         if d.nonlinear:
             continue
@@ -337,7 +337,7 @@ def _size(curves: _Curves) -> int:
 
 def _columns(
     d: Directions, values: dict[str, FloatArray], view: StiffnessData
-) -> tuple[ComplexArray | None, list[_Column]]:
+) -> tuple[ComplexArray | None, list[_LinearPart]]:
     """Return what is known of an element's stiffness, and a column for each coefficient.
 
     `values` are those of the directions, each (..., K).
@@ -373,16 +373,16 @@ def _columns(
 
     columns = []
     if not d.linear:
-        return (None, [_Column(d.scale, at(None, 1.0))]) if scaled else (at(None, 1.0), [])
+        return (None, [_LinearPart(d.scale, at(None, 1.0))]) if scaled else (at(None, 1.0), [])
     if all(p in d.linear for p in d.element.parameters):  # a linear element: nothing else acts
-        return None, [_Column((p,), at(p, 0.0)) for p in d.linear]
+        return None, [_LinearPart((p,), at(p, 0.0)) for p in d.linear]
     scales = d.element.scale_parameters
     if scales and {d.element.parameter(label).name for label in scales} <= linear:
-        return None, [_Column((p,), at(p, 1.0)) for p in d.linear]
+        return None, [_LinearPart((p,), at(p, 1.0)) for p in d.linear]
     base = at(None, 1.0)
     if scaled:
-        columns.append(_Column(d.scale, base))
-    columns += [_Column((p,), at(p, 1.0) - base) for p in d.linear]
+        columns.append(_LinearPart(d.scale, base))
+    columns += [_LinearPart((p,), at(p, 1.0) - base) for p in d.linear]
     return (None if scaled or not np.any(base) else base), columns
 
 
@@ -530,7 +530,7 @@ def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curve
     shift = d.reference.dimension[1] + 1
     if shift:
         curve = curve / np.exp(ln_lengths[..., None] * shift)
-    return _Curves(values, [_Column(d.scale, curve)], None, [e for e in edges if e.any()])
+    return _Curves(values, [_LinearPart(d.scale, curve)], None, [e for e in edges if e.any()])
 
 
 def _powers(direction: Direction, multiples: FloatArray) -> FloatArray:

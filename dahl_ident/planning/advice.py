@@ -11,7 +11,7 @@ from dahl_ident.planning.candidates import Candidates, evaluate, grid, level_ran
 from dahl_ident.planning.design import Design, Objective, continuous_design
 from dahl_ident.planning.forecast import NOTHING, Expected, Forecast
 from dahl_ident.planning.motion_information import evaluate_motions, motions_of
-from dahl_ident.planning.question import BenchLimits, Question, is_expanded
+from dahl_ident.planning.question import BenchLimits, PlanRequest, is_expanded
 from dahl_ident.planning.search import LONGEST, Search
 from dahl_ident.planning.trajectories import PlannedMotion
 from dahl_ident.units import si_unit
@@ -29,7 +29,7 @@ _MODEL_ERROR = {
 
 
 def options_of(
-    question: Question,
+    question: PlanRequest,
     limits: BenchLimits,
     count: int = _FEW_LEVELS,
     lasting: float | None = None,
@@ -96,7 +96,7 @@ def _prevented_by(search: Search, name: str) -> str:
     )
 
 
-def _within_reach(question: Question, name: str, limits: BenchLimits) -> float:
+def _within_reach(question: PlanRequest, name: str, limits: BenchLimits) -> float:
     """Return the uncertainty of one quantity by the best continuous design."""
     options = options_of(question, limits)
     few = Forecast.of(question, options).thinned()

@@ -18,7 +18,7 @@ from dahl_ident import steady_state
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.knowledge import Knowledge
-from dahl_ident.planning.question import BenchLimits, Question, limit
+from dahl_ident.planning.question import BenchLimits, PlanRequest, limit
 from dahl_ident.planning.trajectories import PlannedMotion
 
 CONTROLLED = ("displacement", "force")
@@ -78,7 +78,7 @@ class Candidates:
         return replace(self, **{name: getattr(self, name)[draws] for name in _OF_DRAWS})
 
 
-def grid(question: Question, limits: BenchLimits, count: int) -> tuple[FloatArray, FloatArray]:
+def grid(question: PlanRequest, limits: BenchLimits, count: int) -> tuple[FloatArray, FloatArray]:
     """Return levels and frequencies of about `count` candidates, before limits are applied."""
     if not np.isfinite(limits.frequency_hz[1]):
         raise ValidationError(
@@ -104,7 +104,7 @@ def grid(question: Question, limits: BenchLimits, count: int) -> tuple[FloatArra
     return np.tile(levels, n), np.repeat(frequencies, len(levels))
 
 
-def level_range(question: Question, limits: BenchLimits) -> tuple[float, float]:
+def level_range(question: PlanRequest, limits: BenchLimits) -> tuple[float, float]:
     """Return the lowest and the highest level: the limits, or what the knee suggests."""
     low, high = getattr(limits, question.controlled)
     if question.controlled == "force":
@@ -123,7 +123,7 @@ def level_range(question: Question, limits: BenchLimits) -> tuple[float, float]:
 
 
 def evaluate(
-    question: Question, limits: BenchLimits, level: FloatArray, frequency_hz: FloatArray
+    question: PlanRequest, limits: BenchLimits, level: FloatArray, frequency_hz: FloatArray
 ) -> Candidates:
     """Return the candidates that every limit allows."""
     knowledge, by_force = question.knowledge, question.controlled == "force"

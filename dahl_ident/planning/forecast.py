@@ -19,7 +19,7 @@ from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.planning.candidates import Candidates
 from dahl_ident.planning.design import Design, Term, packed_information
 from dahl_ident.planning.knowledge import Knowledge, spread
-from dahl_ident.planning.question import RESPONSE, Question, is_expanded, least_factor, powers_of
+from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
 
 NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing
@@ -60,7 +60,7 @@ class Forecast:
     departures: int  # W
 
     @classmethod
-    def of(cls, question: Question, candidates: Candidates) -> Forecast:
+    def of(cls, question: PlanRequest, candidates: Candidates) -> Forecast:
         """Return the forecast of candidates and of the quantities asked for."""
         knowledge, units = question.knowledge, question.knowledge.units
         rows, square = candidates.rows * units, np.outer(units, units)

@@ -21,7 +21,7 @@ from dahl_ident.planning.measurement_plan import Plan, PlanStep
 from dahl_ident.planning.question import (
     RESPONSE,
     BenchLimits,
-    Question,
+    PlanRequest,
     larger_model,
     limit,
     motions_among,
@@ -186,7 +186,9 @@ def plan(
         known = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
         recorded = recorded_force(noise, sample_rate, knowledge)
         return _of_motions(
-            Question(known, bench, wanted, has_numbers, costs, recorded=recorded, motions=motions)
+            PlanRequest(
+                known, bench, wanted, has_numbers, costs, recorded=recorded, motions=motions
+            )
         )
     if sample_rate is not None:
         raise ValidationError(
@@ -195,7 +197,7 @@ def plan(
         )
     if controlled == "force" and knowledge.steady == "exact":
         knowledge = knowledge.thinned(SEARCHED)
-    question = Question(
+    question = PlanRequest(
         knowledge, bench, wanted, has_numbers, costs, controlled, noise_of_cycle(noise, knowledge),
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
@@ -214,7 +216,7 @@ def plan(
     return _plan(search, search.best())
 
 
-def _of_motions(question: Question) -> Plan:
+def _of_motions(question: PlanRequest) -> Plan:
     """Return the better of two plans of motions.
 
     The first takes a repeat as worth the same share of a long record for every motion; the second

@@ -102,7 +102,7 @@ class RecordedForce:
 
 
 @dataclass(frozen=True)
-class Question:
+class PlanRequest:
     """The arguments of a plan in checked form; `recorded` and `motions` of motions in time.
 
     `target` has the standard uncertainty of each quantity, 1 where only names were given;

@@ -17,7 +17,7 @@ from dahl_ident.planning.design import Coverage, Design, Exchange, Objective, co
 from dahl_ident.planning.forecast import Expected, Forecast, typical
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
-from dahl_ident.planning.question import Question, limit
+from dahl_ident.planning.question import PlanRequest, limit
 from dahl_ident.planning.suspects import forecast_of_suspects
 
 _POOL = 80  # candidates: the time of the search grows with their number
@@ -38,7 +38,7 @@ _FILLED = 0.999  # fraction of the target that corrected repeats aim at
 class Search:
     """The search for levels and cycles: candidates evaluated once, then solved for any time."""
 
-    def __init__(self, question: Question, candidates: Candidates) -> None:
+    def __init__(self, question: PlanRequest, candidates: Candidates) -> None:
         self.question, knowledge = question, question.knowledge
         self.bench = BenchTime.of(candidates, knowledge, **question.costs)
         settles = np.isfinite(self.bench.alone)

@@ -10,13 +10,13 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import Candidates
 from dahl_ident.planning.forecast import Forecast
 from dahl_ident.planning.knowledge import Knowledge, units_of
-from dahl_ident.planning.question import Question
+from dahl_ident.planning.question import PlanRequest
 
 _UNKNOWN = 1e-2  # information for the search: a suspected parameter is known within a decade or so
 
 
 def forecast_of_suspects(
-    question: Question, knowledge: Knowledge, candidates: Candidates
+    question: PlanRequest, knowledge: Knowledge, candidates: Candidates
 ) -> Forecast:
     """Return the forecast of suspected parameters in the larger model, at the draws given.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from dahl_ident.diagnostics.formatting import rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
-from dahl_ident.reporting.document import Cell, Paragraph, Section, Table
+from dahl_ident.reporting.document import Cell, Paragraph, Section, TextTable
 from dahl_ident.results import FitResult
 from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline
 
@@ -157,7 +157,7 @@ def _comparison(differences: Sequence[_Difference]) -> Section:
         "finding",
     )  # fmt: skip
     caption = "Parameters from the table and from the waveforms, with standard uncertainties"
-    table = Table(caption, header, tuple(rows))
+    table = TextTable(caption, header, tuple(rows))
     return Section("Table and waveforms", (table, Paragraph(_HOW_BOTH)))
 
 
@@ -183,5 +183,5 @@ def changes_section(changed: Sequence[Change]) -> Section:
     header = (
         "parameter", "between", "change", "standard uncertainty u", "unit", "p", "significance"
     )  # fmt: skip
-    table = Table("Changes from each measurement to the next", header, tuple(rows))
+    table = TextTable("Changes from each measurement to the next", header, tuple(rows))
     return Section("Changes", (table, Paragraph(_HOW)))

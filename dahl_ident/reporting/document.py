@@ -53,7 +53,7 @@ class Listing:
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """Rows of cells under a header; units are in the header."""
 
     caption: str
@@ -96,7 +96,7 @@ class Picture:
         return buffer.getvalue()
 
 
-Block = Paragraph | Bullets | Listing | Table | Picture
+Block = Paragraph | Bullets | Listing | TextTable | Picture
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Document:
         names: dict[str, int] = {}
 
         def numbered(block: Block) -> Block:
-            if not isinstance(block, Table | Picture):
+            if not isinstance(block, TextTable | Picture):
                 return block
             kind = "Figure" if isinstance(block, Picture) else "Table"
             counts[kind] += 1

@@ -20,7 +20,7 @@ from dahl_ident.reporting.document import (
     Document,
     Picture,
     Section,
-    Table,
+    TextTable,
     figure_of,
 )
 from dahl_ident.reporting.provenance import parts
@@ -98,7 +98,7 @@ def _header(
     return tuple(rows.items())
 
 
-def _table(names: Sequence[str], fits: Sequence[FitResult]) -> Table:
+def _table(names: Sequence[str], fits: Sequence[FitResult]) -> TextTable:
     every = list(dict.fromkeys(name for fit in fits for name in fit.params))
     rows = []
     for name in every:
@@ -106,7 +106,7 @@ def _table(names: Sequence[str], fits: Sequence[FitResult]) -> Table:
         cells = [_estimate(fit, name) for fit in fits]
         rows.append((Cell(name), Cell(unit or "-"), *cells))
     status = (Cell("status"), Cell("-"), *(Cell(str(fit.status)) for fit in fits))
-    return Table(
+    return TextTable(
         "Estimates, each with its standard uncertainty",
         ("parameter", "unit", *names),
         (*rows, status),

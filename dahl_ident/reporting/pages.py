@@ -18,7 +18,7 @@ from dahl_ident.reporting.document import (
     Paragraph,
     Picture,
     Section,
-    Table,
+    TextTable,
 )
 
 BLANK = "________________"
@@ -87,11 +87,11 @@ def _block(block: Block, folder: str) -> str:
         case Picture():
             caption = _escaped(block.caption)
             return f"![{_escaped(block.alt)}](<{folder}/{block.name}.png>)\n\n*{caption}*"
-        case Table():
+        case TextTable():
             return _table(block)
 
 
-def _table(table: Table) -> str:
+def _table(table: TextTable) -> str:
     rows = [table.header, tuple("---" for _ in table.header)]
     lines = [" | ".join(map(_escaped, rows[0])), " | ".join(rows[1])]
     lines += [" | ".join(map(_cell, row)) for row in table.rows]

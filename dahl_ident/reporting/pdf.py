@@ -27,7 +27,7 @@ from dahl_ident.reporting.document import (
     Paragraph,
     Picture,
     Section,
-    Table,
+    TextTable,
     words,
 )
 
@@ -77,7 +77,7 @@ def pdf(document: Document) -> bytes:
         match section.blocks[0]:
             case Picture():
                 below = _row_height(pictures[:2])
-            case Table() as table:
+            case TextTable() as table:
                 below = _beginning(page, table, _widths(page, table))
             case _:
                 below = _BEGINNING
@@ -173,7 +173,7 @@ def _block(page: FPDF, block: Block) -> None:
         case Listing(text):
             page.set_fill_color(244, 244, 244)
             page.multi_cell(0, 5, text, align="L", fill=True, new_x="LMARGIN", new_y="NEXT")
-        case Table():
+        case TextTable():
             _table(page, block)
 
 
@@ -223,7 +223,7 @@ def _turn_unless_room(page: FPDF, height: float) -> None:
         page.add_page()
 
 
-def _table(page: FPDF, table: Table) -> None:
+def _table(page: FPDF, table: TextTable) -> None:
     widths = _widths(page, table)
     _turn_unless_room(page, _beginning(page, table, widths))
     page.set_font(_FONT, "B", 9.5)
@@ -303,7 +303,7 @@ class _Structure(StructureTreeBuilder):
         yield from self.doc_struct_elem.k
 
 
-def _beginning(page: FPDF, table: Table, widths: Sequence[float]) -> float:
+def _beginning(page: FPDF, table: TextTable, widths: Sequence[float]) -> float:
     """Return the height of a table's caption, header and first row, which stay together."""
     rows = (words(*table.header), *table.rows[:1])
     return _CAPTION_HEIGHT + sum(_height(page, row, widths) for row in rows)
@@ -317,7 +317,7 @@ def _height(page: FPDF, row: Sequence[Cell], widths: Sequence[float]) -> float:
     return 4.0 * (1 + int(max(lines))) + 1.0
 
 
-def _widths(page: FPDF, table: Table) -> list[float]:
+def _widths(page: FPDF, table: TextTable) -> list[float]:
     """Return the widths of columns: no word is broken where all words of a row fit on the page."""
     texts = [tuple(cell.text for cell in row) for row in table.rows]
     least, wanted = [], []

@@ -16,7 +16,7 @@ from dahl_ident.reporting.document import (
     Paragraph,
     Picture,
     Section,
-    Table,
+    TextTable,
     number,
 )
 from dahl_ident.results import Posterior
@@ -44,7 +44,7 @@ def answer(posterior: Posterior) -> Iterator[Block]:
     yield Bullets(tuple(f"Prior of {name}: {text}" for name, text in posterior.priors.items()))
 
 
-def _summary(posterior: Posterior) -> Table:
+def _summary(posterior: Posterior) -> TextTable:
     summary = posterior.summary()
     columns = [name for name in summary.columns if name != "unit"]
     rows = tuple(
@@ -53,7 +53,7 @@ def _summary(posterior: Posterior) -> Table:
     )
     if not posterior.trusted:
         rows = tuple((*row[:2], *(replace(cell, struck=True) for cell in row[2:])) for row in rows)
-    return Table("Posterior of each parameter", ("parameter", "unit", *columns), rows)
+    return TextTable("Posterior of each parameter", ("parameter", "unit", *columns), rows)
 
 
 def _numbers(posterior: Posterior) -> Iterator[Block]:

@@ -25,7 +25,7 @@ from dahl_ident.reporting.document import (
     Listing,
     Paragraph,
     Section,
-    Table,
+    TextTable,
     words,
 )
 from dahl_ident.reporting.equivalent_command import equivalent_command
@@ -341,10 +341,12 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
         rows = tuple(
             words(s.file, "read" if s.read else "origin of the file above", s.sha256) for s in files
         )
-        yield Table("Files", ("file", "what it is", "SHA-256"), rows)
+        yield TextTable("Files", ("file", "what it is", "SHA-256"), rows)
     made = dict(pair for one in results for pair in provenance.options(one.provenances))
     if made:
-        yield Table("Options", ("option", "value"), tuple(words(*pair) for pair in made.items()))
+        yield TextTable(
+            "Options", ("option", "value"), tuple(words(*pair) for pair in made.items())
+        )
     yield Paragraph(f"Versions: {provenance.listed_versions()}.")
     when = f"Made on {provenance.today()}"
     if command is None:

@@ -10,7 +10,7 @@ import numpy as np
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
 from dahl_ident.diagnostics.formatting import degrees_text, interval, percent, rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
-from dahl_ident.reporting.document import Cell, Table, number, words
+from dahl_ident.reporting.document import Cell, TextTable, number, words
 from dahl_ident.results.changes import is_usable
 from dahl_ident.units import prefix, si_unit
 
@@ -29,7 +29,7 @@ _NO_PART = 1e-6  # share of the variance that the details leave out: a thousandt
 _LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
 
 
-def answer(fit: FitResult) -> Table:
+def answer(fit: FitResult) -> TextTable:
     """Return every free parameter with its interval; unusable numbers are struck."""
     limits = fit.conf_interval().at(CONFIDENCE)
     described = fit.status is not VerdictStatus.NOT_DESCRIBED
@@ -70,10 +70,10 @@ def answer(fit: FitResult) -> Table:
     )  # fmt: skip
     crossed = any(cell.struck for row in rows for cell in row)
     hint = ". Numbers that are crossed out must not be used" if crossed else ""
-    return Table(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
+    return TextTable(f"Estimates with their standard uncertainties{hint}", header, tuple(rows))
 
 
-def uncertainty(stated: Budget) -> Table:
+def uncertainty(stated: Budget) -> TextTable:
     """Return the combined uncertainty of every parameter with its largest sources."""
     rows = []
     for p in stated.parameters:
@@ -89,12 +89,12 @@ def uncertainty(stated: Budget) -> Table:
         "parameter", "combined standard uncertainty u", "degrees of freedom", "k", "U = k u",
         "unit", "largest sources, share of the variance",
     )  # fmt: skip
-    return Table(
+    return TextTable(
         f"Expanded uncertainties U; k is for {level_text(CONFIDENCE)} coverage", header, tuple(rows)
     )
 
 
-def budget(stated: Budget) -> Table:
+def budget(stated: Budget) -> TextTable:
     """Return every source of uncertainty of every parameter; the combined one comes first."""
     rows = []
     for p in stated.parameters:
@@ -124,7 +124,7 @@ def budget(stated: Budget) -> Table:
         "parameter", "source", "type", "standard uncertainty u", "unit", "degrees of freedom",
         "share", "k", "U = k u",
     )  # fmt: skip
-    return Table(
+    return TextTable(
         f"Uncertainty budget; k is for {level_text(CONFIDENCE)} coverage", header, tuple(rows)
     )
 
@@ -168,7 +168,7 @@ def prior_text(prior: Any) -> str:
 
 def parameters(
     fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
-) -> Table:
+) -> TextTable:
     """Return every parameter with its intervals, one column a method."""
     at = [one.at(CONFIDENCE) for one in intervals]
     rows = []
@@ -195,7 +195,7 @@ def parameters(
     methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
     columns = (f"{method} {level_text(CONFIDENCE)}" for method in methods)
     header = ("parameter", "estimate", "standard error", "unit", *columns, "description")
-    return Table("Estimates and intervals, one column a method", header, tuple(rows))
+    return TextTable("Estimates and intervals, one column a method", header, tuple(rows))
 
 
 def method_name(intervals: ConfidenceIntervals) -> str:
@@ -211,7 +211,7 @@ def credible_interval(posterior: Posterior, name: str) -> str:
     return interval(float(lower), float(upper), "")
 
 
-def linearization(fit: FitResult) -> Table | None:
+def linearization(fit: FitResult) -> TextTable | None:
     """Return equivalent stiffness, damping and loss of the friction against amplitude."""
     friction = any(element.has_memory for element in fit.model.elements)
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
@@ -235,26 +235,26 @@ def linearization(fit: FitResult) -> Table | None:
         ]
     rows = tuple(zip(*columns.values(), strict=True))
     caption = f"Friction as an equivalent spring and damper (damping at {f:.4g} Hz)"
-    return Table(caption, tuple(columns), rows)
+    return TextTable(caption, tuple(columns), rows)
 
 
-def comparison(compared: ModelComparison) -> Table:
+def comparison(compared: ModelComparison) -> TextTable:
     """Return models side by side."""
     rows = tuple(
         (*map(Cell, row), Cell(model.estimates))
         for row, model in zip(compared.rows, compared.models, strict=True)
     )
-    return Table("Models compared", (*compared.columns, "estimates"), rows)
+    return TextTable("Models compared", (*compared.columns, "estimates"), rows)
 
 
-def meanings(compared: ModelComparison) -> Table:
+def meanings(compared: ModelComparison) -> TextTable:
     """Return what means the same in every law."""
     rows = tuple(tuple(map(Cell, row)) for row in compared.meanings)
     columns = ("model", *compared.common)
-    return Table("Quantities common to all laws", columns, rows)
+    return TextTable("Quantities common to all laws", columns, rows)
 
 
-def measured(data: FrequencyResponse) -> Table:
+def measured(data: FrequencyResponse) -> TextTable:
     """Return the data as used in the fit."""
     columns: list[tuple[str, list[Cell]]] = [
         ("frequency [Hz]", [number(v, 5) for v in data.frequency_hz])
@@ -274,7 +274,7 @@ def measured(data: FrequencyResponse) -> Table:
     return _of_columns("The points as they were fitted", columns)
 
 
-def extraction(data: FrequencyResponse) -> Table:
+def extraction(data: FrequencyResponse) -> TextTable:
     """Return how each point was measured from its waveforms."""
     points = data.select(harmonic=1)
     quality = points.quality
@@ -305,12 +305,12 @@ def _column(name: str, values: FloatArray, unit: str) -> tuple[str, list[Cell]]:
     return f"{name} [{unit}]", [number(v / power) for v in values]
 
 
-def _of_columns(caption: str, columns: Sequence[tuple[str, Sequence[Cell]]]) -> Table:
+def _of_columns(caption: str, columns: Sequence[tuple[str, Sequence[Cell]]]) -> TextTable:
     rows = tuple(zip(*(cells for _, cells in columns), strict=True))
-    return Table(caption, tuple(name for name, _ in columns), rows)
+    return TextTable(caption, tuple(name for name, _ in columns), rows)
 
 
-def goodness(fit: FitResult) -> Table:
+def goodness(fit: FitResult) -> TextTable:
     """Return the numbers that say how well the model describes the data."""
     scale = "known" if fit.scale_known else f"{fit.scale:.4g}, estimated"
     rows = [
@@ -323,7 +323,7 @@ def goodness(fit: FitResult) -> Table:
         (Cell("AIC"), number(fit.aic, 6)),
         (Cell("BIC"), number(fit.bic, 6)),
     ]
-    return Table("Goodness of fit", ("measure", "value"), tuple(rows))
+    return TextTable("Goodness of fit", ("measure", "value"), tuple(rows))
 
 
 def _finite(value: float | None) -> float | None:

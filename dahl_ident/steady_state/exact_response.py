@@ -37,7 +37,7 @@ class ExactMotions(NamedTuple):
     followed: IntArray
 
 
-class _Motion(NamedTuple):
+class _Orbit(NamedTuple):
     harmonics: ComplexArray
     multiplier: float
 
@@ -72,7 +72,7 @@ def exact_motions(
     alike, unique = unique, np.zeros(along.size, dtype=np.bool_)
     near[points], unique[points] = estimates, alike
     values = np.array([float(v) for v in model.known_values()])
-    motions: list[list[_Motion]] = [[] for _ in omega]
+    motions: list[list[_Orbit]] = [[] for _ in omega]
 
     def solved(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> SteadyMotion:
         return shooting(
@@ -85,7 +85,7 @@ def exact_motions(
         new = []
         for place in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():
             known = motions[rows[place]]
-            motion = _Motion(solution.harmonics[place], float(solution.multiplier[place]))
+            motion = _Orbit(solution.harmonics[place], float(solution.multiplier[place]))
             X = motion.fundamental
             if all(abs(X - other.fundamental) >= _SAME * abs(X) for other in known):
                 known.append(motion)
@@ -126,7 +126,7 @@ def exact_motions(
     return ExactMotions(harmonics, multiplier, followed)
 
 
-def _followed(motions: list[list[_Motion]], begins: BoolArray) -> IntArray:
+def _followed(motions: list[list[_Orbit]], begins: BoolArray) -> IntArray:
     """Return the stable motion of every point that a sweep follows: the nearest to the last.
 
     The smallest where a sweep begins.

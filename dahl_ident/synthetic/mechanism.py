@@ -14,7 +14,7 @@ from dahl_ident.elements.equations import law_equations, plant_equations
 from dahl_ident.elements.rational import Rational
 from dahl_ident.engine import Equations, march, translate
 from dahl_ident.errors import FitError, ModelError
-from dahl_ident.synthetic.waveform import Segment, Waveform
+from dahl_ident.synthetic.waveform import SineStep, Waveform
 
 _PER_PERIOD, _POINTS = 24, 8  # polynomials, and their points: they miss 1e-13 of a sine
 _FINER = 1e4  # than records are fitted: motions are right to about 1e-11
@@ -256,7 +256,7 @@ class EngineMotion:
         return output
 
     def _along(
-        self, segment: Segment, first: FloatArray, time: FloatArray
+        self, segment: SineStep, first: FloatArray, time: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the output at some times of a segment, and the states at its end."""
         steps = int(np.ceil(segment.duration * max(segment.frequency_hz) * _PER_PERIOD)) + 1

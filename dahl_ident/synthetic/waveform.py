@@ -18,7 +18,7 @@ from dahl_ident.arrays import FloatArray
 Course = Literal["smooth", "linear", "log"]
 
 
-class Motion(NamedTuple):
+class WaveValues(NamedTuple):
     """A waveform's value with its first and second derivative in time."""
 
     value: FloatArray
@@ -36,7 +36,7 @@ class Window(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Segment:
+class SineStep:
     """a(t) sin(phi(t)) from `start` for `duration` s; amplitude and frequency take one `course`."""
 
     start: float
@@ -61,7 +61,7 @@ class Segment:
         tau = (time - self.start) / self.duration
         return np.asarray(_between(*self.amplitude, self.course, tau) * np.sin(self._phase(tau)))
 
-    def motion(self, time: FloatArray) -> Motion:
+    def motion(self, time: FloatArray) -> WaveValues:
         """Return the waveform and its derivatives at times within the segment."""
         T = self.duration
         tau = (time - self.start) / T
@@ -70,7 +70,7 @@ class Segment:
         w, w1 = 2.0 * np.pi * f, 2.0 * np.pi * f1 / T
         phase = self._phase(tau)
         sin, cos = np.sin(phase), np.cos(phase)
-        return Motion(
+        return WaveValues(
             a * sin,
             a1 / T * sin + a * w * cos,
             (a2 / T**2 - a * w**2) * sin + (2.0 * a1 / T * w + a * w1) * cos,
@@ -87,7 +87,7 @@ class Segment:
 class Waveform:
     """Segments that follow each other without a gap, and the windows meant to be measured."""
 
-    segments: tuple[Segment, ...]
+    segments: tuple[SineStep, ...]
     windows: tuple[Window, ...] = ()
 
     @property
@@ -100,7 +100,7 @@ class Waveform:
         """Highest instantaneous frequency, Hz."""
         return max(max(s.frequency_hz) for s in self.segments)
 
-    def motion(self, time: FloatArray) -> Motion:
+    def motion(self, time: FloatArray) -> WaveValues:
         """Return value and derivatives at any times; constant outside, at the end values."""
         t = np.clip(np.asarray(time), 0.0, self.duration)
         starts = np.array([s.start for s in self.segments])
@@ -110,7 +110,7 @@ class Waveform:
             here = which == i
             parts[:, here] = self.segments[i].motion(t[here])
         parts[1:, t != time] = 0.0
-        return Motion(*parts)
+        return WaveValues(*parts)
 
     def value(self, time: FloatArray) -> FloatArray:
         """Return the waveform at any times."""
@@ -127,7 +127,7 @@ class WaveformBuilder:
     """Appends segments at the phase, amplitude and frequency where the last one ended."""
 
     def __init__(self, frequency_hz: float) -> None:
-        self._segments: list[Segment] = []
+        self._segments: list[SineStep] = []
         self._windows: list[Window] = []
         self._time = self._phase = self._amplitude = 0.0
         self._frequency = frequency_hz
@@ -137,7 +137,7 @@ class WaveformBuilder:
     ) -> None:
         """Move to an amplitude and a frequency within `duration`; at once where that is 0."""
         if duration > 0.0:
-            segment = Segment(
+            segment = SineStep(
                 self._time,
                 duration,
                 (self._amplitude, amplitude),
@@ -203,7 +203,7 @@ def _integral(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArr
     return q0 * tau + step * tau**4 * (2.5 - tau * (3.0 - tau))
 
 
-def _turning_times(segment: Segment, per_period: int = 64, halvings: int = 44) -> FloatArray:
+def _turning_times(segment: SineStep, per_period: int = 64, halvings: int = 44) -> FloatArray:
     """Return where the velocity changes sign: bracketed on a grid, then bisected."""
     cells = int(np.ceil(segment.duration * max(segment.frequency_hz) * per_period)) + 1
     grid = np.linspace(segment.start, segment.stop, cells + 1)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from dahl_ident.data.column_map import SETTINGS, column_map
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.levels import labelled
-from dahl_ident.data.raw_columns import Source
+from dahl_ident.data.raw_columns import RawFile
 from dahl_ident.data.readers.file import FORMATS, File, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
 from dahl_ident.data.record import Record
@@ -322,7 +322,7 @@ def open_source(
     path: PathLike | pd.DataFrame | Sequence[Mapping[str, Any]],
     sheet: str | None = None,
     options: Mapping[str, Any] | None = None,
-) -> Source:
+) -> RawFile:
     """Return the channels of a file of any format, with the user's options."""
     if _is_frame(path):
         from dahl_ident.data.readers.spreadsheets import frame_source
@@ -343,13 +343,13 @@ def open_source(
     return replace(source, options=options or {})
 
 
-def _parsed(file: File, sheet: str | None) -> Source:
+def _parsed(file: File, sheet: str | None) -> RawFile:
     """Pass a file to its reader."""
     form = FORMATS[file.format]
     module, _, name = form.reader.partition(".")
     read = getattr(import_module(f"{__name__}.{module}"), name)  # each imported when first used
     try:
-        source: Source = read(file, sheet) if name == "read_workbook" else read(file)
+        source: RawFile = read(file, sheet) if name == "read_workbook" else read(file)
     except DahlIdentError:
         raise
     except MemoryError as exc:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header
+from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header
 from dahl_ident.data.readers.child_process import apart
 from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
 from dahl_ident.data.tabular import listed
@@ -30,9 +30,9 @@ Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
 
 def tree_source(
     file: File, kind: str, leaves: Iterator[Leaf], metadata: Mapping[str, Any] | None = None
-) -> Source:
+) -> RawFile:
     """Return the numeric vectors and matrices of a tree as channels."""
-    channels: list[Channel] = []
+    channels: list[RawChannel] = []
     notes: list[str] = []
     for path, value, unit in leaves:
         if unit is None:
@@ -56,7 +56,7 @@ def tree_source(
     )
 
 
-def _channels(path: str, value: Any, unit: str | None) -> Iterator[Channel]:
+def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
     """Yield an array as one channel, or a matrix as several."""
     short = re.split(r"[./]", path)[-1]
     array = value if isinstance(value, Stored) else np.asarray(value)
@@ -78,7 +78,7 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[Channel]:
             content = array
         else:
             content = Stored((max(shape),) if shape else (), array.dtype, read, array.what)
-        yield Channel(path + index, content, unit, short=short + index)
+        yield RawChannel(path + index, content, unit, short=short + index)
 
 
 def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
@@ -98,7 +98,7 @@ def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
     return read
 
 
-def read_npz(file: File) -> Source:
+def read_npz(file: File) -> RawFile:
     """Return the arrays of a ``.npz`` file; objects, which would have to be run, are refused."""
     with np.load(io.BytesIO(file.data), allow_pickle=False) as content:
         names = content.files[: MOST_CHANNELS + 1]
@@ -110,7 +110,7 @@ def read_npz(file: File) -> Source:
     return tree_source(file, "NumPy .npz", leaves)
 
 
-def read_npy(file: File) -> Source:
+def read_npy(file: File) -> RawFile:
     """Return the columns of the matrix, or the fields of the table, in a ``.npy`` file."""
     mapped = file.content is None
     stream = file.stream()
@@ -141,7 +141,7 @@ def _fields(path: str, array: NDArray[Any], mapped: File | None = None) -> Itera
             yield where, Stored(values.shape, values.dtype, read, f"{mapped.name}: {where}"), None
 
 
-def read_matlab(file: File) -> Source:
+def read_matlab(file: File) -> RawFile:
     """Return the arrays of a MATLAB v4, v5 or v7 file; those of v7.3 are HDF5."""
     from scipy.io import loadmat
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Channel, Source, plain, split_header, words
+from dahl_ident.data.raw_columns import RawChannel, RawFile, plain, split_header, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
@@ -31,7 +31,7 @@ _VALUES, _UNITS = ("values", "data"), ("unit", "unit_str", "units")
 _TABLES = ("channels", "signals", "columns", "data", "rows")
 
 
-def read_json(file: File) -> Source:
+def read_json(file: File) -> RawFile:
     """Return the columns of a JSON file."""
     try:
         text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
@@ -53,7 +53,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def dictionary_source(
     content: Any, name: str = "the list", kind: str = "channels", sha256: str | None = None
-) -> Source:
+) -> RawFile:
     """Return the columns of a dictionary, of rows, or of a list of channels."""
     channels = tuple(_channels(content, name))
     if not channels:
@@ -61,10 +61,10 @@ def dictionary_source(
     if len(channels) > MOST_CHANNELS:
         raise DataError(f"{name}: {len(channels)} columns; at most {MOST_CHANNELS} are read")
     headerless = all(c.name == _UNNAMED.format(i + 1) for i, c in enumerate(channels))
-    return Source(name, kind, channels, sha256, headerless=headerless)
+    return RawFile(name, kind, channels, sha256, headerless=headerless)
 
 
-def _channels(content: Any, name: str, units: Any = None) -> Iterator[Channel]:
+def _channels(content: Any, name: str, units: Any = None) -> Iterator[RawChannel]:
     """Yield the columns; `units` are by their names, or in the order of a list of names."""
     of_names = _is_list_of(Mapping, content) and all("name" in c for c in content)
     if (
@@ -111,7 +111,7 @@ def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
     return {str(label): [row[i] for row in rows] for i, label in enumerate(labels)}
 
 
-def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
+def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
     """Yield the columns of an object, or of the table in it."""
     common = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
     units = content.get("units", units or common)
@@ -133,7 +133,7 @@ def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]
     yield from _columns(content, name, units)
 
 
-def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel]:
+def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
     stated = units if isinstance(units, dict) else {}
     known = {plain(str(key)): unit for key, unit in stated.items()}
     index: Any = None
@@ -151,10 +151,10 @@ def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[Channel
             yield _channel(key, value, known.get(plain(key)), name)
 
 
-def _channel(key: Any, values: Any, unit: Any, name: str) -> Channel:
+def _channel(key: Any, values: Any, unit: Any, name: str) -> RawChannel:
     label, in_label = split_header(str(key))
     text = unit if isinstance(unit, str) and unit.strip() else in_label
-    return Channel(label, _array(values, f"{name}: column {label!r}"), text)
+    return RawChannel(label, _array(values, f"{name}: column {label!r}"), text)
 
 
 def _array(values: Any, what: str) -> NDArray[Any]:
@@ -177,7 +177,7 @@ def _array(values: Any, what: str) -> NDArray[Any]:
     return words("" if v is None else str(v) for v in values)
 
 
-def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[Channel]:
+def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[RawChannel]:
     """Yield SDyPy's channels and the time that they share."""
     labels = [str(c["name"]) for c in channels]
     twice = [label for label in dict.fromkeys(labels) if labels.count(label) > 1]
@@ -194,7 +194,7 @@ def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[Channel
     if len(times) > 1:
         raise DataError(f"{name}: the channels are sampled at different times; expected one time")
     if "time" not in labels:
-        yield Channel("time", times[0], "s", "time")
+        yield RawChannel("time", times[0], "s", "time")
 
 
 def _time(channel: Mapping[str, Any], count: int, what: str) -> NDArray[Any]:

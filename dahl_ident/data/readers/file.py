@@ -21,7 +21,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from dahl_ident.data.raw_columns import Channel, Source
+from dahl_ident.data.raw_columns import RawChannel, RawFile
 from dahl_ident.data.storage import regular
 from dahl_ident.errors import DataError
 
@@ -159,12 +159,12 @@ class File:
                 "damaged, or has to be unpacked or cut into parts first"
             )
 
-    def source(self, kind: str, channels: Iterable[Channel], **facts: Any) -> Source:
+    def source(self, kind: str, channels: Iterable[RawChannel], **facts: Any) -> RawFile:
         """Return the channels of this file with other facts of a :class:`Source`."""
         channels = tuple(channels)
         if not channels:
             raise DataError(f"{self.name}: the file holds no channels")
-        return Source(self.name, kind, channels, self.sha256, **facts)
+        return RawFile(self.name, kind, channels, self.sha256, **facts)
 
 
 def open_file(path: str | Path) -> File:

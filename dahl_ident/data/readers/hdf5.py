@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Source, Stored, words
+from dahl_ident.data.raw_columns import RawFile, Stored, words
 from dahl_ident.data.readers.array_trees import Leaf, tree_source
 from dahl_ident.data.readers.child_process import apart
 from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
@@ -23,7 +23,7 @@ _PACKING = {"scale_factor", "add_offset", "_FillValue", "missing_value"}
 _LOOKED_AT = 1 << 24  # bytes in all
 
 
-def read_hdf5(file: File) -> Source:
+def read_hdf5(file: File) -> RawFile:
     """Return the data sets of an HDF5 or MATLAB v7.3 file."""
     h5py = library("h5py")
     _refuse_fatal(file, h5py)

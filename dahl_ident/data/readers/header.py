@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Channel, plain, split_header
+from dahl_ident.data.raw_columns import RawChannel, plain, split_header
 from dahl_ident.errors import DataError, UnitError
 from dahl_ident.units import parse_unit
 
@@ -180,7 +180,7 @@ def are_units(cells: Sequence[str]) -> bool:
 
 def named_channels(
     columns: Sequence[NDArray[Any]], named: Header, file: str
-) -> tuple[Channel, ...]:
+) -> tuple[RawChannel, ...]:
     """Return the columns with their names and units, blank ones without a name left out."""
     if named.contradicted:
         raise DataError(
@@ -199,5 +199,5 @@ def named_channels(
                 "expected a name for each"
             )
         unit = named.units[i] if named.names else None
-        channels.append(Channel(label or f"column {i + 1}", values, unit))
+        channels.append(RawChannel(label or f"column {i + 1}", values, unit))
     return tuple(channels)

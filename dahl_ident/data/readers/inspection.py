@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS, FileColumn
-from dahl_ident.data.raw_columns import Channel, Source, plain
+from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
 from dahl_ident.data.record import gaps, is_even, sample_rate
 from dahl_ident.data.record_table import is_stamped
 from dahl_ident.data.tabular import as_html, as_text, extent, listed
@@ -81,7 +81,7 @@ class FileContents:
         return lines + [("gap", gap) for gap in self.gaps] + [("note", n) for n in self.notes]
 
 
-def contents(source: Source) -> FileContents:
+def contents(source: RawFile) -> FileContents:
     """Summarise a source."""
     sampling, missing = _sampling(source)
     return FileContents(
@@ -95,7 +95,7 @@ def contents(source: Source) -> FileContents:
     )
 
 
-def _summary(channel: Channel) -> ChannelSummary:
+def _summary(channel: RawChannel) -> ChannelSummary:
     values = np.atleast_1d(channel.values)
     if values.dtype.kind in "fiu":
         finite = values[np.isfinite(values)]
@@ -110,7 +110,7 @@ def _summary(channel: Channel) -> ChannelSummary:
     return ChannelSummary(channel.name, channel.values.shape, str(values.dtype), unit, text)
 
 
-def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
+def _sampling(source: RawFile) -> tuple[str, tuple[str, ...]]:
     """Describe the sampling of the first channel that is time, and its gaps; of many, some."""
     time_column = RECORD_COLUMNS["time"]
     by_name = [c for c in source.channels if c.is_called(time_column)]
@@ -144,7 +144,7 @@ def _sampling(source: Source) -> tuple[str, tuple[str, ...]]:
     return "", ()
 
 
-def _proposal(source: Source) -> str:
+def _proposal(source: RawFile) -> str:
     """Return a column map in TOML: roles by name first, by unit where no name claims them."""
     groups = _patterns(source)
     if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
@@ -190,7 +190,7 @@ def _likeness(path: str) -> int:
     return across - any(word in name for word in ("friction", "tangential", "lateral"))
 
 
-def _stated_rate(source: Source) -> str:
+def _stated_rate(source: RawFile) -> str:
     """Return a line with the sample rate that single numbers of the file state, if any do."""
     for channel in source.channels:
         if channel.size != 1 or channel.kind not in "fiu":
@@ -203,7 +203,7 @@ def _stated_rate(source: Source) -> str:
     return "# sample_rate = 1000.0  # Hz"
 
 
-def _is_response(channels: Collection[Channel]) -> bool:
+def _is_response(channels: Collection[RawChannel]) -> bool:
     """Return whether channels are a table of response; f is force only with time or motion."""
 
     def any_is(column: FileColumn) -> bool:
@@ -213,7 +213,7 @@ def _is_response(channels: Collection[Channel]) -> bool:
     return any_is(_FREQUENCY) or (not sampled and any_is(_F_TOO))
 
 
-def _entry(role: str, path: str, channel: Channel) -> Iterator[str]:
+def _entry(role: str, path: str, channel: RawChannel) -> Iterator[str]:
     yield f"[{role}]"
     yield f"column = {json.dumps(path, ensure_ascii=False)}"
     if role == "level" or (role == "time" and is_stamped(channel)):
@@ -225,12 +225,12 @@ def _entry(role: str, path: str, channel: Channel) -> Iterator[str]:
         yield f"unit = {json.dumps(unit, ensure_ascii=False)}"
 
 
-def _patterns(source: Source) -> dict[str, Channel]:
+def _patterns(source: RawFile) -> dict[str, RawChannel]:
     """Return channels by path; those of one name in struct arrays by one path with ``*``."""
-    by_short: dict[str, list[Channel]] = {}
+    by_short: dict[str, list[RawChannel]] = {}
     for channel in source.channels:
         by_short.setdefault(channel.short or channel.name, []).append(channel)
-    out: dict[str, Channel] = {}
+    out: dict[str, RawChannel] = {}
     for channels in by_short.values():
         parts = [re.split(r"([.\[\]/])", c.name) for c in channels]
         if len(channels) > 1 and len({len(p) for p in parts}) == 1:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
-from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
+from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
 from dahl_ident.data.readers.file import File, utf8
 from dahl_ident.data.storage import library
 from dahl_ident.data.tabular import listed
@@ -54,7 +54,7 @@ _DATA_TYPES: dict[int, tuple[str, str]] = {
 }
 
 
-def read_uff(file: File) -> Source:
+def read_uff(file: File) -> RawFile:
     """Return the frequency responses and time records of a universal file.
 
     A negative direction of response or reference turns the sign. Units are the axis labels of
@@ -71,7 +71,7 @@ def read_uff(file: File) -> Source:
             f"1); the file holds data sets {sorted({int(s.get('type', 0)) for s in sets})}"
             + (f" with function types {others}" if others else "")
         )
-    channels: list[Channel] = []
+    channels: list[RawChannel] = []
     notes: list[str] = []
     for function in wanted:
         channels += _uff_channels(file, function, units, notes)
@@ -127,7 +127,7 @@ def _uff_text(text: bytes) -> bytes:
 
 def _uff_channels(
     file: File, function: dict[str, Any], units: tuple[str, str] | None, notes: list[str]
-) -> Iterator[Channel]:
+) -> Iterator[RawChannel]:
     """Yield the axis and the values of a data set 58, positive in its directions."""
     direction = {side: int(function[f"{side}_dir"]) for side in ("rsp", "ref")}
     place = {}  # node and direction, such as 1:+Z or 3:-RX
@@ -163,10 +163,10 @@ def _uff_channels(
         name, abscissa, step, role = f"FRF {where}", "frequency", "Hz", "response"
         denominator, turned = unit_of("orddenom", "ref"), turned != (direction["ref"] < 0)
         unit = f"({unit})/({denominator})" if unit and denominator else unit
-    yield Channel(f"{abscissa} {where}", np.asarray(function["x"], dtype=float), step, abscissa)
+    yield RawChannel(f"{abscissa} {where}", np.asarray(function["x"], dtype=float), step, abscissa)
     if turned:
         notes.append(f"{name}: sign turned, as its directions say")
-    yield Channel(name, -values if turned else values, unit, role)
+    yield RawChannel(name, -values if turned else values, unit, role)
 
 
 def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | None:
@@ -184,7 +184,7 @@ def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | N
     return system
 
 
-def merged_axes(channels: list[Channel]) -> list[Channel]:
+def merged_axes(channels: list[RawChannel]) -> list[RawChannel]:
     """Merge the axes of all functions into one where they are the same."""
     axes = [c for c in channels if c.role in ("time", "frequency")]
     if not axes:
@@ -193,10 +193,10 @@ def merged_axes(channels: list[Channel]) -> list[Channel]:
     if any(c.role != first.role or not np.array_equal(c.values, first.values) for c in axes):
         return channels
     others = [c for c in channels if c.role not in ("time", "frequency")]
-    return [Channel(str(first.role), first.values, first.unit, first.role), *others]
+    return [RawChannel(str(first.role), first.values, first.unit, first.role), *others]
 
 
-def read_tdms(file: File) -> Source:
+def read_tdms(file: File) -> RawFile:
     """Return the channels of a TDMS file; evenly sampled ones get a time channel."""
     nptdms = library("nptdms", "tdms")
     stream: Any = io.BytesIO(file.content) if file.content is not None else None
@@ -286,7 +286,7 @@ def _start(channel: Any) -> Any:
     return None if start is None else np.datetime64(start, "ns")
 
 
-def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator[Channel]:
+def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator[RawChannel]:
     times: dict[tuple[float, float, int], Stored] = {}
     for channel in group.channels():
         properties = channel.properties
@@ -308,7 +308,7 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
             times[start, step, count] = Stored((count,), np.dtype(np.float64), even, what)
     for i, time in enumerate(times.values()):
         name = "time" if len(times) == 1 else f"time {i + 1}"
-        yield Channel(f"{group.name}/{name}", time, "s", "time", name)
+        yield RawChannel(f"{group.name}/{name}", time, "s", "time", name)
 
 
 def _tdms_values(file: File, content: Any, channel: Any, rows: slice) -> NDArray[Any]:
@@ -326,13 +326,13 @@ def _even_times(start: float, step: float, count: int, rows: slice) -> NDArray[A
     return np.asarray(start + step * np.arange(first, stop, stride))
 
 
-def labelled_channel(prefix: str, label: str, values: Any, unit: str | None) -> Channel:
+def labelled_channel(prefix: str, label: str, values: Any, unit: str | None) -> RawChannel:
     """Return a channel; many loggers write its unit into the label, as in ``Force (N)``."""
     name, in_label = (label, unit) if unit else split_header(label)
-    return Channel(prefix + name, values, in_label, short=name)
+    return RawChannel(prefix + name, values, in_label, short=name)
 
 
-def evenly_timed(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel]:
+def evenly_timed(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[RawChannel]:
     """Yield the time axes of a group, equal ones once."""
     unique: list[NDArray[Any]] = []
     for time in times:
@@ -340,4 +340,4 @@ def evenly_timed(times: Sequence[NDArray[Any]], prefix: str) -> Iterator[Channel
             unique.append(time)
     for i, time in enumerate(unique):
         name = "time" if len(unique) == 1 else f"time {i + 1}"
-        yield Channel(prefix + name, time, "s", "time", name)
+        yield RawChannel(prefix + name, time, "s", "time", name)

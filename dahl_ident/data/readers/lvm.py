@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Channel, Source, words
+from dahl_ident.data.raw_columns import RawChannel, RawFile, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.readers.instruments import evenly_timed, labelled_channel
 from dahl_ident.errors import DataError
@@ -28,7 +28,7 @@ _MOST_SEGMENTS = 1000  # the time to read grows with their square
 Lines = list[tuple[int, str]]
 
 
-def read_lvm(file: File) -> Source:
+def read_lvm(file: File) -> RawFile:
     """Return the channels of all segments of a LabVIEW measurement file."""
     text = utf8(file.lines()).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     lines, inside = [], False
@@ -38,7 +38,7 @@ def read_lvm(file: File) -> Source:
         if not inside and not mark.startswith(_SPECIAL[1]):
             lines.append((i + 1, line))
     content = _Lvm(file, lines)
-    segments: list[_Segment] = []
+    segments: list[_LvmBlock] = []
     while any(line.strip() for _, line in content.lines):
         segments.append(content.segment())
         if len(segments) > _MOST_SEGMENTS:
@@ -84,7 +84,7 @@ class _Lvm:
     def damage(self, why: str) -> DataError:
         return DataError(f"{self.file.name}: the LVM file is damaged: {why}")
 
-    def segment(self) -> _Segment:
+    def segment(self) -> _LvmBlock:
         """Take the lines of a segment: its header, labels and numbers; all of a single one."""
         header = self.entries(self.header())
         lines = list(itertools.dropwhile(lambda pair: not pair[1].strip(), self.lines))
@@ -107,14 +107,14 @@ class _Lvm:
                     f"{self.file.name}, line {number}: {len(cells)} fields; expected the {width} "
                     "of the column labels"
                 )
-        numbers = Source(
+        numbers = RawFile(
             self.file.name, "", (), decimal=self.mark, row_name=lambda i: f"line {rows[i][0]}"
         )
         data = np.empty((len(rows), width - first))
         for k, label in enumerate(labels[first:width]):
             column = words(cells[first + k] for cells in table)
-            data[:, k] = numbers.from_text(Channel(label, column))
-        segment = _Segment(header, labels[first:width], data, self.columns == "multi")
+            data[:, k] = numbers.from_text(RawChannel(label, column))
+        segment = _LvmBlock(header, labels[first:width], data, self.columns == "multi")
         self.check_samples(segment)
         following = next((pair for pair in self.lines if pair[1].strip()), (0, ""))
         if following[1] and "_" not in following[1] and not following[1][0].isalpha():
@@ -124,7 +124,7 @@ class _Lvm:
             )
         return segment
 
-    def check_samples(self, segment: _Segment) -> None:
+    def check_samples(self, segment: _LvmBlock) -> None:
         """Refuse a segment with fewer or more samples than its header says."""
         rows = len(segment.data)
         stated = [value.strip() for value in segment.header.get("Samples", []) if value.strip()]
@@ -142,7 +142,7 @@ class _Lvm:
             )
 
 
-class _Segment(NamedTuple):
+class _LvmBlock(NamedTuple):
     """Header and numbers of a segment; with `multi`, each channel has its own x column."""
 
     header: dict[str, list[str]]
@@ -150,7 +150,7 @@ class _Segment(NamedTuple):
     data: NDArray[Any]
     multi: bool
 
-    def channels(self, prefix: str) -> Iterator[Channel]:
+    def channels(self, prefix: str) -> Iterator[RawChannel]:
         """Yield the channels, and time: the x columns, or counted from their step."""
         table = list(zip(self.labels, self.data.T, strict=True))
         named = [pair for pair in table if pair[0] != "X_Value"]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import Channel, Source
+from dahl_ident.data.raw_columns import RawChannel, RawFile
 from dahl_ident.data.readers.file import MOST_CHANNELS, File
 from dahl_ident.data.readers.instruments import merged_axes
 
@@ -29,7 +29,7 @@ _UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # others 
 
 
 @dataclass(frozen=True)
-class _Result:
+class _ResultHeader:
     """Header of one result: what its numbers are."""
 
     title: str
@@ -53,7 +53,7 @@ class _Result:
         return self.points * (1 + self.complex)
 
 
-def read_sdf(file: File) -> Source:
+def read_sdf(file: File) -> RawFile:
     """Return the results of an analyser's file with their axes.
 
     A frequency response is in the engineering units of its channels. Where its coherence is in the
@@ -96,7 +96,7 @@ class _Sdf:
             at += len(record)
             yield record
 
-    def source(self) -> Source:
+    def source(self) -> RawFile:
         results = [self.result(record) for record in self.records(_DATA)]
         vectors = [struct.unpack_from(">4h", record, 10) for record in self.records(_VECTOR)]
         channels = list(self.records(_CHANNEL))
@@ -109,7 +109,7 @@ class _Sdf:
                 f"its results take {sum(expected)} bytes, and {len(numbers)} are there (results "
                 "of several scans are not read)"
             )
-        read: list[Channel] = []
+        read: list[RawChannel] = []
         doubts: list[str] = []
         notes: list[str] = []
         at = 0
@@ -132,14 +132,14 @@ class _Sdf:
                 name = result.title + (f" {k + 1}" if result.vectors[1] > 1 else "")
                 read.append(axis)
                 role = "response" if is_response else None
-                read.append(Channel(name, factor * values, unit if is_response else None, role))
+                read.append(RawChannel(name, factor * values, unit if is_response else None, role))
         read += self.deviations(results, read, notes)
         return self.file.source(
             "SDF", merged_axes(read), row_name=lambda i: f"sample {i}",
             notes=tuple(notes), doubts=tuple(doubts),
         )  # fmt: skip
 
-    def result(self, record: bytes) -> _Result:
+    def result(self, record: bytes) -> _ResultHeader:
         """Read the header of a result."""
         title, domain, kind, points = struct.unpack_from(">16s3h", record, 10)
         spacing, x_number, _, y_number, values, is_complex, _, _, valid = struct.unpack_from(
@@ -157,13 +157,13 @@ class _Sdf:
                 f"the result {_text(title)!r} has {points} points of {values} values of type "
                 f"{y_number}; expected some points of one value"
             )
-        return _Result(
+        return _ResultHeader(
             _text(title) or "result", domain, kind, points, spacing, x_number, y_number,
             is_complex == 1, valid != 0, (first, rows * columns), _unit(record[68:78]) or "",
             _unit(record[92:102]) if struct.unpack_from(">h", record, 90)[0] else None, start, step,
         )  # fmt: skip
 
-    def axis(self, result: _Result) -> Channel:
+    def axis(self, result: _ResultHeader) -> RawChannel:
         """Return the frequencies or times of a result."""
         names = {_FREQUENCY: "frequency", _TIME: "time"}
         name = names.get(result.domain, "x")
@@ -190,7 +190,7 @@ class _Sdf:
         if not np.isfinite(values).all():
             raise ValueError("an axis that is not finite")
         role = name if name in ("frequency", "time") else None
-        return Channel(f"{name} of {result.title}", values, result.x_unit or None, role)
+        return RawChannel(f"{name} of {result.title}", values, result.x_unit or None, role)
 
     def scale(
         self, powers: tuple[int, ...], channels: list[bytes], doubts: list[str]
@@ -211,8 +211,8 @@ class _Sdf:
         return factor, f"({units[0]})/({units[1]})" if all(units) else units[0] or None
 
     def deviations(
-        self, results: list[_Result], channels: list[Channel], notes: list[str]
-    ) -> Iterator[Channel]:
+        self, results: list[_ResultHeader], channels: list[RawChannel], notes: list[str]
+    ) -> Iterator[RawChannel]:
         """Yield the standard deviation that the coherence of averages gives a response."""
         responses = [c for c in channels if c.role == "response"]
         kinds = [r.kind for r in results for _ in range(r.vectors[1])]
@@ -227,7 +227,7 @@ class _Sdf:
         notes.append(f"standard deviations from the coherence of {self.averages} averages")
         share = np.sqrt((1.0 - coherence) / (2.0 * self.averages * coherence))
         std = np.maximum(share, np.finfo(np.float32).eps) * np.abs(responses[0].values)
-        yield Channel("std", std, responses[0].unit, "std")
+        yield RawChannel("std", std, responses[0].unit, "std")
 
 
 def _text(letters: bytes) -> str:

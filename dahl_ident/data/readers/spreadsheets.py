@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
-from dahl_ident.data.raw_columns import Channel, Source, Stored, split_header, words
+from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
 from dahl_ident.data.readers.child_process import apart
 from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
@@ -27,7 +27,7 @@ _HEAD_ROWS = 400  # looked at as text, which takes long, to find the table
 _BYTES, _SECONDS = 1 << 30, 15  # that reading may take: a small archive can unpack to anything
 
 
-def read_workbook(file: File, sheet: str | None = None) -> Source:
+def read_workbook(file: File, sheet: str | None = None) -> RawFile:
     """Return the table on a sheet; without a name, on the only sheet that has one."""
     sheets = _cells(file)
     if sheet is not None:
@@ -82,7 +82,7 @@ def _rows(book: Any, name: str) -> list[list[Any]]:  # pragma: no cover
     return [[cell if isinstance(cell, plain) else str(cell) for cell in row] for row in rows]
 
 
-def _table(file: File, sheet: str, cells: list[list[Any]]) -> Source | None:
+def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
     texts = [[_text(cell) for cell in row] for row in cells[:_HEAD_ROWS]]
     rows = [row if any(row) else None for row in texts]
     run = best_run(rows, ".")
@@ -119,7 +119,7 @@ def _column(cells: list[Any]) -> NDArray[Any]:
     return words(texts)
 
 
-def read_parquet(file: File) -> Source:
+def read_parquet(file: File) -> RawFile:
     """Return the columns of a Parquet file, each read when it is used."""
     pa, pq = library("pyarrow", "parquet"), library("pyarrow.parquet")
     table = pq.ParquetFile(file.stream())
@@ -140,7 +140,7 @@ def read_parquet(file: File) -> Source:
     file.refuse_above_limit(8 * rows, "one column")
     if not rows:
         raise DataError(f"{file.name}: the table is empty")
-    channels: list[Channel] = []
+    channels: list[RawChannel] = []
     notes: list[str] = []
     for field in schema:
         if pa.types.is_nested(field.type) or schema.names.count(field.name) > 1:
@@ -151,7 +151,7 @@ def read_parquet(file: File) -> Source:
         what = f"{file.name}: column {field.name!r}"
         content: Any = Stored((rows,), np.dtype(np.float64), read, what)
         number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
-        channels.append(Channel(name, content if number else content.array, unit))
+        channels.append(RawChannel(name, content if number else content.array, unit))
     if not channels:
         raise DataError(f"{file.name}: no column of numbers or text; {listed(notes, 3)}")
     return file.source("Parquet", channels, metadata=metadata, notes=tuple(notes))
@@ -188,7 +188,7 @@ def _parquet_values(table: Any, name: str, rows: slice) -> NDArray[Any]:
 
 def frame_source(
     frame: pd.DataFrame, name: str = "the table", kind: str = "table", sha256: str | None = None
-) -> Source:
+) -> RawFile:
     """Return the columns of a pandas table, a named index among them, units out of their names."""
     metadata = frame.attrs.get("dahl_ident", {})
     if any(level is not None for level in frame.index.names):
@@ -197,9 +197,10 @@ def frame_source(
         raise DataError(f"{name}: the table is empty")
     headers = [split_header(str(label)) for label in frame.columns]
     channels = tuple(
-        Channel(header, _plain(frame.iloc[:, i]), unit) for i, (header, unit) in enumerate(headers)
+        RawChannel(header, _plain(frame.iloc[:, i]), unit)
+        for i, (header, unit) in enumerate(headers)
     )
-    return Source(name, kind, channels, sha256, metadata=metadata)
+    return RawFile(name, kind, channels, sha256, metadata=metadata)
 
 
 def _plain(series: pd.Series[Any]) -> NDArray[Any]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
-from dahl_ident.data.raw_columns import TRACE, Channel, Source, plain, split_header, words
+from dahl_ident.data.raw_columns import TRACE, RawChannel, RawFile, plain, split_header, words
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
 from dahl_ident.data.readers.header import (
     CELL,
@@ -95,7 +95,7 @@ class _Layout:
     comments: tuple[str, ...] = ()
 
 
-def read_text_table(file: File) -> Source:
+def read_text_table(file: File) -> RawFile:
     """Return the columns of a text table."""
     data, name = utf8(file.data), file.name
     if b"\0" in data:
@@ -138,7 +138,7 @@ def read_text_table(file: File) -> Source:
     channels = named_channels(columns, layout.header, name)
     if runs and all(plain(c.name) != "run" for c in channels):
         labels = np.searchsorted(runs, np.arange(len(columns[0])), side="right") + 1
-        channels = (*channels, Channel("run", labels.astype(np.str_)))
+        channels = (*channels, RawChannel("run", labels.astype(np.str_)))
     return file.source(
         "text table" if trace is None else TRACE,
         channels,
