@@ -22,6 +22,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import pytest
 from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -121,13 +122,16 @@ def tests_of(module: str, line: int, tree: Path, data: CoverageData) -> list[str
     """Return the responsible tests that execute a line; those of its name come first.
 
     All of them for what is compiled, or executed on import or by a fixture: who needs that is not
-    known.
+    known. Of a test that is defined within a function, all of its file.
     """
     room, stem = Path(module).parts[1], Path(module).stem
     files = responsible(room)
     contexts = data.contexts_by_lineno(str(tree / module)).get(line, [])
     names = [name.split(".") for name in contexts if name]
-    tests = [f"tests/{file}.py::{'::'.join(test)}" for _, file, *test in names]
+    tests = {
+        f"tests/{file}.py" + ("" if "<locals>" in test else "::" + "::".join(test))
+        for _, file, *test in names
+    }
     chosen = [test for test in tests if test.partition("::")[0] in files]
     return sorted(chosen, key=lambda test: (stem not in test, test)) or files
 
@@ -159,6 +163,8 @@ def survivor(tree: Path, change: Change, data: CoverageData) -> str | None:
         status = _run(tree, ["-m", "pytest", "-x", "-q", "-n", "0", *tests], _LIMIT)
     finally:
         (tree / change.module).write_text(source, "utf-8")
+    if status in {pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED}:
+        raise SystemExit(f"these tests do not run: {' '.join(tests)}")
     if status != 0:
         return None
     return f"{change.module}:{line} {type(node).__name__}: {source.splitlines()[line - 1].strip()}"
