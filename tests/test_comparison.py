@@ -252,3 +252,25 @@ def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere() -> None:
     wild = replace(optimum, theta=optimum.problem.to_search([30.0, -1e6, 300.0]))
     with pytest.raises(FitError, match="no finite response"):
         predictive_density(wild)
+
+
+def test_a_model_that_spoils_the_fundamental_is_not_better() -> None:
+    """Fundamentals of Dahl's law, third harmonics of tiny covariance that only a gap explains."""
+    data = table(noise=0.01, seed=23)
+    assert data.amplitude is not None
+    third = Backlash(FRICTION, 2e-3).dynamic_stiffness(data.amplitude, harmonic=3)
+    size = np.abs(data.response)
+    both = FrequencyResponse(
+        np.ones(60),
+        np.concatenate([data.response, third]),
+        np.tile(data.amplitude, 2),
+        harmonic=np.repeat([1, 3], 30),
+        covariance=np.concatenate([0.01 * size, 1e-5 * size])[:, None, None] ** 2 * np.eye(2),
+    )
+    comparison = compare_models(
+        fit(both, Dahl(alpha=1), throw=False), {"gap": Backlash(Dahl(alpha=1))}
+    )
+    plain, gap = comparison.models
+    assert gap.density.gain_over(plain.density)[0] > 20.0
+    assert gap.density.misfit > 1.5 * plain.density.misfit
+    assert comparison.best is plain

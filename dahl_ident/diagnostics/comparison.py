@@ -5,7 +5,8 @@ with frequency for a damper, a force that falls with it for LuGre's law, any oth
 another shape of loop. Each is judged by how it predicts tests that it was not fitted to
 (:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
 error of the highest the simplest is the best; so is the one fitted while nothing is higher than it
-by more than chance among many candidates makes.
+by more than chance among many candidates makes. A model that describes the fundamentals worse than
+the fit, by more than chance, is not better, however well it predicts harmonics.
 AIC and BIC are stated as well, and decide nothing: over harmonics whose covariance is tiny they
 prefer a model that spoils the fundamental. If no model describes the data, the best of them does
 not either, and one of negative damping is not a mechanism's.
@@ -45,6 +46,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.units import si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
+_WORSE = 2.0  # loss of the log likelihood of fundamentals at two standard errors
 _RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
 _SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
@@ -204,9 +206,10 @@ class ModelComparison:
         """The simplest model within one standard error of the highest predictive density.
 
         Apart from the one that was fitted, only models count whose parameters are determined and
-        physical, and whose force limit and stiffness are not a hundred times those of the fit. It
-        is the one that was fitted where models that are alike disagree (`undecided`), and where one
-        that the data do not determine leaves far less (`undetermined`).
+        physical, whose force limit and stiffness are not a hundred times those of the fit, and
+        which describe the fundamentals no worse than the fit does. It is the one that was fitted
+        where models that are alike disagree (`undecided`), and where one that the data do not
+        determine leaves far less (`undetermined`).
         """
         return self.models[0] if self.undecided or self.undetermined else self._simplest
 
@@ -251,7 +254,8 @@ class ModelComparison:
         keys = ("force limit", "stiffness at zero force")
         sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in keys]
         absurd = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
-        return model.is_determined and model.is_physical and not absurd
+        worse = model.density.loss_of_fundamentals(self.models[0].density) > _WORSE
+        return model.is_determined and model.is_physical and not absurd and not worse
 
     @property
     def headline(self) -> str:

@@ -49,11 +49,20 @@ class PredictiveDensity:
     harmonic_misfit: float
     # of an average over all fundamentals; NaN of records
     noise: float = float("nan")
+    fundamentals: int = 0  # how many rows; none of records
 
     @property
     def total(self) -> float:
         """The sum over the tests."""
         return float(self.tests.sum())
+
+    def loss_of_fundamentals(self, other: PredictiveDensity) -> float:
+        """Return how much less likely the fundamentals are than by another, scatter unknown.
+
+        In units of the log likelihood; zero of records, which have none.
+        """
+        sizes = np.maximum([self.misfit, other.misfit], _EXACT)
+        return 2.0 * self.fundamentals * float(np.log(sizes[0] / sizes[1]))
 
     def gain_over(self, other: PredictiveDensity) -> tuple[float, float]:
         """Return how much higher the density is than another's, and its standard error.
@@ -147,6 +156,7 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
         if others.any()
         else float("nan"),
         misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan)),
+        int(np.count_nonzero(fundamental)),
     )
 
 

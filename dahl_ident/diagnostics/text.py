@@ -388,7 +388,8 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     ),
     "displacement_noise": _displacement_noise,
     "effective_samples": lambda effective, samples: (
-        f"Error bars take the residuals' correlation into account: {effective:.0f} effective of "
+        "Error bars take the residuals' correlation into account: "
+        f"{min(effective, samples):.0f} effective of "
         f"{samples} samples."
     ),
     "not_converged": lambda message: message,
@@ -400,6 +401,10 @@ _TEXT: Mapping[str, Callable[..., str]] = {
         f"Noise alone is counted; with every source of the budget, u is {listed(compared)}."
     ),
     "evidence": lambda ln: f"ln evidence: {ln:.4f}",
+    "robust_loss": lambda loss: (
+        f"With the loss {loss} the stated uncertainties count noise alone, neither model error nor "
+        "scatter between runs: fit without a loss for all sources."
+    ),
     "records_assumed": lambda parts: f"Assumed: {'; '.join(parts)}.",
     "warning": lambda text: f"Warning on reading: {text}.",
     "more_warnings": lambda count: f"{count} more warnings on reading.",
