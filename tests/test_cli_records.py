@@ -191,3 +191,22 @@ def test_two_days_of_waveforms_are_compared(run: Runner) -> None:
     assert found is not None
     assert abs(float(found[1]) - 0.02) < 4.0 * float(found[2])
     assert "Changes from each measurement" in Path("r.html").read_text(encoding="utf-8")
+
+
+def test_waveforms_are_read_alike_by_every_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded(DAHL, "random", 600, 1e-3).save(tmp_path / "run.csv")
+    file, note = tmp_path / "run.csv", "the files hold waveforms: fitted sample by sample"
+    code, _, why = told(monkeypatch, capsys, "fit", file, "--predicted", "force")
+    assert (code, note in why) == (0, True)
+    code, out, why = told(monkeypatch, capsys, "sample", file, "--steps", 20, "--max-steps", 20)
+    assert (code, note in why) == (3, True)
+    assert "f_max" in out
+    page = tmp_path / "page.md"
+    code, _, why = told(monkeypatch, capsys, "report", file, "-o", page)
+    assert (code, note in why) == (0, True)
+    assert "sigma" in page.read_text()
+    code, _, why = told(monkeypatch, capsys, "fit", file, "--levels", 1)
+    assert code == 1
+    assert "--levels is given together with records of waveforms" in why

@@ -160,6 +160,14 @@ def test_declarations_are_checked(parameters: Any, message: str) -> None:
         law(dahl, parameters)()
 
 
+def test_several_states_are_refused() -> None:
+    class Two(law(dahl)):  # type: ignore[misc]
+        states = ("f", "g")
+
+    with pytest.raises(ValidationError, match=r"Two declares states = \('f', 'g'\); a law has one"):
+        Two(0.2, 3.0)
+
+
 def test_a_law_is_checked_once() -> None:
     calls = []
 

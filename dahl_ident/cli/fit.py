@@ -51,7 +51,7 @@ _estimating = in_panel(_ESTIMATING)
 Predicted = Annotated[
     str | None,
     one_of(
-        "With --record: force or motion is predicted from the other; by default motion where "
+        "Of records: force or motion is predicted from the other; by default motion where "
         "the model has a mass.",
         None,
         "force|motion",
@@ -157,10 +157,11 @@ def fit(
         return
     if save is not None:
         place_of(save, "a fit", FORMATS)
-    if predicted is not None and not record:
-        raise ValidationError("--predicted is given without --record; give both, or neither")
-    read = reading.read_records if record else reading.read_either
-    data = read(files, channels)
+    data = reading.read_any(files, channels, record=record)
+    if predicted is not None and not isinstance(data, list):
+        raise ValidationError(
+            "--predicted is given for a table, which has no motion in time; leave it out"
+        )
     result = fitted(data, model, estimating, predicted)
     if save is not None:
         result.save(save, overwrite=writing.overwrite)
@@ -264,7 +265,7 @@ def report(
     fits: Sequence[FitResult] = (
         [saved_fit(file) for file in files]
         if saved
-        else [fitted(reading.read(files), model, estimating)]
+        else [fitted(reading.read_any(files), model, estimating)]
     )
     results: list[Reported] = [*fits]
     for fit in fits if bootstrap else ():

@@ -137,16 +137,22 @@ class Reading:
         taken = ", ".join(map(option, _OF_RECORDS))
         refuse(
             [name for name in changed(self) if name not in _OF_RECORDS],
-            f"together with --record; of the options of reading, records take {taken} and the "
-            "names of channels, such as --displacement (dahl-ident inspect proposes a column map)",
+            f"together with records of waveforms; of the options of reading, they take {taken} "
+            "and the names of channels, such as --displacement (dahl-ident inspect proposes a "
+            "column map)",
         )
         how = vars(channels) | {name: getattr(self, name) for name in _OF_RECORDS}
         return [read_record(name, **how) for name in files]
 
-    def read_either(self, files: list[str], channels: Channels) -> FrequencyResponse | list[Record]:
-        """Read a table, or records where the files hold waveforms, and say so."""
+    def read_any(
+        self, files: list[str], channels: Channels | None = None, *, record: bool = False
+    ) -> FrequencyResponse | list[Record]:
+        """Read a table, or records where the files hold waveforms or `record` says so."""
         from dahl_ident.data.response_table import WaveformsError
 
+        channels = channels or Channels()
+        if record:
+            return self.read_records(files, channels)
         try:
             data = self.read(files)
         except WaveformsError:

@@ -120,12 +120,7 @@ def sample(
     check_reports(report)
     sampling.check()
     how = {**model.keywords(), **sampling.keywords()}
-    data: Any
-    if record:
-        data = reading.read_records(files, channels)
-    else:
-        channels.refuse()
-        data = reading.read(files)
+    data = reading.read_any(files, channels, record=record)
     try:
         posterior = estimate_posterior(data, **how)
     except KeyboardInterrupt:

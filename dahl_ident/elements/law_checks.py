@@ -58,7 +58,7 @@ def check_declarations(law: type[Element]) -> None:
     ------
     ValidationError
         If one is not a parameter, two have one name, a name is not an identifier, bounds are the
-        wrong way round, or a unit is unknown.
+        wrong way round, a unit is unknown, or several states are declared.
     """
     if is_of_package(law):
         return
@@ -68,6 +68,11 @@ def check_declarations(law: type[Element]) -> None:
         raise ValidationError(
             f"{name}.parameters is {declared!r}; expected a tuple of di.Parameter(...), such as "
             '(di.Parameter("f_max", "N", "friction limit", lower=0.0, transform="log"),)'
+        )
+    if hasattr(law, "states"):
+        raise ValidationError(
+            f"{name} declares states = {law.states!r}; a law has one state, its force. Write it as "
+            "dF/dx = slope(force, ...), and add laws in parallel where several forces are needed"
         )
     for label, count in Counter(p.name for p in declared).items():
         if count > 1:
