@@ -350,7 +350,7 @@ def test_stored_and_read_again(tmp_path: Path) -> None:
     table = fit.summary()
     assert list(table.index[:3]) == ["sigma", "q", "p"]
     assert again.budget().to_dict() == fit.budget().to_dict()
-    for kind in ("time", "loop", "residuals", "residuals_displacement"):
+    for kind in ("fit", "loop", "residuals"):
         assert fit.plot(kind).get_ylabel()
 
 
@@ -377,7 +377,7 @@ def test_refusals() -> None:
         di.fit(record, DAHL)
     with pytest.raises(ModelError, match="start names nothing"):
         di.fit(record, di.Dahl(), start={"nothing": 1.0})
-    with pytest.raises(ValidationError, match="noise given"):
+    with pytest.raises(ValidationError, match="noise is given with records: their noise is estimated"):
         di.fit(record, di.Dahl(), noise="relative")
     with pytest.raises(ValidationError, match="data holds a str"):
         di.fit("run.csv", di.Dahl())  # type: ignore[arg-type]

@@ -113,7 +113,7 @@ def test_command_line_and_report(
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 1
-    assert "--likelihood given with a posterior of records" in capsys.readouterr().err
+    assert "--likelihood is given with records" in capsys.readouterr().err
 
 
 def test_data_that_the_model_misses_are_said() -> None:
