@@ -377,7 +377,7 @@ def test_refusals() -> None:
         di.fit(record, DAHL)
     with pytest.raises(ModelError, match="start names nothing"):
         di.fit(record, di.Dahl(), start={"nothing": 1.0})
-    with pytest.raises(ValidationError, match="noise is given with records: their noise is estimated"):
+    with pytest.raises(ValidationError, match="noise is given with records: their noise"):
         di.fit(record, di.Dahl(), noise="relative")
     with pytest.raises(ValidationError, match="data holds a str"):
         di.fit("run.csv", di.Dahl())  # type: ignore[arg-type]
