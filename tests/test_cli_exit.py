@@ -324,10 +324,6 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "volt.csv: drive_factor_uncertainty is given without drive_factor; give both"),
         (("extract", "r.csv", "--time", "time", "--sample-rate", "5"),
          "time and sample_rate are both given"),
-        (("sample", "r.csv"),
-         "r.csv: it holds waveforms (time [s], displacement [m], force [N]), and a table of"),
-        (("sample", "friction.csv"),
-         "friction.csv: it holds waveforms (time [s], displacement [m], friction force [N]), and"),
         (("fit", "levels.csv", "--level", "high"),
          "levels.csv: --level high is given, but the table has its own levels"),
         (("fit", "t.csv", "--level", "high", "--level-from-name", "(t)"),
@@ -346,7 +342,6 @@ def test_input_without_effect_or_of_another_kind_is_refused(
     labelled = TABLE.format(drive="level,", value="low,")
     Path("levels.csv").write_text(labelled, encoding="utf-8")
     Path("r.csv").write_text(RECORD, encoding="utf-8")
-    Path("friction.csv").write_text(RECORD.replace("force", "friction force"), encoding="utf-8")
     Path("volt.csv").write_text(RECORD.replace("force [N]", "drive [V]"), encoding="utf-8")
     outcome = run(*arguments)
     assert (outcome.status, outcome.out) == (1, "")

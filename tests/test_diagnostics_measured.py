@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -187,7 +188,9 @@ class TestBeam:
         data = data.select(rows=np.arange(data.n) % 8 == 0)
         found = fit(data, Iwan(ratio=1.0) + Mass() + Damper(), throw=False)
         assert found.verdict.startswith("Not described.")  # a misfit of 37 %
-        assert "because of jackknife over tests" in found.verdict
+        assert re.search(
+            "chi: .*, not determined, because of (model error|jackknife over tests)", found.verdict
+        )
         check = found.cross_validation
         assert check is not None
         assert check.inside >= 0.88 * check.count  # of 95 %: less happens once in 200 times

@@ -515,7 +515,7 @@ def no_narrower(
     Examples
     --------
     >>> no_narrower(np.inf, 1.0, np.array([0.1, 1.0]), 2).round(2).tolist()
-    [2.1, 1.0]
+    [2.05, 1.0]
     """
     least = special.stdtrit(runs - 1.0, _UPPER) * np.sqrt(np.divide(of_runs, variance))
     narrow = least > np.where(np.isinf(dof), special.ndtri(_UPPER), special.stdtrit(dof, _UPPER))

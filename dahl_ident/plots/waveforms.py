@@ -157,7 +157,7 @@ def plot_sample_residuals(
 
     Examples
     --------
-    >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title()
+    >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title("left")
     '3 rms'
     """
     axis = ax or style.new_axes(1, 1, size=(6.4, 3.0), sharex=True)[0, 0]
