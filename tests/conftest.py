@@ -22,6 +22,14 @@ hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=Tr
 hypothesis.settings.load_profile("repeatable")
 
 
+def pytest_configure() -> None:
+    """Load the kernels from the users' cache; collection would compile them where they lie."""
+    from dahl_ident.engine.motion import kernels
+
+    for name in ("cycle", "samples", "loop"):
+        kernels(name)
+
+
 @pytest.fixture(autouse=True)
 def _blank_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Write figures blank, which saves most of a report's time, but where a test is marked."""
