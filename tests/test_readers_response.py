@@ -533,6 +533,17 @@ class TestManyFiles:
             several = read_frequency_response([*paths, tmp_path / f"{other}.csv"])
             assert sorted(several.runs or ()) == sorted([*names, other])
 
+    def test_one_amplitude_at_several_frequencies_is_no_run(self, tmp_path: Path) -> None:
+        header = "frequency_hz,amplitude [m],real [N/m],imag [N/m]"
+        names = ("low 1Hz", "high 1Hz", "low 2Hz", "high 2Hz")
+        for name, (hz, x) in zip(names, ((1, 1), (1, 3), (2, 1.02), (2, 2.9)), strict=True):
+            (tmp_path / f"{name}.csv").write_text(f"{header}\n{hz},{x},2,1\n")
+        paths = [tmp_path / f"{name}.csv" for name in names]
+        data = read_frequency_response(paths)
+        assert (data.run, data.levels) == (None, list(names))
+        (tmp_path / "again.csv").write_text(f"{header}\n1.0002,1.05,2,1\n")
+        assert len(read_frequency_response([*paths, tmp_path / "again.csv"]).runs or ()) == 5
+
     def test_the_run_is_found_by_name(self, tmp_path: Path) -> None:
         path = tmp_path / "t.csv"
         path.write_text(

@@ -15,6 +15,7 @@ from dahl_ident.errors import UnitError, ValidationError
 from dahl_ident.units import DRIVE_KINDS, MOTION_KINDS, parse_quantity
 
 _SAME = 1.1  # ratio up to which drives or amplitudes are one level
+_SAME_FREQUENCY = 1.001  # points next to each other at a sharp resonance differ by more
 _NEARLY_ALL = 0.99  # of a wave's samples: noise and spikes lie beyond
 _NUMBER = r"(?P<value>[0-9]+(?:[.,][0-9]+)?(?:e[-+]?[0-9]+)?)"
 _UNIT = r"[^\W\d_][^;,\t\])\"']{0,20}"
@@ -49,26 +50,25 @@ def labelled(parts: Sequence[FrequencyResponse], names: Sequence[str]) -> list[F
 
 
 def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:
-    """Return whether each table holds one level, and no two the same."""
+    """Return whether each table holds one level, and no two the same one at one frequency."""
     if all(part.level is not None for part in parts):
         labels = [set(np.asarray(part.level).tolist()) for part in parts]
         return max(map(len, labels)) == 1 and len(set.union(*labels)) == len(parts)
     if any(part.level is not None for part in parts):
         return False
-    held = [_held(part) for part in parts]
-    for sizes in zip(*held, strict=True):
+    bands = np.array([(p.frequency_hz.min(), p.frequency_hz.max()) for p in parts])
+    for sizes in zip(*map(_held, parts), strict=True):
         known = [size for size in sizes if size is not None]
         if len(known) < len(parts):
             continue
-        middle = np.sort([np.median(size) for size in known])
         one_each = all(size.max() < _SAME * size.min() for size in known)
-        if one_each and np.all(middle[1:] > _SAME * middle[:-1]):
+        if one_each and _all_differ(np.array([np.median(size) for size in known]), bands):
             return True
     return False
 
 
 def one_run(records: Sequence[Record]) -> bool:
-    """Return whether each record is a sine or a sweep at one level, and no two levels are alike.
+    """Return whether each record is a sine or a sweep at one level, and no two are alike.
 
     A sine that keeps its amplitude has a largest value of the square root of two times its root
     mean square. Such records of several levels are one run, as such tables are.
@@ -78,10 +78,19 @@ def one_run(records: Sequence[Record]) -> bool:
         largest = np.array([np.quantile(np.abs(wave), _NEARLY_ALL) for wave in waves])
         sizes = np.array([np.sqrt(2.0 * np.mean(wave**2)) for wave in waves])
         keep = (sizes < _SAME * largest) & (largest < _SAME * sizes)
-        sizes.sort()
-        if keep.all() and np.all(sizes[1:] > _SAME * sizes[:-1]):
+        halves = np.array([np.count_nonzero(np.diff(np.signbit(wave))) for wave in waves])
+        rates = 0.5 * halves / [record.time[-1] - record.time[0] for record in records]
+        if keep.all() and _all_differ(sizes, rates[:, None] * [_SAME**-0.5, _SAME**0.5]):
             return True
     return False
+
+
+def _all_differ(sizes: FloatArray, bands: FloatArray) -> bool:
+    """Return whether no two of `sizes`, (n,), agree where `bands` of frequency, (n, 2), overlap."""
+    low, high = bands.T
+    overlap = (low[:, None] < _SAME_FREQUENCY * high) & (low < _SAME_FREQUENCY * high[:, None])
+    alike = (sizes[:, None] < _SAME * sizes) & (sizes < _SAME * sizes[:, None])
+    return bool(np.count_nonzero(overlap & alike) == len(sizes))  # each with itself
 
 
 def _held(part: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
