@@ -32,6 +32,14 @@ def three_days(scatter: float, seed: int) -> FrequencyResponse:
     return FrequencyResponse(np.ones(36), N, A, run=np.repeat(["mon", "tue", "wed"], 12))
 
 
+def gross_errors(data: FrequencyResponse, seed: int, stated: bool) -> FrequencyResponse:
+    """Return a table with a tenth of its rows off by ten times the noise or more."""
+    rng, factors = np.random.default_rng(seed), np.ones(data.n, dtype=np.complex128)
+    factors[rng.choice(data.n, data.n // 10, replace=False)] = 1.0 + rng.uniform(0.1, 0.4)
+    C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
+    return replace(data, response=data.response * factors, covariance=C if stated else None)
+
+
 class TestVariances:
     @staticmethod
     def model(y: np.ndarray, J: np.ndarray, day: np.ndarray) -> MixedModel:
@@ -337,6 +345,31 @@ class TestEstimate:
         assert found.estimate.misfit == 0.0
         plain = fit(data, Dahl(alpha=1.0)).optimum
         np.testing.assert_allclose(found.theta, plain.theta, atol=1e-7)
+
+    @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+    @pytest.mark.parametrize("stated", [False, True])
+    def test_a_robust_loss_counts_every_source(self, loss: str, stated: bool) -> None:
+        """As least squares does without the gross errors: exponent, days, noise."""
+        for seed in (3, 5):
+            data = three_days(0.05, seed)
+            clean, robust = (
+                fit(one, Dahl(), loss=by)
+                for one, by in ((data, "linear"), (gross_errors(data, seed, stated), loss))
+            )
+            assert robust.trusted
+            assert robust.assumed == ("alpha",)
+            for name in ("f_max", "sigma"):
+                one, other = clean.params[name], robust.params[name]
+                assert other.stderr == pytest.approx(one.stderr, rel=0.3)
+                assert (other.stderr or 0.0) > 3.0 * robust.stderr_noise[name]
+                assert other.value == pytest.approx(one.value, abs=one.stderr)
+
+    def test_a_robust_loss_changes_little_without_gross_errors(self) -> None:
+        plain, robust = (fit(table(seed=4), Dahl(), loss=loss) for loss in ("linear", "huber"))
+        for name in ("f_max", "sigma"):
+            one, other = plain.params[name], robust.params[name]
+            assert other.stderr == pytest.approx(one.stderr, rel=0.15)
+            assert other.value == pytest.approx(one.value, abs=0.5 * (one.stderr or 0.0))
 
     def test_harmonics_of_tiny_covariance_do_not_pull(self) -> None:
         """Third harmonics 20 % off, their stated error a hundredth of the fundamental's."""

@@ -373,9 +373,7 @@ def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
 
 
 def _assumed(fit: Judged) -> Iterator[Finding]:
-    """Yield the assumptions of a fit; where noise alone is counted by choice, it is approximate."""
-    if fit.optimum.loss != "linear" and fit.errors is None and not fit.optimum.is_exact:
-        yield Finding(_ASSUMED, _APPROXIMATE, "robust_loss", {"loss": fit.optimum.loss})
+    """Yield the assumptions of a fit."""
     yield from assumptions(fit.optimum, fit.errors)
 
 

@@ -64,7 +64,7 @@ from dahl_ident.diagnostics.residual_space import (
     run_deviations,
 )
 from dahl_ident.fitting import Optimum
-from dahl_ident.fitting.optimum import blanked, inverse
+from dahl_ident.fitting.optimum import agreed_scale, blanked, information_of, inverse
 from dahl_ident.problem import TableProblem
 
 _FEWEST_TESTS = 5  # of which each is left out in turn
@@ -224,14 +224,12 @@ class ErrorModel:
         open_ = [i for i, name in enumerate(self.names) if not self.holds(name)]
         C[open_] = C[:, open_] = 0.0
         C[open_, open_] = np.inf
-        y, _ = problem.residuals_and_jacobian(theta)
-        m = problem.n_residuals
-        data, priors = float(y[:m] @ y[:m]), float(y[m:] @ y[m:])
-        scale = 1.0
+        y, m = problem.residuals(theta), problem.n_residuals
+        scale, loss = 1.0, self.estimate.loss
         if not problem.scale_known:
-            free = max(optimum.dof - priors, 1.0)
-            scale = max(float(np.sqrt(data / free)), float(problem.rounding))
-        cost = 0.5 * (data + scale**2 * priors)
+            free = max(optimum.dof - float(y[m:] @ y[m:]), 1.0)
+            scale = agreed_scale(problem, loss, lambda _: (theta, free), self.estimate.scale)
+        cost = scale**2 * float(problem.quadratic(theta, scale, loss).cost)
         return replace(
             optimum, problem=problem, theta=theta, values=np.array(values), covariance=C,
             scale=scale, cost=cost,
@@ -248,11 +246,12 @@ class ErrorModel:
         problem, stated = problem.widened(self.estimate.misfit_variance), self.at_estimate
         kept = [self.names.index(name) for name in problem.names]
         theta, lost = self.theta[kept], ~np.isfinite(np.diagonal(stated.covariance)[kept])
-        covariance, _ = inverse(problem.information(theta, stated.scale))
-        y = problem.residuals(theta, stated.scale)
+        scale, loss = stated.scale, self.estimate.loss
+        covariance, _ = inverse(information_of(problem, theta, scale, loss, stated.dof))
+        cost = scale**2 * float(problem.quadratic(theta, scale, loss).cost)
         return replace(
             stated, problem=problem, theta=theta, values=stated.values[kept],
-            covariance=blanked(covariance, lost), cost=0.5 * stated.scale**2 * float(y @ y),
+            covariance=blanked(covariance, lost), cost=cost,
         )  # fmt: skip
 
     @cached_property
@@ -270,7 +269,7 @@ class ErrorModel:
             spread[place] = self.variances[k] ** 0.5
         mean = -self._of_theta(predicted[: self.state.model.parameters])
         noise = float(self.noises[0] ** 0.5) * self.estimate.scale
-        return run_deviations(self.estimate.problem, self.theta, mean, effects, spread, noise)
+        return run_deviations(self.estimate, mean, effects, spread, noise)
 
     @cached_property
     def within_runs(self) -> ComplexArray:
@@ -342,11 +341,9 @@ class ErrorModel:
 def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorModel | None:
     """Return the model of an optimum's errors; None where there is nothing to estimate it from.
 
-    That is a robust loss, residuals that are rounding errors, or an undetermined parameter;
-    `of_combinations`: then the covariance holds for what the data determine, and for that alone.
+    That is residuals that are rounding errors, or an undetermined parameter; `of_combinations`:
+    then the covariance holds for what the data determine, and for that alone.
     """
-    if optimum.loss != "linear":
-        return None  # its errors are those of the robust estimate, noise alone
     if optimum.is_exact or not np.isfinite(optimum.theta).all():
         return None
     determined = optimum.success and bool(np.isfinite(optimum.covariance).all())

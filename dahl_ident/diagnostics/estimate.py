@@ -8,6 +8,8 @@ the misfit s the same for all fundamentals, and such that chi-square equals its 
 zero where the model describes the data. That of harmonics is the larger of it and their own, and
 they count less the farther their estimate lies from that of the fundamentals, so that they cannot
 pull it away. Where no covariance is stated, the noise's scale takes its place.
+With a robust loss the residuals are its scores, and chi-square and scale are those of
+:mod:`dahl_ident.fitting.losses`; to first order all else is as in least squares.
 Priors of sensors and ranges of assumed exponents are further rows. Where the optimum lies at
 infinity, the coordinates are those of its limit (:mod:`dahl_ident.fitting.asymptotes`), such as
 sigma^2/f_max in microslip. Source: Paule and Mandel,
@@ -28,6 +30,9 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, limits
+from dahl_ident.fitting.losses import Loss, loss_named
+from dahl_ident.fitting.optimum import agreed_scale
+from dahl_ident.noise import squares_of
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
@@ -161,10 +166,16 @@ class WeightedEstimate:
     misfit: float  # share s of the fundamental force of a row's test
     misfit_variance: FloatArray  # (n,): what it adds to the stated covariances
     scale: float  # of the residuals; 1 where the data state it
-    y: FloatArray  # (M,): residuals of data, then of priors, of unit variance
+    residuals: FloatArray  # (M,): those of data, then of priors, of unit variance
     jacobian: FloatArray  # (M, Q): their derivatives
+    loss: Loss | None
     # changes of theta that the data determine at all; None where that is every one
     basis: Basis | None = None
+
+    @cached_property
+    def y(self) -> FloatArray:
+        """Residuals that are least squares at the estimate, (M,): scores where there is a loss."""
+        return scores_of(self.residuals, self.problem.n_residuals, self.loss)
 
     @property
     def columns(self) -> FloatArray:
@@ -215,11 +226,11 @@ class WeightedEstimate:
         kept[left_out] = False
         step = np.linalg.lstsq(self.columns[kept], -self.y[kept], rcond=1e-13)[0]
         theta = _moved(self.problem, self.theta, np.asarray(step), self.basis)
-        y, J = self.problem.residuals_and_jacobian(theta, self.scale)
-        if not (np.isfinite(y).all() and np.isfinite(J).all()):
+        r, J = self.problem.residuals_and_jacobian(theta, self.scale, tails=self.loss is None)
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
             return self
         basis = None if self.basis is None else self.basis.at(theta)
-        return replace(self, theta=theta, y=y, jacobian=J, basis=basis)
+        return replace(self, theta=theta, residuals=r, jacobian=J, basis=basis)
 
     def jackknife(self, tests: Sequence[NDArray[np.intp]]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
@@ -246,14 +257,16 @@ def weighted_estimate(
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters])
     stated, basis = problem.widened(np.zeros(problem.data.n)), None
+    loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
     if not determined:
         _, J = stated.residuals_and_jacobian(theta)
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
     last: FloatArray | None = None
     for _ in range(_STEPS):
-        misfit, variance, scale = _weights(stated, theta)
+        misfit, variance, scale = _weights(stated, theta, loss)
         weighted = stated.widened(variance)
-        y, J = weighted.residuals_and_jacobian(theta, scale)
+        r, J = weighted.residuals_and_jacobian(theta, scale, tails=loss is None)
+        y = scores_of(r, m, loss)
         basis = None if basis is None else basis.at(theta)
         columns = J if basis is None else J @ basis.matrix
         step = np.linalg.lstsq(columns, -y, rcond=1e-13)[0]
@@ -265,11 +278,12 @@ def weighted_estimate(
         moved = columns @ step
         further = _further(moved, last)
         step, last = further * step, moved if further == 1.0 else None
-        cost, length = float(y @ y), 1.0
+        mean = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
+        cost, length = _cost(r, m, loss, mean), 1.0
         for _ in range(_HALVINGS):
             trial = _moved(problem, theta, np.asarray(length * step), basis)
-            value = weighted.residuals_and_jacobian(trial, scale)[0]
-            if np.isfinite(value).all() and value @ value < cost:
+            value = weighted.residuals_and_jacobian(trial, scale, tails=loss is None)[0]
+            if np.isfinite(value).all() and _cost(value, m, loss, mean) < cost:
                 break
             length *= 0.5
         else:
@@ -277,7 +291,18 @@ def weighted_estimate(
         theta = trial
     if not np.isfinite(y).all():
         raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
-    return WeightedEstimate(weighted, theta, misfit, variance, scale, y, J, basis)
+    return WeightedEstimate(weighted, theta, misfit, variance, scale, r, J, loss, basis)
+
+
+def scores_of(r: FloatArray, m: int, loss: Loss | None) -> FloatArray:
+    """Return residuals whose sum of squares the estimate makes least, the first m of data."""
+    return r if loss is None else np.concatenate([loss.scores(r[:m]), r[m:]])
+
+
+def _cost(r: FloatArray, m: int, loss: Loss | None, mean: float) -> float:
+    """Return the sum of squares, or of losses over their mean slope, which has those scores."""
+    z = squares_of(r[:m])
+    return float(np.sum(z if loss is None else loss.rho(z) / mean) + r[m:] @ r[m:])
 
 
 def _further(moved: FloatArray, last: FloatArray | None) -> float:
@@ -302,22 +327,24 @@ def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp
     return test, np.where(others, fundamental[test], np.arange(data.n))
 
 
-def _weights(stated: TableProblem, theta: FloatArray) -> tuple[float, FloatArray, float]:
+def _weights(
+    stated: TableProblem, theta: FloatArray, loss: Loss | None
+) -> tuple[float, FloatArray, float]:
     """Return the misfit, what it adds to each row's variance, and the scale of the residuals."""
     nothing = np.zeros(stated.data.n)
     m, dof = stated.n_residuals, stated.n_numbers - len(stated.names)
-    y = stated.residuals_and_jacobian(theta)[0]  # with what the weighted ones will need
+    # with what the weighted ones will need
+    y = stated.residuals_and_jacobian(theta, tails=loss is None)[0]
     if not stated.scale_known:
         scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)
-        return 0.0, nothing, scale
+        return 0.0, nothing, agreed_scale(stated, loss, lambda _: (theta, dof), scale)
     first = stated.data.harmonic == 1
     apart = bool(first.any() and not first.all() and 2 * first.sum() > len(stated.names))
     first = first | (not apart)
     numbers = np.where(stated.data.harmonic == 0, 1, 2)
     free = len(stated.names) - stated.n_priors + float(y[m:] @ y[m:])
-    squares = np.sum(y[:m].reshape(-1, 2) ** 2, axis=1)
     targets = [(first, numbers[first].sum() - free), (~first, numbers[~first].sum())]
-    if targets[0][1] <= 0.0 or all(squares[rows].sum() <= target for rows, target in targets):
+    if targets[0][1] <= 0.0:
         return 0.0, nothing, 1.0
     size = np.abs(stated.data.response)[tests_of(stated.data)[1]]
     both = np.asarray(size[None] * np.array([[1.0], [1.0j]]), dtype=np.complex128)
@@ -326,13 +353,15 @@ def _weights(stated: TableProblem, theta: FloatArray) -> tuple[float, FloatArray
     b, z = np.maximum(b, 0.0), np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)) ** 2
     square = np.zeros(len(first))
     for rows, target in targets:
-        if squares[rows].sum() > target:
-            square[rows] = _root(z[rows].ravel(), b[rows].ravel(), float(target))
+        square[rows] = _square(z[rows], b[rows], float(target), loss)
+    if not square.any():
+        return 0.0, nothing, 1.0
     square[~first] = np.maximum(square[~first], square[first].max())
     variance = square * size**2
     if apart:
-        at_misfit = stated.widened(variance).residuals_and_jacobian(theta)
-        variance = np.where(first, 1.0, _disagreement(*at_misfit, ~first)) * variance
+        r, J = stated.widened(variance).residuals_and_jacobian(theta, tails=loss is None)
+        at_misfit = scores_of(r, m, loss)
+        variance = np.where(first, 1.0, _disagreement(at_misfit, J, ~first)) * variance
     return float(np.sqrt(square.max())), variance, 1.0
 
 
@@ -364,9 +393,24 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
     return float(np.exp(high))
 
 
+def _square(z: FloatArray, b: FloatArray, target: float, loss: Loss | None) -> float:
+    """Return the square x of a misfit with which chi-square of rows (n, 2) meets its target."""
+    x = _root(z, b, target)
+    if loss is None or not len(z):
+        return x
+    for _ in range(_ROOT_STEPS):
+        counts = loss.counts(np.sum(z / (1.0 + b * x), axis=1), target)
+        last, x = x, _root(counts[:, None] * z, b, target)
+        if abs(x - last) <= _SAME * x:
+            break
+    return x
+
+
 def _root(z: FloatArray, b: FloatArray, target: float) -> float:
-    """Return x with sum z/(1 + b x) = target; the sum falls and is convex."""
+    """Return x >= 0 with sum z/(1 + b x) = target, or below; the sum falls and is convex."""
     x = 0.0
+    if z.sum() <= target:
+        return x
     fixed = float(z[b == 0.0].sum())
     if fixed >= target:
         raise np.linalg.LinAlgError("no misfit makes these residuals as small as their covariance")

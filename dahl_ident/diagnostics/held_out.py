@@ -116,7 +116,8 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
             -1, len(r), 2, len(r), 2
         )
         own = np.einsum("rai,rkij,raj->kra", turn, blocks[:, r, :, r], turn)
-        missed = turn @ (D @ there.weighted[index]).reshape(-1, 2, 1)
+        predicted = refit.y[index] - D @ there.weighted[index]
+        missed = turn @ (refit.residuals[index] - predicted).reshape(-1, 2, 1)
         variance = np.maximum(own[0], 0.0)
         spread = np.einsum("kra,kl,lra->ra", own[1:], W, own[1:])
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.estimate import WeightedEstimate
+from dahl_ident.diagnostics.estimate import WeightedEstimate, scores_of
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.problem import TableProblem
@@ -90,22 +90,24 @@ def linearization(problem: TableProblem, theta: FloatArray, runs: RunDeviations)
 
 
 def run_deviations(
-    problem: TableProblem, theta: FloatArray, mean: FloatArray, effects: FloatArray,
-    spread: FloatArray, noise: float,
+    estimate: WeightedEstimate, mean: FloatArray, effects: FloatArray, spread: FloatArray,
+    noise: float,
 ) -> RunDeviations:  # fmt: skip
     """Return how runs deviate, where each run's residuals and deviations together are least."""
+    problem, scale = estimate.problem, estimate.scale
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
     unit, b = spread[scatters], effects.copy()
     for last in (False, False, True):
         runs = RunDeviations(labels, mean + b[:, :-2], b[:, -2], b[:, -1])
         if last:
             break
-        near = linearization(problem, theta, runs)
+        near = linearization(problem, estimate.theta, runs)
+        r = scale * scores_of(near.residuals / scale, len(near.residuals), estimate.loss)
         for i, (_, rows, _) in enumerate(near.parts):
             both, share = np.repeat(rows, 2), near.predicted * rows
             turns = near.change(np.array([-share, -1j * problem.data.harmonic * share]))
             columns = np.hstack([near.J[both], turns[:, both].T])[:, scatters] * unit
-            left = np.concatenate([near.residuals[both], noise * b[i, scatters] / unit])
+            left = np.concatenate([r[both], noise * b[i, scatters] / unit])
             every = np.vstack([columns, noise * np.eye(len(unit))])
             b[i, scatters] -= unit * np.linalg.lstsq(every, left, rcond=None)[0]
     return runs

@@ -401,10 +401,6 @@ _TEXT: Mapping[str, Callable[..., str]] = {
         f"Noise alone is counted; with every source of the budget, u is {listed(compared)}."
     ),
     "evidence": lambda ln: f"ln evidence: {ln:.4f}",
-    "robust_loss": lambda loss: (
-        f"With the loss {loss} the stated uncertainties count noise alone, neither model error nor "
-        "scatter between runs: fit without a loss for all sources."
-    ),
     "records_assumed": lambda parts: f"Assumed: {'; '.join(parts)}.",
     "warning": lambda text: f"Warning on reading: {text}.",
     "more_warnings": lambda count: f"{count} more warnings on reading.",

@@ -66,9 +66,23 @@ class Loss:
         nodes, weights = special.roots_genlaguerre(100, 0.5 * self.parts - 1.0)
         return float(weights @ self.chi(2.0 * nodes) / weights.sum())
 
-    def rescaled(self, z: FloatArray, dof: int) -> float:
+    def scores(self, y: FloatArray) -> FloatArray:
+        """Return residuals (m,) of which least squares makes the estimate of the loss.
+
+        They are psi(y)/mean(psi'), y in units of the noise: their scatter gives its covariance,
+        and what moves y moves them as much on average. Source: Huber, section 7.10.
+        """
+        z = np.sum(y.reshape(-1, self.parts) ** 2, axis=1)
+        return y * np.repeat(self.slope(z) / self.mean_slope(z), self.parts)
+
+    def counts(self, z: FloatArray, dof: float) -> FloatArray:
+        """Return by how much each square `z` counts in the scale: noise alone gives sum z = dof."""
+        weight = self.slope(z * (self.parts * z.size / dof)) ** self.power
+        return weight * (self.parts / self.gaussian_chi)
+
+    def rescaled(self, z: FloatArray, dof: float) -> float:
         """Return s_new^2/s^2, for squares `z` in units of s^2."""
-        return float(np.mean(self.chi(z * (self.parts * z.size / dof))) / self.gaussian_chi)
+        return float(np.sum(self.counts(z, dof) * z) / dof)
 
     @cached_property
     def log_area(self) -> float:

@@ -418,7 +418,7 @@ def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.int
 
 
 def _scale_ratio(
-    problem: Problem, theta: FloatArray, scale: float, loss: Loss | None, dof: int
+    problem: Problem, theta: FloatArray, scale: float, loss: Loss | None, dof: float
 ) -> float:
     """Return the scale that the residuals at `theta` have, over the `scale` that was assumed.
 
@@ -434,7 +434,7 @@ def _scale_ratio(
 def agreed_scale(
     problem: Problem,
     loss: Loss | None,
-    search: Callable[[float], tuple[FloatArray, int]],
+    search: Callable[[float], tuple[FloatArray, float]],
     scale: float,
 ) -> float:
     """Return the noise's scale on which a search and its residuals agree.

@@ -96,7 +96,8 @@ def fit(
         Gains and delay of the channels; left out, they are taken as exact. Of records: priors
         about 1 and 0 alone, whose standard deviations count in the uncertainty.
     loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
-        A robust loss down-weights outliers; the noise's scale is then estimated robustly.
+        A robust loss down-weights outliers; the noise's scale is then estimated robustly. All
+        sources of error count as without one.
     start : mapping of str to float, optional
         Additional start of the search: values of some or all free parameters.
     constraints : callable, optional
@@ -433,10 +434,9 @@ def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
         raise ValidationError(
             "the fit had constraints, which a posterior does not take; pass the data instead"
         )
-    if fit.problem.around_optimum and fit.optimum.loss != "linear":
+    if fit.optimum.loss != "linear":
         raise ValidationError(
-            "the fit of records had a robust loss, which a posterior does not take; pass the "
-            "records instead"
+            "the fit had a robust loss, which a posterior does not take; pass the data instead"
         )
 
 
