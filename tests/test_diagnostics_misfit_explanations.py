@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import TURNS, Turn, neighbourhood
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError
@@ -88,6 +89,12 @@ class TestRows:
         assert found.goodness.cause == ""
         assert "do not cover the misfit" in found.verdict
         assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in found.verdict
+        robust = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl(), loss="huber")
+        assert robust.status is VerdictStatus.APPROXIMATE
+        assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in robust.verdict
+        last = fit(scaled(table(), [29], [1.8]), Dahl(), loss="huber")
+        assert last.status is VerdictStatus.APPROXIMATE
+        assert "it is the first or the last: check" in last.verdict
 
     def test_rows_at_random_seldom_lie_side_by_side(self) -> None:
         optimum, rng = fit(table(), Dahl()).optimum, np.random.default_rng(1)

@@ -214,7 +214,8 @@ class Goodness:
     without_them : str
         How the model describes the data without those rows.
     neighbours : str
-        Where the suspicious rows lie, if they alone depart from the model, but side by side.
+        Where the suspicious rows lie, if they alone depart from the model, but side by side; of a
+        robust fit also if a single one is at an end.
     bound : float or None
         Where it helps with data that are not described: the least misfit of parallel Jenkins
         elements.
@@ -376,7 +377,8 @@ class Goodness:
         if self.suspicious:
             names = tuple(point.name for point in self.suspicious)
             values = {"names": names, "neighbours": self.neighbours}
-            yield Finding(described, note, "suspicious", values)
+            worst = VerdictStatus.APPROXIMATE if self.neighbours else note
+            yield Finding(described, worst, "suspicious", values)
         if self.bound is not None:
             values = {"least": self.bound, "law": self.bound < FAR_LESS * self.rms_misfit}
             yield Finding(described, note, "jenkins_bound", values)
@@ -415,6 +417,8 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     found = _tested(optimum, errors)
     if errors is not None and found.objections:
         found = _within_runs(errors) or found
+    if optimum.loss != "linear":  # which hides where the model fails
+        found = replace(found, neighbours=_side_by_side(optimum, found))
     if optimum.method == "ipopt" or (optimum.success and not found.objections):
         return found  # another solver may have had constraints, which no trial would keep
     sign = sign_convention(optimum, found.rms_misfit, _tested_estimate)
@@ -461,12 +465,21 @@ def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
         return found
     if not rest.rms_misfit * EXPLAINS < found.rms_misfit:
         return found
-    where = neighbourhood(optimum, rows)
+    where = _side_by_side(optimum, found)
     if where:
         return replace(found, neighbours=where)
     (remaining,) = (str(f) for f in rest.findings() if f.code == "noise")
     names = tuple(point.name for point in found.suspicious)
     return replace(found, apart=names, without_them=remaining, rows=optimum.problem.data.n)
+
+
+def _side_by_side(optimum: Optimum, found: Goodness) -> str:
+    """Return where suspicious rows lie close together, or at an end; "" where they do not."""
+    rows = [point.row for point in found.suspicious]
+    if at_an_end(optimum, rows):
+        return "it is the first or the last"
+    where = neighbourhood(optimum, rows)
+    return f"they are neighbours, {where}" if where else ""
 
 
 def _within_runs(errors: ErrorModel) -> Goodness | None:

@@ -131,8 +131,8 @@ def _suspicious(names: Sequence[str], neighbours: str) -> str:
     rows = joined(names, _MOST_ROWS)
     if neighbours:
         return (
-            f"Suspicious rows: {rows}; without them the model describes the data, but they are "
-            f"neighbours, {neighbours}: check them, or the model is wrong there."
+            f"Suspicious rows: {rows}; without them the model describes the data, but "
+            f"{neighbours}: check them, or the model is wrong there."
         )
     return f"Suspicious rows: {rows}; check them (a robust loss down-weights these rows)."
 
