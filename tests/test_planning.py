@@ -336,6 +336,10 @@ class TestPlan:
         assert after.expected["sigma"].before == pytest.approx(
             fit.errors.stderr["sigma"] / fit.errors.values["sigma"], rel=0.05
         )
+        for name, stated in after.expected.items():
+            assert stated.value == pytest.approx(fit.params[name].value, rel=1e-12)
+        middle = np.sqrt(NEAR["sigma"][0] * NEAR["sigma"][1])
+        assert before.expected["sigma"].value == pytest.approx(middle, rel=1e-12)
         # what is missing is f_max: the plan goes where it shows
         assert max(step.level for step in after.steps) > 2.0 * X_C
 

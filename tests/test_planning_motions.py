@@ -154,6 +154,7 @@ class TestPlan:
             assert after.expected[name].before == pytest.approx(
                 float(own.stderr or 0.0) / own.value, rel=0.1
             )
+            assert after.expected[name].value == pytest.approx(own.value, rel=1e-12)
             assert after.expected[name].after < after.expected[name].before
         with pytest.raises(ValidationError, match="ranges are given with a fit of records"):
             di.plan(fit, limits=BENCH, candidates="trapezoid", sample_rate=RATE, target="f_max",
@@ -164,6 +165,7 @@ class TestPlan:
         assert told.before == pytest.approx(
             float(fit.params["f_max"].stderr or 0.0) / fit.params["f_max"].value, rel=0.05
         )
+        assert told.value == pytest.approx(fit.params["f_max"].value, rel=1e-12)
         assert told.after <= 0.003
         assert plan.seconds <= _plan("trapezoid", {}, target=target).seconds
 

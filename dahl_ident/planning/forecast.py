@@ -33,7 +33,7 @@ _PLACES = 24  # of the candidates, over which the response is averaged
 class Expected:
     """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one."""
 
-    value: float  # median over the draws; NaN of the response
+    value: float  # as the fit or posterior states it, or the middle of ranges; NaN of the response
     # relative standard uncertainty from the earlier data, and with the plan's data; inf where
     # nothing is known. Geometric mean over the draws
     before: float
@@ -146,11 +146,11 @@ class Forecast:
         """Return the expected uncertainty of each quantity after a design."""
         after, shares = self.after(design)
         before = self.uncertainty(covariance_of(self.before))
-        values, names = self.knowledge.values, self.knowledge.names
+        values, names = self.knowledge.stated, self.knowledge.names
         return {
             name: Expected(
                 value=np.nan if name == RESPONSE
-                else float(np.median(np.prod(values ** powers_of(name, names), axis=-1))),
+                else float(np.prod(values ** powers_of(name, names))),
                 before=least_factor(name) * typical(before[name]),
                 after=typical(u),
                 low=_shown(float(np.quantile(u, 0.1))),

@@ -43,6 +43,7 @@ class Knowledge:
     model: Model  # what is measured, and through what
     parameters: tuple[Parameter, ...]  # the free ones, P of them
     theta: FloatArray  # (S, P) draws, search coordinates
+    stated: FloatArray  # (P,) values that the source states, of ranges the middle; NaN without any
     # (S, P, P) of the data measured before, at each draw, and of assumed values such as the
     # exponent of ``Dahl()``, which are parameters here as they are in a fit's uncertainty
     information: FloatArray
@@ -144,13 +145,14 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
             "posterior"
         )
     if problem.response is None:
-        fit, values = (source.fit, source.draws(_MANY, seed)) if sampled else (source, None)
-        return _of_records(fit, values, ranges, draws, rng)
+        return _of_records(
+            source, source.draws(_MANY, seed) if sampled else None, ranges, draws, rng
+        )
     if sampled:
         values, P = np.asarray(source.draws(draws, seed)), len(problem.names)
         scale = values[:, P] if values.shape[1] > P else np.ones(draws)
         prior = _leaned_on(problem.parameters, *_moments(problem.parameters, ranges))
-        return _of_data(problem, problem.to_search(values[:, :P]), scale, prior)
+        return _of_data(source, problem.to_search(values[:, :P]), scale, prior)
     return _of_fit(source, ranges, draws, rng)
 
 
@@ -172,9 +174,11 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
     parameters = tuple(p for p in model.parameters if p.free)
     theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
     names, prior = [p.name for p in free], _leaned_on(free, centre, std)
+    middle, _ = _among(parameters, names, centre, prior)
     theta, prior = _among(parameters, names, theta, prior)
     known = np.broadcast_to(_of_assumed(parameters, assumed), (draws, *2 * prior.shape))
-    return Knowledge(model, parameters, theta, known, prior, tuple(assumed))
+    stated = Space(parameters).to_values(middle)
+    return Knowledge(model, parameters, theta, stated, known, prior, tuple(assumed))
 
 
 def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
@@ -192,19 +196,18 @@ def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> K
             )
     prior = _leaned_on(problem.parameters, centre, std)
     if fit.errors is not None:
-        return _of_errors(fit.errors, prior, draws, rng)
+        return _of_errors(fit, prior, draws, rng)
     theta = np.where(finite, theta, centre)
     scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
     covariance = np.linalg.inv(problem.information(theta, scale) + np.diag(1.0 / std**2))
     # a range counts only where the data say nothing; elsewhere the estimate is the centre
     drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
-    return _of_data(problem, _within(drawn, problem.parameters), scale, prior, at=theta)
+    return _of_data(fit, _within(drawn, problem.parameters), scale, prior, at=theta)
 
 
-def _of_errors(
-    errors: ErrorModel, leaned: FloatArray, draws: int, rng: np.random.Generator
-) -> Knowledge:
+def _of_errors(fit: Any, leaned: FloatArray, draws: int, rng: np.random.Generator) -> Knowledge:
     """Return the knowledge from a fit with all its sources of error."""
+    errors: ErrorModel = fit.errors
     fitted = errors.optimum.problem
     model, assumed = _with_assumed(fitted.model)
     kept = [i for i, name in enumerate(errors.names) if name in (*fitted.names, *assumed)]
@@ -217,7 +220,7 @@ def _of_errors(
     known = np.linalg.inv(errors.covariance)[part]
     stated, cycles = _row_noise(errors.problem, 0.0)
     return Knowledge(
-        model, parameters, _within(drawn, parameters),
+        model, parameters, _within(drawn, parameters), _stated(fit, parameters),
         np.broadcast_to(known, (draws, *known.shape)), prior, tuple(assumed),
         fitted.sensors, fitted.data.motion,
         float(np.hypot(stated, errors.rms(NOISE))), cycles, errors.problem, errors.rms(RUNS),
@@ -225,14 +228,21 @@ def _of_errors(
     )  # fmt: skip
 
 
+def _stated(source: Any, parameters: Sequence[Parameter]) -> FloatArray:
+    """Return the values that a fit or a posterior states, (P,); NaN where they are at a limit."""
+    values = np.array([source.params[p.name].value for p in parameters])
+    return np.where(np.isfinite(values), values, np.nan)
+
+
 def _of_data(
-    fitted: TableProblem,
+    source: Any,
     drawn: FloatArray,
     scale: Any,
     leaned: FloatArray,
     at: FloatArray | None = None,
 ) -> Knowledge:
     """Return draws with the information of their data, at each draw or at one place."""
+    fitted: TableProblem = source.problem
     model, assumed = _with_assumed(fitted.model)
     problem = fitted.like(model=model) if assumed else fitted
     theta, prior = _among(problem.parameters, fitted.names, drawn, leaned)
@@ -240,14 +250,14 @@ def _of_data(
     known = problem.information(where, scale) + _of_assumed(problem.parameters, assumed)
     noise, cycles = _row_noise(problem, float(np.median(scale)))
     return Knowledge(
-        model, problem.parameters, theta, np.broadcast_to(known, (len(theta), *known.shape[-2:])),
-        prior, tuple(assumed), problem.sensors, problem.data.motion, noise, cycles, problem,
-        steady=problem.steady,
+        model, problem.parameters, theta, _stated(source, problem.parameters),
+        np.broadcast_to(known, (len(theta), *known.shape[-2:])), prior, tuple(assumed),
+        problem.sensors, problem.data.motion, noise, cycles, problem, steady=problem.steady,
     )  # fmt: skip
 
 
 def _of_records(
-    fit: Any, values: FloatArray | None, ranges: Ranges, draws: int, rng: np.random.Generator
+    source: Any, values: FloatArray | None, ranges: Ranges, draws: int, rng: np.random.Generator
 ) -> Knowledge:
     """Return the knowledge from a fit of records whose force was predicted, or its posterior."""
     if ranges:
@@ -255,6 +265,7 @@ def _of_records(
             "plan: ranges are given with a fit of records, which determines its parameters; leave "
             f"them out, or give the model with {argument('ranges')}"
         )
+    fit = source if values is None else source.fit
     problem: RecordProblem = fit.optimum.problem
     if problem.output != "force":
         raise ValidationError(
@@ -277,7 +288,8 @@ def _of_records(
         theta = every[rng.integers(len(every), size=draws)]
     known = np.broadcast_to(np.linalg.inv(covariance), (draws, P, P))
     return Knowledge(
-        problem.model, parameters, _within(theta, parameters), known, np.zeros(P),
+        problem.model, parameters, _within(theta, parameters), _stated(source, parameters), known,
+        np.zeros(P),
         motion=problem.records[0].motion,
         sample_noise=float(np.std(np.concatenate(fit.residuals))),
     )  # fmt: skip
