@@ -327,6 +327,20 @@ def _normalised(text: str, written: str) -> str:
     return out
 
 
+def percent(share: float, digits: int = 2, *, sign: bool = False) -> str:
+    """Return a share as text, such as ``"9.2 %"``.
+
+    Examples
+    --------
+    >>> percent(0.0917), percent(1.04), percent(float("nan"))
+    ('9.2 %', '100 %', '-')
+    >>> percent(-0.998, sign=True), percent(0.01234, 3)
+    ('-100 %', '1.23 %')
+    """
+    rounded = float(f"{100.0 * share:.{digits}g}")
+    return f"{rounded:{'+' if sign else ''}g} %" if math.isfinite(share) else "-"
+
+
 def _common(text: str) -> tuple[float, Dimension] | None:
     """Read a product or quotient of common units; None for any other text."""
     text = text.strip()

@@ -104,8 +104,13 @@ class TestVerdicts:
     def test_friction_lost_in_the_noise_gives_no_advice_on_slip(self) -> None:
         """Deep slip with a spring: nothing tells it from microslip, so neither is claimed."""
         data = table(model=FRICTION + Spring(SIGMA), beta=(1e3, 1e4), noise=0.01, seed=11)
-        found = identifiability(fit(data, Dahl() + Spring(), throw=False)).parameters
-        assert np.isinf(found["f_max"].interval.upper)
+        result = fit(data, Dahl() + Spring(), throw=False)
+        found, stated = identifiability(result).parameters, result.conf_interval()
+        _, limits, widest = stated["f_max"]
+        assert np.isinf(widest.upper)
+        assert not np.isinf(limits.upper)
+        assert found["f_max"].interval == limits  # 95.45 %, as for every parameter
+        assert "(95.45 %)" in found["f_max"].text
         for name in ("f_max", "sigma"):
             assert found[name].verdict is NOT
             assert "drive" not in found[name].text

@@ -84,7 +84,7 @@ def marks(folder: Path) -> di.FrequencyResponse:
     [
         (radians, "are the phases in radians?"),
         (one_sign, "the phase's sign creates energy: line 5"),
-        (rms_drive, "drive and amplitude do not agree with the response by more than 10%"),
+        (rms_drive, "drive and amplitude do not agree with the response by more than 10 %"),
         (two_days, "the header is repeated in the file: read as 2 runs"),
         (stuck, "does a converter stick?"),
         (marks, "3 samples left out: column 'F' is -9999 in them, a mark of a missing value"),

@@ -154,7 +154,7 @@ class TestTables:
             "gaps",
             "0 rad/s",
             "1 V",
-            "2 N m/V within 0.00%",
+            "2 N m/V within 0 %",
             "run.csv",
             "something assumed",
         )

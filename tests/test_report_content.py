@@ -277,6 +277,11 @@ def test_two_saved_fits_say_what_changed(run: Runner, fit: di.FitResult) -> None
     assert "give no other options" in run("fit", "monday.json", "friday.json", "--mass", "1").err
     as_json = json.loads(run("fit", "monday.json", "friday.json", "--json").out)
     assert {c["parameter"] for c in as_json} == {"f_max", "sigma"}
+    di.fit(measured(50.0, 2, amplitudes=(0.15, 15.0)), di.Dahl()).save("other.json")
+    assert re.search(
+        r"f_max from other to monday: .* N \(-100 %, p < 0",
+        run("fit", "other.json", "monday.json").out,
+    )
 
 
 def test_equal_devices_seldom_change_significantly(tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def _tell_of_sweeps(
     """Say how to fit waveforms that were swept too fast for a table."""
     import numpy as np
 
-    from dahl_ident.diagnostics.formatting import percent
+    from dahl_ident.units import percent
 
     points = _one_row_a_point(data)
     fast = ~points.quality["settled"] & (points.quality["more_periods"] == 0)

@@ -39,7 +39,7 @@ from dahl_ident.data.quantities import converted, jacobian
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, distinct, extent, listed, noted
 from dahl_ident.errors import ValidationError, spelled
-from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, si_unit
+from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, percent, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -348,7 +348,7 @@ class FrequencyResponse(Tabular):
         if self.quality:
             lines.append(("quality", listed(self.quality)))
         if self.drive_factor_uncertainty:
-            lines.append(("drive factor", f"uncertain by {self.drive_factor_uncertainty:.2%}"))
+            lines.append(("drive factor", f"uncertain by {percent(self.drive_factor_uncertainty)}"))
         lines += noted(self.provenance)
         return f"FrequencyResponse: {self.n} points of {name}, {self.motion}", lines
 

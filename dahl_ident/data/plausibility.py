@@ -17,6 +17,7 @@ from scipy.special import stdtrit
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.errors import DataError
+from dahl_ident.units import percent
 
 Doubt = Callable[[NDArray[np.bool_], str], None]
 """What warns of the rows that are marked, with a message, if there are any."""
@@ -62,7 +63,7 @@ def check_drive(data: FrequencyResponse, doubt: Doubt) -> None:
     doubt(
         np.abs(mismatch) > _MISMATCH,
         "drive and amplitude do not agree with the response by more than "
-        f"{_MISMATCH:.0%} (rms against zero to peak?)",
+        f"{percent(_MISMATCH)} (rms against zero to peak?)",
     )
 
 
@@ -125,7 +126,7 @@ def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
         if part.n >= _FEWEST_ROWS and fall > _MISMATCH and 0.0 < angle < _SMALL_PHASE * fall:
             doubt(
                 rows,
-                f"the gain varies by {fall:.0%} at {frequency:g} Hz, yet no phase is above "
+                f"the gain varies by {percent(fall)} at {frequency:g} Hz, yet no phase is above "
                 f"{np.degrees(angle):.2g} degrees; are the phases in radians?",
             )
 

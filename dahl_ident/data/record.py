@@ -26,7 +26,7 @@ from dahl_ident.data.columns import RECORD_COLUMNS, Column, frozen_copy, frozen_
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, extent, noted
 from dahl_ident.errors import DataWarning, ValidationError
-from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion, si_unit
+from dahl_ident.units import MOTION_KINDS, MOTIONS, Motion, percent, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -243,7 +243,7 @@ class Record(Tabular):
             lines.append(("drive", extent(self.drive, self.drive_unit)))
         if self.drive_unit in ("V", "A") and self.drive_factor is not None:
             unit = f"{si_unit('force', self.motion)}/{self.drive_unit}"
-            uncertain = f" within {self.drive_factor_uncertainty:.2%}"
+            uncertain = f" within {percent(self.drive_factor_uncertainty)}"
             lines.append(("drive factor", f"{self.drive_factor:.6g} {unit}{uncertain}"))
         lines += noted(self.provenance)
         return f"Record: {self.n} samples of {kind} in {self.motion}", lines

@@ -24,7 +24,7 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.formatting import listed, percent, table, with_unit
+from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
@@ -43,7 +43,7 @@ from dahl_ident.elements.facts import Alternative
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
-from dahl_ident.units import si_unit
+from dahl_ident.units import percent, si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _WORSE = 2.0  # loss of the log likelihood of fundamentals at two standard errors
@@ -400,7 +400,7 @@ def _change(value: float, before: float) -> str:
         ratio = round(float(np.float64(value) / before - 1.0), _PLACES)
     if abs(ratio) > _RUNAWAY:
         return "far more"
-    return percent(ratio) if ratio < 0.0 or not np.isfinite(ratio) else f"+{percent(abs(ratio))}"
+    return percent(ratio, sign=True)
 
 
 def compare_models(

@@ -66,17 +66,6 @@ def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
     return f"{number} ± {error} {unit}".rstrip()
 
 
-def percent(share: float) -> str:
-    """Return a share with two significant digits, such as ``"9.2 %"``.
-
-    Examples
-    --------
-    >>> percent(0.0917), percent(1.04), percent(float("nan"))
-    ('9.2 %', '100 %', '-')
-    """
-    return f"{float(f'{100.0 * share:.2g}'):g} %" if math.isfinite(share) else "-"
-
-
 def p_text(p: float) -> str:
     """Return ``"p = 0.012"``, or a bound where noise alone cannot be the reason.
 

@@ -27,7 +27,7 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
-from dahl_ident.diagnostics.formatting import p_text, percent, with_unit
+from dahl_ident.diagnostics.formatting import p_text, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
@@ -59,6 +59,7 @@ from dahl_ident.diagnostics.trends import (
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
+from dahl_ident.units import percent
 
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
 _HINT = 0.05  # the same of hints, which doubt nothing

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.error_sources import FEWEST_TESTS, rows_of_tests
 from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
@@ -42,7 +43,6 @@ _MOST_TESTS = 100  # left out one at a time: the share inside is then known to 2
 _PRIOR_SCORES = 10.0  # values that Student's t counts for: a table's own 5 % are known from more
 _NORMAL = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
 _WIDEST = 1e6  # standard deviation of ln gain or phase, beyond which nothing is predicted
-_CONFIDENCE = 0.95  # of the bands: one value in twenty is outside by chance
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Held-out gains and phases of fundamentals against their 95 % bands.
+    """Held-out gains and phases of fundamentals against their 95.45 % bands.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ def cross_validation(left_out: HeldOut | None) -> CrossValidation | None:
     width = np.empty(left_out.std.shape)
     for test in np.unique(left_out.test).tolist():
         rows = left_out.test == test
-        k = band_factor(left_out.without(test), left_out.dof[rows], _CONFIDENCE)
+        k = band_factor(left_out.without(test), left_out.dof[rows], CONFIDENCE)
         width[rows] = k * left_out.std[rows]
     known = np.isfinite(width).all(axis=1)
     if not known.any():

@@ -19,13 +19,13 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
-from dahl_ident.diagnostics.formatting import percent
 from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.fitting.global_start import own_starts
 from dahl_ident.problem import TableProblem
+from dahl_ident.units import percent
 
 _LEVEL = 0.01  # false-alarm rate, of the worst of all points
 _SHARE = 0.1  # of the rows: if more stand out, model or noise is wrong, not single rows

@@ -11,7 +11,7 @@ from scipy import special
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
-from dahl_ident.diagnostics.formatting import percent, with_unit
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.elements import Element, Model, Parameter
@@ -20,7 +20,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.steady_state import response
-from dahl_ident.units import Motion, engineering, shown_unit
+from dahl_ident.units import Motion, engineering, percent, shown_unit
 
 _SEEN = 1e-3  # relative difference that is worth a place
 _DISTORTED = 0.05  # of a force: less changes the fundamental by well below 1 %

@@ -16,7 +16,6 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.checks import contradicted, doubted
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
-from dahl_ident.diagnostics.formatting import percent
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.physics import below_zero, is_single, slight
 from dahl_ident.diagnostics.record_errors import MODEL, NOISE, RecordErrors, record_assumptions
@@ -25,7 +24,7 @@ from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
-from dahl_ident.units import Motion, si_unit
+from dahl_ident.units import Motion, percent, si_unit
 
 _SEGMENTS = 50  # the worst one is 2 % of a record
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined

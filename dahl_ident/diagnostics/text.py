@@ -7,11 +7,14 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from dahl_ident.diagnostics.formatting import listed, p_text, percent, with_unit
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
+from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
+from dahl_ident.units import percent
 
 _MOST_DEPARTURES = 3  # in the verdict; the details list all
 _MOST_ROWS = 3  # the same
+_LEVEL = level_text(CONFIDENCE)
 
 
 def sentence(code: str, values: Mapping[str, Any]) -> str:
@@ -165,14 +168,14 @@ def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, wi
     of = "" if tests == available else f" of {available}"
     return (
         f"Fitted without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and "
-        f"{phases} of {rows} phases of fundamentals are inside their 95 % bands "
+        f"{phases} of {rows} phases of fundamentals are inside their {_LEVEL} bands "
         f"(half width {percent(width)})."
     )
 
 
 def _narrow_bands(width: float, misfit: float) -> str:
     return (
-        f"The 95 % bands (half width {percent(width)}) do not cover the misfit "
+        f"The {_LEVEL} bands (half width {percent(width)}) do not cover the misfit "
         f"({percent(misfit)} rms): no uncertainty can be stated."
     )
 

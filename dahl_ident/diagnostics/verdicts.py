@@ -16,7 +16,7 @@ determined direction is given as a vector.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
@@ -292,8 +292,12 @@ def judged(
     parameters = {}
     for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
         unit = parameter.unit
-        limits = _shown((stated or intervals)[name], verdicts[name])
-        reason = _reason(optimum, name, unit, verdicts[name], limits, lost)
+        _, limits, widest = (stated or intervals)[name]
+        within = _within(limits, unit)
+        if verdicts[name] is Verdict.NOT_IDENTIFIED:
+            reason = f"{within}, not determined, {advice(optimum, name, widest, lost)}"
+        else:
+            reason = f"{within}, {verdicts[name].value}"
         if name in beyond and errors is not None:
             shown = with_unit(errors.values[name], errors.stderr[name], unit)
             reason = f"{shown}, not determined, {beyond[name]}"
@@ -446,13 +450,6 @@ def _is_closed(interval: Interval) -> bool:
     return bool(np.isfinite(interval.upper) and np.isfinite(interval.lower))
 
 
-def _shown(limits: Sequence[Interval], verdict: Verdict) -> Interval:
-    """Return the 95.45 % interval, or the 99.73 % one where only that says why."""
-    _, narrow, wide = limits
-    only = verdict is Verdict.NOT_IDENTIFIED and _is_closed(narrow) and not _is_closed(wide)
-    return wide if only else narrow
-
-
 def _determined(
     optimum: Optimum,
     information: Information,
@@ -540,16 +537,6 @@ def _split(candidate: Candidate) -> FloatArray:
     return np.diag(candidate.direction)[members]
 
 
-def _reason(
-    optimum: Optimum,
-    name: str,
-    unit: str,
-    verdict: Verdict,
-    limits: Interval,
-    lost: frozenset[str],
-) -> str:
+def _within(limits: Interval, unit: str) -> str:
     lower = -np.inf if limits.lower == 0.0 else limits.lower
-    within = f"{interval_text(lower, limits.upper, unit)} ({level_text(limits.level)})"
-    if verdict is not Verdict.NOT_IDENTIFIED:
-        return f"{within}, {verdict.value}"
-    return f"{within}, not determined, {advice(optimum, name, limits, lost)}"
+    return f"{interval_text(lower, limits.upper, unit)} ({level_text(limits.level)})"

@@ -55,6 +55,7 @@ from dahl_ident.extraction.transient import (
     SIGNIFICANT,
     Transient,
 )
+from dahl_ident.units import percent
 
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
 _MOVING_MEAN = 0.02  # of the amplitude, over the segment, where the force is controlled
@@ -408,13 +409,13 @@ class Phasors:
         held = ("displacement", "force")[self.held]  # which the rows take for a sine
         distorted = quality[f"{held}_distortion"]
         if distorted > _DISTORTED:
-            objections.append(f"{held} distorted {100 * distorted:.2g} %")
+            objections.append(f"{held} distorted {percent(distorted)}")
         for name in ("displacement", "force"):
             steps, clipped = quality[f"{name}_steps"], quality[f"{name}_clipped"]
             if steps < _FEW_STEPS:
                 objections.append(f"{name} only {steps:.2g} sensor steps")
             if clipped:
-                objections.append(f"{name} clipped in {100 * clipped:.2g} % of samples")
+                objections.append(f"{name} clipped in {percent(clipped)} of samples")
         return objections
 
 

@@ -32,6 +32,7 @@ from dahl_ident.extraction.transient import (
     Transient,
     estimate_transient,
 )
+from dahl_ident.units import percent
 
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
@@ -130,8 +131,8 @@ def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: Flo
     for name, share in zip((settings.motion_channel, "force"), shares, strict=True):
         if share < settings.min_share:
             raise ExtractionError(
-                f"{name} {_where(segment)}: the fundamental has {100.0 * share:.3g} % of the "
-                f"power; expected at least {100.0 * settings.min_share:.3g} %, one dominant sine: "
+                f"{name} {_where(segment)}: the fundamental has {percent(share, 3)} of the "
+                f"power; expected at least {percent(settings.min_share, 3)}, one dominant sine: "
                 f"check the channel and {argument('frequency')}, or lower "
                 f"{argument('min_share')} if it is noise"
             )
@@ -192,7 +193,7 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
     shares = np.abs(bias + lag) / np.abs(response).max()
     verdicts = []
     for good, more, share in zip(settled, missing.astype(int), shares, strict=True):
-        too_fast = f"swept too fast to settle, biased by about {100.0 * share:.2g} %"
+        too_fast = f"swept too fast to settle, biased by about {percent(share)}"
         unsettled = f"not settled, {more} more periods" if more else too_fast
         verdicts.append("; ".join([unsettled][: not good] + shared) or "good")
     return Point(

@@ -16,6 +16,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import spelled
 from dahl_ident.extraction.cycles import Cycles
+from dahl_ident.units import percent
 
 _PERIOD_CHANGE = 0.03  # limit from one cycle to the next (median by energy) of a sine measurement
 _AMPLITUDE_CHANGE = 0.1  # the same of the amplitude, which resonances change faster
@@ -59,13 +60,13 @@ def not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) 
     in_noise = pairs >= _FEWEST_PAIRS and (covered > 0.0 or noise > _NOISY)
     if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE) and turns > 1:
         return ""
-    power = f"its strongest line has {100.0 * line:.2g} % of the power"
+    power = f"its strongest line has {percent(line)} of the power"
     if pairs < _FEWEST_PAIRS:
         short = ", or a record too short for one" if turns < _FEWEST_PAIRS else ""
         return f"not a sine test{short}: the motion has no two consecutive cycles, and {power}"
     return (
-        f"not a sine test: neighbouring cycles of the motion differ by {100.0 * period:.2g} % in "
-        f"period and {100.0 * amplitude:.2g} % in amplitude (median), and {power}"
+        f"not a sine test: neighbouring cycles of the motion differ by {percent(period)} in "
+        f"period and {percent(amplitude)} in amplitude (median), and {power}"
     )
 
 

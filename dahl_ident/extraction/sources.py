@@ -24,6 +24,7 @@ from dahl_ident.errors import DataError, ValidationError, name_options, names_op
 from dahl_ident.extraction.from_record import record_response
 from dahl_ident.extraction.phasors import Settings
 from dahl_ident.extraction.plateaus import Mode
+from dahl_ident.units import percent
 
 PathLike = str | Path
 Columns = Mapping[str, Any] | str | Path
@@ -298,7 +299,7 @@ def _without_needless_rows(data: FrequencyResponse) -> FrequencyResponse:
         return data.select(rows=~even)
     warnings.warn(
         f"the force is asymmetric in {np.count_nonzero(asymmetry)} of {asymmetry.size} "
-        f"points: even harmonics are up to {100.0 * asymmetry.max():.2g} % of the fundamental; "
+        f"points: even harmonics are up to {percent(asymmetry.max())} of the fundamental; "
         "rows of the mean force (k = 0) and of even harmonics hold it",
         stacklevel=3,
     )

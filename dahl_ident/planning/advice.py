@@ -14,7 +14,7 @@ from dahl_ident.planning.motion_information import evaluate_motions, motions_of
 from dahl_ident.planning.question import BenchLimits, PlanRequest, is_expanded
 from dahl_ident.planning.search import LONGEST, Search
 from dahl_ident.planning.trajectories import PlannedMotion
-from dahl_ident.units import si_unit
+from dahl_ident.units import percent, si_unit
 
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates with which the effect of a wider limit is judged
@@ -50,14 +50,14 @@ def undetermined(
     """Return a sentence for each undetermined quantity, with the limit that prevents it."""
     q = search.question
     lost = {
-        name: f"{name} stays undetermined (standard uncertainty {percent(e.after)})"
+        name: f"{name} stays undetermined (standard uncertainty {_shown(e.after)})"
         for name, e in expected.items()
         if name not in (*q.target, *q.knowledge.assumed) and not e.after < _UNDETERMINED
     }
     for name, u in q.target.items() if q.has_numbers else ():
         if expected[name].after > 1.001 * u:
             what = "" if is_expanded(name) else "a standard uncertainty of "
-            lost[name] = f"{name} reaches {what}{percent(expected[name].after)}, not {percent(u)}"
+            lost[name] = f"{name} reaches {what}{_shown(expected[name].after)}, not {_shown(u)}"
     if q.suspects and search.suspect_ratio(design) > 1.0:
         names = ", ".join(q.suspects)
         lost.setdefault(names, f"{names} is not seen as well as wanted")
@@ -120,12 +120,12 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
         within = [f"{name} within the range that a fit assumes" for name in known.assumed]
     else:
         noise = (
-            f"noise of one cycle: {100.0 * q.noise.relative:.3g} % of the response"
+            f"noise of one cycle: {percent(q.noise.relative, 3)} of the response"
             + (f", {q.noise.force:.3g} {force}" if q.noise.force else "")
             + (f", {q.noise.displacement:.3g} {length}" if q.noise.displacement else ""),
             *["a row of the earlier data counts as one cycle"]
             * (known.row_noise is not None and known.row_cycles == 1.0),
-            f"scatter between runs: {100.0 * q.scatter:.3g} %"
+            f"scatter between runs: {percent(q.scatter, 3)}"
             if q.scatter
             else "no scatter between runs",
         )
@@ -140,6 +140,6 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def percent(u: float, without_bound: str = "without bound") -> str:
+def _shown(u: float) -> str:
     """Return a relative uncertainty in percent."""
-    return f"{100.0 * u:.3g} %" if np.isfinite(u) else without_bound
+    return percent(u, 3) if np.isfinite(u) else "without bound"

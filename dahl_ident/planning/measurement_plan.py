@@ -14,11 +14,10 @@ from dahl_ident.arrays import FloatArray, positive_number
 from dahl_ident.data.storage import place_of, plain_data, write_whole
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning import trajectories
-from dahl_ident.planning.advice import percent
 from dahl_ident.planning.forecast import Expected
 from dahl_ident.planning.search import Search
 from dahl_ident.synthetic.waveform import Waveform, WaveformBuilder
-from dahl_ident.units import Motion, shown_unit
+from dahl_ident.units import Motion, percent, shown_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -302,9 +301,9 @@ class Plan:
             (
                 name,
                 f"{e.value:.4g}" if np.isfinite(e.value) else "",
-                percent(e.before, "-"),
-                percent(e.after, "-"),
-                percent(self.target[name]) if name in self.target else "",
+                percent(e.before, 3),
+                percent(e.after, 3),
+                percent(self.target[name], 3) if name in self.target else "",
             )
             for name, e in self.expected.items()
         ]
@@ -323,7 +322,7 @@ class Plan:
         if not (self.reached and self.seconds < 0.5 * time < np.inf):
             return []
         whole = self.search.expected_after(time)
-        bought = ", ".join(f"{name} {percent(whole[name].after, '-')}" for name in self.target)
+        bought = ", ".join(f"{name} {percent(whole[name].after, 3)}" for name in self.target)
         lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {bought}."]
         if self.runs == 1:
             lines.append(

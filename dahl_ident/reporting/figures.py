@@ -13,14 +13,14 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import curves
 from dahl_ident.diagnostics.bands import ENERGY
 from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
-from dahl_ident.diagnostics.formatting import percent, with_unit
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import shares
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
 from dahl_ident.plots.style import new_axes
 from dahl_ident.reporting.document import Picture, figure_of
 from dahl_ident.results.fit_plots import standardized_residuals
-from dahl_ident.units import engineering, si_unit
+from dahl_ident.units import engineering, percent, si_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,7 +12,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.reporting.document import Picture, figure_of
 from dahl_ident.reporting.provenance import parts, sources
-from dahl_ident.units import si_unit
+from dahl_ident.units import percent, si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
@@ -34,14 +34,14 @@ def settling(data: FrequencyResponse, record: Record) -> Picture:
     response, mean = cycle_by_cycle(record, f, start - dropped / f, end)
     one_cycle = float(error[i]) * np.sqrt(max(response.size - dropped, 1))
     used = response[dropped:]
-    scatter = 100.0 * float(np.std(used) / np.abs(np.mean(used)))
+    scatter = float(np.std(used) / np.abs(np.mean(used)))
     where = f"{f:.4g} Hz, {points.amplitude[i]:.3g} {si_unit('displacement', data.motion)}"
     return Picture(
         "cycles",
         f"Settling of the point at {where}, which has the largest ratio of bias to error: "
         f"{dropped} of {response.size} cycles are left out. The grey band is two standard "
         "deviations of one cycle.",
-        f"The response of the {used.size} cycles used scatters by {scatter:.2g} %; the bias is "
+        f"The response of the {used.size} cycles used scatters by {percent(scatter)}; the bias is "
         f"{excess[i]:.2g} standard errors.",
         lambda: figure_of(
             plots.plot_cycles(response, mean, left_out=dropped, response_std=one_cycle)

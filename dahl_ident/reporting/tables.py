@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
-from dahl_ident.diagnostics.formatting import degrees_text, interval, percent, rounded, with_unit
+from dahl_ident.diagnostics.formatting import degrees_text, interval, rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting.document import Cell, TextTable, number, words
 from dahl_ident.results.changes import is_usable
-from dahl_ident.units import prefix, si_unit
+from dahl_ident.units import percent, prefix, si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.arrays import FloatArray

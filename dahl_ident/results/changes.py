@@ -15,6 +15,7 @@ from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.results.fit_result import FitResult
+from dahl_ident.units import percent
 
 SIGNIFICANT = 0.05  # two-sided probability below which a change is called significant
 
@@ -87,7 +88,7 @@ class Change:
         numbers = f"{value} ± {error} {self.unit}".rstrip()
         return (
             f"{self.parameter} from {self.before} to {self.after}: {numbers} "
-            f"({100.0 * self.relative:+.2g} %, {self.p_text}): {self.significance}"
+            f"({percent(self.relative, sign=True)}, {self.p_text}): {self.significance}"
         )
 
 

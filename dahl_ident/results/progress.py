@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from dahl_ident.bayes.chain import Chain, ChainSettings, Listener
 from dahl_ident.bayes.convergence import LENGTH, Convergence
+from dahl_ident.units import percent
 
 
 def expected_steps(settings: ChainSettings, verdict: Convergence | None) -> int | None:
@@ -58,8 +59,10 @@ def fit_progress() -> Iterator[Callable[[int, float], None]]:
     def update(evaluations: int, share: float) -> None:
         if time.monotonic() - began > _PATIENCE:
             bar.start()
-        left = 100.0 * share**0.5
-        bar.update(task, description=f"fitting: {evaluations} evaluations, {left:.3g} % rms left")
+        bar.update(
+            task,
+            description=f"fitting: {evaluations} evaluations, {percent(share**0.5, 3)} rms left",
+        )
 
     try:
         yield update

@@ -22,8 +22,8 @@ from dahl_ident.diagnostics.bands import (
     response_band,
 )
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
-from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
-from dahl_ident.diagnostics.formatting import percent, table
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, LEVELS, checked_levels, level_text
+from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement
 from dahl_ident.diagnostics.record_checks import (
@@ -52,7 +52,7 @@ from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.fitting.record_search import hold_model
 from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.results.assessment import Assessment
-from dahl_ident.units import shown_unit
+from dahl_ident.units import percent, shown_unit
 
 _LEAST = 1e-100  # of a positive value, or of a share of the response
 _UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
@@ -398,7 +398,7 @@ class HeldOutPart:
     rms_share : float
         Of the prediction errors, over the standard deviation of the part's output.
     inside : float
-        Share of its samples within the 95 % band.
+        Share of its samples within the 95.45 % band.
     """
 
     record: int
@@ -428,12 +428,13 @@ class HoldOut:
 
     @property
     def inside(self) -> float:
-        """Share of all samples within the 95 % bands of their predictions."""
+        """Share of all samples within the 95.45 % bands of their predictions."""
         samples = [part.samples for part in self.parts]
         return float(np.average([part.inside for part in self.parts], weights=samples))
 
     def __str__(self) -> str:
-        rows = [["record", "from (s)", "to (s)", "error (% rms)", "inside 95 % band"]]
+        inside = f"inside {level_text(CONFIDENCE)} band"
+        rows = [["record", "from (s)", "to (s)", "error (% rms)", inside]]
         rows += [
             [
                 str(part.record), f"{part.start:.4g}", f"{part.stop:.4g}",

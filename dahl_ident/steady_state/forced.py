@@ -27,6 +27,7 @@ from dahl_ident.steady_state.exact_response import HARMONICS, exact_motions
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import find_roots
 from dahl_ident.steady_state.shooting import LINEAR, NEUTRAL, STEADY, Steady, obstacle
+from dahl_ident.units import percent
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _DISTORTED = 0.02  # third harmonic over the fundamental: its error is as large as a measurement's
@@ -272,7 +273,7 @@ def _not_a_sine(plant: Model, omega: FloatArray, drive: FloatArray, A: FloatArra
     row = int(np.nanargmax(third))
     return (
         "the motion is not the sine for which the describing function takes it: the third harmonic "
-        f"is about {100.0 * third[row]:.2g} % at {omega[row] / (2.0 * np.pi):g} Hz, drive "
+        f"is about {percent(third[row])} at {omega[row] / (2.0 * np.pi):g} Hz, drive "
         f"{drive[row]:g}, and the fundamental may be off by several times as much; steady='exact' "
         "has no such error"
     )

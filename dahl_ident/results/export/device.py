@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.errors import FitError, ModelError, argument
+from dahl_ident.units import percent
 from dahl_ident.version import __version__
 
 LUMPED = {"mass": "mass", "damper": "damping", "spring": "stiffness"}
@@ -105,7 +106,7 @@ def linear(law: Law, form: str) -> tuple[str, ...]:
     if not worst <= _EXPONENT_MATTERS:
         raise ModelError(
             f"{form} carries Dahl with the exponent 1, and alpha is {1.0 + a:.4g}: the force would "
-            f"differ by {worst:.0%} of f_max; fit with {argument('alpha', 1)} if that describes "
-            "the data"
+            f"differ by {percent(worst)} of f_max; fit with {argument('alpha', 1)} if that "
+            "describes the data"
         )
-    return (f"alpha = {1.0 + a:.5g} is taken as 1: within {worst:.1%} of f_max",)
+    return (f"alpha = {1.0 + a:.5g} is taken as 1: within {percent(worst)} of f_max",)
