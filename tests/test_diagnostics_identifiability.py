@@ -18,6 +18,7 @@ from dahl_ident import (
     fit,
 )
 from dahl_ident.diagnostics import Verdict, identifiability
+from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.results import FitResult
 from tests.friction_tables import F_MAX, FRICTION, SIGMA, X_C, plant_table, relative_noise, table
 
@@ -198,6 +199,17 @@ class TestVerdicts:
         for parameter in found.parameters.values():
             assert "because no number is left to estimate the noise by" in parameter.text
             assert "slip" not in parameter.text
+
+    def test_copies_of_rows_tell_nothing_new(self) -> None:
+        data = table(n=6)
+        row = data.select(rows=np.arange(6) == 3)
+        once, often = fit(data, Dahl()), fit(FrequencyResponse.concatenate([data] * 4), Dahl())
+        assert often.summary().equals(once.summary())
+        assert "18 of 24 rows are copies of others, identical to the digit" in often.verdict
+        one = fit(FrequencyResponse.concatenate([row] * 6), Dahl())
+        assert one.status is VerdictStatus.NOT_DETERMINED
+        assert "2 numbers and 2 parameters leave no degree of freedom" in one.verdict
+        assert set(verdicts(one).values()) == {NOT}
 
     def test_rotation_has_its_units(self) -> None:
         found = identifiability(fit(turned(table(beta=(1e-4, 1e-3))), Dahl(), throw=False))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +59,13 @@ def problem_of(
     if kind_of(data) is TableProblem:
         table = data if isinstance(data, FrequencyResponse) else read_frequency_response(data)
         return TableProblem(
-            table, model, noise=noise, sensors=sensors, free=free, fixed=fixed, steady=steady
+            without_copies(table),
+            model,
+            noise=noise,
+            sensors=sensors,
+            free=free,
+            fixed=fixed,
+            steady=steady,
         )
     return RecordProblem(
         [data] if isinstance(data, Record) else list(data),
@@ -67,6 +74,32 @@ def problem_of(
         excitation=excitation,
         calibration=(sensors or Sensors()).stated_uncertainties(),
     )
+
+
+def without_copies(data: FrequencyResponse) -> FrequencyResponse:
+    """Return a table without rows that repeat another to the digit: they tell nothing new.
+
+    Its provenance says how many there were.
+
+    Examples
+    --------
+    >>> once = without_copies(FrequencyResponse([1, 1, 1], [2 + 1j, 2 + 1j, 2 + 2j], [3, 3, 3]))
+    >>> once.n, once.provenance["warnings"]
+    (2, ['1 of 3 rows is a copy of another, identical to the digit: copies are left out'])
+    """
+    run = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
+    numbers = (data.frequency_hz, data.response.real, data.response.imag, data.harmonic, run)
+    levels = (column for column in (data.amplitude, data.drive) if column is not None)
+    first = np.unique(np.column_stack([*numbers, *levels]), axis=0, return_index=True)[1]
+    copies = data.n - len(first)
+    if not copies:
+        return data
+    known = dict(data.provenance or {})
+    are = "is a copy of another" if copies == 1 else "are copies of others"
+    text = f"{copies} of {data.n} rows {are}, identical to the digit: copies are left out"
+    known["warnings"] = [*known.get("warnings", ()), text]
+    kept = np.isin(np.arange(data.n), first)
+    return replace(data.select(rows=kept), provenance=known)
 
 
 class ProblemBatch(TableProblem):
