@@ -22,7 +22,7 @@ from dahl_ident.problem import TableProblem
 from dahl_ident.results import Posterior
 from tests.bayes_cases import friction_table
 
-STEPS = 1200
+STEPS = 800
 h5py = import_module("h5py")
 ROOT = Path(__file__).parents[1]
 LONG_RUN = f"""

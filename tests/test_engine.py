@@ -302,11 +302,10 @@ def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
 
     size = np.max(np.abs(motion.output))
     assert np.max(np.abs(oracle(values, first) - motion.output)) < 1e-8 * size
-    for i in (3, 4):  # a limit and the mass; settled motions have them all
-        step = np.zeros(7)
-        step[i] = 1e-5 * values[i]
-        difference = (oracle(values + step, first) - oracle(values - step, first)) / 2e-5
-        assert np.max(np.abs(motion.by_parameter[:, i] * values[i] - difference)) < 2e-6 * size
+    step = np.zeros(7)  # of a limit; settled motions have them all
+    step[3] = 1e-5 * values[3]
+    difference = (oracle(values + step, first) - oracle(values - step, first)) / 2e-5
+    assert np.max(np.abs(motion.by_parameter[:, 3] * values[3] - difference)) < 2e-6 * size
     step = np.array([0.0, 1e-6, 0.0, 0.0])
     difference = (oracle(values, first + step) - oracle(values, first - step)) / 2e-6
     assert np.max(np.abs(motion.by_first[:, 1] - difference)) < 1e-6
@@ -314,7 +313,7 @@ def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
 
 def test_friction_faster_than_the_sampling() -> None:
     """f_max 0.5, m 1, c 1, k 400 at 100 Hz: sigma 30,000 slips within a thousandth of a sample."""
-    n, interval = 256, 0.01
+    n, interval = 128, 0.01
     lines = 2.0 * np.pi * np.arange(1, 20) / (n * interval)
     phase = seeded(60).uniform(0.0, 2.0 * np.pi, lines.size)
 

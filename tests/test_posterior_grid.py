@@ -130,7 +130,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
     assert abs(mass.sum() - 1.0) < grid.error
 
 
-@pytest.mark.parametrize("rows", [2, 5, 30])
+@pytest.mark.parametrize("rows", [2, 12])
 def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows: int) -> None:
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
     data = friction_table(rows, noise=0.1)
@@ -253,6 +253,7 @@ def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> Non
         free=["alpha"],
         method="grid",
         uncertainty="noise",
+        tolerance=1e-2,
     )
     assert wider.log_evidence < plain.log_evidence
 
