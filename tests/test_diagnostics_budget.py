@@ -139,6 +139,17 @@ class TestBudget:
             assert found.k > 3.0
         assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.4)
 
+    def test_passes_over_the_levels_are_days_where_they_differ(self) -> None:
+        """Whoever does not state days gets their uncertainty; most repeats stay repeats."""
+        passes = "each of 3 passes over the levels a run of its own"
+        data = three_days(0.03, 8)
+        stated, found = fit(data, Dahl()), fit(replace(data, run=None), Dahl())
+        assert passes in found.verdict
+        for name in ("f_max", "sigma"):
+            assert found.params[name].stderr == pytest.approx(stated.params[name].stderr, rel=1e-6)
+        alike = (replace(three_days(0.0, seed), run=None) for seed in range(12))
+        assert sum(passes in fit(one, Dahl()).verdict for one in alike) <= 6  # two, three by chance
+
     @pytest.mark.parametrize("factors", [(1.0, 1.05), (0.95, 1.0, 1.08)])
     @pytest.mark.parametrize("scatters", ["f_max", "sigma", "gain"])
     def test_runs_that_differ_by_far_more_than_the_noise(

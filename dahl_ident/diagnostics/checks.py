@@ -398,12 +398,14 @@ def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding
     if "delay" in sensors and "force_gain" not in sensors:
         stated["force_gain"] = 1.0
     cost = optimum.constraint_cost
+    runs = len((data if errors is None else errors.problem.data).runs or ())
     values = {
         "ranges": tuple(ranges),
         "stated": stated,
         "constraints": () if cost is None else tuple(cost.texts),
         "exact": tuple(taken_as_exact(optimum)),
-        "single_run": len(data.runs or ()) < 2,
+        "single_run": runs < 2,
+        "passes": runs * (data.run is None),
         "no_drift": in_order_of_level(data),
         "noise_alone": errors is None,
     }

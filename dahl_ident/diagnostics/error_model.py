@@ -43,6 +43,7 @@ from dahl_ident.diagnostics.error_sources import (
     Source,
     error_sources,
     own_errors,
+    passes,
     rows_of,
     rows_of_tests,
 )
@@ -349,22 +350,22 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
     determined = optimum.success and bool(np.isfinite(optimum.covariance).all())
     if not (determined or of_combinations):
         return None
-    problem, assumed = with_assumed(optimum.problem)
+    problem = optimum.problem
     if problem.n_numbers - len(optimum.names) <= 0:
         return None
     try:
-        estimate = weighted_estimate(optimum, problem, determined=determined)
-        return _with_sources(optimum, problem, estimate, assumed)
+        errors = _with_sources(optimum, problem, determined=determined)
+        if problem.data.run is None and any(source.name == RUNS for source in errors.sources):
+            runs = problem.like(data=replace(problem.data, run=passes(problem.data)))
+            errors = _with_sources(optimum, runs, determined=determined)
     except np.linalg.LinAlgError:
         return None
+    return errors
 
 
-def _with_sources(
-    optimum: Optimum,
-    problem: TableProblem,
-    estimate: WeightedEstimate,
-    assumed: Mapping[str, Assumption],
-) -> ErrorModel:
+def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) -> ErrorModel:
+    problem, assumed = with_assumed(problem)
+    estimate = weighted_estimate(optimum, problem, determined=determined)
     sources: tuple[Source, ...] = ()
     if _distinguishes_noise(problem, assumed):
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))

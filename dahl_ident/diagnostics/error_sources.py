@@ -116,6 +116,30 @@ def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
     return _LEVELS_OF[data]
 
 
+def passes(data: FrequencyResponse) -> NDArray[np.str_] | None:
+    """Return the pass over the levels that each row belongs to, (n,); None where there is one.
+
+    Levels that are repeated one block after the other may have been measured on several days.
+
+    Examples
+    --------
+    >>> A, R = np.tile([1e-3, 2e-3, 4e-3], 2), np.ones(6)
+    >>> passes(FrequencyResponse(np.ones(6), R, A)).tolist()
+    ['pass 1', 'pass 1', 'pass 1', 'pass 2', 'pass 2', 'pass 2']
+    >>> passes(FrequencyResponse(np.ones(6), R, np.sort(A))) is None
+    True
+    """
+    if data.run is not None:
+        return None
+    place = np.column_stack([repeated_levels(data), data.harmonic])
+    number = np.empty(data.n, dtype=np.intp)
+    for rows in rows_of(np.unique(place, axis=0, return_inverse=True)[1].ravel()):
+        number[rows] = np.arange(len(rows))
+    if number[-1] == 0 or (np.diff(number) < 0).any() or np.bincount(number).min() < _FEWEST:
+        return None
+    return np.array([f"pass {k + 1}" for k in number.tolist()])
+
+
 def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
     """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
     for labels in (data.run, data.level):
@@ -328,18 +352,24 @@ def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
 
 
 def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
-    """Yield what differs from run to run: gain, phase, and parameters of friction."""
+    """Yield what differs from run to run: gain, phase, and parameters of friction.
+
+    Passes over the levels that differ by more than noise are runs that nobody stated.
+    """
     problem = estimate.problem
-    if problem.data.run is None or len(problem.data.runs or ()) < _FEWEST:
+    stated = problem.data.run
+    labels, chance = (passes(problem.data), _OFTEN) if stated is None else (stated, 1.0)
+    runs = np.empty((0, problem.data.n)) if labels is None else _indicators(labels)
+    if len(runs) < _FEWEST:
         return
-    runs = _indicators(np.asarray(problem.data.run))
     share = runs * estimate.predicted
     turned = 1j * problem.data.harmonic * share
-    yield Source(RUNS, estimate.changed(share), 0.5, own="gain")
-    yield Source(RUNS, estimate.changed(turned), 0.5, own="phase")
+    yield Source(RUNS, estimate.changed(share), 0.5, own="gain", chance=chance)
+    yield Source(RUNS, estimate.changed(turned), 0.5, own="phase", chance=chance)
     each = np.pad(np.repeat(runs, 2, axis=1).T, ((0, problem.n_priors), (0, 0)))
     for i in _scattering_parameters(problem):
-        yield Source(RUNS, -each * estimate.jacobian[:, i : i + 1], 0.0, own=problem.names[i])
+        column = -each * estimate.jacobian[:, i : i + 1]
+        yield Source(RUNS, column, 0.0, own=problem.names[i], chance=chance)
 
 
 def _levels(estimate: WeightedEstimate) -> Iterator[Source]:

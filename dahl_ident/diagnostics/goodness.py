@@ -417,7 +417,9 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     """
     found = _tested(optimum, errors)
     if errors is not None and found.objections:
-        found = _within_runs(errors) or found
+        within, stated = _within_runs(errors), optimum.problem.data.run is not None
+        if within is not None:  # labels may say what passes over the levels are
+            found = within if stated else replace(within, groups=found.groups)
     if optimum.loss != "linear":  # which hides where the model fails
         found = replace(found, neighbours=_side_by_side(optimum, found))
     if optimum.method == "ipopt" or (optimum.success and not found.objections):

@@ -295,6 +295,7 @@ def _assumed(
     constraints: Sequence[str],
     exact: Sequence[str],
     single_run: bool,
+    passes: int,
     no_drift: bool,
     noise_alone: bool,
 ) -> str:
@@ -306,6 +307,7 @@ def _assumed(
     parts += [f"{name} = {value:g} exactly" for name, value in stated.items()]
     parts += [f"the constraint {listed(constraints)}"] if constraints else []
     parts += [f"{listed(exact)} exact"] if exact else []
+    parts += [f"each of {passes} passes over the levels a run of its own"] if passes else []
     drift = " without drift" if no_drift else ""
     parts += [f"a single run{drift}"] if single_run else [f"runs{drift}"] * no_drift
     if noise_alone:
