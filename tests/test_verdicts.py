@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from dahl_ident import (
     compare_models,
     fit,
     load_dataset,
+    report,
 )
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics import Verdict
@@ -153,15 +156,23 @@ class TestWords:
         assert len(known.open) < len(known.parameters)
         assert all("anything" not in parameter.reason for parameter in known.open)
 
-    def test_one_chi_square(self) -> None:
+    def test_one_chi_square(self, tmp_path: Path) -> None:
         data = table(n=12)
         C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
         rough = FrequencyResponse(
             data.frequency_hz, data.response, data.amplitude, covariance=C, dof=np.full(12, 4.0)
         )
-        report = fit(rough, Dahl()).fit_report()
-        assert report.count("chi-square ") == 1 + report.count("and chi-square")
-        assert "sum of squares (after Student's t)" in report
+        found = fit(rough, Dahl())
+        text = found.fit_report()
+        assert text.count("chi-square ") == 1 + text.count("and chi-square")
+        assert f"chi-square {found.chisqr:.4g} with {found.nfree} degrees of freedom" in text
+        assert found.redchi == pytest.approx(found.chisqr / found.nfree)
+        assert "sum of squares" not in text
+        for place in ("r.md", "r.json"):
+            report(found, tmp_path / place)
+        assert "sum of squares" not in (tmp_path / "r.md").read_text("utf-8")
+        told = json.loads((tmp_path / "r.json").read_text("utf-8"))["fits"][0]
+        assert told["redchi"] == pytest.approx(found.redchi)
 
 
 class TestComparison:

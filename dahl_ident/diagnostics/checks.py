@@ -170,9 +170,10 @@ def _bands(fit: Judged) -> Iterator[Finding]:
         return
     enough = check.count >= _ENOUGH_HELD_OUT
     if enough and fit.errors is not None:
-        misfit = _misfit_within_runs(fit.errors)
-        if check.width < misfit:  # misfits inside a band have an rms below its half width
-            values = {"width": check.width, "misfit": misfit}
+        misfit = min(_misfit_within_runs(fit.errors), goodness.rms_misfit)
+        narrow = check.width < misfit  # misfits inside a band have an rms below its half width
+        if narrow:
+            values = {"width": check.width, "misfit": goodness.rms_misfit}
             yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
             return
     outside = enough and check.inside < _FEWEST_INSIDE * check.count
@@ -233,9 +234,9 @@ def _slight(fit: Judged) -> Iterator[Finding]:
     if not (fit.goodness.objections and _is_determined(fit)):
         return
     values, stderr = _estimates(fit)
-    misfit, errors = fit.goodness.rms_misfit, fit.errors
-    if errors is not None:  # what an exponent explains is not missed
-        misfit = rms_misfit_of(errors.problem, errors.within_runs)
+    misfit = within = fit.goodness.rms_misfit
+    if fit.errors is not None:  # what runs differ by is not missed
+        within = min(misfit, rms_misfit_of(fit.errors.problem, fit.errors.within_runs))
     view = fit.optimum.problem.stiffness_data
     rows = view.harmonic == 1
     for element in fit.optimum.problem.model.elements:
@@ -245,7 +246,8 @@ def _slight(fit: Judged) -> Iterator[Finding]:
             part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
             share = float(np.sqrt(np.mean(np.abs(part) ** 2)))
             error = float(stderr.get(parameter.name, 0.0))
-            yield from slight(parameter, value, error, share, misfit)
+            if share < within:
+                yield from slight(parameter, value, error, share, misfit)
 
 
 def _constraints(fit: Judged) -> Iterator[Finding]:

@@ -312,13 +312,18 @@ def _of_columns(caption: str, columns: Sequence[tuple[str, Sequence[Cell]]]) -> 
 
 def goodness(fit: FitResult) -> TextTable:
     """Return the numbers that say how well the model describes the data."""
-    scale = "known" if fit.scale_known else f"{fit.scale:.4g}, estimated"
+    scale, sums = "known", []
+    if not fit.scale_known:  # else chi-square stands among the tests
+        scale = f"{fit.scale:.4g}, estimated"
+        sums = [
+            (Cell("sum of squares"), number(fit.chisqr)),
+            (Cell("sum of squares over degrees of freedom"), number(fit.redchi)),
+        ]
     rows = [
         words("data (real numbers)", f"{fit.ndata}"),
         words("degrees of freedom", f"{fit.nfree}"),
         words("rms misfit", percent(fit.goodness.rms_misfit)),
-        (Cell("sum of squares"), number(fit.chisqr)),
-        (Cell("sum of squares over degrees of freedom"), number(fit.redchi)),
+        *sums,
         words("noise scale", scale),
         (Cell("AIC"), number(fit.aic, 6)),
         (Cell("BIC"), number(fit.bic, 6)),

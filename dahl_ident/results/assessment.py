@@ -76,10 +76,16 @@ class Assessment(ABC):
         }
 
     @property
+    def chi_square(self) -> tuple[float, int]:
+        """Sum of squared residuals, and its degrees of freedom."""
+        residuals = self.estimate.residuals
+        return float(residuals @ residuals), self.optimum.dof
+
+    @property
     def redchi(self) -> float:
         """Sum of squared residuals over degrees of freedom, NaN where there are none."""
-        residuals, dof = self.estimate.residuals, self.optimum.dof
-        return float(residuals @ residuals) / dof if dof > 0 else math.nan
+        value, dof = self.chi_square
+        return value / dof if dof > 0 else math.nan
 
     @property
     @abstractmethod

@@ -116,16 +116,13 @@ def _correlations(fit: FitResult) -> list[str]:
     return [f"{a}, {b}: {c:+.3f}" for a, b, c in pairs]
 
 
-def _counted(fit: FitResult) -> str:
-    """Return how residuals enter the sum, where that is not by their squares alone."""
-    if fit.optimum.loss != "linear":
-        return " (robust)"
-    return "" if fit.problem.gaussian else " (after Student's t)"
-
-
 def _solver(fit: FitResult) -> list[str]:
-    return [
+    lines = [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
         f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",
-        f"sum of squares{_counted(fit)} {fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}",
     ]
+    if fit.scale_known:  # chi-square stands among the tests
+        return lines
+    robust = "" if fit.optimum.loss == "linear" else " (robust)"
+    sums = f"{fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}"
+    return [*lines, f"sum of squares{robust} {sums}"]

@@ -201,12 +201,12 @@ class FitResult(Result):
 
     @property
     def chisqr(self) -> float:
-        """Sum of squared residuals."""
-        return float(self.residual @ self.residual)
+        """Sum of squared residuals; chi-square of `goodness` where the noise is known."""
+        return self.assessment.chi_square[0]
 
     @property
     def redchi(self) -> float:
-        """`chisqr` over `nfree`; the squared scale where that was estimated."""
+        """`chisqr` over its degrees of freedom; the squared scale where that was estimated."""
         return self.assessment.redchi
 
     @property

@@ -172,6 +172,12 @@ class TableAssessment(Assessment):
         """Whether the residuals are noise, and the estimates physically possible."""
         return goodness(self.optimum, self.errors_of_combinations)
 
+    @property
+    def chi_square(self) -> tuple[float, int]:
+        """Chi-square of the goodness of fit where it applies, else the sum of squares."""
+        known = self.goodness.chi_square
+        return super().chi_square if known is None else (known.value, known.dof)
+
     @cached_property
     def cross_validation(self) -> CrossValidation | None:
         """Held-out tests against their bands; None without tests to hold out."""
