@@ -337,7 +337,7 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
         )
     if command == "export":
         run("fit", "-", "--save", "fit.json", stdin=run("datasets", "noisy", "-o", "-").out)
-    run.line(found[1].strip())
+    run.line(found[1].strip(), *(("--alpha", "1") if command == "sample" else ()))
 
 
 @pytest.mark.versions
@@ -396,7 +396,7 @@ def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(
 
 def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
     table = run("datasets", "noisy", "-o", "-").out
-    assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0
+    assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=table).status == 0
     assert run("report", "fit.json", "--posterior", "-o", "r.json").status == 0
     told = json.loads(Path("r.json").read_text(encoding="utf-8"))
     assert told["posteriors"][0]["converged"] is True
@@ -406,10 +406,10 @@ def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
 
 def test_a_chain_goes_on_from_its_file(run: Runner) -> None:
     Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
-    options = ("sample", "noisy.csv", "--json", "--resume", "chain.h5", "--steps")
-    first = json.loads(run(*options, "30").out)
-    second = json.loads(run(*options, "60").out)
-    whole = json.loads(run("sample", "noisy.csv", "--json", "--steps", "60").out)
+    options = ("sample", "noisy.csv", "--alpha", "1", "--json")
+    first = json.loads(run(*options, "--resume", "chain.h5", "--steps", "30").out)
+    second = json.loads(run(*options, "--resume", "chain.h5", "--steps", "60").out)
+    whole = json.loads(run(*options, "--steps", "60").out)
     assert (first["steps"], second["steps"]) == (30, 60)
     assert second["summary"]["sigma"]["mean"] == whole["summary"]["sigma"]["mean"]
 
@@ -448,7 +448,7 @@ def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
     di.load_dataset("noisy").save(table)
     ours, theirs = pty.openpty()
     done = subprocess.run(
-        [str(PROGRAM), "sample", str(table), "--steps", "30", "--json"],
+        [str(PROGRAM), "sample", str(table), "--alpha", "1", "--steps", "30", "--json"],
         stdout=subprocess.PIPE, stderr=theirs, env={**os.environ, "TERM": "xterm-256color"},
     )  # fmt: skip
     os.close(theirs)

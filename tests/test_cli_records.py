@@ -32,7 +32,7 @@ unit = "kN"
 @pytest.fixture
 def odd_columns(tmp_path: Path) -> Path:
     """Return a file that only a column map explains: two motions, units of its own."""
-    record = recorded(DAHL, "random", 600, 1e-3)
+    record = recorded(DAHL, "random", 300, 1e-3)
     x, force = np.asarray(record.displacement), record.force_samples
     rows = np.column_stack([record.time, 1e3 * x, 1e-3 * force, np.gradient(x, record.time)])
     place = tmp_path / "run.csv"

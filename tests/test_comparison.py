@@ -165,7 +165,7 @@ def test_two_jenkins_elements_are_maxwell_slip() -> None:
     assert comparison.best.name in ("Maxwell slip", "as fitted")
 
 
-T = np.arange(1500) / 100.0
+T = np.arange(1000) / 100.0
 X = 1e-3 * np.sin(3.0 * T) + 7e-3 * np.sin(0.9 * T) * np.sin(0.31 * T)
 
 

@@ -30,7 +30,7 @@ def test_python_control_gets_the_exact_describing_function(friction: Element) ->
 def test_python_controls_own_quadrature_has_the_same_sign_and_value(friction: Element) -> None:
     A = 0.03  # beta = 9: the memory of the first cycle is gone after one more
     numerical = control.describing_function(
-        FrictionNonlinearity(friction), [A], num_points=4000, try_method=False
+        FrictionNonlinearity(friction), [A], num_points=2000, try_method=False
     )
     assert numerical[0] == pytest.approx(friction.dynamic_stiffness(A), rel=1e-5)
     assert numerical[0].imag > 0.0

@@ -49,7 +49,9 @@ def test_a_posterior_counts_noise_alone_or_the_stated_calibration() -> None:
     gain = di.Sensors(force_gain=norm(1.0, 0.05))
     fit = di.fit(record, model, sensors=gain)
     both = {
-        kind: di.posterior(record, model, sensors=gain, method="grid", uncertainty=kind)
+        kind: di.posterior(
+            record, model, sensors=gain, method="grid", uncertainty=kind, tolerance=0.03
+        )
         for kind in ("combined", "noise")
     }
     u = {kind: float(one.params["f_max"].stderr or 0.0) for kind, one in both.items()}

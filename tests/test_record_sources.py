@@ -200,7 +200,7 @@ def test_the_posterior_of_an_approximate_fit_is_approximate() -> None:
     force = level * clean.force_samples + noise
     fit = di.fit(di.Record(clean.time, displacement=clean.displacement, force=force), di.Dahl())
     assert fit.status.value == "approximate"
-    found = di.posterior(fit, seed=1, steps=400, walkers=64)
+    found = di.posterior(fit, seed=1, steps=400, walkers=32)
     assert found.converged
     assert found.status.value == "approximate"
     assert "The misfit exceeds the noise." in found.verdict

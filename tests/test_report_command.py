@@ -111,7 +111,7 @@ def test_of_a_posterior(run: Runner) -> None:
     table(di.Dahl(0.1, 30.0)).save("t.csv")
     data = di.read_frequency_response("t.csv")
     priors: dict[str, Any] = {"f_max": stats.lognorm(s=0.5, scale=0.1), "sigma": (1.0, 100.0)}
-    posterior = di.posterior(data, di.Dahl(), priors=priors, seed=4, steps=80)
+    posterior = di.posterior(data, di.Dahl(alpha=1.0), priors=priors, seed=4, steps=80)
     command = command_of(posterior)
     assert command is not None
     told = json.loads(run.line(command, "--json").out)

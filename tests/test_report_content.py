@@ -300,7 +300,7 @@ def test_json_follows_the_published_schema(
     fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
 ) -> None:
     jsonschema = pytest.importorskip("jsonschema")
-    chain = di.posterior(fit.data, di.Dahl(), seed=1, steps=60)
+    chain = di.posterior(fit.data, di.Dahl(alpha=1.0), seed=1, steps=60)
     cases: tuple[list[Any], ...] = ([fit], [microslip], [fit, chain], [chain], [fit, microslip])
     for i, results in enumerate(cases):
         facts = json.loads(report(results, tmp_path / f"{i}.json").read_text("utf-8"))

@@ -152,10 +152,11 @@ class Result(ABC):
     --------
     >>> import dahl_ident as di
     >>> data = di.load_dataset("noisy")
-    >>> for result in (di.fit(data, di.Dahl()), di.posterior(data, di.Dahl(), method="grid")):
+    >>> law = di.Dahl(alpha=1.0)
+    >>> for result in (di.fit(data, law), di.posterior(data, law, method="grid")):
     ...     print(result.status, result.params["f_max"])
-    trusted f_max = 0.10002 ± 0.00049 N
-    trusted f_max = 0.10002 ± 0.00039 N
+    trusted f_max = 0.09982 ± 0.00031 N
+    trusted f_max = 0.09982 ± 0.00028 N
     """
 
     _called: ClassVar[str] = "a result"
