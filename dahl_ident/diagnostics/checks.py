@@ -99,9 +99,9 @@ def judgement(fit: Judged) -> Judgement:
 
 def _parameters(fit: Judged) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
-    optimum, known = fit.optimum, fit.identifiability
     if fit.goodness.sign:
         return  # what the numbers leave undetermined says nothing of the mechanism
+    optimum, known = fit.optimum, fit.identifiability
     can_tell = optimum.scale_known or optimum.dof > 0
     if can_tell or known.complete:
         yield known.finding
@@ -128,8 +128,8 @@ def _parameters(fit: Judged) -> Iterator[Finding]:
 
 
 def _is_determined(fit: Judged) -> bool:
-    optimum = fit.optimum
-    determined = optimum.success and optimum.dof > 0 and fit.goodness.judged
+    optimum, goodness = fit.optimum, fit.goodness
+    determined = optimum.success and optimum.dof > 0 and goodness.judged and not goodness.sign
     return determined and fit.identifiability.complete
 
 
@@ -145,7 +145,7 @@ def _residuals(fit: Judged) -> Iterator[Finding]:
     )
     large = goodness.rms_misfit > _TOO_LARGE
     severity = _NOT_DESCRIBED if lost or large else _APPROXIMATE
-    yield from goodness.findings(severity, counted=_is_determined(fit) and severity is _APPROXIMATE)
+    yield from goodness.findings(severity, counted=severity is _APPROXIMATE and _is_determined(fit))
     if large and not goodness.objections:
         yield Finding(_DESCRIBED, severity, "large_misfit", {"rms": goodness.rms_misfit})
 
