@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 import dahl_ident as di
-from tests.test_record_fit import DAHL, recorded
+from tests.test_record_fit import DAHL, driven, recorded
 
 
 def slow_noise(seed: int = 0) -> di.Record:
@@ -124,3 +124,17 @@ def test_data_that_the_model_misses_are_said() -> None:
     assert found.status.value != "trusted"
     assert any(finding.code == "records_misfit" for finding in found.findings)
     assert "Counted: noise" in str(found)
+
+
+def test_importance_points_of_a_plant_take_few_motions() -> None:
+    """A record determines its parameters to first order nearly: the posterior is Student's t."""
+    model = di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring(50.0)
+    fit = di.fit(driven(1, 0.01, 400), model)
+    grid = di.posterior(fit, method="grid")
+    assert grid.converged
+    assert grid.evaluations < 1000
+    for name in grid.names:
+        parameter, low, high = fit.params[name], *grid.quantile(name, np.array([0.16, 0.84]))
+        half = t(fit.errors.dof).ppf(0.84) * float(parameter.stderr or 0.0)
+        assert 0.5 * float(high - low) == pytest.approx(half, rel=0.03)
+        assert 0.5 * float(high + low) == pytest.approx(parameter.value, abs=0.2 * half)

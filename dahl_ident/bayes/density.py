@@ -18,7 +18,7 @@ For outliers a row may count as Student's t in two dimensions with nu = 4 instea
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -39,6 +39,7 @@ LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
 TAIL_DOF = 4.0  # of Student's t: heavy tails for outliers, yet a finite variance
 _FARTHEST = 300.0  # of ln s
+Sums = Callable[[FloatArray], FloatArray]
 _COLUMNS = (
     "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
     "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance", "harmonic",
@@ -58,9 +59,37 @@ class LogDensity(ABC):
     normalised: bool = True
     """Whether the density is that of the data, and not only up to a factor."""
 
-    def marginal(self, theta: FloatArray) -> FloatArray:
-        """Return the log-density of theta, (S, P), an unknown scale integrated out."""
-        return self(theta)
+    def log_prior(self, theta: FloatArray) -> FloatArray:
+        """Return the log-prior of theta, (S, P); -inf outside its support."""
+        return self.prior.log_density(theta)
+
+    @abstractmethod
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        """Return the residuals of which the squares are added, (S, P) -> (S, K)."""
+
+    @property
+    def weights(self) -> FloatArray:
+        """What their squares count, (K, M) or (1, 1), for each of M sizes of shared errors."""
+        return np.ones((1, 1))
+
+    def sums(self, theta: FloatArray) -> FloatArray:
+        """Return sums of squares at theta, (S, P): (S, M)."""
+        return self.added(self.residuals(theta))
+
+    def added(self, residuals: FloatArray) -> FloatArray:
+        """Return sums of squares of residuals, (S, K): (S, M); infinite where there are none."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            squares = residuals**2
+            single = self.weights.shape == (1, 1)
+            sums = squares.sum(axis=1, keepdims=True) if single else squares @ self.weights
+        return np.where(np.isnan(sums), np.inf, sums)
+
+    @abstractmethod
+    def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
+        """Return the log-density of theta, (S, P), an unknown scale integrated out.
+
+        Another function may take the place of :meth:`sums`.
+        """
 
     @abstractmethod
     def __call__(self, x: FloatArray) -> FloatArray:
@@ -202,31 +231,26 @@ class Density(LogDensity):
             result[inside] += self.log_likelihood(*self.split(x[inside]))
         return result
 
-    def marginal(self, theta: FloatArray) -> FloatArray:
+    def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
         """Return the log-density of theta, (S, P), an unknown scale integrated out."""
         if self.likelihood == "student_t" and self.has_scale:
             raise ValidationError(
                 f"{argument('likelihood', 'student_t')} with an unknown noise scale has no closed "
                 "integral over the scale; give the data a covariance, or use sampling"
             )
-        if self.likelihood == "student_t":
-            return self(theta)
-        if self.errors is not None:
-            return self._combined(theta)
-        # for an unknown scale the integral over s is a constant times the maximum over s
-        return self.highest(theta) + self._integral_constant
+        return self(theta) if self.likelihood == "student_t" else self.highest(theta, sums)
 
-    def highest(self, theta: FloatArray) -> FloatArray:
-        """Return the Gaussian log-posterior of theta, (S, P), at the likeliest scale.
-
-        With shared errors, the scale is integrated out instead.
-        """
-        if self.errors is not None:
-            return self._combined(theta)
+    def highest(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
+        """Return the Gaussian log-posterior of theta, (S, P), an unknown scale integrated out."""
         result = self.log_prior(theta)
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
-            result[inside] += self.quick.log_likelihood(theta[inside])
+            squares, n = (sums or self.sums)(theta[inside]), 0.5 * self.problem.n_residuals
+            with np.errstate(divide="ignore"):
+                terms = -n * np.log(squares) if self.has_scale else -0.5 * squares
+            result[inside] += self._mean(terms) + self._constant
+            if self.has_scale:
+                result[inside] += float(gammaln(n) + (n - 1.0) * np.log(2.0))
         return result
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
@@ -257,16 +281,21 @@ class Density(LogDensity):
         with np.errstate(over="ignore"):  # far off, a point has no chance
             return np.asarray(y.real**2 + y.imag**2)
 
-    def sums(self, theta: FloatArray) -> FloatArray:
-        """Return sums of squares at theta, (S, P): (S, M), one for each size of shared errors."""
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        """Return the residuals of which the squares are added, (S, P) -> (S, K)."""
         if self.errors is None:
-            return np.asarray(self.squares(theta).sum(axis=-1)[:, None])
+            y, _ = self.quick.whitened(theta, derivatives=False)
+            return np.ascontiguousarray(y).view(np.float64)
         held = self.errors.held(theta)
         y, _ = self.quick.whitened(held, derivatives=False, tails=False)
         parts = np.broadcast_to(y, (len(theta), y.shape[-1])).copy().view(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
-            squares = self.errors.squares(parts + self.errors.moved(theta))
-        return np.where(np.isnan(squares), np.inf, squares)
+            return self.errors.uncorrelated(parts + self.errors.moved(theta))
+
+    @property
+    def weights(self) -> FloatArray:
+        """What their squares count, (K, M) or (1, 1), for each of M sizes of shared errors."""
+        return np.ones((1, 1)) if self.errors is None else self.errors.weights
 
     def probabilities(self, sums: FloatArray) -> FloatArray:
         """Return how probable each size of shared errors is, (S, M), given sums of squares."""
@@ -289,22 +318,10 @@ class Density(LogDensity):
             y, by = errors.independent(y, by)
             return float(0.5 * np.sum(y**2)), by[0].T @ by[0]
 
-    def _combined(self, theta: FloatArray) -> FloatArray:
-        """Return the log-posterior with shared errors, an unknown scale integrated out."""
-        result = self.log_prior(theta)
-        inside = result > -np.inf
-        if inside.any():
-            sums, n = self.sums(theta[inside]), 0.5 * self.problem.n_residuals
-            if self.has_scale:
-                rest = float(gammaln(n) - np.log(2.0) + n * np.log(2.0))
-                result[inside] += self._mean(-n * np.log(sums)) + rest + self._constant
-            else:
-                result[inside] += self._mean(-0.5 * sums) + self._constant
-        return result
-
     def _mean(self, terms: FloatArray) -> FloatArray:
         """Return ln of the mean likelihood over the sizes of shared errors, (S, M) -> (S,)."""
-        assert self.errors is not None
+        if self.errors is None:
+            return np.asarray(terms[:, 0])
         return np.asarray(logsumexp(terms + self.errors.log_weights, axis=1))
 
     @cached_property
@@ -320,22 +337,7 @@ class Density(LogDensity):
         alone = problem.like(sensors=problem.sensors.with_free(list(problem.priors)))
         return problem.near(solve(alone).theta)
 
-    @cached_property
-    def _integral_constant(self) -> float:
-        """Log of the integral over ln s minus log of the maximum: both vary as S^-n."""
-        if not self.has_scale:
-            return 0.0
-        n = self.problem.n_residuals / 2.0
-        return float(gammaln(n) - np.log(2.0) - n * np.log(n) + n)
-
-    @cached_property
+    @property
     def _constant(self) -> float:
-        """The Gaussian log-likelihood at s = 1 less its exponent; the same at every theta."""
-        theta = self.prior.draw(np.random.default_rng(0), 64)
-        ones = np.ones(len(theta)) if self.has_scale else None
-        squares = self.squares(theta).sum(axis=-1)
-        with np.errstate(invalid="ignore"):
-            constant = self.quick.log_likelihood(theta, ones) + 0.5 * squares
-        if not np.isfinite(constant).any():
-            raise SamplingError("the model predicts nothing anywhere in the prior; check both")
-        return float(constant[np.nanargmin(np.where(np.isfinite(constant), squares, np.nan))])
+        """The Gaussian log-likelihood at s = 1 less its exponent."""
+        return float(self.problem.log_area - 0.5 * self.problem.n_residuals * np.log(2.0 * np.pi))

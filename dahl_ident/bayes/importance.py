@@ -198,7 +198,7 @@ class _Mixture:
         total = batch.log_prior
         for mean, root in zip(self.means, self.roots, strict=True):
             t = np.linalg.solve(root, (batch.phi - mean).T)
-            log_t = constant - half * np.log1p(t**2 / _DOF).sum(axis=0)
+            log_t = constant - half * np.log(np.prod(1.0 + t**2 / _DOF, axis=0))
             total = np.logaddexp(total, log_t - np.linalg.slogdet(root)[1])
         return np.asarray(total - np.log(count + 1))
 

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.density import LogDensity
+from dahl_ident.bayes.density import LogDensity, Sums
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.problem.record_problem import RecordProblem
@@ -103,7 +103,7 @@ class RecordDensity(LogDensity):
 
     @cached_property
     def _least(self) -> float:
-        return self._squares(self.centre)
+        return float(np.sum(self._residuals(self.centre) ** 2))
 
     @cached_property
     def _bend(self) -> FloatArray:
@@ -119,27 +119,36 @@ class RecordDensity(LogDensity):
         return np.asarray(self.root @ shrunk @ np.linalg.inv(self.root))
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        """Return the log-density, (S, P) -> (S,); -inf outside the prior's support."""
-        result = self.prior.log_density(x)
+        """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
+        return self.marginal(x)
+
+    def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
+        """Return the log-density of theta, (S, P); the noise's scale is no coordinate."""
+        result = self.log_prior(theta)
         noise = self._least / self.problem.n_residuals
-        power = 0.5 * (self.dof + len(self.names))
-        for i in np.flatnonzero(result > -np.inf):
-            bent = self.centre + self._bend @ (x[i] - self.centre)
-            excess = (self._squares(bent) - self._least) / (self.dof * noise)
-            result[i] -= power * np.log1p(max(excess, -0.5))
+        inside = result > -np.inf
+        if inside.any():
+            squares = (sums or self.sums)(theta[inside])[:, 0]
+            excess = (squares - self._least) / (self.dof * noise)
+            power = 0.5 * (self.dof + len(self.names))
+            result[inside] -= power * np.log1p(np.maximum(excess, -0.5))
         return result
 
-    def _squares(self, theta: FloatArray) -> float:
-        """Return the sum of squared residuals, states and offsets projected out."""
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        """Return the residuals at theta*, (S, P) -> (S, n), states and offsets projected out."""
+        bent = self.centre + (theta - self.centre) @ self._bend.T
+        return np.array([self._residuals(one) for one in bent])
+
+    def _residuals(self, theta: FloatArray) -> FloatArray:
         full = self.values.copy()
         full[: theta.size] = self.to_values(theta)
-        total = 0.0
+        parts = []
         try:
             for number, y in enumerate(self.problem.measured):
                 predicted = self.problem.predict(full, number, derivatives=False)
                 e = self.problem.filtered(y - predicted.output)
                 basis = self._nuisance[number][0]
-                total += float(e @ e) - float(np.sum((basis.T @ e) ** 2))
+                parts.append(e - basis @ (basis.T @ e))
         except FitError:  # the motion grows beyond all bounds
-            return np.inf
-        return total if np.isfinite(total) else np.inf
+            return np.full(self.problem.n_residuals, np.inf)
+        return np.concatenate(parts)

@@ -116,11 +116,19 @@ class RowErrors:
         """Return what those parameters add to the residuals, (S, m)."""
         return np.asarray((theta - self.held(theta)) @ self.slopes.T)
 
-    def squares(self, y: FloatArray) -> FloatArray:
-        """Return the sum of squares of residuals, (S, m) -> (S, M)."""
+    def uncorrelated(self, y: FloatArray) -> FloatArray:
+        """Return uncorrelated residuals, (S, m) -> (S, K), last those that rows do not share."""
         y = self._weighted(y)
         turned = y @ self.turn.T
-        return np.asarray(turned**2 @ (1.0 / self._variances) + self._beyond(y)[..., None])
+        if self.inside is None:
+            return np.asarray(turned)
+        return np.concatenate([turned, y - (y @ self.inside) @ self.inside.T], axis=1)
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """What the squares of uncorrelated residuals count, for each lambda, (K, M)."""
+        alone = 0 if self.inside is None else len(self.inside)
+        return np.concatenate([1.0 / self._variances, np.ones((alone, len(self.sizes)))])
 
     def _weighted(self, y: FloatArray) -> FloatArray:
         """Return residuals (..., m) with their weights."""

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,14 @@ from dahl_ident.bayes.chain import Chain, ChainSettings, Listener, Pool, run
 from dahl_ident.bayes.checkpoint import identity, open_chain
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import Density, LogDensity
-from dahl_ident.bayes.importance import WeightedDraws, WeightedPoints, in_blocks, integrate
+from dahl_ident.bayes.importance import (
+    Function,
+    WeightedDraws,
+    WeightedPoints,
+    in_blocks,
+    integrate,
+)
+from dahl_ident.bayes.interpolation import interpolated
 from dahl_ident.errors import SamplingError, ValidationError, argument
 
 _MOST_AXES = 3  # the number of points is a power of the number of axes
@@ -124,6 +131,7 @@ class PointSample(Sample):
     density: LogDensity
     integral: WeightedPoints
     tolerance: float
+    sums: Function
 
     @cached_property
     def draws(self) -> WeightedDraws:
@@ -131,7 +139,7 @@ class PointSample(Sample):
         points = self.integral
         if not isinstance(self.density, Density) or not self.density.has_scale:
             return points
-        return WeightedDraws(_with_scale(self.density, points), points.weights)
+        return WeightedDraws(_with_scale(self.density, self.sums, points), points.weights)
 
     @property
     def converged(self) -> bool:
@@ -214,11 +222,12 @@ def sample_points(
     begin: Callable[[], tuple[FloatArray, FloatArray]],
     given: Sequence[str],
     tolerance: float,
+    tell: Callable[[int], None] | None = None,
 ) -> PointSample:
     """Integrate a density of few parameters.
 
     `begin` returns a centre and a covariance, (P,) and (P, P); `given` names the parameters that
-    were left free by the user.
+    were left free by the user; `tell` takes the number of points so far.
     """
     names = [part.parameter.name for part in density.prior.priors]
     if len(names) > _MOST_AXES:
@@ -230,18 +239,39 @@ def sample_points(
         )
     positive_number(tolerance, "tolerance")
     centre, covariance = begin()
+    evaluations = 0
+
+    def counted(function: Function) -> Function:
+        def of_points(theta: FloatArray) -> FloatArray:
+            nonlocal evaluations
+            result = function(theta)
+            evaluations += len(theta)
+            if tell is not None:
+                tell(evaluations)
+            return result
+
+        return of_points
+
+    near, log_density, sums, error = None, counted(density.marginal), density.sums, 0.0
+    if density.likelihood == "gaussian":
+        near = interpolated(
+            density, counted(density.residuals), centre, covariance, 0.5 * tolerance
+        )
+    if near is not None:
+        log_density, sums, error = partial(density.marginal, sums=near), near, near.error
     integral = integrate(
-        density.marginal,
+        log_density,
         density.prior,
         centre,
         covariance,
         density.decorrelation,
-        tolerance=tolerance,
+        tolerance=tolerance - error,
     )
-    return PointSample(density, integral, tolerance)
+    integral = replace(integral, error=integral.error + error, evaluations=evaluations)
+    return PointSample(density, integral, tolerance, sums)
 
 
-def _with_scale(density: Density, points: WeightedPoints) -> FloatArray:
+def _with_scale(density: Density, sums_of: Function, points: WeightedPoints) -> FloatArray:
     """Return theta of the points with ln s as their last coordinate, (N, P + 1).
 
     At fixed parameters with sum of squares S over n rows, s^2 follows the inverse gamma
@@ -251,7 +281,7 @@ def _with_scale(density: Density, points: WeightedPoints) -> FloatArray:
     """
     from scipy.stats import qmc
 
-    sums = in_blocks(density.sums, points.theta)
+    sums = in_blocks(sums_of, points.theta)
     uniform = qmc.Halton(2, scramble=False).random(len(sums) + 1)[1:]  # the first is zero
     uniform = uniform[np.argsort(np.argsort(np.log(sums).mean(axis=1)))]
     below = np.cumsum(density.probabilities(sums), axis=1)

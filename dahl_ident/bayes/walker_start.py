@@ -15,6 +15,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density, LogDensity
 from dahl_ident.errors import FitError, SamplingError
 from dahl_ident.fitting import Optimum, solve
+from dahl_ident.fitting.record_search import Tell
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors
 
@@ -26,10 +27,10 @@ _POSITIONS = 5  # of the offending parameter, each of which takes a fit of the o
 _EXACT = 1e-13  # relative noise below which a fit is exact to rounding
 
 
-def optimum_of(problem: Problem) -> Optimum | None:
+def optimum_of(problem: Problem, tell: Tell | None = None) -> Optimum | None:
     """Return the least-squares optimum; None if a table has too few data."""
     try:
-        return solve(_with_normal_priors(problem))
+        return solve(_with_normal_priors(problem), tell=tell)
     except FitError:
         if problem.around_optimum:
             raise

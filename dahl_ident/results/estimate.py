@@ -35,7 +35,7 @@ from dahl_ident.problem import Problem, ProblemBatch, kind_of, problem_of, refus
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
-from dahl_ident.results.progress import fit_progress, progress_bar
+from dahl_ident.results.progress import fit_progress, grid_progress, progress_bar
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
 
@@ -320,7 +320,7 @@ def posterior(
         Spreads the likelihood over processes. Left out, one process computes all walkers at
         once, which is faster unless a single likelihood takes milliseconds.
     progress : bool, default False
-        Show a bar on the terminal, with the time that is left.
+        Show on the terminal how far it is; of a chain, with the time that is left.
     tolerance : float, default 1e-3
         With "grid": relative error of the evidence and error of probabilities to be reached.
 
@@ -387,14 +387,16 @@ def posterior(
             data, _checked(model), free=free, fixed=fixed, sensors=sensors, noise=noise,
             steady=steady or "exact",
         )  # fmt: skip
-        optimum = optimum_of(problem)
+        with fit_progress() if progress else nullcontext() as tell:
+            optimum = optimum_of(problem, tell)
         fitted = None if optimum is None else FitResult(optimum)
     if fitted is None or likelihood != "gaussian":
         uncertainty = "noise"
     density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
     begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
     if method == "grid":
-        points = sample_points(density, begin, problem.names, tolerance)
+        with grid_progress() if progress else nullcontext() as told:
+            points = sample_points(density, begin, problem.names, tolerance, told)
         return Posterior(density, points, fitted, uncertainty)
     drawn = chain(density, partial(starting_points, density, optimum))
     result = Posterior(density, drawn, fitted, uncertainty)

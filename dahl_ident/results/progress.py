@@ -46,25 +46,38 @@ _PATIENCE = 2.0  # s without a display
 
 
 @contextmanager
-def fit_progress() -> Iterator[Callable[[int, float], None]]:
-    """Yield a function of evaluations and share of variance left, which shows them after 2 s."""
+def spinner(task: str) -> Iterator[Callable[[str], None]]:
+    """Yield a function of how far a task is, in words, which shows them after 2 s."""
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     began = time.monotonic()
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task("fitting")
+    number = bar.add_task(task)
 
-    def update(evaluations: int, share: float) -> None:
+    def update(far: str) -> None:
         if time.monotonic() - began > _PATIENCE:
             bar.start()
-        bar.update(
-            task,
-            description=f"fitting: {evaluations} evaluations, {percent(share**0.5, 3)} rms left",
-        )
+        bar.update(number, description=f"{task}: {far}")
 
     try:
         yield update
     finally:
         bar.stop()
+
+
+@contextmanager
+def fit_progress() -> Iterator[Callable[[int, float], None]]:
+    """Yield a function of evaluations and share of variance left, which shows them after 2 s."""
+    with spinner("fitting") as show:
+        yield lambda evaluations, share: show(
+            f"{evaluations} evaluations, {percent(share**0.5, 3)} rms left"
+        )
+
+
+@contextmanager
+def grid_progress() -> Iterator[Callable[[int], None]]:
+    """Yield a function of the number of points, which shows it after 2 s."""
+    with spinner("integrating") as show:
+        yield lambda points: show(f"{points} points")
