@@ -123,6 +123,14 @@ def test_what_is_stated_stands_next_to_what_noise_alone_gives() -> None:
     assert float(found.meanings[0][1]) == pytest.approx(result.params["f_max"].value, rel=5e-3)
 
 
+def test_what_runs_away_is_not_determined() -> None:
+    """Microslip: any limit of the force would do."""
+    data = table(beta=(1e-4, 1e-3), noise=0.01)
+    found = compare_models(fit(data, Dahl(), throw=False), {"gap": Backlash(Dahl())})
+    assert {row[1] for row in found.meanings} == {"not determined"}
+    assert {row[5] for row in found.rows} == {"-"}
+
+
 def test_a_damper_is_told_from_another_loop_at_one_frequency() -> None:
     """Without a damper among the candidates, Bouc-Wen's law took its place."""
     A = np.geomspace(3e-4, 3e-2, 12)

@@ -25,10 +25,11 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
-from dahl_ident.diagnostics.information import parameter_values
+from dahl_ident.diagnostics.information import Information, parameter_values, values_at
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
+from dahl_ident.diagnostics.verdicts import NOT_IDENTIFIED_ABOVE
 from dahl_ident.elements import (
     Damper,
     Element,
@@ -56,6 +57,7 @@ _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave 
 _UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
 _DISAGREE = 0.2  # of a force limit: what else friction is then depends on the choice
 _PLACES = 6  # of a change: less is rounding
+_STEP = 1e-5  # of a parameter, for slopes
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
@@ -155,9 +157,10 @@ class ComparedModel:
 
         Of all elements with memory together: N, N/m, and joules lost in a cycle at the smallest,
         the middle and the largest amplitude, of records at their rms displacements. Infinite where
-        a law never slips.
+        a law never slips, NaN where these data do not determine it.
         """
-        return _meaning(self.optimum.problem, parameter_values(self.optimum))
+        found = _meaning(self.optimum.problem, parameter_values(self.optimum))
+        return found | dict.fromkeys(_undetermined(self.optimum, found), np.nan)
 
     @property
     def resemblances(self) -> list[str]:
@@ -329,7 +332,7 @@ class ModelComparison:
         """Quantities common to all laws, one row a model, the stated estimate first."""
         pairs = [] if self.stated is None else [(_STATED, self.stated)]
         pairs += [(m.name, m.meaning) for m in self.models]
-        return [[name, *(f"{meaning[key]:.3g}" for key in self.common)] for name, meaning in pairs]
+        return [[name, *(_number(meaning[key]) for key in self.common)] for name, meaning in pairs]
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a model."""
@@ -382,6 +385,28 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
         f"energy a cycle at {size:.2g} {unit}": float(e)
         for size, e in zip(sizes, energy, strict=True)
     }
+
+
+def _undetermined(optimum: Optimum, found: Mapping[str, float]) -> list[str]:
+    """Return which quantities are not determined, by the first-order error of their logarithms."""
+    names, theta = [key for key in found if not key.startswith("energy")], optimum.theta
+    if not optimum.converged:
+        return names
+    before = np.array([found[name] for name in names])
+    changes = np.zeros((len(names), len(theta)))
+    for i, size in enumerate(np.maximum(1.0, np.abs(theta)).tolist()):
+        for step in (-_STEP * size, _STEP * size):
+            moved = theta.copy()
+            moved[i] += step
+            there = _meaning(optimum.problem, values_at(optimum.problem, moved))
+            with np.errstate(all="ignore"):
+                changes[:, i] += np.array([there[n] for n in names]) / before / (2.0 * step)
+    stds = Information(optimum).std(np.nan_to_num(changes))
+    return [n for n, u in zip(names, stds.tolist(), strict=True) if not u <= NOT_IDENTIFIED_ABOVE]
+
+
+def _number(value: float) -> str:
+    return "not determined" if np.isnan(value) else f"{value:.3g}"
 
 
 def _noise(problem: Any) -> str:
@@ -461,8 +486,10 @@ def compare_models(
             fitted.append(ComparedModel(name, other, density, reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
+    first = fitted[0].meaning
     stated = _meaning(optimum.problem, {name: p.value for name, p in fit.params.items()})
-    same = stated == fitted[0].meaning
+    stated |= {key: value for key, value in first.items() if np.isnan(value)}
+    same = stated == first
     return ModelComparison(tuple(fitted), failed, None if same else stated)
 
 
