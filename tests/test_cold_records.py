@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,6 +50,34 @@ def test_driven_plants(made: Callable[[int], Case], seed: int) -> None:
 )
 def test_free_decays(name: str, known: str) -> None:
     assert_found(cold.decay(name, known, 1))
+
+
+class StiffnessFirst(di.Friction):
+    """Jenkins' element with its parameters in the order of a user."""
+
+    parameters = (
+        di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
+        di.Parameter("limit", "N", "friction limit", lower=0.0, transform="log"),
+    )
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+        k, limit = values
+        return k * (direction * force < limit)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_an_own_law_at_any_scale_whatever_the_order_of_its_parameters(scale: float) -> None:
+    t = np.arange(600) / 100.0
+    x = 3e-3 * scale * (np.sin(6.0 * t) + np.sin(21.3 * t))
+    force = np.zeros(t.size)
+    for i, step in enumerate(np.diff(x)):  # a spring that slips
+        force[i + 1] = np.clip(force[i] + 30.0 / scale * step, -0.1, 0.1)
+    force += 1e-3 * np.random.default_rng(3).standard_normal(t.size)
+    fit = di.fit(di.Record(t, displacement=x, force=force), StiffnessFirst())
+    assert fit.trusted, fit.verdict
+    for name, value in (("k", 30.0 / scale), ("limit", 0.1)):
+        found = fit.params[name]
+        assert abs(found.value - value) < 4.0 * float(found.stderr or 0.0)
 
 
 def with_gap(record: di.Record, low: int, high: int) -> di.Record:

@@ -132,18 +132,19 @@ class _Scan:
     def _choices(self, element: Element) -> Iterator[tuple[float, ...]]:
         """Yield values for an element's parameters at which its force is to be computed.
 
-        A parameter that scales the force is 1 in the first place; the others of it follow.
+        The first parameter that scales the force is 1. With it those that follow are lengths and
+        times in disguise: with 1 N/m a force is the length at which a spring exerts it.
         """
         grids: list[list[float]] = []
-        scaled = False
+        one: tuple[int, int, int] | None = None  # dimension of the parameter that is 1
         for label, parameter in zip(element.labels, element.parameters, strict=True):
             fixed = [] if parameter.value is None else [float(parameter.value)]
             if label in element.linear_parameters:
                 grids.append([1.0] if parameter.free else fixed)
-                scaled = True
-            elif parameter.free and label in element.scale_parameters and not scaled:
+                one = parameter.dimension
+            elif parameter.free and label in element.scale_parameters and one is None:
                 grids.append([1.0])
-                scaled = True
+                one = parameter.dimension
             elif fixed:
                 grids.append(fixed)
             elif isinstance(element, LinearSystem):
@@ -154,12 +155,16 @@ class _Scan:
             elif parameter.scan:
                 grids.append(list(parameter.scan))
             else:
-                force, length, time = parameter.dimension
+                force, length, time = map(float, parameter.dimension)
                 unit = self.length**length * self.time**time
                 if force:
-                    # compared with a force of 1: a length in disguise
-                    size = 1.0 if scaled else self._force_size()
-                    grids.append([size**force * (self.length * s) ** length for s in _LENGTHS])
+                    size = self._force_size() ** force
+                    if one is not None and one[0]:
+                        share = force / one[0]  # the power of what is 1 that has this force
+                        length, time = length - share * one[1], time - share * one[2]
+                        size = self.time**time
+                    lengths = [size * (self.length * s) ** length for s in _LENGTHS]
+                    grids.append(list(dict.fromkeys(lengths)))
                 elif parameter.lower < 0.0:
                     some = [unit * s for s in _SIGNED]
                     grids.append([*(-v for v in some), 0.0, *some])
