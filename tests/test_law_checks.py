@@ -92,6 +92,10 @@ WRONG: dict[str, tuple[Slope, str]] = {
         lambda _, F, d, v, p: p[1] if d > 0 else 2.0 * p[1],
         r"asks a Python question of arrays \(if, .*; write comparisons as factors",
     ),
+    "if on a value": (
+        lambda _, F, d, v, p: dahl(_, F, d, v, p) if p[0] > 0.0 else p[1] + 0.0 * F,
+        r"asks a Python question of arrays",
+    ),
     "min": (lambda _, F, d, v, p: p[1] * min(1.0, 1.0 - d * F / p[0]), r"asks a Python question"),
     "math": (lambda _, F, d, v, p: p[1] * math.exp(-d * F), r"TypeError.*; expected plain arithm"),
     "name": (lambda _, F, d, v, p: sgima * F, r"NameError: name 'sgima'"),  # type: ignore[name-defined] # noqa: F821
@@ -150,9 +154,14 @@ def test_the_energy_created_is_that_of_the_loop() -> None:
         ((di.Parameter("a", "N", "", lower=2.0, upper=1.0),), "bounds of a are 2 and 1; expected"),
         ((di.Parameter("a", "N", "", prior=(2.0, 1.0)),), "prior of a are 2 and 1"),
         ((di.Parameter("a", "N", "", upper=-1.0, transform="log"),), "its upper bound is -1"),
+        (
+            (di.Parameter("a", "N", "", lower=-1.0, transform="log"),),
+            "its lower bound is -1; expected lower=0.0 or more",
+        ),
         ((positive("a", "furlong"),), "unit of a is 'furlong'; expected a product of powers of N"),
         (("f_max", "sigma"), r"parameters is \('f_max', 'sigma'\); expected a tuple of di.Param"),
         ([positive("a", "N")], "expected a tuple"),
+        (positive("a", "N"), r"parameters is Parameter\(name='a'.* expected a tuple"),
     ],
 )
 def test_declarations_are_checked(parameters: Any, message: str) -> None:
@@ -224,11 +233,22 @@ def test_what_cannot_be_compiled_is_named() -> None:
             return dahl(self, force, direction, velocity, values)
         return values[1] if direction > 0 else values[0]
 
-    for slope, message in (
+    joined = r"joins comparisons by &, \| or ~; write np\.logical_and\(a, b\), np\.logical_or"
+    written: tuple[Slope, ...] = (
+        lambda _, F, d, v, p: p[1] * np.logical_and(d * F < p[0], d * F > -9.0 * p[0]),
+        lambda _, F, d, v, p: p[1] * np.logical_or(d * F < p[0], d * F < -9.0 * p[0]),
+        lambda _, F, d, v, p: p[1] * np.logical_not(d * F >= p[0]),
+    )
+    cases: tuple[tuple[Slope, str], ...] = (
         (loops, "gives another result; expected plain arithmetic"),
         (on_type, "gives another result; expected plain arithmetic"),
         (asks, "asks a Python question"),
-    ):
+        (lambda _, F, d, v, p: p[1] * ((d * F < p[0]) & (d * F > -9.0 * p[0])), joined),
+        (lambda _, F, d, v, p: p[1] * ((d * F < p[0]) | (d * F < -9.0 * p[0])), joined),
+        (lambda _, F, d, v, p: p[1] * ~(d * F >= p[0]), joined),
+    )
+    for slope, message in cases:
         with pytest.raises(DahlIdentError, match=message):
             drive(plant(slope))
-    drive(plant(SOUND["two limits"]))
+    for slope in (SOUND["two limits"], *written):
+        drive(plant(slope))

@@ -8,6 +8,7 @@ fails at the values given, or, where it may depend on the values, at every one t
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from keyword import iskeyword
@@ -97,10 +98,11 @@ def check_declarations(law: type[Element]) -> None:
             raise ValidationError(
                 f"{name}: the transform of {p.name} is {p.transform!r}; expected 'log' or 'linear'"
             )
-        if p.positive and not p.upper > 0.0:
+        side, limit = ("lower", p.lower) if -np.inf < p.lower < 0.0 else ("upper", p.upper)
+        if p.positive and not (side == "upper" and limit > 0.0):
             raise ValidationError(
-                f"{name}: {p.name} is searched by its logarithm, but its upper bound is "
-                f'{p.upper:g}; expected one above 0, or transform="linear"'
+                f"{name}: {p.name} is searched by its logarithm, but its {side} bound is "
+                f'{limit:g}; expected lower=0.0 or more, or transform="linear"'
             )
         if not p.is_mechanical:
             raise ValidationError(
@@ -154,9 +156,15 @@ def _agrees_with_units(law: Friction) -> bool:
     direction = np.resize([1.0, -1.0], _TRIALS)
     speed = None if law.rate_independent else direction * rng.uniform(0.1, 1.0, _TRIALS)
     scaled = [v * _FORCE_UNIT**power for v, power in zip(values, powers, strict=True)]
-    with np.errstate(all="ignore"):
-        slope = np.asarray(law.slope(force, direction, speed, values))
-        other = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
+    try:
+        with np.errstate(all="ignore"):
+            slope = np.asarray(law.slope(force, direction, speed, values))
+            other = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
+    except Exception as exc:  # what one set of values does not show, such as an if on a value
+        raise ModelError(
+            f"{type(law).__name__}.slope failed for arrays of {_TRIALS} forces and of {_TRIALS} "
+            f"of each value: {_in_words(exc)}"
+        ) from exc
     return bool(np.allclose(other, _FORCE_UNIT * slope, rtol=1e-12, atol=0.0, equal_nan=True))
 
 
@@ -438,6 +446,11 @@ def _in_words(exc: Exception) -> str:
         return (
             "it asks a Python question of arrays (if, and, or, not, min, max); write comparisons "
             "as factors, such as stiffness * (direction * force < f_max), or np.where"
+        )
+    if re.search("operand type.* for (&|\\||unary ~)", text):
+        return (
+            "it joins comparisons by &, | or ~; write np.logical_and(a, b), np.logical_or(a, b) "
+            "and np.logical_not(a), which work on arrays"
         )
     return (
         f"{type(exc).__name__}: {text[:200]}; expected plain arithmetic and numpy's functions, "
