@@ -27,6 +27,22 @@ def fit() -> di.FitResult:
     return di.fit(record(TRUE + NOISE), MODEL)
 
 
+@pytest.mark.parametrize("label", ["offset", "drift", "initial_force"])
+def test_a_parameter_called_as_one_of_the_records_is_refused(label: str) -> None:
+    class Own(di.Friction):
+        parameters = (
+            di.Parameter("sigma", "N/m", "stiffness", lower=0.0, transform="log"),
+            di.Parameter(label, "N", "friction limit", lower=0.0, transform="log"),
+        )
+
+        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+            return values[0] * (1.0 - direction * force / values[1])
+
+    for model in (Own(), Own(30.0), Own(None, 0.1) + di.Spring()):
+        with pytest.raises(ModelError, match=f"has a parameter called {label}, as a fit of rec"):
+            di.fit(record(TRUE + NOISE), model)
+
+
 @pytest.mark.parametrize("method", ["scipy", "ipopt"])
 def test_every_method_finds_the_same_optimum(method: str, fit: di.FitResult) -> None:
     other = di.fit(record(TRUE + NOISE), MODEL, method=method)

@@ -13,6 +13,7 @@ from dahl_ident.data import Record
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.elements.facts import HistoryGradient
+from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
     from dahl_ident.problem.record_problem import RecordProblem
@@ -137,7 +138,13 @@ _SMALL = 0.1  # of the motion's inverse size: rates below are searched as number
 
 
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:
-    """Return what each record adds: first states, an offset and, for forces, a drift."""
+    """Return what each record adds: first states, an offset and, for forces, a drift.
+
+    Raises
+    ------
+    ModelError
+        If one is called as a parameter of the model.
+    """
     unknowns = []
     channel = records[0].motion_channel
     unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]
@@ -160,6 +167,13 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
             unknowns.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
         else:
             unknowns.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
+    own = {p.name for p in unknowns}
+    for p in model.parameters:
+        if p.name in own:
+            raise ModelError(
+                f"{model!r} has a parameter called {p.name}, as a fit of records calls one of its "
+                "own; expected another name: change it in the law's declaration"
+            )
     return unknowns
 
 

@@ -69,7 +69,8 @@ class RecordProblem(Problem):
     DataError
         If a record lacks a channel, or is too short.
     ModelError
-        If the model cannot predict the output, or nothing is free.
+        If the model cannot predict the output, nothing is free, or a parameter of the model is
+        called as one of the records' own.
 
     Examples
     --------
