@@ -44,6 +44,8 @@ SOUND: dict[str, Slope] = {
         p[1] * np.sign(1.0 - d * F / p[0]) * np.abs(1.0 - d * F / p[0]) ** 0.5
     ),
     "no full slip": lambda _, F, d, v, p: p[1] / (1.0 + np.abs(F / p[0]) * (1.0 + d * np.sign(F))),
+    "hardens": lambda _, F, d, v, p: p[1] * (0.1 + np.exp(-d * F / p[0])),
+    "bilinear": lambda _, F, d, v, p: p[1] * (1e-3 + (d * F < p[0])),
     "overflows far beyond slip": lambda _, F, d, v, p: (
         p[1] * (1.0 - d * F / p[0]) * np.exp(-0.7 * d * F / p[0])
     ),
@@ -63,6 +65,18 @@ WRONG: dict[str, tuple[Slope, str]] = {
     "infinite between": (
         lambda _, F, d, v, p: p[1] * (1.0 - d * F / p[0]) / (d * F / p[0] - 0.503) ** 2,
         r"is inf at force = 0\.1006 N, direction = \+1",
+    ),
+    "infinite after reversal": (
+        lambda _, F, d, v, p: p[1] / (1.0 + d * F / p[0]),
+        r"is inf at force = -0\.2 N, direction = \+1.* also after the direction has changed",
+    ),
+    "infinite after reversal, positive around": (
+        lambda _, F, d, v, p: p[1] + p[1] / (3.0 + d * F / p[0]) ** 2,
+        r"is inf at force = -0\.6 N, direction = \+1",
+    ),
+    "negative far from rest": (
+        lambda _, F, d, v, p: p[1] * (0.1 + 1 / (1 + (F / p[0]) ** 2) - 0.5 * (d * F < -2 * p[0])),
+        r"is -.* N/m, negative before full slip, at force = -.*, direction = \+1",
     ),
     "infinite from a force on": (
         lambda _, F, d, v, p: np.where(d * F > 0.5 * p[0], np.inf, p[1] * (1.0 - d * F / p[0])),

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 _TRIALS = 12  # sets of values
 _SPREAD = 0.5  # decades to either side, of values that are tried
 _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
-_LINE = 201  # forces between those of full slip
+_LINE = 201  # forces to either side
+_FAR = 1e3  # times the scale: how far laws without full slip are looked at
 _BEYOND = 1.001  # of the force of full slip: integrators pass it by rounding and by a stage
 _OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
 _CLOSER = 8  # looks at the largest slope, each 64 times as close: forces differ by rounding then
@@ -127,7 +128,7 @@ def check_slope(law: Friction) -> None:
     if declared in done:
         return
     trial = _Trial(law)
-    for check in (trial.slip, trial.constant, trial.loops):
+    for check in (trial.slip, trial.constant, trial.loops, trial.far):
         reasons = check()
         if all(reasons):
             raise ModelError(f"{type(law).__name__}.slope {reasons[0]}")
@@ -196,7 +197,7 @@ class _Trial:
             f"{p.name} = {float(v[row, 0]):.4g}"
             for p, v in zip(self._law.parameters, self._values, strict=True)
         ]
-        where = [f"force = {force:.4g} N", f"direction = {direction:+g}", *numbers]
+        where = [f"force = {force + 0.0:.4g} N", f"direction = {direction:+g}", *numbers]
         return f"at {', '.join(where)}"
 
     def _slope(self, force: FloatArray, direction: float) -> FloatArray:
@@ -269,17 +270,22 @@ class _Trial:
 
     def slip(self) -> list[str]:
         """Return what is wrong with the slope up to full slip, for each set of values."""
+        ends = np.where(np.isfinite(self._limits), self._limits, self._scale)
+        return self._within(ends[..., None] * np.linspace(0.0, 1.0, _LINE))
+
+    def far(self) -> list[str]:
+        """Return what is wrong with the slope at greater forces, of laws without full slip."""
+        if np.isfinite(self._limits).all():
+            return [""]
+        return self._within(np.stack([self._reached(0), self._reached(1)]))
+
+    def _within(self, reached: FloatArray) -> list[str]:
+        """Return what is wrong with the slope at sizes of forces to either side, from 0 on."""
         found = [""] * self._count
-        share = np.linspace(0.0, 1.0, _LINE)
         for i, direction in enumerate((1.0, -1.0)):
-            own, other = (
-                np.where(np.isfinite(limit), limit, self._scale)
-                for limit in (self._limits[i], self._limits[1 - i])
-            )
-            size = share * (own + other)[:, None] - other[:, None]
+            own, other = reached[i], reached[1 - i]  # after a reversal, the other side's forces
+            size = np.c_[-other[:, :0:-1], own, _BEYOND * own[:, -1]]
             slopes = self._slope(direction * size, direction)
-            passed = self._slope(direction * _BEYOND * own[:, None], direction)
-            size, slopes = np.c_[size, _BEYOND * own], np.c_[slopes, passed]
             place, peak = self._peak(size, slopes, direction)
             size, slopes = np.c_[place, size], np.c_[peak, slopes]
             for row in range(self._count):
@@ -290,6 +296,24 @@ class _Trial:
                 )
         return found
 
+    def _reached(self, side: int) -> FloatArray:
+        """Return sizes of the forces that motions reach on one side, from 0 on.
+
+        Up to full slip; without it, ever farther apart, until one direction's slope overflows.
+        """
+        share, rest = np.linspace(0.0, 1.0, _LINE), len(_MAGNITUDES)
+        before, after = self._wide[side][:, rest + 1 :], self._wide[1 - side][:, rest - 1 :: -1]
+        limit, scale = self._limits[side], self._scale
+        with np.errstate(invalid="ignore"):
+            steepest = np.maximum(np.abs(before), np.abs(after))
+            wild = ~(steepest < _OVERFLOW * self._rest[:, None])
+        wild &= scale[:, None] < _MAGNITUDES
+        farthest = np.where(wild, _MAGNITUDES, _FAR * scale[:, None]).min(axis=1)
+        sizes: FloatArray = scale[:, None] * np.expm1(share * np.log1p(farthest / scale)[:, None])
+        ends = np.isfinite(limit)
+        sizes[ends] = share * limit[ends, None]
+        return sizes
+
     def _peak(
         self, size: FloatArray, slopes: FloatArray, direction: float
     ) -> tuple[FloatArray, FloatArray]:
@@ -297,13 +321,17 @@ class _Trial:
 
         Infinite where it grows beyond all bounds.
         """
-        bounds, step = size[:, [0, -1]].T[..., None], (size[:, 1] - size[:, 0])[:, None]
+        bounds, gaps = size[:, [0, -1]].T[..., None], np.pad(np.diff(size), ((0, 0), (1, 1)))
+        widths = np.maximum(gaps[:, :-1], gaps[:, 1:])
         most = np.sort(np.abs(slopes), axis=1)[:, [-2]]  # the largest may be at a pole
         for _ in range(_CLOSER):
             largest = np.argmax(np.abs(slopes), axis=1)[:, None]
-            place, peak = (np.take_along_axis(a, largest, axis=1) for a in (size, slopes))
-            size = np.clip(place + step * np.linspace(-1.0, 1.0, 129), *bounds)
-            slopes, step = self._slope(direction * size, direction), step / 64.0
+            place, peak, width = (
+                np.take_along_axis(a, largest, axis=1) for a in (size, slopes, widths)
+            )
+            size = np.clip(place + width * np.linspace(-1.0, 1.0, 129), *bounds)
+            slopes = self._slope(direction * size, direction)
+            widths = np.broadcast_to(width / 64.0, size.shape)
         return place, np.where(np.abs(peak) > _OVERFLOW * most, np.inf, peak)
 
     def _not_finite(self, row: int, size: FloatArray, slopes: FloatArray, direction: float) -> str:
@@ -313,8 +341,9 @@ class _Trial:
         first = wrong[np.argmin(np.abs(size[wrong]))]
         return (
             f"is {slopes[first]} {self._at(row, direction * size[first], direction)}; expected a "
-            "finite number for every force up to full slip, and a little beyond it, as from "
-            "np.sign(m) * np.abs(m)**alpha with m = 1 - direction*force/f_max"
+            "finite number for every force up to full slip, also after the direction has changed, "
+            "and a little beyond it, as from np.sign(m) * np.abs(m)**alpha with "
+            "m = 1 - direction*force/f_max"
         )
 
     def _not_positive(
