@@ -158,6 +158,20 @@ def test_the_energy_created_is_that_of_the_loop() -> None:
     assert created == pytest.approx(-exact, rel=0.02)
 
 
+def test_no_loop_is_an_error_and_not_a_number() -> None:
+    """The slope is at least sigma (1 + F^2/f^2)/2, so F is infinite within 2 pi f/sigma."""
+
+    def hardening(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        f, sigma = values
+        return sigma * (1.0 + (force / f) ** 2 - 0.5 * direction * np.tanh(force / f))
+
+    mine = law(hardening)(1.0, 1.0)
+    assert mine.gain(0.5) > 0.0
+    for method in (mine.describing_function, mine.fourier_coefficients, mine.phase):
+        with pytest.raises(ModelError, match="has no steady loop at the amplitude 4 m, where its"):
+            method([0.5, 4.0, 5.0])
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

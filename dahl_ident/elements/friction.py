@@ -326,6 +326,17 @@ class Friction(Element):
         x = amplitude * np.cos(theta)
         return self.force_history(values, x, -amplitude * np.sin(theta), float(top))
 
+    def _coefficients(self, amplitude: FloatArray, harmonic: int) -> ComplexArray:
+        """Return F_k/X_1, refused where no loop settles."""
+        N = self.stiffness(self.known_values(), amplitude, np.zeros(()), harmonic)
+        lost = ~np.isfinite(N)
+        if lost.any():
+            raise ModelError(
+                f"{self!r} has no steady loop at the amplitude {amplitude[lost].min():g} m, where "
+                "its force or its slope grows too large; expected a smaller amplitude"
+            )
+        return N
+
     def _check_rate(self, method: str) -> None:
         if not self.rate_independent:
             raise ModelError(
@@ -349,7 +360,7 @@ class Friction(Element):
         Raises
         ------
         ModelError
-            If a parameter has no value.
+            If a parameter has no value, or no loop is steady at an amplitude.
         ValidationError
             If an amplitude is negative, NaN, infinite or complex.
 
@@ -367,7 +378,7 @@ class Friction(Element):
         """
         self._check_rate("describing_function")
         A = non_negative_array(amplitude, "amplitude")
-        return self.stiffness(self.known_values(), A, np.zeros(()))[()]
+        return self._coefficients(A, 1)[()]
 
     def fourier_coefficients(
         self, amplitude: ArrayLike, harmonic: int = 1
@@ -389,7 +400,7 @@ class Friction(Element):
         Raises
         ------
         ModelError
-            If a parameter has no value.
+            If a parameter has no value, or no loop is steady at an amplitude.
         ValidationError
             If an amplitude is negative, NaN, infinite or complex, or `harmonic` is not a whole
             number of at least 1.
@@ -409,7 +420,7 @@ class Friction(Element):
         self._check_rate("fourier_coefficients")
         A = non_negative_array(amplitude, "amplitude")
         k = whole_number(harmonic, "harmonic", 1)
-        c = A * self.stiffness(self.known_values(), A, np.zeros(()), k)
+        c = A * self._coefficients(A, k)
         return c.real[()], -c.imag[()]
 
     def gain(self, amplitude: ArrayLike) -> FloatArray:
