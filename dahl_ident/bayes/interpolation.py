@@ -103,7 +103,7 @@ def interpolated(
         chosen = np.isfinite(rows).all(axis=1) & (log_p > -np.inf)
         roots = np.exp(0.5 * (log_p[chosen, None] - log_p.max()))
         terms = _terms(np.linalg.solve(root, (theta[chosen] - centre).T).T, degree)
-        coefficients = np.linalg.lstsq(roots * terms, roots * rows[chosen])[0]
+        coefficients = np.linalg.lstsq(roots * terms, roots * rows[chosen], rcond=None)[0]
         factors = [
             np.linalg.qr((coefficients * np.sqrt(counted)).T, mode="r")
             for counted in density.weights.T
