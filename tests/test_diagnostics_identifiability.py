@@ -17,8 +17,7 @@ from dahl_ident import (
     Spring,
     fit,
 )
-from dahl_ident.diagnostics import Verdict, identifiability
-from dahl_ident.diagnostics.judgement import VerdictStatus
+from dahl_ident.diagnostics import Verdict, VerdictStatus, identifiability
 from dahl_ident.results import FitResult
 from tests.friction_tables import F_MAX, FRICTION, SIGMA, X_C, plant_table, relative_noise, table
 

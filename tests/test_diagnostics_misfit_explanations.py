@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
-from dahl_ident.diagnostics.judgement import VerdictStatus
+from dahl_ident.diagnostics import VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import TURNS, Turn, neighbourhood
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError

@@ -171,8 +171,7 @@ def _bands(fit: Judged) -> Iterator[Finding]:
     enough = check.count >= _ENOUGH_HELD_OUT
     if enough and fit.errors is not None:
         misfit = min(_misfit_within_runs(fit.errors), goodness.rms_misfit)
-        narrow = check.width < misfit  # misfits inside a band have an rms below its half width
-        if narrow:
+        if check.width < misfit:  # misfits inside a band have an rms below its half width
             values = {"width": check.width, "misfit": goodness.rms_misfit}
             yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
             return

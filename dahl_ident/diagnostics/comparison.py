@@ -28,6 +28,7 @@ from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
+from dahl_ident.diagnostics.record_errors import RELATIVE_STEP
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.verdicts import NOT_IDENTIFIED_ABOVE
 from dahl_ident.elements import (
@@ -57,7 +58,6 @@ _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave 
 _UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
 _DISAGREE = 0.2  # of a force limit: what else friction is then depends on the choice
 _PLACES = 6  # of a change: less is rounding
-_STEP = 1e-5  # of a parameter, for slopes
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
@@ -395,7 +395,7 @@ def _undetermined(optimum: Optimum, found: Mapping[str, float]) -> list[str]:
     before = np.array([found[name] for name in names])
     changes = np.zeros((len(names), len(theta)))
     for i, size in enumerate(np.maximum(1.0, np.abs(theta)).tolist()):
-        for step in (-_STEP * size, _STEP * size):
+        for step in (-RELATIVE_STEP * size, RELATIVE_STEP * size):
             moved = theta.copy()
             moved[i] += step
             there = _meaning(optimum.problem, values_at(optimum.problem, moved))

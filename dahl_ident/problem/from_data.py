@@ -77,7 +77,7 @@ def problem_of(
 
 
 def without_copies(data: FrequencyResponse) -> FrequencyResponse:
-    """Return a table without rows that repeat another to the digit: they tell nothing new.
+    """Return a table without exact copies of other rows, which add no information.
 
     Its provenance says how many there were.
 

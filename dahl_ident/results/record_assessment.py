@@ -152,9 +152,10 @@ class RecordAssessment(Assessment):
         loss = loss_named(self.optimum.loss, self.problem.parts)
         if loss is not None:  # to first order, least squares of these residuals
             units = [size * self.optimum.scale for size in self.problem.sizes]
-            z = [(e / unit) ** 2 for e, unit in zip(residuals, units, strict=True)]
-            mean = loss.mean_slope(np.concatenate(z))
-            residuals = [e * loss.slope(each) / mean for e, each in zip(residuals, z, strict=True)]
+            whole = np.concatenate([e / unit for e, unit in zip(residuals, units, strict=True)])
+            ends = np.cumsum([e.size for e in residuals])[:-1]
+            scores = np.split(loss.scores(whole), ends)
+            residuals = [unit * part for unit, part in zip(units, scores, strict=True)]
         if self.first_order:
             return errors_on_constraints(self.optimum, jacobians, residuals)
         return record_errors(self.problem, self.optimum.values, jacobians, residuals)
