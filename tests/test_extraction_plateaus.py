@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.extraction.cycles import find_cycles
-from dahl_ident.extraction.plateaus import Mode, Span, find_spans
+from dahl_ident.extraction.cycles import Mode, Span, find_cycles, find_spans
 
 RATE = 500.0
 

@@ -15,21 +15,19 @@ places: R_k = X_k exp(-j k phi)/abs(F_1), phi being the force's phase.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from scipy.special import fdtri
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray, positive_number, whole_number
-from dahl_ident.data.columns import CONTROLLED, one_of
+from dahl_ident.data.columns import CONTROLLED, one_of, set_checked
 from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ValidationError
-from dahl_ident.extraction.cycles import scattered
+from dahl_ident.extraction.cycles import MODES, Mode, scattered
 from dahl_ident.extraction.line_noise import LineNoise, line_noise
-from dahl_ident.extraction.plateaus import MODES, Mode
 from dahl_ident.extraction.segment_quality import (
     BY_CHANCE,
     EVEN,
@@ -51,10 +49,7 @@ from dahl_ident.extraction.sine_fit import (
     columns,
     sine_fit,
 )
-from dahl_ident.extraction.transient import (
-    SIGNIFICANT,
-    Transient,
-)
+from dahl_ident.extraction.transient import SIGNIFICANT, Transient
 from dahl_ident.units import percent
 
 _DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
@@ -72,46 +67,32 @@ Row = tuple[complex, FloatArray, FloatArray, float]
 class Settings:
     """How segments are turned into points; see :func:`dahl_ident.extraction.extract`."""
 
-    harmonics: tuple[int, ...]
-    num_periods: int | None
-    settling_periods: int | None
-    min_share: float
-    controlled: str
-    frequency: float | None
-    mode: Mode
+    harmonics: tuple[int, ...] = tuple(range(HARMONICS + 1))
+    num_periods: int | None = None
+    settling_periods: int | None = None
+    min_share: float = 0.6
+    controlled: str = "displacement"
+    frequency: float | None = None
+    mode: Mode = "auto"
     motion_channel: str = "displacement"
 
-    @classmethod
-    def of(
-        cls,
-        *,
-        frequency: float | None = None,
-        mode: Mode = "auto",
-        num_periods: int | None = None,
-        settling_periods: int | None = None,
-        harmonics: Sequence[int] | None = None,
-        controlled: str = "displacement",
-        min_share: float = 0.6,
-    ) -> Settings:
-        """Return settings once they are in range; all harmonics where none are named."""
-        if num_periods is not None:
-            num_periods = whole_number(num_periods, "num_periods", FEWEST_CYCLES)
-        if settling_periods is not None:
-            settling_periods = whole_number(settling_periods, "settling_periods", 0)
-        if harmonics is None:
-            harmonics = (1,) if controlled == "force" else range(HARMONICS + 1)
-        orders = tuple(whole_number(k, "harmonics", 0) for k in harmonics)
+    def __post_init__(self) -> None:
+        set_checked(self, partial(whole_number, minimum=FEWEST_CYCLES), "num_periods")
+        set_checked(self, partial(whole_number, minimum=0), "settling_periods")
+        set_checked(self, positive_number, "frequency")
+        orders = tuple(whole_number(k, "harmonics", 0) for k in self.harmonics)
         if not orders or max(orders) > HARMONICS or len(set(orders)) < len(orders):
             raise ValidationError(
-                f"harmonics is {list(harmonics)!r}; expected different numbers from 0 to "
+                f"harmonics is {list(self.harmonics)!r}; expected different numbers from 0 to "
                 f"{HARMONICS}"
             )
-        one_of(controlled, "controlled", CONTROLLED)
-        if not 0.0 <= min_share < 1.0:
-            raise ValidationError(f"min_share is {min_share!r}; expected a share from 0 to below 1")
-        one_of(mode, "mode", MODES)
-        hertz = None if frequency is None else positive_number(frequency, "frequency")
-        return cls(orders, num_periods, settling_periods, min_share, controlled, hertz, mode)
+        object.__setattr__(self, "harmonics", orders)
+        one_of(self.controlled, "controlled", CONTROLLED)
+        if not 0.0 <= self.min_share < 1.0:
+            raise ValidationError(
+                f"min_share is {self.min_share!r}; expected a share from 0 to below 1"
+            )
+        one_of(self.mode, "mode", MODES)
 
     @property
     def of_displacement(self) -> bool:

@@ -11,10 +11,7 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError, argument
 from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise
 from dahl_ident.extraction.phasors import Phasors, Settings, without
-from dahl_ident.extraction.segment_quality import (
-    fundamental_share,
-    sensor_step,
-)
+from dahl_ident.extraction.segment_quality import fundamental_share, sensor_step
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     HARMONICS,
@@ -27,11 +24,7 @@ from dahl_ident.extraction.sine_fit import (
     thinned,
     whole_cycles,
 )
-from dahl_ident.extraction.transient import (
-    MOST_CYCLES,
-    Transient,
-    estimate_transient,
-)
+from dahl_ident.extraction.transient import MOST_CYCLES, Transient, estimate_transient
 from dahl_ident.units import percent
 
 _NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out

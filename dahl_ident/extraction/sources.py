@@ -21,9 +21,9 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.levels import labelled
 from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
 from dahl_ident.errors import DataError, ValidationError, name_options, names_options
+from dahl_ident.extraction.cycles import Mode
 from dahl_ident.extraction.from_record import record_response
 from dahl_ident.extraction.phasors import Settings
-from dahl_ident.extraction.plateaus import Mode
 from dahl_ident.units import percent
 
 PathLike = str | Path
@@ -194,7 +194,10 @@ def extract_all(
 
     Several tasks without runs get their names as runs, or as levels.
     """
-    settings = Settings.of(**how)
+    given = {name: value for name, value in how.items() if value is not None}
+    if how.get("controlled") == "force":
+        given.setdefault("harmonics", (1,))
+    settings = Settings(**given)
     refuse_repeated([task.source for task in tasks])
     jobs = min(whole_number(jobs, "jobs", 1), len(tasks))
     if jobs == 1:

@@ -2,29 +2,36 @@
 
 A path names an array: ``FRdata.ForceControl[2].frequency`` in MATLAB files, where indices of
 struct and cell arrays count from 0, ``group/dataset`` in HDF5. A matrix appears as its columns
-or rows, whichever are fewer: ``data[:,0]``, ``data[:,1]``.
+or rows, whichever are fewer: ``data[:,0]``, ``data[:,1]``. The arrays of HDF5, and of MATLAB v7.3,
+which is HDF5 inside, stay in the file until they are used.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header
-from dahl_ident.data.readers.child_process import apart
-from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File
+from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
+from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File, apart, refuse_many
+from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
 _WIDEST = 64  # columns; a matrix with more both ways is a map or a picture
 _SECONDS, _BYTES_A_SECOND = 5, 10_000_000  # in which MATLAB's files are read
+_LOOK_SECONDS = 1  # a look at a good file takes some milliseconds,
+_LOOK_BYTES_A_SECOND = 1_000_000  # and at one of many small objects 0.2 ms for each 300 bytes
+_PACKING = {"scale_factor", "add_offset", "_FillValue", "missing_value"}
+_LOOKED_AT = 1 << 24  # bytes in all
 Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
 
 
@@ -43,11 +50,7 @@ def tree_source(
         if not those:
             dtype = getattr(value, "dtype", type(value).__name__)
             notes.append(f"{path} ({np.shape(value)}, {dtype}) is not used")
-        if len(channels) + len(notes) > MOST_CHANNELS:
-            raise DataError(
-                f"{file.name}: the file holds more than {MOST_CHANNELS} arrays; expected a "
-                "record or a table. Save what is needed in a file of its own"
-            )
+        refuse_many(file.name, len(channels) + len(notes), "arrays")
     if not channels:
         others = f"; {listed(notes, 3)}" if notes else ""
         raise DataError(f"{file.name}: the file holds no vector or matrix of numbers{others}")
@@ -101,11 +104,12 @@ def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
 def read_npz(file: File) -> RawFile:
     """Return the arrays of a ``.npz`` file; objects, which would have to be run, are refused."""
     with np.load(io.BytesIO(file.data), allow_pickle=False) as content:
-        names = content.files[: MOST_CHANNELS + 1]
+        names = content.files
+        refuse_many(file.name, len(names), "arrays")
         arrays = {name: content[name] for name in names}
-    repeated = [name for name in arrays if names.count(name) > 1]
-    if repeated:
-        raise DataError(f"{file.name}: two arrays are called {repeated[0]!r}; expected one")
+    if len(arrays) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DataError(f"{file.name}: two arrays are called {twice!r}; expected one")
     leaves = (leaf for name, array in arrays.items() for leaf in _fields(name, array))
     return tree_source(file, "NumPy .npz", leaves)
 
@@ -117,10 +121,7 @@ def read_npy(file: File) -> RawFile:
     array = np.load(stream, mmap_mode="r" if mapped else None, allow_pickle=False)
     end = getattr(array, "offset", 0) + array.nbytes if mapped else stream.tell()
     if file.length != end:
-        raise DataError(
-            f"{file.name}: the file is damaged: {file.length - end} bytes behind its array; were "
-            "some added?"
-        )
+        raise ValueError(f"{file.length - end} bytes behind its array; were some added?")
     return tree_source(file, "NumPy .npy", _fields("data", array, file if mapped else None))
 
 
@@ -178,3 +179,174 @@ def _matlab_leaves(file: File, value: Any, path: str, depth: int) -> Iterator[Le
                 yield from _matlab_leaves(file, part, inner, depth + 1)
     else:
         yield path, value, None
+
+
+def read_hdf5(file: File) -> RawFile:
+    """Return the data sets of an HDF5 or MATLAB v7.3 file."""
+    h5py = library("h5py")
+    _refuse_fatal(file, h5py)
+    root = h5py.File(file.stream(), "r")  # open as long as an array of it waits to be read
+    # Bytes that were added move others; the library itself refuses a file that is too short.
+    # (HDF5 File Format Specification, II.A: the superblock)
+    with file.opened() as content:
+        content.seek(root.userblock_size)
+        block = content.read(100)
+    width = block[13 if block[8] < 2 else 9]  # bytes of an address
+    at = {0: 24, 1: 28}.get(block[8], 12) + 2 * width
+    end = int.from_bytes(block[at : at + width], "little")
+    if file.length != end:
+        raise ValueError(f"it has {file.length} bytes, and says that it ends after {end}")
+    matlab = root.userblock_size >= 512 and file.head.startswith(b"MATLAB")
+    tree = _Tree(file, root, h5py)
+    leaves = list(tree.matlab_group(root, "", 0) if matlab else tree.group(root, "", 0))
+    text = root.attrs.get("dahl_ident")
+    metadata = {} if text is None else read_metadata(text)
+    return tree_source(file, "MATLAB v7.3" if matlab else "HDF5", iter(leaves), metadata)
+
+
+def _refuse_fatal(file: File, h5py: Any) -> None:
+    """Visit every object, and read the data sets whose places the file has to look up."""
+
+    def look() -> None:  # pragma: no cover
+        with contextlib.suppress(Exception), h5py.File(file.stream(), "r") as root:
+            dict(root.attrs)  # an error will be met again, and named, by the reader
+            left = _LOOKED_AT
+            for _, item in _Tree(file, root, h5py).all_items(root, 0):
+                with contextlib.suppress(Exception):
+                    dict(item.attrs)
+                if isinstance(item, h5py.Dataset) and item.chunks is not None:
+                    with contextlib.suppress(Exception):
+                        _ = item[()] if item.nbytes < left else (item[:1], item[-1:])
+                    left -= min(item.nbytes, left)
+
+    error = apart(look, seconds=_LOOK_SECONDS + file.length // _LOOK_BYTES_A_SECOND).error
+    if error:
+        raise ValueError(f"{error} on its structure")
+
+
+class _Tree:
+    """Walks through the groups of a file, each object once."""
+
+    def __init__(self, file: File, root: Any, h5py: Any) -> None:
+        self.file, self.root, self.h5py = file, root, h5py
+        self.seen: set[Any] = set()
+        self.count = 0
+
+    def members(self, group: Any, depth: int) -> Iterator[tuple[str, Any]]:
+        """Yield what a group holds itself; links to elsewhere are not followed."""
+        if depth > DEEPEST:
+            raise DataError(f"{self.file.name}: groups are nested deeper than {DEEPEST} levels")
+        for name in group:
+            self.count += 1
+            refuse_many(self.file.name, self.count, "objects", 2 * MOST_CHANNELS)
+            if not isinstance(group.get(name, getlink=True), self.h5py.HardLink):
+                continue
+            item = group[name]
+            key = self.h5py.h5o.get_info(item.id).addr
+            if key not in self.seen:
+                self.seen.add(key)
+                yield name, item
+
+    def all_items(self, group: Any, depth: int) -> Iterator[tuple[str, Any]]:
+        """Yield every object below a group."""
+        for name, item in self.members(group, depth):
+            yield name, item
+            if isinstance(item, self.h5py.Group):
+                yield from self.all_items(item, depth + 1)
+
+    def group(self, group: Any, path: str, depth: int) -> Iterator[Leaf]:
+        for name, item in self.members(group, depth):
+            where = f"{path}/{name}" if path else name
+            if isinstance(item, self.h5py.Group):
+                yield from self.group(item, where, depth + 1)
+            elif isinstance(item, self.h5py.Dataset):
+                yield from self.dataset(item, where)
+
+    def dataset(self, item: Any, path: str) -> Iterator[Leaf]:
+        if item.shape is None or (item.dtype.kind == "O" and item.ndim > 1):
+            return
+        unit = item.attrs.get("unit", item.attrs.get("units"))
+        unit = unit.decode() if isinstance(unit, bytes) else unit
+        unit = unit if isinstance(unit, str) and unit.strip() else None
+        if self.h5py.check_string_dtype(item.dtype) is not None:
+            self.refuse(item, path)
+            yield path, words(np.ravel(item.asstr()[()])).reshape(item.shape), unit
+        elif item.dtype.names:
+            for name in item.dtype.names:
+                dtype = item.dtype[name]
+                yield f"{path}.{name}", self.stored(item, path, dtype, lambda a, n=name: a[n]), unit
+        elif _PACKING & item.attrs.keys():
+            yield path, self.stored(item, path, np.float64, partial(_unpacked, item.attrs)), unit
+        else:
+            yield path, self.stored(item, path, item.dtype, lambda a: a), unit
+
+    def stored(
+        self, item: Any, path: str, dtype: Any, form: Any, *, turned: bool = False
+    ) -> Stored:
+        """Return an array that is read when it is used."""
+
+        def read(rows: slice) -> NDArray[Any]:
+            self.refuse(item, path)
+            array = form(item[()] if rows == slice(None) or turned else item[rows])
+            return np.asarray(array[rows] if turned else array)
+
+        shape = tuple(int(n) for n in (item.shape[::-1] if turned else item.shape))
+        return Stored(shape, np.dtype(dtype), read, f"{self.file.name}: {path}")
+
+    def refuse(self, item: Any, path: str) -> None:
+        """Refuse a data set that is too large, or whose values are in other files."""
+        if item.external or item.is_virtual:
+            how = "virtual, made of parts of others" if item.is_virtual else "in an external file"
+            raise DataError(
+                f"{self.file.name}: the values of {path} are {how}; write them into one file, "
+                "such as with h5repack"
+            )
+        self.file.refuse_above_limit(int(item.size) * max(item.dtype.itemsize, 8), path)
+
+    def matlab_group(self, group: Any, path: str, depth: int) -> Iterator[Leaf]:
+        """Walk through a v7.3 file, whose struct arrays are data sets of references."""
+        for name, item in self.members(group, depth):
+            if not name.startswith("#"):
+                where = f"{path}.{name}" if path else name
+                yield from self.matlab_item(item, where, path, name, depth)
+
+    def matlab_item(
+        self, item: Any, where: str, path: str, name: str, depth: int
+    ) -> Iterator[Leaf]:
+        if depth > DEEPEST:
+            raise DataError(f"{self.file.name}: {path} is nested deeper than {DEEPEST} levels")
+        if isinstance(item, self.h5py.Group):
+            yield from self.matlab_group(item, where, depth + 1)
+        elif not isinstance(item, self.h5py.Dataset) or item.shape is None:
+            return
+        elif self.h5py.check_ref_dtype(item.dtype) is not None:
+            self.refuse(item, where)
+            refuse_many(self.file.name, item.size, f"cells in {where}")
+            cell = item.attrs.get("MATLAB_class") == b"cell"
+            # MATLAB stores its arrays transposed
+            for i, reference in enumerate(np.ravel(item[()].T)):
+                inner = f"{where}[{i}]" if cell else f"{path}[{i}].{name}"
+                if reference:  # a null reference is an empty cell
+                    yield from self.matlab_item(self.root[reference], inner, path, name, depth + 1)
+        elif item.attrs.get("MATLAB_class") == b"char" and "MATLAB_empty" not in item.attrs:
+            self.refuse(item, where)
+            codes = np.ravel(np.asarray(item[()]).T).tolist()
+            yield where, np.asarray("".join(map(chr, codes))), None
+        elif "MATLAB_empty" not in item.attrs:
+            parts = item.dtype.names == ("real", "imag")
+            kind = np.dtype(np.complex128) if parts else item.dtype
+            form = _joined if parts else np.transpose
+            yield where, self.stored(item, where, kind, form, turned=True), None
+
+
+def _unpacked(attributes: Any, array: NDArray[Any]) -> NDArray[np.float64]:
+    """Return what numbers stand for, as NetCDF packs them; a missing one is NaN."""
+    values = array * float(np.squeeze(attributes.get("scale_factor", 1.0)))
+    values = np.asarray(values + float(np.squeeze(attributes.get("add_offset", 0.0))))
+    for name in ("_FillValue", "missing_value"):
+        values[np.isin(array, np.asarray(attributes.get(name, [])))] = np.nan
+    return values
+
+
+def _joined(parts: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(parts["real"].T + 1j * parts["imag"].T)

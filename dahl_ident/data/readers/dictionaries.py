@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import RawChannel, RawFile, plain, split_header, words
-from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
+from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
@@ -58,8 +58,7 @@ def dictionary_source(
     channels = tuple(_channels(content, name))
     if not channels:
         raise DataError(f"{name}: no columns; expected an object of columns, or a list of rows")
-    if len(channels) > MOST_CHANNELS:
-        raise DataError(f"{name}: {len(channels)} columns; at most {MOST_CHANNELS} are read")
+    refuse_many(name, len(channels), "columns")
     headerless = all(c.name == _UNNAMED.format(i + 1) for i, c in enumerate(channels))
     return RawFile(name, kind, channels, sha256, headerless=headerless)
 
@@ -78,8 +77,7 @@ def _channels(content: Any, name: str, units: Any = None) -> Iterator[RawChannel
             yield from _columns({str(column["name"]): column}, name, units)
     elif _is_list_of(dict, content):
         keys = list(dict.fromkeys(key for row in content for key in row))
-        if len(keys) > MOST_CHANNELS:
-            raise DataError(f"{name}: {len(keys)} columns; at most {MOST_CHANNELS} are read")
+        refuse_many(name, len(keys), "columns")
         columns = {key: [row.get(key) for row in content] for key in keys}
         yield from _columns(columns, name, units)
     elif _is_list_of(list, content):

@@ -1,18 +1,27 @@
-"""A file with its hash, its format found from the content, and limits of its size.
+"""A file with its hash, its format found from the content, and limits of size and time.
 
 The unpacked or declared size of a file is limited before memory is allocated, because a damaged or
-malicious file of some kilobytes may declare exabytes.
+malicious file of some kilobytes may declare exabytes. Compiled libraries trust what a file says of
+its own structure; they work in a process of its own, which damage may end, hang or fill with
+numbers. There a crash is an error like others. Systems without ``fork`` go without.
 """
 
 from __future__ import annotations
 
 import bz2
+import contextlib
+import faulthandler
 import gzip
 import hashlib
 import io
 import lzma
+import os
+import pickle
 import re
+import signal
 import sys
+import threading
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
@@ -65,16 +74,16 @@ FORMATS = {
     "npy": Format("NumPy's .npy", ".npy", "array_trees.read_npy", "the file"),
     "parquet": Format("Parquet", ".parquet .pq", "spreadsheets.read_parquet", "the file"),
     "matlab": Format("MATLAB v5 or v7", ".mat", "array_trees.read_matlab", "the file"),
-    "hdf5": Format("HDF5 or MATLAB v7.3", ".mat .h5 .hdf5", "hdf5.read_hdf5", "the file"),
+    "hdf5": Format("HDF5 or MATLAB v7.3", ".mat .h5 .hdf5", "array_trees.read_hdf5", "the file"),
     "uff": Format(
         "a universal file",
         ".uff .unv .bunv .txt .dat .asc",
-        "instruments.read_uff",
+        "analysers.read_uff",
         "the universal file",
     ),
-    "tdms": Format("NI TDMS", ".tdms", "instruments.read_tdms", "the TDMS file"),
-    "lvm": Format("LabVIEW LVM", ".lvm .txt .dat .asc", "lvm.read_lvm"),
-    "sdf": Format("an analyser's SDF", ".sdf .dat", "sdf.read_sdf", "the SDF file"),
+    "tdms": Format("NI TDMS", ".tdms", "labview.read_tdms", "the TDMS file"),
+    "lvm": Format("LabVIEW LVM", ".lvm .txt .dat .asc", "labview.read_lvm", "the LVM file"),
+    "sdf": Format("an analyser's SDF", ".sdf .dat", "analysers.read_sdf", "the SDF file"),
 }
 _UFF = re.compile(rb"-1[ \t]*[\r\n]\s*\d")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -165,6 +174,15 @@ class File:
         if not channels:
             raise DataError(f"{self.name}: the file holds no channels")
         return RawFile(self.name, kind, channels, self.sha256, **facts)
+
+
+def refuse_many(name: str, count: int, what: str, most: int = MOST_CHANNELS) -> None:
+    """Refuse a file of more columns, arrays or the like than a laboratory's has."""
+    if count > most:
+        raise DataError(
+            f"{name}: the file has {count} {what}; at most {most} are read. Save what is needed in "
+            "a file of its own"
+        )
 
 
 def open_file(path: str | Path) -> File:
@@ -275,3 +293,57 @@ def utf8(data: bytes) -> bytes:
     except UnicodeDecodeError:
         return data.decode("cp1252", errors="replace").encode("utf-8")
     return data
+
+
+class Answer(NamedTuple):
+    """What the work gave, or why it gave nothing."""
+
+    value: Any = None
+    error: str = ""
+
+
+def apart(work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = None) -> Answer:
+    """Return what a function gives within some time, and memory in addition to what is used."""
+    if not hasattr(os, "fork"):
+        return Answer(work())
+    reading, writing = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # other threads are not touched
+        process = os.fork()
+    if process == 0:  # pragma: no cover
+        try:
+            _limit(seconds, bytes_at_most)
+            answer = Answer(work())
+        except BaseException as exc:
+            answer = Answer(error=str(exc) or type(exc).__name__)
+        with contextlib.suppress(BaseException), os.fdopen(writing, "wb") as pipe:
+            pickle.dump(answer, pipe)
+        os._exit(0)
+    os.close(writing)
+    timer = threading.Timer(2.0 * seconds, os.kill, (process, signal.SIGKILL))  # on the clock
+    timer.start()
+    with os.fdopen(reading, "rb") as pipe:
+        content = pipe.read()
+    timer.cancel()
+    _, status = os.waitpid(process, 0)
+    if status or not content:
+        hung = os.waitstatus_to_exitcode(status) in (-signal.SIGXCPU, -signal.SIGKILL)
+        return Answer(error=f"its reader {'hangs' if hung else 'fails'}")
+    answer = pickle.loads(content)
+    assert isinstance(answer, Answer)
+    return answer
+
+
+def _limit(seconds: int, bytes_at_most: int | None) -> None:  # pragma: no cover
+    """Limit the processor time and the memory of this process, which prints nothing."""
+    import resource
+
+    faulthandler.disable()
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+    if bytes_at_most is not None:
+        with contextlib.suppress(OSError):  # where there is no such file, the limit is the whole
+            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            bytes_at_most += pages * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (bytes_at_most, bytes_at_most))

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
-from dahl_ident.data.readers.child_process import apart
-from dahl_ident.data.readers.file import MOST_CHANNELS, ZIP_ERRORS, File
+from dahl_ident.data.readers.file import ZIP_ERRORS, File, apart, refuse_many
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
@@ -55,7 +54,7 @@ def _cells(file: File) -> dict[str, list[list[Any]]]:
     with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
         broken = archive.testzip()
     if broken is not None:
-        raise DataError(f"{file.name}: the workbook is damaged: the check sum of {broken} differs")
+        raise ValueError(f"the check sum of {broken} differs")
     calamine = library("python_calamine", "excel")
 
     def read() -> dict[str, list[list[Any]]]:  # pragma: no cover
@@ -130,13 +129,9 @@ def read_parquet(file: File) -> RawFile:
         attributes = json.loads(stored.get(b"PANDAS_ATTRS", b"{}"))
     saved = attributes.get("dahl_ident") if isinstance(attributes, dict) else None
     metadata = {} if saved is None else read_metadata(json.dumps(saved))
-    added = _added_bytes(file, table.metadata)
-    if added:
-        raise DataError(
-            f"{file.name}: the file is damaged: {added} bytes belong to no column; were some added?"
-        )
-    if len(schema.names) > MOST_CHANNELS:
-        raise DataError(f"{file.name}: the file has more than {MOST_CHANNELS} columns")
+    if added := _added_bytes(file, table.metadata):
+        raise ValueError(f"{added} bytes belong to no column; were some added?")
+    refuse_many(file.name, len(schema.names), "columns")
     file.refuse_above_limit(8 * rows, "one column")
     if not rows:
         raise DataError(f"{file.name}: the table is empty")

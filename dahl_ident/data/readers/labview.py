@@ -1,31 +1,174 @@
-"""LabVIEW measurement files: text with a header for the file and one for each segment.
+"""Files of National Instruments: TDMS, and LabVIEW's measurement files (LVM).
 
-Every line of a segment must have the fields of its column labels, and a segment the number of
-samples that its header says; a lost line would move all later samples in time.
+An LVM file is text with a header for the file and one for each segment. Every line of a segment
+must have the fields of its column labels, and a segment the number of samples that its header says;
+a lost line would move all later samples in time.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import io
 import itertools
+import os
 import re
-from collections.abc import Iterator
+import struct
+import weakref
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import RawChannel, RawFile, words
-from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
-from dahl_ident.data.readers.instruments import evenly_timed, labelled_channel
+from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
+from dahl_ident.data.readers.file import File, refuse_many, utf8
+from dahl_ident.data.storage import library
+from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
+_LEAD_IN = struct.Struct("<4sIIQQ")  # of a TDMS segment: tag, contents, version, and two sizes
+_LONGEST_METADATA = 1 << 24  # bytes of a segment that are looked at
+_LONGEST_SEGMENT = 1 << 48  # bytes; more means that the segment was never closed
 _END = "***End_of_Header***"
 _SPECIAL = ("***Start_Special***", "***End_Special***")
 _SEPARATORS = {"tab": "\t", "comma": ",", "semicolon": ";"}
 _SAME_STEP = 0.01  # relative: more than what is rounded in times and in the header
 _MOST_SEGMENTS = 1000  # the time to read grows with their square
 Lines = list[tuple[int, str]]
+
+
+def read_tdms(file: File) -> RawFile:
+    """Return the channels of a TDMS file; evenly sampled ones get a time channel."""
+    nptdms = library("nptdms", "tdms")
+    stream: Any = file.stream()
+    if isinstance(stream, Path):
+        stream = _Bounded(io.FileIO(stream))
+    with _damage_named():
+        content = nptdms.TdmsFile.open(stream)
+        weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
+        starts = [t for g in content.groups() for c in g.channels() if (t := _start(c)) is not None]
+        first = min(starts, default=None)
+        channels = [
+            c for group in content.groups() for c in _tdms_channels(file, content, group, first)
+        ]
+        begun = _begun_again(file)
+    doubts = []
+    if sum(c.role == "time" for c in channels) > 1 and len(set(starts)) > 1:
+        late = (max(starts) - min(starts)) / np.timedelta64(1, "s")
+        doubts.append(
+            f"the channels start at different times, up to {late:.4g} s apart (wf_start_time); "
+            "each has a time of its own"
+        )
+    if begun:
+        doubts.append(
+            f"segments {listed([str(i) for i in begun], 5)} of the file state wf_increment again, "
+            "as a file that was appended does; time goes on as if no pause were between them. "
+            "Split the file where it holds several runs"
+        )
+    return file.source("TDMS", channels, row_name=lambda i: f"sample {i}", doubts=tuple(doubts))
+
+
+class _Bounded(io.BufferedReader):
+    """A file of which no more is read than there is, for which memory would be set aside."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def _begun_again(file: File) -> list[int]:
+    """Return the numbers of later segments that state the sampling of a waveform again."""
+    again, number = [], 0
+    with file.opened() as stream:
+        while lead := stream.read(_LEAD_IN.size):
+            if len(lead) < _LEAD_IN.size or not lead.startswith(b"TDSm"):
+                raise ValueError(
+                    f"bytes behind segment {number}, from byte {stream.tell() - len(lead)} on, "
+                    "belong to none; were some added?"
+                )
+            _, _, _, following, metadata = _LEAD_IN.unpack(lead)
+            number += 1
+            if following > _LONGEST_SEGMENT:
+                break
+            start = stream.tell()
+            if number > 1 and b"wf_increment" in stream.read(min(metadata, _LONGEST_METADATA)):
+                again.append(number)
+            stream.seek(start + following)
+    return again
+
+
+@contextlib.contextmanager
+def _damage_named() -> Iterator[None]:
+    """Raise what the library would print on the terminal as an error."""
+    printer, printed = library("nptdms.log").log_manager.console_handler, io.StringIO()
+    terminal = printer.setStream(printed)
+    try:
+        yield
+    finally:
+        printer.setStream(terminal)
+    if printed.getvalue():
+        raise ValueError(printed.getvalue().splitlines()[0].partition("] ")[2])
+
+
+def _start(channel: Any) -> Any:
+    """Return when a waveform began; None where the file does not say."""
+    if float(channel.properties.get("wf_increment", 0.0)) <= 0.0:
+        return None
+    start = channel.properties.get("wf_start_time")
+    return None if start is None else np.datetime64(start, "ns")
+
+
+def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator[RawChannel]:
+    times: dict[tuple[float, float, int], Stored] = {}
+    for channel in group.channels():
+        properties = channel.properties
+        unit = properties.get("unit_string") or properties.get("NI_UnitDescription")
+        count = len(channel)
+        file.refuse_above_limit(8 * count, channel.path)
+        read = functools.partial(_tdms_values, content, channel)
+        what = f"{file.name}: {channel.path}"
+        values: Any = Stored((count,), np.dtype(channel.dtype), read, what)
+        if values.dtype.kind not in "fiubc":
+            values = words(map(str, values.array))
+        yield _labelled(f"{group.name}/", channel.name, values, unit)
+        step = float(properties.get("wf_increment", 0.0))
+        if step > 0.0:
+            start, begun = float(properties.get("wf_start_offset", 0.0)), _start(channel)
+            if begun is not None:  # to a hundredth of a step: clocks of modules differ by less
+                start += step * round(float((begun - first) / np.timedelta64(1, "s")) / step, 2)
+            even = functools.partial(_even_times, start, step, count)
+            times[start, step, count] = Stored((count,), np.dtype(np.float64), even, what)
+    yield from _time_channels(times.values(), f"{group.name}/")
+
+
+def _tdms_values(content: Any, channel: Any, rows: slice) -> NDArray[Any]:
+    """Return some values of a channel, whose file is open as long as `content` lives."""
+    assert content is not None
+    with _damage_named():
+        values = np.asarray(channel[rows])
+    if values.size != len(range(*rows.indices(len(channel)))):
+        raise ValueError("it ends before its last sample")
+    return values
+
+
+def _even_times(start: float, step: float, count: int, rows: slice) -> NDArray[Any]:
+    return np.asarray(start + step * np.arange(count)[rows])
+
+
+def _labelled(prefix: str, label: str, values: Any, unit: str | None) -> RawChannel:
+    """Return a channel; many loggers write its unit into the label, as in ``Force (N)``."""
+    name, in_label = (label, unit) if unit else split_header(label)
+    return RawChannel(prefix + name, values, in_label, short=name)
+
+
+def _time_channels(times: Iterable[Any], prefix: str) -> Iterator[RawChannel]:
+    """Yield the time axes of a group, all different."""
+    axes = list(times)
+    for i, time in enumerate(axes):
+        name = "time" if len(axes) == 1 else f"time {i + 1}"
+        yield RawChannel(prefix + name, time, "s", "time", name)
 
 
 def read_lvm(file: File) -> RawFile:
@@ -43,8 +186,6 @@ def read_lvm(file: File) -> RawFile:
         segments.append(content.segment())
         if len(segments) > _MOST_SEGMENTS:
             raise DataError(f"{file.name}: the file has more than {_MOST_SEGMENTS} segments")
-    if not segments:
-        raise DataError(f"{file.name}: the LVM file is damaged: it holds no segment")
     channels = [
         channel
         for i, segment in enumerate(segments)
@@ -74,25 +215,21 @@ class _Lvm:
             if line.strip() == _END:
                 head, self.lines = self.lines[:i], self.lines[i + 1 :]
                 return [pair for pair in head if pair[1].strip()]
-        raise self.damage(f"a header without {_END}")
+        raise ValueError(f"a header without {_END}")
 
     def entries(self, head: Lines) -> dict[str, list[str]]:
         """Return the values of a header by their keys."""
         cells = (line.split(self.separator) for _, line in head)
         return {key.strip(): values for key, *values in cells}
 
-    def damage(self, why: str) -> DataError:
-        return DataError(f"{self.file.name}: the LVM file is damaged: {why}")
-
     def segment(self) -> _LvmBlock:
         """Take the lines of a segment: its header, labels and numbers; all of a single one."""
         header = self.entries(self.header())
         lines = list(itertools.dropwhile(lambda pair: not pair[1].strip(), self.lines))
         if not lines:
-            raise self.damage("a segment without column labels")
+            raise ValueError("a segment without column labels")
         labels = [label.strip() for label in lines[0][1].split(self.separator)]
-        if len(labels) > MOST_CHANNELS:
-            raise DataError(f"{self.file.name}: a segment has more than {MOST_CHANNELS} channels")
+        refuse_many(self.file.name, len(labels), "channels")
         blank = (i for i in range(1, len(lines)) if not lines[i][1].strip())
         stop = len(lines) if self.single else next(blank, len(lines))
         rows, self.lines = [row for row in lines[1:stop] if row[1].strip()], lines[stop:]
@@ -130,7 +267,7 @@ class _Lvm:
         stated = [value.strip() for value in segment.header.get("Samples", []) if value.strip()]
         for value in stated:
             if not re.fullmatch("[0-9]{1,18}", value):
-                raise self.damage(f"{value[:40]!r} is not a number of samples")
+                raise ValueError(f"{value[:40]!r} is not a number of samples")
         most = max(map(int, stated), default=rows)
         # a single header is that of the first samples written, which more may follow
         timed = "X_Value" in segment.labels
@@ -157,9 +294,8 @@ class _LvmBlock(NamedTuple):
         units = self.header.get("Y_Unit_Label", [])
         if self.multi and len(units) > len(named) and not any(u.strip() for u in units[1::2]):
             units = units[0::2]
-        for i, (name, values) in enumerate(named):
-            unit = units[i].strip() if i < len(units) else ""
-            yield labelled_channel(prefix, name, values, unit)
+        for (name, values), unit in zip(named, [*units, *[""] * len(named)], strict=False):
+            yield _labelled(prefix, name, values, unit.strip())
         if {word.strip() for word in self.header.get("X_Dimension", [])} - {"Time", ""}:
             return
         times: list[NDArray[Any]] = [values for name, values in table if name == "X_Value"]
@@ -167,7 +303,7 @@ class _LvmBlock(NamedTuple):
             n = np.arange(len(self.data))
             both = zip(self.floats("X0"), self.floats("Delta_X"), strict=False)
             times = [start + step * n for start, step in both if step > 0]
-        yield from evenly_timed(times, prefix)
+        yield from _time_channels({time.tobytes(): time for time in times}.values(), prefix)
 
     def contradictions(self) -> Iterator[str]:
         """Yield what the header says of the sampling, and the column of times does not."""
