@@ -19,7 +19,7 @@ from dahl_ident.diagnostics import error_sources, prediction_error
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.planning import Plan, forecast
-from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
+from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.design import (
     Exchange,
     Objective,

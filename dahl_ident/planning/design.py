@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
+from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime
 
 _POWER = 4.0  # q: 1 would add the targets' variances, infinity would use only the largest
 _IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels

@@ -17,8 +17,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.errors import ValidationError
-from dahl_ident.planning.bench_time import LEAST_CYCLES
-from dahl_ident.planning.candidates import Candidates, allowed
+from dahl_ident.planning.candidates import LEAST_CYCLES, Candidates, allowed
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.question import BenchLimits, RecordedForce, limit
 from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid

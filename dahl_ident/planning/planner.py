@@ -12,12 +12,17 @@ from dahl_ident.arrays import non_negative_array, positive_number, whole_number
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError, argument
-from dahl_ident.planning.advice import assumptions_of, options_of, undetermined
 from dahl_ident.planning.candidates import CONTROLLED, evaluate
 from dahl_ident.planning.design import Design
 from dahl_ident.planning.forecast import SEARCHED
 from dahl_ident.planning.knowledge import Ranges, gather
-from dahl_ident.planning.measurement_plan import Plan, PlanStep
+from dahl_ident.planning.measurement_plan import (
+    Plan,
+    PlanStep,
+    assumptions_of,
+    options_of,
+    undetermined,
+)
 from dahl_ident.planning.question import (
     RESPONSE,
     BenchLimits,

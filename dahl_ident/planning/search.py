@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
-from dahl_ident.planning.bench_time import LEAST_CYCLES, BenchTime
-from dahl_ident.planning.candidates import Candidates
+from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime, Candidates
 from dahl_ident.planning.design import Coverage, Design, Exchange, Objective, continuous_design
-from dahl_ident.planning.forecast import Expected, Forecast, typical
+from dahl_ident.planning.forecast import Expected, Forecast, forecast_of_suspects, typical
 from dahl_ident.planning.knowledge import spread
 from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import PlanRequest, limit
-from dahl_ident.planning.suspects import forecast_of_suspects
 
 _POOL = 80  # candidates: the time of the search grows with their number
 _MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
