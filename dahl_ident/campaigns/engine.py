@@ -25,7 +25,7 @@ from statistics import median
 from typing import Any, TypeVar
 
 from dahl_ident.campaigns import worker
-from dahl_ident.campaigns.work import Job, Row, failed
+from dahl_ident.campaigns.worker import Job, Row, failed
 from dahl_ident.data.storage import library
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.version import __version__

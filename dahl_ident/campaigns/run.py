@@ -1,16 +1,24 @@
-"""The public function that runs the missing fits of a campaign and writes its table."""
+"""The public function that runs the missing fits of a campaign and writes its table.
+
+The journal has one line for each fit; the table is made from the lines. Only the last line can be
+incomplete, after a crash; it is dropped when the file is opened again. Only keys and positions of
+lines are held in memory.
+"""
 
 from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from dahl_ident.arrays import positive_number, whole_number
 from dahl_ident.campaigns.definition import Definition, Task, read_definition
@@ -24,9 +32,16 @@ from dahl_ident.campaigns.engine import (
     default_workers,
     run_jobs,
 )
-from dahl_ident.campaigns.journal import Journal, finished, write_tables
-from dahl_ident.campaigns.work import Job, Row, digest_of
-from dahl_ident.data.storage import as_before_inert, locked, read_text, regular, write_whole
+from dahl_ident.campaigns.worker import Job, Row, digest_of
+from dahl_ident.data.storage import (
+    as_before_inert,
+    inert,
+    locked,
+    put_in_place,
+    read_text,
+    regular,
+    write_whole,
+)
 from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.version import __version__
 
@@ -38,6 +53,9 @@ if TYPE_CHECKING:
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
 _TRIALS = 3  # fits that say whether the options of a new campaign can be used at all
+_ROWS_AT_ONCE = 2000
+"""Rows that are in memory as dictionaries, which are ten times as large as in a table."""
+_FIRST = ("device", "run", "status", "error", "statements")
 
 
 @dataclass(frozen=True)
@@ -419,3 +437,103 @@ def _digest(path: Path, seconds: float) -> str:
         return digest.result(seconds)
     except TimeoutError:
         raise DataError(f"{path}: cannot be read within {seconds:.3g} s") from None
+
+
+class Journal:
+    """The lines of one campaign: where that of each finished key is, and how long fits took."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.places, self.seconds, end = finished(path)
+        try:
+            self._file: IO[bytes] = path.open("r+b" if path.exists() else "w+b")
+            self._file.truncate(end)
+            self._file.seek(end)
+        except OSError as exc:
+            raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+
+    def add(self, key: str, row: Mapping[str, Any]) -> None:
+        """Append one result; it has been passed to the operating system when this returns."""
+        line = json.dumps({"key": key, **row}, ensure_ascii=False).encode() + b"\n"
+        self.places[key] = self._file.tell()
+        self._file.write(line)
+        self._file.flush()
+
+    def rows(self, keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Yield results by key, in the order asked for."""
+        with self._path.open("rb") as file:
+            for key in keys:
+                file.seek(self.places[key])
+                yield json.loads(file.readline())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def finished(path: Path) -> tuple[dict[str, int], list[float], int]:
+    """Return the position of each finished key's line, seconds, and the end of the last line.
+
+    A fit whose failure may have another cause than its device is not finished: a process or a
+    worker that died, files that a worker does not see, a limit of time or memory.
+    """
+    places: dict[str, int] = {}
+    seconds: list[float] = []
+    end = 0
+    if not path.exists():
+        return places, seconds, end
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                row = json.loads(line)
+                if not row.get("retry"):
+                    places[row["key"]] = end
+                if row["status"] != "failed":
+                    seconds.append(float(row["seconds"]))
+            except (ValueError, KeyError, AttributeError, TypeError):
+                raise DataError(
+                    f"{path}: line {number} is not a result of a campaign; move the file away to "
+                    "start again"
+                ) from None
+            end += len(line)
+    return places, seconds, end
+
+
+def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, int]:
+    """Write ``results.csv`` and, with pyarrow, ``results.parquet``; return counts of statuses."""
+    import pandas as pd
+
+    flat = map(_flat, rows)
+    blocks = iter(lambda: list(islice(flat, _ROWS_AT_ONCE)), [])
+    table = pd.concat([pd.DataFrame(), *map(pd.DataFrame, blocks)], ignore_index=True)
+    first = [name for name in _FIRST if name in table]
+    table = table[[*first, *sorted(map(str, set(table) - set(first)))]]
+    is_number = pd.api.types.is_numeric_dtype
+    table = table.astype({c: "float64" if is_number(table[c]) else "string" for c in table})
+    writers: dict[str, Callable[[Path], object]] = {
+        "results.csv": partial(inert(table).to_csv, index=False, lineterminator="\n")
+    }
+    if find_spec("pyarrow") is not None:
+        writers["results.parquet"] = partial(table.to_parquet, engine="pyarrow", index=False)
+    for name, write in writers.items():
+        path = folder / name
+        try:
+            put_in_place(path, write)
+        except OSError as exc:
+            raise DataError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+    return dict(Counter(table["status"].tolist())) if len(table) else {}
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return one row of the table: numbers and texts alone."""
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, list):
+            flat[name] = " | ".join(map(str, value))
+        elif isinstance(value, int) and not isinstance(value, bool):
+            flat[name] = float(value)
+        else:
+            flat[name] = value
+    return flat

@@ -1,28 +1,201 @@
-"""A process that does fits for another one, which can stop it; and how that one holds it.
+"""One fit of a campaign in a process of its own: from files to a row, with limits.
 
 Fits run in a process of their own wherever they run: on this machine, in a thread of an executor,
 on a worker of a cluster. So a fit that hangs, needs too much memory or kills its process ends as a
 row, and nothing else is lost. Jobs go through standard input and rows come back through standard
-output, as pickles; nothing of the calling script is imported but the files of its laws.
+output, as pickles; nothing of the calling script is imported but the files of its laws. Numerical
+libraries are imported only inside functions, so that this module loads at once.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import hashlib
+import importlib
 import math
 import os
 import pickle
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
-from dahl_ident.campaigns.work import THREADS, Job, Row, do, failed
+from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.version import __version__
 
+if TYPE_CHECKING:
+    from dahl_ident.data import FrequencyResponse
+    from dahl_ident.elements.law_files import LawFile
+    from dahl_ident.results import FitResult
+
+Row = dict[str, Any]
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _DEATHS = 3  # deaths of a process after which its job is taken as the cause
 _START = "import sys; sys.path[:] = {!r}; from dahl_ident.campaigns.worker import serve; serve()"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process needs to do one fit; plain data."""
+
+    name: str  # device and run
+    # paths, with the contents if these are sent with the job
+    files: tuple[tuple[str, bytes | None], ...]
+    runs: tuple[str, ...]  # label of each file
+    options: Mapping[str, Any]  # of :class:`dahl_ident.campaigns.definition.Definition`
+    report: str | None  # where the report goes
+    # modules, or files with their contents, that define laws of the model
+    laws: tuple[str | LawFile, ...] = ()
+    version: str = __version__  # that of the package that made the job
+
+
+class UnseenError(DataError):
+    """A file that cannot be read where the fit is made; perhaps it can elsewhere."""
+
+
+def failed(error: str, *, retry: bool = False, refused: bool = False, seconds: float = 0.0) -> Row:
+    """Return the row of a fit that failed.
+
+    With `retry`, the same command tries it again; `refused` says that options or model are wrong.
+    """
+    row: Row = {"status": "failed", "error": error, "digests": [], "seconds": seconds}
+    return row | {name: True for name, is_so in (("retry", retry), ("refused", refused)) if is_so}
+
+
+def do(job: Job) -> Row:
+    """Return the row of one fit; a failure is a row with the reason."""
+    began = time.perf_counter()
+    digests: list[str] = []
+    try:
+        for law in job.laws:
+            _load(law)
+        row = _done(job, digests)
+    except UnseenError as exc:
+        row = failed(
+            f"{exc}; where workers do not have the files, send them with send_files=True (on the "
+            "command line --send-files)",
+            retry=True,
+        )
+    except MemoryError as exc:
+        row = failed(
+            f"the limit of memory for a device does not suffice ({' '.join(str(exc).split())}); "
+            "give it more with memory= (on the command line --memory)",
+            retry=True,
+        )
+    except Exception as exc:  # one device that fails, however, must not end the campaign
+        wrong = isinstance(exc, (ValidationError, ModelError))
+        row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}", refused=wrong)
+    return {**row, "digests": digests, "seconds": time.perf_counter() - began}
+
+
+def _load(law: str | LawFile) -> None:
+    """Import a module, or run a file, so that the laws in it are known by their kinds."""
+    if isinstance(law, str):
+        importlib.import_module(law)
+        return
+    from dahl_ident.elements.law_files import run
+
+    run(law)
+
+
+def _done(job: Job, digests: list[str]) -> Row:
+    import dahl_ident as di
+    from dahl_ident.elements.description import model_from_description
+
+    options = job.options
+    with _on_disk(job, digests) as paths:
+        data = _response(paths, job.runs, options)
+    model = model_from_description(options["model"])
+    result = di.fit(data, model, throw=False, **options["fit"])
+    row = _row(result)
+    results: list[Any] = [result]
+    if options["posterior"] is not None:
+        posterior = di.posterior(data, model, seed=0, **options["posterior"])
+        results.append(posterior)
+        for name, estimate in posterior.params.items():
+            row[f"posterior_{name}"] = estimate.value
+            row[f"u_posterior_{name}"] = estimate.stderr
+    if job.report is not None:
+        place = Path(job.report)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        di.report(results, place, title=job.name, overwrite=True)
+        row["report"] = place.name
+    return row
+
+
+def _response(
+    paths: list[Path], runs: tuple[str, ...], options: Mapping[str, Any]
+) -> FrequencyResponse:
+    import dahl_ident as di
+
+    if options["kind"] == "response":
+        chosen: Any = paths if len(paths) > 1 else paths[0]
+        return di.read_frequency_response(chosen, **options["read"])
+    records = {
+        run: di.read_record(path, **options["read"]) for run, path in zip(runs, paths, strict=True)
+    }
+    return di.extract(records, **options["extract"])
+
+
+@contextmanager
+def _on_disk(job: Job, digests: list[str]) -> Iterator[list[Path]]:
+    """Give the paths of the files while they are read, and record their digests.
+
+    Files that came with the job are in a folder that is removed afterwards.
+    """
+    with TemporaryDirectory(prefix="campaign_") as folder:
+        paths = []
+        for index, (name, content) in enumerate(job.files):
+            path = Path(name)
+            if content is not None:
+                path = Path(folder) / str(index) / path.name
+                path.parent.mkdir()
+                path.write_bytes(content)
+            paths.append(path)
+            digests.append(digest_of(path))
+        yield paths
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 digest of a regular file, or why there is none."""
+    from dahl_ident.data.storage import regular
+
+    try:
+        path.stat()  # what is not there may be elsewhere; what is not a file is not one anywhere
+        with regular(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as exc:
+        raise UnseenError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
+
+
+def _row(result: FitResult) -> Row:
+    from dahl_ident.errors import FitError
+
+    row: Row = {
+        "status": result.status.value,
+        "statements": list(result.statements),
+        "points": len(result.data.response),
+        "runs": len(result.data.runs or ()) or 1,
+    }
+    for name, estimate in result.params.items():
+        row[name] = estimate.value
+        row[f"unit_{name}"] = estimate.unit
+    try:
+        budget = result.budget()
+    except FitError:  # there is no finite uncertainty; the statements say why
+        return row
+    for name, part in budget.items():
+        row |= {f"u_{name}": part.u, f"U_{name}": part.U, f"dof_{name}": part.dof}
+        for source in part.rows:
+            row[f"u_{name}_{source.source.replace(' ', '_')}"] = source.u
+    return row
 
 
 class _Process:
