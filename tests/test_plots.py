@@ -351,7 +351,7 @@ def test_plots_of_two_parts_draw_on_the_axes_given(draw: Callable[[Any], Any]) -
     assert len(figure.axes) == 2
     plt.close(figure)
     figure, ax = plt.subplots()
-    with pytest.raises(ValidationError, match="ax holds 1 axes; expected two"):
+    with pytest.raises(ValidationError, match="ax holds 1 axes; expected 2"):
         draw(ax)
     plt.close(figure)
 

@@ -119,10 +119,7 @@ def plot_trace(
     values = np.asarray(chain, dtype=float)
     p = values.shape[2]
     logs = _logarithmic(values.reshape(-1, p), log)
-    if ax is None:
-        rows = style.new_axes(p, 1, size=(5.4, 1.0 + 1.3 * p), sharex=True)[:, 0]
-    else:
-        rows = np.ravel(np.asarray(ax, dtype=object))
+    rows = style.axes_column(ax, p, size=(5.4, 1.0 + 1.3 * p))
     shown = values[:, :: max(1, values.shape[1] // 32)]
     for i, axis in enumerate(rows):
         axis.plot(shown[:, :, i], color=style.BLUE, alpha=0.35, lw=0.5, rasterized=True)

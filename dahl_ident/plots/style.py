@@ -87,13 +87,20 @@ def axes_pair(
     ax: Sequence[Axes] | None, *, size: tuple[float, float] = (4.6, 5.0)
 ) -> tuple[Axes, Axes]:
     """Return the two given axes, or two new ones, one above the other, that share x."""
+    top, bottom = axes_column(ax, 2, size=size)
+    return top, bottom
+
+
+def axes_column(
+    ax: Sequence[Axes] | None, count: int, *, size: tuple[float, float]
+) -> NDArray[Any]:
+    """Return so many axes, those given or new ones, one above the other, that share x."""
     if ax is None:
-        top, bottom = new_axes(2, 1, size=size, sharex=True)[:, 0]
-        return top, bottom
-    pair = np.ravel(np.asarray(ax, dtype=object))
-    if pair.size != 2:
-        raise ValidationError(f"ax holds {pair.size} axes; expected two, for gain and phase")
-    return pair[0], pair[1]
+        return np.asarray(new_axes(count, 1, size=size, sharex=True)[:, 0])
+    column = np.ravel(np.asarray(ax, dtype=object))
+    if column.size != count:
+        raise ValidationError(f"ax holds {column.size} axes; expected {count}")
+    return column
 
 
 def level_colours(count: int) -> list[Any]:

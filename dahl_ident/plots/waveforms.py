@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
 
 
@@ -50,15 +49,7 @@ def plot_waveforms(
     >>> rows[0].get_ylabel(), rows[0].get_xlabel()
     ('force [N]', 'time [s]')
     """
-    if ax is None:
-        size = (6.4, 0.8 + 1.4 * len(channels))
-        rows = style.new_axes(len(channels), 1, size=size, sharex=True)[:, 0]
-    else:
-        rows = np.ravel(np.asarray(ax, dtype=object))
-        if rows.size != len(channels):
-            raise ValidationError(
-                f"ax holds {rows.size} axes; expected {len(channels)}, one for each channel"
-            )
+    rows = style.axes_column(ax, len(channels), size=(6.4, 0.8 + 1.4 * len(channels)))
     predicted = [*fitted, *[None] * (len(channels) - len(fitted))]
     for axis, (label, samples), model in zip(rows, channels, predicted, strict=True):
         axis.plot(time, samples, color=style.BLUE, lw=0.8, label="measured")
@@ -160,7 +151,7 @@ def plot_sample_residuals(
     >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title("left")
     '3 rms'
     """
-    axis = ax or style.new_axes(1, 1, size=(6.4, 3.0), sharex=True)[0, 0]
+    axis = style.axes(ax, size=(6.4, 3.0))
     axis.plot(x, residuals, color=style.BLUE, lw=0.6)
     axis.axhline(0.0, color="0.5", lw=0.6)
     axis.set(xlabel=x_label, ylabel=f"measured minus fitted {channel}")
