@@ -19,7 +19,6 @@ from dahl_ident.reporting.document import (
     Picture,
     Section,
     TextTable,
-    figure_of,
     number,
     words,
 )
@@ -127,14 +126,14 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
         f"devices_{p.name}",
         f"{p.name} of each device: own estimate, and estimate shrunk towards the population",
         f"{len(p.devices)} devices around {p.mean[0]:.4g}; outside the population: {beyond}",
-        lambda: figure_of(devices()),
+        devices,
     )
     yield Picture(
         f"charts_{p.name}",
         f"Individuals (limits: three standard deviations from moving ranges){drift}, corrected for "
         f"covariates{compared}",
         f"{len(p.out_of_control)} of {len(p.fits)} fits lie outside the limits",
-        lambda: figure_of(charts()),
+        charts,
     )
 
 

@@ -1,4 +1,7 @@
-"""Output of commands: results on standard output, warnings and errors on standard error."""
+"""What commands read and write: results on standard output, files, warnings, errors.
+
+Files are written atomically; ``-`` is standard input or output.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ import re
 import shlex
 import shutil
 import sys
+import tempfile
 import textwrap
-import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,10 +23,13 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import DataError, ValidationError
+from dahl_ident.progress import spinner
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from dahl_ident.data import FrequencyResponse, Record
 
 STANDARD = "-"  # standard input or output, in place of a file's name
 BAD_INPUT = 1  # exit status, as are the others; the one of any uncaught error
@@ -32,7 +38,6 @@ NOT_TRUSTED = 3  # the first that is free
 _NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
 _STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
 _STYLES = {"Trusted": "bold green", "Approximate": "bold yellow"}
-_PATIENCE, _REDRAWN = 2.0, 0.1  # s without a sign of progress, and between its changes
 INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 
@@ -163,37 +168,8 @@ def busy(task: str) -> Iterator[Callable[[float, float], None]]:
     if _session.quiet or not sys.stderr.isatty():
         yield lambda _done, _total: None
         return
-    steps = [0.0, 0.0]
-    done = threading.Event()
-    show = threading.Thread(target=_spin, args=(task, steps, done), daemon=True)
-    show.start()
-
-    def update(number: float, total: float) -> None:
-        steps[:] = number, total
-
-    try:
-        yield update
-    finally:
-        done.set()
-        show.join()
-
-
-def _spin(task: str, steps: list[float], done: threading.Event) -> None:
-    """Draw a spinner until the task is done."""
-    if done.wait(_PATIENCE):
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn
-    from rich.progress import TimeElapsedColumn as Elapsed
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), Elapsed(), Remaining())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        number = bar.add_task(task, total=None)
-        bar.tasks[0].start_time = bar.get_time() - _PATIENCE
-        while not done.wait(_REDRAWN):
-            counted = f"{task} {steps[0]:g} of {steps[1]:g}" if steps[1] > 1.0 else task
-            bar.update(number, description=counted, completed=steps[0], total=steps[1] or None)
+    with spinner(task) as show:
+        yield lambda done, total: show(f" {done:g} of {total:g}" * (total > 1.0), done, total)
 
 
 def write_error(text: str) -> None:
@@ -250,3 +226,41 @@ def finish(trusted: bool, reason: str) -> None:
     if not trusted:
         write_error(f"not to be trusted: {reason}")
         raise typer.Exit(NOT_TRUSTED)
+
+
+def write_data(data: FrequencyResponse | Record, output: str, *, overwrite: bool) -> None:
+    """Write a table or a record to a file, or as CSV to standard output."""
+    written(lambda place: data.save(place, overwrite=overwrite), output, ".csv")
+
+
+def written(write: Callable[[str | Path], Path], output: str, ending: str) -> str:
+    """Call `write` with a path; for standard output, with a temporary file of this ending."""
+    if output != STANDARD:
+        return str(write(output))
+    with tempfile.TemporaryDirectory() as directory:
+        content = write(Path(directory) / f"output{ending}").read_bytes()
+    sys.stdout.flush()
+    # UTF-8 as in a file, whatever the terminal's own encoding
+    sys.stdout.buffer.write(content)
+    return output
+
+
+def make_folder(place: Path) -> None:
+    """Make a folder if it does not exist."""
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"{place}: the folder cannot be made: {exc.strerror or exc}") from exc
+
+
+def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
+    """Write the figure of some axes in the format given by the file name."""
+    from dahl_ident.data.storage import write_whole
+    from dahl_ident.reporting.document import figure_of
+
+    buffer = io.BytesIO()
+    try:
+        figure_of(axes).savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=150)
+    except ValueError as exc:
+        raise DataError(f"{path}: not a format for plots: {exc}") from exc
+    write_whole(Path(path), buffer.getvalue(), overwrite=overwrite)

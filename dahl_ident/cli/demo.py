@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console, extract
+from dahl_ident.cli.console import make_folder
 from dahl_ident.cli.estimation import as_json, finish
-from dahl_ident.cli.files import make_folder
 from dahl_ident.cli.options import General, Writing, with_option_groups
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD
-from dahl_ident.cli.files import written
+from dahl_ident.cli.console import STANDARD, written
 from dahl_ident.cli.options import Writing, one_of
 
 if TYPE_CHECKING:
@@ -94,29 +93,20 @@ def report_also(
 def as_json(result: FitResult) -> dict[str, Any]:
     """Return a fit as plain data."""
     from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+    from dahl_ident.results.fit_report import facts
 
-    facts: dict[str, Any] = {
-        "status": str(result.status),
-        "trusted": result.trusted,
-        "verdict": result.verdict,
+    assumed = (result.params[name] for name in result.assumed)
+    limits = result.conf_interval().at(CONFIDENCE)
+    return {
+        **facts(result),
         "success": result.success,
         "message": result.message,
-        "findings": [finding.to_dict() for finding in result.findings],
-    }
-    budget, assumed = result.stated_budget, [result.params[name] for name in result.assumed]
-    facts |= {
         "assumed": {p.name: {"value": p.value, "stderr": p.stderr} for p in assumed},
-        "budget": None if budget is None else budget.to_dict(),
-        "determined": [str(c) for c in result.identifiability.combinations],
-        "warnings": list(result.goodness.warnings),
-        **result.assessment.facts,
+        "params": {
+            name: {**vars(estimate), "interval": limits[name][1:] if estimate.vary else None}
+            for name, estimate in result.params.items()
+        },
     }
-    limits = result.conf_interval().at(CONFIDENCE)
-    facts["params"] = {
-        name: {**vars(estimate), "interval": limits[name][1:] if estimate.vary else None}
-        for name, estimate in result.params.items()
-    }
-    return facts
 
 
 def worst(results: Sequence[Any]) -> Any:

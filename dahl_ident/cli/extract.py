@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, changed, option
-from dahl_ident.cli.files import write_data, write_picture
+from dahl_ident.cli.console import STANDARD, changed, option, write_data, write_picture
 from dahl_ident.cli.options import (
     General,
     Writing,

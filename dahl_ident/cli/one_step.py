@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD
+from dahl_ident.cli.console import STANDARD, write_data, written
 from dahl_ident.cli.estimation import finish, saved_fit
-from dahl_ident.cli.files import write_data, written
 from dahl_ident.cli.options import (
     General,
     Laws,

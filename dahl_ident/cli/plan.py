@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from dahl_ident.cli import console
+from dahl_ident.cli.console import write_picture
 from dahl_ident.cli.distributions import ends, number
 from dahl_ident.cli.estimation import saved_fit
-from dahl_ident.cli.files import write_picture
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.options import (
     General,

@@ -1,25 +1,52 @@
-"""Options of reading, and the tables or records that files hold."""
+"""Options of reading, and the tables or records that files hold, or the rows chosen of them."""
 
 from __future__ import annotations
 
+import ast
 import glob
+import operator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD, changed, option, refuse
 from dahl_ident.cli.options import controlled_option, in_panel, one_of, quantity
-from dahl_ident.errors import DataError
+from dahl_ident.errors import DataError, ValidationError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dahl_ident.data import FrequencyResponse, Record
 
 _READING = "Reading"
 _OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
 reading = in_panel(_READING)
+Channel = Annotated[
+    str | None,
+    reading('Its column, with unit if needed: "x \\[mm]".'),
+]
+DriveFactor = Annotated[
+    str | None,
+    reading('Force for one unit of drive, "12.5 N/V".'),
+]
+DriveFactorUncertainty = Annotated[
+    float | None,
+    reading("Its relative standard uncertainty."),
+]
+Sheet = Annotated[str | None, reading("Sheet of an Excel workbook.")]
+_COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
 
 
 def _existing(patterns: list[str]) -> list[str]:
@@ -41,19 +68,6 @@ Files = Annotated[
     list[str],
     typer.Argument(help="Files to read, or patterns; - is standard input.", callback=_existing),
 ]
-Channel = Annotated[
-    str | None,
-    reading('Its column, with unit if needed: "x \\[mm]".'),
-]
-DriveFactor = Annotated[
-    str | None,
-    reading('Force for one unit of drive, "12.5 N/V".'),
-]
-DriveFactorUncertainty = Annotated[
-    float | None,
-    reading("Its relative standard uncertainty."),
-]
-Sheet = Annotated[str | None, reading("Sheet of an Excel workbook.")]
 
 
 @dataclass(frozen=True)
@@ -123,7 +137,6 @@ class Reading:
 
     def read(self, files: list[str]) -> FrequencyResponse:
         """Read the files into one table."""
-        from dahl_ident.cli.row_selection import selected
         from dahl_ident.data import read_frequency_response
 
         how = dict(vars(self))
@@ -176,3 +189,113 @@ class RecordReading(Channels):
     drive_factor: DriveFactor = None
     drive_factor_uncertainty: DriveFactorUncertainty = None
     sheet: Sheet = None
+
+
+def selected(
+    data: FrequencyResponse, where: str | None, levels: str | None, runs: str | None
+) -> FrequencyResponse:
+    """Return the rows selected by the options --where, --levels and --runs."""
+    for name, column, text in (("--levels", "level", levels), ("--runs", "run", runs)):
+        if text is not None:
+            data = _labelled(data, name, column, [part.strip() for part in text.split(",")])
+    if where is None:
+        return data
+    rows = _Condition(data, where).rows()
+    if not rows.any():
+        raise ValidationError(f"--where {where!r} selects none of {data.n} rows")
+    return data.select(rows=rows)
+
+
+def _labelled(
+    data: FrequencyResponse, option: str, column: str, wanted: list[str]
+) -> FrequencyResponse:
+    import numpy as np
+
+    labels = getattr(data, column)
+    known = [] if labels is None else list(dict.fromkeys(str(label) for label in labels))
+    missing = [label for label in wanted if label not in known]
+    if missing:
+        there = ", ".join(known) if known else f"no {column}s"
+        raise ValidationError(f"{option} names {', '.join(missing)}; the data have {there}")
+    return data.select(rows=np.array([str(label) in wanted for label in labels]))
+
+
+class _Condition:
+    """A condition on the columns of a table; only comparisons, and, or, not."""
+
+    def __init__(self, data: FrequencyResponse, text: str) -> None:
+        import numpy as np
+
+        self._text, self._n = text, data.n
+        columns: dict[str, Any] = {
+            "frequency_hz": data.frequency_hz,
+            "amplitude": data.amplitude,
+            "drive": data.drive,
+            "gain": data.gain,
+            "phase_deg": np.degrees(data.phase),
+            "harmonic": data.harmonic,
+            "level": data.level,
+            "run": data.run,
+            **data.quality,
+        }
+        self._columns = {name: values for name, values in columns.items() if values is not None}
+
+    def rows(self) -> NDArray[np.bool_]:
+        """Return which rows meet it."""
+        import numpy as np
+
+        try:
+            value = self._value(ast.parse(self._text, mode="eval").body)
+        except SyntaxError as exc:
+            raise self._refused(str(exc.msg)) from exc
+        rows = np.asarray(value)
+        if rows.dtype != np.bool_ or rows.shape != (self._n,):
+            raise self._refused("it contains no comparison")
+        return rows
+
+    def _refused(self, why: str) -> ValidationError:
+        return ValidationError(
+            f"--where is {self._text!r}: {why}; expected comparisons of "
+            f"{', '.join(self._columns)}, such as 'level > 3 and harmonic == 1'"
+        )
+
+    def _value(self, node: ast.expr) -> Any:
+        import numpy as np
+
+        match node:
+            case ast.Constant(value=int() | float() | str() as value):
+                return value
+            case ast.Name(id=name):
+                if name not in self._columns:
+                    raise self._refused(f"there is no column {name}")
+                return self._columns[name]
+            case ast.UnaryOp(op=ast.Not(), operand=operand):
+                return np.logical_not(self._value(operand))
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
+                return -value
+            case ast.BoolOp(op=op, values=parts):
+                join = np.logical_and if isinstance(op, ast.And) else np.logical_or
+                return join.reduce([self._value(part) for part in parts])
+            case ast.Compare(left=left, ops=ops, comparators=others):
+                sides = [self._value(side) for side in (left, *others)]
+                pairs = zip(ops, sides, sides[1:], strict=False)
+                return np.logical_and.reduce([self._compared(*pair) for pair in pairs])
+            case _:
+                raise self._refused(f"{ast.unparse(node)} is not understood")
+
+    def _compared(self, op: ast.cmpop, left: Any, right: Any) -> Any:
+        import numpy as np
+
+        if type(op) not in _COMPARE:
+            raise self._refused("in, is and the like are not understood")
+        sides = [np.asarray(side) for side in (left, right)]
+        if any(side.dtype.kind in "fiu" for side in sides):
+            try:
+                sides = [side.astype(float) for side in sides]
+            except ValueError as exc:
+                raise self._refused(
+                    "a label that is not a number is compared with a number"
+                ) from exc
+        else:
+            sides = [side.astype(str) for side in sides]
+        return _COMPARE[type(op)](*sides)

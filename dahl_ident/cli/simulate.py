@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import changed, refuse
+from dahl_ident.cli.console import changed, refuse, write_data
 from dahl_ident.cli.distributions import number, numbers
-from dahl_ident.cli.files import write_data
 from dahl_ident.cli.model import (
     ELEMENT_HELP,
     MODEL,

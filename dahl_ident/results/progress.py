@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dahl_ident.bayes.chain import Chain, ChainSettings, Listener
 from dahl_ident.bayes.convergence import LENGTH, Convergence
+from dahl_ident.progress import spinner
 from dahl_ident.units import percent
 
 
@@ -42,37 +42,12 @@ def progress_bar(settings: ChainSettings) -> Iterator[Listener]:
         yield update
 
 
-_PATIENCE = 2.0  # s without a display
-
-
-@contextmanager
-def spinner(task: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function of how far a task is, in words, which shows them after 2 s."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    began = time.monotonic()
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    number = bar.add_task(task)
-
-    def update(far: str) -> None:
-        if time.monotonic() - began > _PATIENCE:
-            bar.start()
-        bar.update(number, description=f"{task}: {far}")
-
-    try:
-        yield update
-    finally:
-        bar.stop()
-
-
 @contextmanager
 def fit_progress() -> Iterator[Callable[[int, float], None]]:
     """Yield a function of evaluations and share of variance left, which shows them after 2 s."""
     with spinner("fitting") as show:
         yield lambda evaluations, share: show(
-            f"{evaluations} evaluations, {percent(share**0.5, 3)} rms left"
+            f": {evaluations} evaluations, {percent(share**0.5, 3)} rms left"
         )
 
 
@@ -80,4 +55,4 @@ def fit_progress() -> Iterator[Callable[[int, float], None]]:
 def grid_progress() -> Iterator[Callable[[int], None]]:
     """Yield a function of the number of points, which shows it after 2 s."""
     with spinner("integrating") as show:
-        yield lambda points: show(f"{points} points")
+        yield lambda points: show(f": {points} points")
