@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 from dahl_ident.elements import Damper, Mass, Spring
 from dahl_ident.elements.law_files import class_named
 from dahl_ident.errors import DahlIdentError
+from dahl_ident.synthetic.experiment import toml_text
 from dahl_ident.units import SI_UNITS, parse_quantity
 
 LINEAR = {"mass": Mass, "damping": Damper, "stiffness": Spring}
@@ -104,11 +106,8 @@ def _linear(model: Mapping[str, str]) -> Iterator[tuple[str, str]]:
 
 
 def _options(form: Mapping[str, str], names: Sequence[str]) -> list[str]:
-    return [word for name in names for word in _option(name, form.get(name, ""))]
-
-
-def _option(name: str, value: str) -> list[str]:
-    return [f"--{name.replace('_', '-')}", value.strip()] if value.strip() else []
+    stated = ((name, form.get(name, "").strip()) for name in names)
+    return [w for name, text in stated if text for w in (f"--{name.replace('_', '-')}", text)]
 
 
 def as_python(work: Mapping[str, Any], folder: Path, *, metadata: bool) -> str:
@@ -170,27 +169,29 @@ def columns_toml(form: Mapping[str, str]) -> str:
 def report_toml(form: Mapping[str, str]) -> str:
     """Return the metadata of the report that the form states, empty fields left out."""
     entries = {name: text.strip() for name, text in form.items() if text.strip()}
-    texts = {k.removeprefix("meta_"): v for k, v in entries.items() if k.startswith("meta_")}
-    lines = [f"{name} = {_text(text)}\n" for name, text in texts.items()]
+    stated: dict[str, Any] = {
+        name.removeprefix("meta_"): text
+        for name, text in entries.items()
+        if name.startswith("meta_")
+    }
     for channel in ("force", "displacement", "delay"):
         fields = ("name", "serial", "calibration", "uncertainty", "k")
-        one = {f: entries[f"{channel}_{f}"] for f in fields if f"{channel}_{f}" in entries}
+        one: dict[str, Any] = {
+            f: entries[f"{channel}_{f}"] for f in fields if f"{channel}_{f}" in entries
+        }
         if set(one) - {"k"}:
-            lines.append(f"\n[[instruments]]\nchannel = {_text(channel)}\n")
-            one.setdefault("name", f"{channel} channel".capitalize())
-            lines += [
-                f"{f} = {text if f == 'k' and _is_number(text) else _text(text)}\n"
-                for f, text in one.items()
-            ]
-    return "".join(lines)
+            one = {"channel": channel, "name": f"{channel} channel".capitalize(), **one}
+            if _is_number(one.get("k", "")):
+                one["k"] = float(one["k"])
+            stated.setdefault("instruments", []).append(one)
+    return toml_text(stated)
 
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        return math.isfinite(float(text))
     except ValueError:
         return False
-    return True
 
 
 def _text(text: str) -> str:

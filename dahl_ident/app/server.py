@@ -245,8 +245,10 @@ class App:
         """Return a file of a run: one of those that its jobs write, by a name from the folder."""
         work, folder = self._run(request)
         wanted = request.path_params["path"]
-        if wanted == "points.csv" and _is_table(folder):
-            await run_in_threadpool(_write_points, folder)
+        points = folder / "points.csv"
+        if wanted == points.name and _is_table(folder) and not points.exists():
+            fit = await run_in_threadpool(FitResult.load, folder / "fit.json")
+            save_frame(fit.data.to_frame(), points)
         there = {str(path.relative_to(folder)): path for path in folder.rglob("*")}
         path = there.get(wanted)
         if path is None or not path.is_file() or path.suffix not in (
@@ -314,13 +316,6 @@ def _to(place: str) -> Response:
 async def _form(request: Request) -> dict[str, str]:
     form = await request.form(max_fields=5000)
     return {name: value for name, value in form.items() if isinstance(value, str)}
-
-
-def _write_points(folder: Path) -> None:
-    """Write the points of a fit, where an extraction has not done so."""
-    if not (folder / "points.csv").exists():
-        points = FitResult.load(folder / "fit.json").data.to_frame()
-        save_frame(points, folder / "points.csv")
 
 
 def _is_table(folder: Path) -> bool:

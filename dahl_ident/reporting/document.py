@@ -74,13 +74,13 @@ class Picture:
     alt : str
         Description for readers who cannot see it: the kind of plot and its result.
     draw : callable
-        Makes a new figure.
+        Draws on new axes, and returns them.
     """
 
     name: str
     caption: str
     alt: str
-    draw: Callable[[], Figure]
+    draw: Callable[[], Any]
 
     def rendered(self, kind: str) -> bytes:
         """Return the picture as "svg" or "png"; the same each time."""
@@ -89,7 +89,7 @@ class Picture:
 
         buffer = io.BytesIO()
         with mpl.rc_context({"svg.hashsalt": "dahl_ident", "svg.fonttype": "path"}):
-            figure = self.draw()
+            figure = figure_of(self.draw())
             metadata = {"Date": None} if kind == "svg" else None
             figure.savefig(buffer, format=kind, dpi=160, metadata=metadata)
             plt.close(figure)

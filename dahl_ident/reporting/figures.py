@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,22 +18,24 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import shares
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.elements import Friction, UniversalCurve
+from dahl_ident.errors import ValidationError
 from dahl_ident.plots.style import new_axes
-from dahl_ident.reporting.document import Picture, figure_of
-from dahl_ident.results.fit_plots import standardized_residuals
+from dahl_ident.reporting.document import Picture
+from dahl_ident.reporting.provenance import parts, sources
+from dahl_ident.results.fit_plots import draw_budget, standardized_residuals
 from dahl_ident.units import engineering, percent, si_unit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from dahl_ident.data import FrequencyResponse, Record
     from dahl_ident.diagnostics.budget import Budget
-    from dahl_ident.results import FitResult
+    from dahl_ident.results import FitResult, Posterior
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
 _APART = 1.2  # of the largest frequency over the smallest
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 _WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / amplitude
+_INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _LOOP_POINTS = 73  # of a measured loop, every 5 degrees; one in six of the model's
 
 
@@ -52,7 +55,8 @@ def _of_table(fit: FitResult) -> Iterator[Picture]:
         universal = friction[0].universal_curve()
         if universal is not None:
             yield _universal(fit, universal)
-    if len(friction) == 1 and friction[0].rate_independent and _all_finite(fit):
+    finite = all(np.isfinite(estimate.value) for estimate in fit.params.values())
+    if len(friction) == 1 and friction[0].rate_independent and finite:
         yield _loops(fit, friction[0])
     if fit.success:
         yield _profiles(fit)
@@ -81,12 +85,8 @@ def _of_records(fit: FitResult) -> Iterator[Picture]:
             f"record_{kind}",
             f"{caption}{of}.",
             f"{caption}{of}: the residuals are {share} rms of the measured signal.",
-            partial(_figure, draw),
+            draw,
         )
-
-
-def _figure(draw: Callable[[], Any]) -> Figure:
-    return figure_of(draw())
 
 
 _PICTURES = {"table": _of_table, "records": _of_records}
@@ -94,7 +94,6 @@ _PICTURES = {"table": _of_table, "records": _of_records}
 
 def budget_picture(budget: Budget) -> Picture:
     """Return the shares of the sources in each parameter's variance."""
-    rows = [(p.name, row.source, row.share) for p in budget.parameters for row in p.rows]
     largest = (
         f"{p.name}: {p.rows[0].source}, {100.0 * p.rows[0].share:.0f} %" for p in budget.parameters
     )
@@ -103,7 +102,7 @@ def budget_picture(budget: Budget) -> Picture:
         "Share of each source in the variance of each parameter.",
         "Bars with the shares of the sources. The largest source is, for "
         f"{'; for '.join(largest)}.",
-        lambda: figure_of(plots.plot_budget(rows)),
+        lambda: draw_budget(budget),
     )
 
 
@@ -124,7 +123,7 @@ def _response(fit: FitResult) -> Picture:
         f"Data (points, with error bars) and fit (lines) over {over}. Bands are the "
         f"{level_text(LEVELS[1])} confidence bands of the fit."
     )
-    return Picture("response", caption, alt, lambda: figure_of(fit.plot_fit()))
+    return Picture("response", caption, alt, fit.plot_fit)
 
 
 def _over_levels(fit: FitResult) -> Picture:
@@ -139,11 +138,9 @@ def _over_levels(fit: FitResult) -> Picture:
     peaks = [f"{np.abs(R).max():.3g}" for R in (responses[0], responses[-1])]
     gain_unit = si_unit("receptance", data.motion)
 
-    def draw() -> Figure:
+    def draw() -> Any:
         levels = [(engineering(u, unit), grid, R) for u, R in zip(drives, responses, strict=True)]
-        return figure_of(
-            plots.plot_frequency_response(levels, gain_label=f"receptance [{gain_unit}]")
-        )
+        return plots.plot_frequency_response(levels, gain_label=f"receptance [{gain_unit}]")
 
     return Picture(
         "levels",
@@ -179,7 +176,7 @@ def _residuals(fit: FitResult) -> Picture:
         "Residuals of every point; the grey band is two standard deviations, suspicious points "
         "are ringed."
     )
-    return Picture("residuals", caption, alt, lambda: figure_of(fit.plot_residuals()))
+    return Picture("residuals", caption, alt, fit.plot_residuals)
 
 
 def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
@@ -187,12 +184,10 @@ def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
     normalised = fit.data.select(harmonic=1).to("dynamic_stiffness").response / sigma
     off = float(np.max(np.abs(normalised - fit.best_fit[fit.data.harmonic == 1] / sigma)))
 
-    def draw() -> Figure:
+    def draw() -> Any:
         marks = [(b, complex(curve.response(np.array([b]))[0])) for b in _MARKED_BETA]
-        return figure_of(
-            plots.plot_universal_curve(
-                normalised, curve=curve.response(np.geomspace(1e-3, 1e4, 400)), marked_beta=marks
-            )
+        return plots.plot_universal_curve(
+            normalised, curve=curve.response(np.geomspace(1e-3, 1e4, 400)), marked_beta=marks
         )
 
     return Picture(
@@ -209,7 +204,7 @@ def _profiles(fit: FitResult) -> Picture:
     """Return the profile of every free parameter, two panels a row."""
     best = [f"{name} is {v:.4g}" for name, v in zip(fit.var_names, fit.optimum.values, strict=True)]
 
-    def draw() -> Figure:
+    def draw() -> Any:
         rows = -(-fit.nvarys // 2)
         grid = new_axes(rows, 2, size=(4.8, 1.9 * rows), sharex=False)
         for index, axis in enumerate(grid.flat):
@@ -217,7 +212,7 @@ def _profiles(fit: FitResult) -> Picture:
                 _draw_profile(fit, index, axis)
             else:
                 axis.set_axis_off()
-        return figure_of(grid)
+        return grid
 
     return Picture(
         "profiles",
@@ -240,7 +235,7 @@ def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
         profiler.curve(index, coordinate),
         best=float(fit.optimum.values[index]),
         limits={level_text(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
-        label=_with_unit(name, parameter.unit),
+        label=f"{name} [{parameter.unit}]" if parameter.unit else name,
         log=bool(logarithmic and np.ptp(coordinate) > _STRAIGHT),
         ax=axis,
     )
@@ -267,7 +262,7 @@ def _correlation(fit: FitResult) -> Picture:
         "Correlation of the estimates.",
         f"Matrix of numbers; the strongest correlation is {matrix[i, j]:.2f}, between {names[i]} "
         f"and {names[j]}.",
-        lambda: figure_of(plots.plot_correlation(names, matrix)),
+        lambda: plots.plot_correlation(names, matrix),
     )
 
 
@@ -287,12 +282,10 @@ def _information(fit: FitResult) -> Picture:
         "Discs on one line for each parameter; " + "; ".join(places) + "."
         if places
         else "No point distinguishes the parameters.",
-        lambda: figure_of(
-            plots.plot_information(
-                x,
-                dict(zip(fit.var_names, share, strict=True)),
-                x_label=f"displacement amplitude [{unit}]",
-            )
+        lambda: plots.plot_information(
+            x,
+            dict(zip(fit.var_names, share, strict=True)),
+            x_label=f"displacement amplitude [{unit}]",
         ),
     )
 
@@ -306,14 +299,6 @@ def _is_friction_alone(fit: FitResult) -> bool:
     return len(elements) == 1 and elements[0].has_memory and exact and whole and free
 
 
-def _all_finite(fit: FitResult) -> bool:
-    return all(np.isfinite(estimate.value) for estimate in fit.params.values())
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
-
-
 def _loops(fit: FitResult, friction: Friction) -> Picture:
     """Return the picture of the loops at the smallest, a middle and the largest amplitude."""
     sizes, measured = _chosen(fit, friction)
@@ -322,7 +307,7 @@ def _loops(fit: FitResult, friction: Friction) -> Picture:
     drawn = [friction.loop(float(A), 6 * (_LOOP_POINTS - 1) + 1) for A in sizes]
     over_amplitude = bool(sizes[-1] > _WIDE * sizes[0])
 
-    def draw() -> Figure:
+    def draw() -> Any:
         scale = sizes if over_amplitude else np.ones_like(sizes)
         model = [
             (x / by, force, engineering(A, unit))
@@ -330,13 +315,11 @@ def _loops(fit: FitResult, friction: Friction) -> Picture:
         ]
         dots = [(x / by, force) for by, (x, force) in zip(scale, measured, strict=False)]
         x_label = "displacement over amplitude" if over_amplitude else f"displacement [{unit}]"
-        return figure_of(
-            plots.plot_loops(
-                model,
-                measured=dots,
-                displacement_label=x_label,
-                force_label=f"friction [{force_unit}]",
-            )
+        return plots.plot_loops(
+            model,
+            measured=dots,
+            displacement_label=x_label,
+            force_label=f"friction [{force_unit}]",
         )
 
     lines = "Lines: friction of the fitted element at three amplitudes of the data."
@@ -403,3 +386,94 @@ def _distance(
         same = model[:: (model.size - 1) // (force.size - 1)]
         away.append(np.sqrt(np.mean((force - same) ** 2)) / np.abs(force).max())
     return f"The measured loops are within {percent(max(away))} rms of the model's."
+
+
+def settling(data: FrequencyResponse, record: Record) -> Picture:
+    """Return the figure of the point with the largest ratio of bias to error."""
+    _check_origin(data, record)
+    points = data.select(harmonic=1)
+    assert points.covariance is not None  # extraction gives it
+    assert points.amplitude is not None
+    error = np.sqrt(0.5 * np.trace(points.covariance, axis1=1, axis2=2))
+    excess = np.hypot(points.quality["bias_real"], points.quality["bias_imag"]) / error
+    i = int(np.argmax(excess))
+    f, dropped = float(points.frequency_hz[i]), int(points.quality["settling_periods"][i])
+    start, end = (float(points.quality[name][i]) for name in ("start_time", "end_time"))
+    response, mean = cycle_by_cycle(record, f, start - dropped / f, end)
+    one_cycle = float(error[i]) * np.sqrt(max(response.size - dropped, 1))
+    used = response[dropped:]
+    scatter = float(np.std(used) / np.abs(np.mean(used)))
+    where = f"{f:.4g} Hz, {points.amplitude[i]:.3g} {si_unit('displacement', data.motion)}"
+    return Picture(
+        "cycles",
+        f"Settling of the point at {where}, which has the largest ratio of bias to error: "
+        f"{dropped} of {response.size} cycles are left out. The grey band is two standard "
+        "deviations of one cycle.",
+        f"The response of the {used.size} cycles used scatters by {percent(scatter)}; the bias is "
+        f"{excess[i]:.2g} standard errors.",
+        lambda: plots.plot_cycles(response, mean, left_out=dropped, response_std=one_cycle),
+    )
+
+
+def cycle_by_cycle(
+    record: Record, frequency_hz: float, start: float, end: float
+) -> tuple[ComplexArray, FloatArray]:
+    """Return dynamic stiffness and mean force of each whole cycle between two times."""
+    omega = 2.0 * np.pi * frequency_hz
+    edges = start + np.arange(np.floor((end - start) * frequency_hz + 0.5) + 1.0) / frequency_hz
+    bounds = np.searchsorted(record.time, edges)
+    channels = np.stack([record.motion_samples, record.force_samples], axis=-1)
+    cycles = []
+    for rows in itertools.starmap(slice, itertools.pairwise(bounds)):
+        angle = omega * (record.time[rows] - start)
+        design = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=-1)
+        offset, cosine, sine = np.linalg.lstsq(design, channels[rows], rcond=None)[0]
+        motion, force = cosine - 1j * sine
+        cycles.append((force / motion, offset[1]))
+    ratio, mean = (np.array(column) for column in zip(*cycles, strict=True))
+    return ratio * (1j * omega) ** _INTEGRATIONS[record.motion_channel], mean.real
+
+
+def _check_origin(data: FrequencyResponse, record: Record) -> None:
+    digest = dict(record.provenance or {}).get("sha256")
+    known = [source.sha256 for source in sources([data.provenance]) if source.sha256]
+    if (
+        "start_time" not in data.quality
+        or len(parts([data.provenance])) > 1
+        or digest not in (*known, None)
+    ):
+        raise ValidationError(
+            "the data were not extracted from this record alone; give the one that they were "
+            "extracted from, or none"
+        )
+
+
+def corner(posterior: Posterior) -> Picture:
+    """Return the densities of a posterior's parameters and pairs."""
+    covariance = np.atleast_2d(np.cov(posterior.values.T, aweights=posterior.weights))
+    size = np.sqrt(covariance.diagonal())
+    correlation = covariance / np.outer(size, size)
+    i, j = np.unravel_index(np.argmax(np.abs(np.triu(correlation, 1))), correlation.shape)
+    finding = (
+        f"The strongest correlation is {correlation[i, j]:.2f}, between {posterior.names[i]} and "
+        f"{posterior.names[j]}."
+        if len(posterior.names) > 1
+        else f"One parameter, {posterior.names[0]}."
+    )
+    return Picture(
+        "corner",
+        "Posterior density of each parameter (dashed: 16, 50 and 84 %) and of each pair.",
+        finding,
+        posterior.plot_corner,
+    )
+
+
+def trace(posterior: Posterior) -> Picture:
+    """Return the walkers' paths of a chain."""
+    return Picture(
+        "trace",
+        "Paths of the walkers; the shaded warm-up is not used in any result.",
+        f"{posterior.steps} steps, of which the first {posterior.warm_up} are warm-up. "
+        f"{'The chain has converged' if posterior.converged else 'The chain has NOT converged'}.",
+        posterior.plot_trace,
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +21,11 @@ from dahl_ident.reporting.document import (
     Picture,
     Section,
     TextTable,
-    figure_of,
 )
 from dahl_ident.reporting.provenance import parts
 from dahl_ident.reporting.sections import RANK, fit_facts, header, origin_facts, signed
 from dahl_ident.results import FitResult, Posterior
 from dahl_ident.results.changes import changes, headline, is_usable
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def overlay(
@@ -126,7 +122,7 @@ def _estimate(fit: FitResult, name: str) -> Cell:
 
 
 def _picture(names: Sequence[str], fits: Sequence[FitResult]) -> Picture:
-    def draw() -> Figure:
+    def draw() -> Any:
         tables = [fit.data.select(harmonic=1) for fit in fits]
         over_frequency = any(np.ptp(t.frequency_hz) > 0.5 * t.frequency_hz.max() for t in tables)
         levels, fitted = [], []
@@ -136,13 +132,11 @@ def _picture(names: Sequence[str], fits: Sequence[FitResult]) -> Picture:
             predicted = fit.best_fit[fit.data.harmonic == 1]
             levels.append((name, x, table.response))
             fitted.append(plots.Curve(x[order], predicted[order]))
-        return figure_of(
-            plots.plot_frequency_response(
-                levels,
-                fitted=fitted if not over_frequency else (),
-                gain_label=f"{tables[0].quantity.replace('_', ' ')} [{tables[0].unit}]",
-                x_label="frequency [Hz]" if over_frequency else "displacement amplitude",
-            )
+        return plots.plot_frequency_response(
+            levels,
+            fitted=fitted if not over_frequency else (),
+            gain_label=f"{tables[0].quantity.replace('_', ' ')} [{tables[0].unit}]",
+            x_label="frequency [Hz]" if over_frequency else "displacement amplitude",
         )
 
     ranges = (

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.pages import html, markdown
 from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import FitResult, Posterior
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
@@ -113,7 +110,7 @@ def report(
             f"{argument('record', option='waveforms')} is given, the waveforms of a table, but no "
             "result on a table; leave it out"
         )
-    if _on_one_table(of_tables):
+    if all(np.array_equal(t.data.response, of_tables[0].data.response) for t in of_tables):
         whole = document(listed, record=record, **how)
     elif len(of_tables) < len(listed):
         raise ValidationError(
@@ -145,10 +142,10 @@ def _counted(whole: Document, progress: Callable[[int, int], None]) -> Document:
             return block
         draw = block.draw
 
-        def count() -> Figure:
-            figure = draw()
+        def count() -> Any:
+            axes = draw()
             progress(min(next(drawn), total), total)
-            return figure
+            return axes
 
         return replace(block, draw=count)
 
@@ -185,10 +182,6 @@ def _one_line(title: str) -> str:
     """Return a title that every format can hold: no half characters, no control signs, not long."""
     whole = re.sub(r"[\s\x00-\x1f\x7f]+", " ", title.encode(errors="replace").decode())
     return whole if len(whole) <= _LONGEST_TITLE else f"{whole[:_LONGEST_TITLE]}..."
-
-
-def _on_one_table(results: Sequence[Any]) -> bool:
-    return all(np.array_equal(one.data.response, results[0].data.response) for one in results)
 
 
 def _content(whole: Document, kind: str) -> bytes:

@@ -15,7 +15,7 @@ from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
-from dahl_ident.reporting import posterior_sections, provenance, tables
+from dahl_ident.reporting import provenance, tables
 from dahl_ident.reporting.comparison import KINDS, comparison_of, of_kind
 from dahl_ident.reporting.document import (
     MARKS,
@@ -28,10 +28,9 @@ from dahl_ident.reporting.document import (
     TextTable,
     words,
 )
-from dahl_ident.reporting.equivalent_command import equivalent_command
-from dahl_ident.reporting.figures import budget_picture, pictures_of
-from dahl_ident.reporting.settling import settling
+from dahl_ident.reporting.figures import budget_picture, corner, pictures_of, settling, trace
 from dahl_ident.results import FitResult, Posterior
+from dahl_ident.results.fit_report import facts
 from dahl_ident.version import __version__
 
 Result = FitResult | Posterior
@@ -60,7 +59,7 @@ def document(
     fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
     tables_first = sorted(results, key=lambda result: result.problem.response is None)
     first, known = tables_first[0], metadata or Metadata()
-    repeated = command or equivalent_command(results)
+    repeated = command or provenance.equivalent_command(results)
     compared = comparison_of(fits)
     front: list[Section] = []
     details: list[Section] = []
@@ -72,8 +71,8 @@ def document(
         details += _details(fit, drawn, of)
     for one in drawn:
         if not fits or one.problem.around_optimum:
-            front.append(Section("Posterior", tuple(posterior_sections.answer(one))))
-        details += posterior_sections.sections(one)
+            front.append(_posterior_answer(one))
+        details += _posterior_details(one)
     data = first.problem.response
     return Document(
         title=title or known.title or title_of(first),
@@ -83,7 +82,7 @@ def document(
                 [
                     *compared.verdict,
                     *(line for fit in fits for line in _verdict(fit, fits)),
-                    *(line for one in drawn for line in posterior_sections.verdict(one)),
+                    *(line for one in drawn for line in _posterior_verdict(one)),
                 ]
             )
         ),
@@ -221,6 +220,10 @@ def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
     yield from (f"{before}{line}" for line in (*lines, *warnings))
 
 
+def _posterior_verdict(posterior: Posterior) -> list[str]:
+    return [f"Posterior: {posterior.findings[0]}", *map(str, posterior.findings[1:])]
+
+
 def _answer(fit: FitResult, of: str) -> Iterator[Section]:
     combinations = fit.identifiability.combinations
     yield Section(
@@ -309,6 +312,32 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
         yield tables.meanings(compared)
 
 
+def _posterior_answer(posterior: Posterior) -> Section:
+    priors = (f"Prior of {name}: {text}" for name, text in posterior.priors.items())
+    return Section("Posterior", (tables.posterior_summary(posterior), Bullets(tuple(priors))))
+
+
+def _posterior_details(posterior: Posterior) -> Iterator[Section]:
+    yield Section("Posterior", tuple(_posterior_numbers(posterior)), details=True)
+    pictures = [corner(posterior), *([trace(posterior)] if posterior.is_chain else [])]
+    yield Section("Pictures of the posterior", tuple(pictures), details=True)
+
+
+def _posterior_numbers(posterior: Posterior) -> Iterator[Block]:
+    yield Paragraph(posterior.message)
+    yield tables.posterior_summary(posterior)
+    if posterior.is_chain:
+        yield Paragraph(
+            "mcse is the Monte Carlo standard error of the mean, ess the effective number of "
+            "draws, r_hat compares independent ensembles and is 1 if they agree."
+        )
+    yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
+    yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
+    yield Bullets(tuple(map(str, posterior.findings)))
+    if posterior.is_chain:
+        yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
+
+
 def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:
     """Yield how the points were measured, where they come from waveforms."""
     seen = () if record is None else (settling(data, record),)
@@ -347,7 +376,8 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
         yield TextTable(
             "Options", ("option", "value"), tuple(words(*pair) for pair in made.items())
         )
-    yield Paragraph(f"Versions: {provenance.listed_versions()}.")
+    versions = ", ".join(f"{name} {version}" for name, version in provenance.versions().items())
+    yield Paragraph(f"Versions: {versions}.")
     when = f"Made on {provenance.today()}"
     if command is None:
         yield Paragraph(f"{when}, in Python; no command describes this model and these data.")
@@ -367,10 +397,7 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
     return {
         "model": repr(fit.problem.model),
         "equations": list(in_words(fit.problem.model)),
-        "status": str(fit.status),
-        "trusted": fit.trusted,
-        "verdict": fit.verdict,
-        "findings": [finding.to_dict() for finding in fit.findings],
+        **facts(fit),
         "parameters": {
             name: {
                 "value": e.value,
@@ -382,9 +409,5 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
             }
             for name, e in fit.params.items()
         },
-        "budget": None if fit.stated_budget is None else fit.stated_budget.to_dict(),
         "priors": tables.priors(fit),
-        "determined": [str(c) for c in fit.identifiability.combinations],
-        "warnings": list(fit.goodness.warnings),
-        **fit.assessment.facts,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,9 +13,12 @@ from dahl_ident.diagnostics.formatting import degrees_text, interval, rounded, w
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.reporting.document import Cell, TextTable, number, words
 from dahl_ident.results.changes import is_usable
+from dahl_ident.results.posterior_result import QUANTILES
 from dahl_ident.units import percent, prefix, si_unit
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from dahl_ident.arrays import FloatArray
     from dahl_ident.data import FrequencyResponse
     from dahl_ident.diagnostics import ConfidenceIntervals
@@ -209,6 +213,32 @@ def credible_interval(posterior: Posterior, name: str) -> str:
         return "-"
     lower, upper = posterior.quantile(name, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE])
     return interval(float(lower), float(upper), "")
+
+
+def posterior_summary(posterior: Posterior) -> TextTable:
+    """Return the moments and quantiles of a posterior; struck if they must not be used."""
+    summary = posterior.summary()
+    columns = [name for name in summary.columns if name != "unit"]
+    rows = tuple(
+        (Cell(str(name)), Cell(str(row["unit"]) or "-"), *_moments(row))
+        for name, row in summary.iterrows()
+    )
+    if not posterior.trusted:
+        rows = tuple((*row[:2], *(replace(cell, struck=True) for cell in row[2:])) for row in rows)
+    return TextTable("Posterior of each parameter", ("parameter", "unit", *columns), rows)
+
+
+def _moments(row: pd.Series[Any]) -> Iterator[Cell]:
+    """Yield the numbers of one parameter, rounded by its standard deviation."""
+    std = float(row["std"])
+    for name in ("mean", *QUANTILES):
+        value, error = rounded(float(row[name]), std)
+        yield Cell(value, float(row[name]))
+        if name == "mean":
+            yield Cell(error, std)
+    for name, digits in (("mcse", 2), ("ess", 4), ("r_hat", 5)):
+        if name in row:
+            yield number(row[name], digits) if np.isfinite(row[name]) else Cell("-")
 
 
 def linearization(fit: FitResult) -> TextTable | None:

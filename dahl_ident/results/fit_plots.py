@@ -34,7 +34,7 @@ def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
     kinds: dict[str, Callable[[], Any]] = {
         "fit": lambda: _FIT[fit.problem.kind](fit, ax, record),
         "residuals": lambda: draw_residuals(fit, None, ax, record),
-        "budget": lambda: _draw_budget(fit.budget(), ax),
+        "budget": lambda: draw_budget(fit.budget(), ax),
     }
     if fit.problem.response is None:
         kinds["loop"] = lambda: _draw_loop(fit, ax, record)
@@ -48,8 +48,9 @@ def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None, record:
     return _RESIDUALS[fit.problem.kind](fit, against, ax, record)
 
 
-def _draw_budget(budget: Budget, ax: Any) -> Axes:
-    shares = [(name, row.source, row.share) for name in budget for row in budget[name].rows]
+def draw_budget(budget: Budget, ax: Axes | None = None) -> Axes:
+    """Draw the share of each source in the variance of each parameter."""
+    shares = [(p.name, row.source, row.share) for p in budget.parameters for row in p.rows]
     return plot_budget(shares, ax=ax)
 
 

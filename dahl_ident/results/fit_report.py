@@ -1,4 +1,4 @@
-"""The text report of a fit: the verdict, then every number with its error and its source."""
+"""What a fit states, as text and for machines: the verdict, then every number with its source."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import html
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import level_text
@@ -18,6 +18,21 @@ if TYPE_CHECKING:
 
 _CORRELATED = 0.1  # smaller correlations change an uncertainty by less than 0.5 %
 _BRIEF = 15  # lines that a reader takes in at a glance
+
+
+def facts(fit: FitResult) -> dict[str, Any]:
+    """Return what a fit states for machines, apart from its parameters."""
+    budget = fit.stated_budget
+    return {
+        "status": str(fit.status),
+        "trusted": fit.trusted,
+        "verdict": fit.verdict,
+        "findings": [finding.to_dict() for finding in fit.findings],
+        "budget": None if budget is None else budget.to_dict(),
+        "determined": [str(c) for c in fit.identifiability.combinations],
+        "warnings": list(fit.goodness.warnings),
+        **fit.assessment.facts,
+    }
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data.storage import read_text
 from dahl_ident.diagnostics.bands import DerivedQuantity, ResponseBand
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.confidence_levels import LEVELS
@@ -593,7 +594,7 @@ class FitResult(Result):
         ModelError
             If a law of the model is not known here.
         """
-        optimum, first_order = fit_storage.load(path)
+        optimum, first_order = fit_storage.from_json(read_text(path), str(path))
         return cls(optimum, first_order=first_order)
 
     def __str__(self) -> str:

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.storage import digest, plain_data, read_text
+from dahl_ident.data.columns import COLUMNS
+from dahl_ident.data.storage import digest, plain_data
 from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
 from dahl_ident.errors import DataError
@@ -31,14 +31,7 @@ _SCHEMAS = {"table": "dahl_ident.fit_result", "records": "dahl_ident.record_fit"
 VERSION = 4  # of the layout; others are refused
 _SAME = 1e-6  # relative: what versions of numerical libraries never change
 
-_COLUMNS = (
-    "frequency_hz", "amplitude", "drive", "covariance", "dof", "amplitude_std",
-    "amplitude_covariance", "drive_std", "drive_covariance", "level", "run",
-    "controlled", "harmonic",
-)  # fmt: skip
-_ERRORS = (
-    "covariance", "dof", "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance",
-)  # fmt: skip
+_TEXTS = ("level", "run", "controlled", "harmonic")  # labels, words and counts
 _SENSORS = ("force_gain", "displacement_gain", "delay")
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 _OF_RECORD = ("drive_unit", "drive_factor", "drive_factor_uncertainty", "motion", "provenance")
@@ -54,7 +47,7 @@ def to_json(optimum: Optimum, first_order: bool) -> str:
         "model": describe_model(problem.model),
         "laws": describe_laws(problem.model.elements),
         **_DESCRIBED[problem.kind](problem),
-        "optimum": describe_optimum(optimum) | {"first_order": first_order},
+        "optimum": _describe_optimum(optimum) | {"first_order": first_order},
     }
     content = plain_data(facts, not_finite=str)
     indent = None if problem.response is None else 1  # samples would stand on a line each
@@ -69,7 +62,7 @@ def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
         raise DataError(f"{source} is not JSON: {exc}; expected a saved fit") from exc
     _check(content, source)
     try:
-        optimum = optimum_from(_BUILT[content["schema"]](content), content["optimum"])
+        optimum = _optimum(_BUILT[content["schema"]](content), content["optimum"])
         first_order, laws = content["optimum"]["first_order"], content["laws"]
     except (KeyError, TypeError) as exc:
         raise DataError(
@@ -82,11 +75,6 @@ def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
             "saved with; take the file of the law as it was, or repeat the fit"
         )
     return optimum, first_order
-
-
-def load(path: str | Path) -> tuple[Optimum, bool]:
-    """Return the fit that a file holds."""
-    return from_json(read_text(path), str(path))
 
 
 def _check(content: Any, source: str) -> None:
@@ -181,47 +169,42 @@ _BUILT: Mapping[str, Callable[[Mapping[str, Any]], Problem]] = {
 }  # fmt: skip
 
 
-def describe_optimum(optimum: Optimum) -> dict[str, Any]:
+def _describe_optimum(optimum: Optimum) -> dict[str, Any]:
     """Return an optimum as data, its problem left out."""
-    numbers = ("theta", "values", "covariance", "scale", "dof", "cost", "nfev")
+    stored = {one.name: getattr(optimum, one.name) for one in fields(optimum)}
+    for follows in ("problem", "scale_known"):
+        del stored[follows]
     cost = optimum.constraint_cost
     return {
         "names": list(optimum.names),
-        **{name: getattr(optimum, name) for name in (*numbers, "message", "method", "loss")},
+        **stored,
         "status": optimum.status.name,
         "combinations": [asdict(c) for c in optimum.combinations],
         "constraint_cost": None if cost is None else asdict(cost),
     }
 
 
-def optimum_from(problem: Problem, stored: Mapping[str, Any]) -> Optimum:
-    """Return the optimum of a problem that :func:`describe_optimum` described."""
+def _optimum(problem: Problem, stored: Mapping[str, Any]) -> Optimum:
+    """Return the optimum of a problem that :func:`_describe_optimum` described."""
+    known = {name: value for name, value in stored.items() if name not in ("names", "first_order")}
     if list(problem.names) != stored["names"]:
         raise KeyError(f"the free parameters {stored['names']}, found {list(problem.names)}")
-    return Optimum(
-        problem=problem,
-        theta=_floats(stored["theta"]),
-        values=_floats(stored["values"]),
-        covariance=_floats(stored["covariance"]),
-        scale=float(stored["scale"]),
-        scale_known=problem.scale_known,
-        dof=stored["dof"],
-        cost=float(stored["cost"]),
-        nfev=stored["nfev"],
-        status=Status[stored["status"]],
-        message=stored["message"],
-        method=stored["method"],
-        loss=stored["loss"],
-        constraint_cost=_constraint_cost(stored.get("constraint_cost")),
-        combinations=tuple(
-            DeterminedCombination(c["expression"], float(c["value"]), float(c["stderr"]))
-            for c in stored["combinations"]
-        ),
+    cost = stored["constraint_cost"]
+    known |= {name: _floats(known[name]) for name in ("theta", "values", "covariance")}
+    known |= {name: float(known[name]) for name in ("scale", "cost")}
+    known["status"] = Status[stored["status"]]
+    known["combinations"] = tuple(
+        DeterminedCombination(c["expression"], float(c["value"]), float(c["stderr"]))
+        for c in stored["combinations"]
     )
+    if cost is not None:
+        rise, dof = float(cost["rise"]), float(cost["dof"])
+        known["constraint_cost"] = ConstraintCost(tuple(cost["texts"]), rise, dof)
+    return Optimum(problem=problem, scale_known=problem.scale_known, **known)
 
 
 def _describe_data(data: FrequencyResponse) -> dict[str, Any]:
-    columns = {name: getattr(data, name) for name in _COLUMNS}
+    columns = {name: getattr(data, name) for name in COLUMNS if name != "response"}
     return {
         "quantity": data.quantity,
         "motion": data.motion,
@@ -235,12 +218,13 @@ def _describe_data(data: FrequencyResponse) -> dict[str, Any]:
 
 
 def _data(content: Mapping[str, Any]) -> FrequencyResponse:
-    columns = {name: content[name] for name in _COLUMNS if name in content}
-    for name in columns.keys() & set(_ERRORS):
-        columns[name] = _floats(columns[name])
+    columns = {
+        name: content[name] if name in _TEXTS else _floats(content[name])
+        for name in COLUMNS
+        if name in content
+    }
     return FrequencyResponse(
-        columns.pop("frequency_hz"),
-        _floats(content["real"]) + 1j * _floats(content["imag"]),
+        response=_floats(content["real"]) + 1j * _floats(content["imag"]),
         quantity=content["quantity"],
         motion=content["motion"],
         drive_factor_uncertainty=content.get("drive_factor_uncertainty", 0.0),
@@ -248,12 +232,6 @@ def _data(content: Mapping[str, Any]) -> FrequencyResponse:
         provenance=content["provenance"],
         **columns,
     )
-
-
-def _constraint_cost(stored: Mapping[str, Any] | None) -> ConstraintCost | None:
-    if stored is None:
-        return None
-    return ConstraintCost(tuple(stored["texts"]), float(stored["rise"]), float(stored["dof"]))
 
 
 def _describe_channel(channel: Any) -> Any:

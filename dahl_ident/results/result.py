@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from numpy.typing import ArrayLike
-
 from dahl_ident.data.storage import place_of, write_whole
-from dahl_ident.diagnostics.bands import DerivedQuantity
 from dahl_ident.diagnostics.formatting import (
     html_table,
     pair,
@@ -26,12 +23,10 @@ from dahl_ident.diagnostics.formatting import (
 )
 from dahl_ident.diagnostics.judgement import Finding, Judgement, VerdictStatus
 from dahl_ident.problem import Problem
-from dahl_ident.units import Quantity, shown_unit
+from dahl_ident.units import shown_unit
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from dahl_ident.diagnostics import Budget
+    pass
 
 FORMATS = (".json",)
 
@@ -214,36 +209,6 @@ class Result(ABC):
     @abstractmethod
     def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
         """Where the data come from: one for the table, or one for each record."""
-
-    @abstractmethod
-    def summary(self) -> pd.DataFrame:
-        """Return a table, one row a parameter."""
-
-    @abstractmethod
-    def budget(self) -> Budget:
-        """Return the uncertainty budget: each parameter's sources, combined and expanded."""
-
-    @abstractmethod
-    def predict(
-        self,
-        frequency_hz: Any,
-        /,
-        *,
-        amplitude: ArrayLike | None = None,
-        drive: ArrayLike | None = None,
-        quantity: Quantity | None = None,
-    ) -> Any:
-        """Return the response at other frequencies, or another record, with its bands."""
-
-    @abstractmethod
-    def derived(
-        self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
-    ) -> tuple[DerivedQuantity, ...]:
-        """Return x_c, energy per cycle, equivalent stiffness and damping, with their errors."""
-
-    @abstractmethod
-    def plot(self, kind: str | None = None, ax: Any = None) -> Any:
-        """Draw the result; each class names its kinds."""
 
     @abstractmethod
     def to_json(self) -> str:

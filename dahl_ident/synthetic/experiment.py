@@ -174,7 +174,7 @@ class Experiment:
 
     def to_toml(self) -> str:
         """Return the description as TOML."""
-        return _toml(self.to_dict())
+        return toml_text(self.to_dict())
 
     @classmethod
     def from_toml(cls, text: str) -> Experiment:
@@ -253,17 +253,18 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _toml(data: Mapping[str, Any], prefix: str = "") -> str:
+def toml_text(data: Mapping[str, Any], prefix: str = "") -> str:
     """Return nested plain data without None as TOML, which the standard library only reads."""
     lines, tables = [], []
     for key, value in data.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            tables.append(f"\n[{name}]\n{_toml(value, f'{name}.')}")
+            tables.append(f"\n[{name}]\n{toml_text(value, f'{name}.')}")
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            tables += [f"\n[[{name}]]\n{_toml(entry, f'{name}.')}" for entry in value]
+            tables += [f"\n[[{name}]]\n{toml_text(entry, f'{name}.')}" for entry in value]
         else:  # JSON writes strings, booleans, finite numbers and lists of them as TOML does
             text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+            text = text.replace("\x7f", "\\u007f")  # which JSON leaves as it is
             wide = isinstance(value, list) and len(text) > _WIDTH
             rows = textwrap.wrap(text, _WIDTH) if wide else [text]
             lines.append(f"{key} = {_INDENT.join(rows)}\n")
