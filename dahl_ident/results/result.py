@@ -26,7 +26,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.units import shown_unit
 
 if TYPE_CHECKING:
-    pass
+    from dahl_ident.diagnostics import Budget
 
 FORMATS = (".json",)
 
@@ -209,6 +209,10 @@ class Result(ABC):
     @abstractmethod
     def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
         """Where the data come from: one for the table, or one for each record."""
+
+    @abstractmethod
+    def budget(self) -> Budget:
+        """Return the uncertainty budget: each parameter's sources, combined and expanded."""
 
     @abstractmethod
     def to_json(self) -> str:
