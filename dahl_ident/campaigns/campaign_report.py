@@ -20,7 +20,6 @@ from dahl_ident.reporting.document import (
     Section,
     TextTable,
     number,
-    words,
 )
 
 if TYPE_CHECKING:
@@ -42,14 +41,12 @@ def write_campaign_report(
 ) -> Path:
     """Write the report of a campaign; `reports` is the folder of the fits' reports, for links."""
     from dahl_ident.data.storage import place_of, write_whole
-    from dahl_ident.reporting.pages import html
-    from dahl_ident.reporting.pdf import pdf
+    from dahl_ident.reporting.publish import content_of
 
     place = place_of(path, "a campaign's report", FORMATS)
     folder = "" if reports is None else os.path.relpath(reports, place.parent)
     document = campaign_document(table, evaluated, title, Path(folder).as_posix())
-    content = html(document) if place.suffix.lower() == ".html" else pdf(document)
-    write_whole(place, content, overwrite=overwrite)
+    write_whole(place, content_of(document, place.suffix.lower()), overwrite=overwrite)
     return place
 
 
@@ -83,13 +80,13 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     yield TextTable(
         f"{measured} at the mean of the covariates, and its change per unit of each",
         ("coefficient", "value", "standard uncertainty"),
-        tuple((words(k)[0], number(v), number(u, 2)) for k, (v, u) in p.coefficients.items()),
+        tuple((Cell(k), number(v), number(u, 2)) for k, (v, u) in p.coefficients.items()),
     )
     yield TextTable(
         f"Scatter of {measured}",
         ("source", "median", "2.3 %", "97.7 %"),
         tuple(
-            (words(f"scatter between {where}")[0], *(number(x, 3) for x in scatter))
+            (Cell(f"scatter between {where}"), *(number(x, 3) for x in scatter))
             for where, scatter in scatters.items()
             if scatter[0] or where == "devices"
         ),
@@ -159,7 +156,7 @@ def _all(table: pd.DataFrame, folder: str) -> Iterator[Block]:
     labels = [c for c in ("device", "run") if c in table]
     rows = []
     for _, row in table.head(_LISTED).iterrows():
-        cells: list[Cell] = [*words(*(str(row[c]) for c in labels), str(row["status"]))]
+        cells = [Cell(str(row[c])) for c in (*labels, "status")]
         if "report" in table and isinstance(row["report"], str):
             cells[0] = Cell(cells[0].text, link=f"{folder}/{row['report']}")
         for name in names:
@@ -175,4 +172,4 @@ def _all(table: pd.DataFrame, folder: str) -> Iterator[Block]:
 
 
 def _cell(value: float, digits: int) -> Cell:
-    return number(value, digits) if np.isfinite(value) else words("-")[0]
+    return number(value, digits) if np.isfinite(value) else Cell("-")

@@ -12,6 +12,7 @@ from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD, changed, option, write_data, write_picture
 from dahl_ident.cli.options import (
     General,
+    OutputFile,
     Writing,
     controlled_option,
     in_panel,
@@ -71,10 +72,7 @@ def extract(
     reading: RecordReading,
     extracting: Extracting,
     writing: Writing,
-    output: Annotated[
-        str | None,
-        typer.Option("--output", "-o", help="Table to write; - is standard output, as CSV."),
-    ] = None,
+    output: OutputFile = None,
     plot: Annotated[str | None, typer.Option(help="Plot to write, such as points.png.")] = None,
     level_from_name: Annotated[
         str | None, typer.Option(help="Regular expression for file names; its group is the level.")

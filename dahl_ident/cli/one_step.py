@@ -14,6 +14,7 @@ from dahl_ident.cli.estimation import finish, saved_fit
 from dahl_ident.cli.options import (
     General,
     Laws,
+    OutputFile,
     Seed,
     Writing,
     one_of,
@@ -118,10 +119,7 @@ def datasets(
             help="Data set to describe or copy; lists all if left out.", autocompletion=_names
         ),
     ] = None,
-    output: Annotated[
-        str | None,
-        typer.Option("--output", "-o", help="File to copy it to; - is standard output, as CSV."),
-    ] = None,
+    output: OutputFile = None,
 ) -> None:
     """List the shipped synthetic data sets, or copy one to a file.
 

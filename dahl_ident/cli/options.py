@@ -26,6 +26,10 @@ from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD
 from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
 
+OutputFile = Annotated[
+    str | None,
+    typer.Option("--output", "-o", help="File to write; - is standard output, as CSV."),
+]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 _LawFiles = Annotated[
     list[Path] | None,

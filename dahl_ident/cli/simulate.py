@@ -22,6 +22,7 @@ from dahl_ident.cli.model import (
 from dahl_ident.cli.options import (
     General,
     Laws,
+    OutputFile,
     Seed,
     Writing,
     controlled_option,
@@ -145,10 +146,7 @@ def simulate(
         str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
     ] = None,
     seed: Seed = 1,
-    output: Annotated[
-        str | None,
-        typer.Option("--output", "-o", help="File to write; - is standard output, as CSV."),
-    ] = None,
+    output: OutputFile = None,
 ) -> None:
     """Simulate an experiment; without an output file, print its description.
 

@@ -178,11 +178,12 @@ class Document:
                 block = replace(block, name=f"{block.name}_{same}") if same > 1 else block
             return replace(block, caption=f"{kind} {counts[kind]}. {block.caption}")
 
-        sections = (
-            replace(section, blocks=tuple(map(numbered, section.blocks)))
-            for section in self.sections
-        )
-        return replace(self, sections=tuple(sections))
+        return self.mapped(numbered)
+
+    def mapped(self, change: Callable[[Block], Block]) -> Document:
+        """Return the document with every block changed."""
+        changed = (replace(s, blocks=tuple(map(change, s.blocks))) for s in self.sections)
+        return replace(self, sections=tuple(changed))
 
 
 def words(*texts: str) -> tuple[Cell, ...]:

@@ -128,7 +128,7 @@ def report(
         _write_pictures(whole, folder, overwrite)
         content = markdown(whole, folder.name)
     else:
-        content = _content(whole, kind)
+        content = content_of(whole, kind)
     write_whole(place, content, overwrite=overwrite)
     return place
 
@@ -149,8 +149,7 @@ def _counted(whole: Document, progress: Callable[[int, int], None]) -> Document:
 
         return replace(block, draw=count)
 
-    sections = (replace(s, blocks=tuple(map(counted, s.blocks))) for s in whole.sections)
-    return replace(whole, sections=tuple(sections))
+    return whole.mapped(counted)
 
 
 def _check(results: Sequence[object]) -> None:
@@ -184,7 +183,8 @@ def _one_line(title: str) -> str:
     return whole if len(whole) <= _LONGEST_TITLE else f"{whole[:_LONGEST_TITLE]}..."
 
 
-def _content(whole: Document, kind: str) -> bytes:
+def content_of(whole: Document, kind: str) -> bytes:
+    """Return the bytes of a file of a kind: ".html", ".pdf" or ".json"."""
     if kind == ".html":
         return html(whole)
     if kind == ".pdf":

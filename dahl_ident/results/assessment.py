@@ -94,16 +94,6 @@ class Assessment(ABC):
 
     @property
     @abstractmethod
-    def exact(self) -> tuple[str, ...]:
-        """What is taken as exact, for want of a stated uncertainty."""
-
-    @property
-    @abstractmethod
-    def noise_in_words(self) -> list[str]:
-        """How residuals were weighted."""
-
-    @property
-    @abstractmethod
     def estimate(self) -> Optimum:
         """The estimate, as an optimum."""
 
