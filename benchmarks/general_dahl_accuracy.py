@@ -16,7 +16,7 @@ import mpmath as mp
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.general_dahl import stiffness_gradient
+from dahl_ident.elements.general_dahl import stiffness
 
 DIGITS = 50
 STEP = mp.mpf(10) ** -18
@@ -56,7 +56,7 @@ def exact_harmonics(beta: float, alpha: float, harmonics: Sequence[int]) -> list
 def kernel_harmonics(beta: float, alpha: float, harmonics: Sequence[int]) -> list[Harmonic]:
     """Return the same from the kernel."""
     b, a = np.asarray(beta), np.asarray(alpha)
-    rows = [[beta * part for part in stiffness_gradient(b, a, k)] for k in harmonics]
+    rows = [[beta * part for part in stiffness(b, a, k, 2)] for k in harmonics]
     return [Harmonic(*map(complex, row)) for row in rows]
 
 

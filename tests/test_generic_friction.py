@@ -138,6 +138,10 @@ def test_facts_follow_from_the_slope() -> None:
     np.testing.assert_allclose(
         ours, Dahl().transient_decay(values, A, np.zeros(())), rtol=1e-7, atol=1e-12
     )
+    for points in (4, 51):  # the turning point is none of four
+        np.testing.assert_allclose(
+            law.loop(0.4, points)[1], Dahl(1.3, 7.0, 2.0).loop(0.4, points)[1], atol=1e-8
+        )
     x, force = law.loop(0.4)
     assert law.dissipated_energy(0.4) == pytest.approx(float(-trapezoid(x, force)), rel=1e-4)
     with mpmath.workdps(20):

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import hysteresis
-from dahl_ident.elements.hysteresis import force_history, steady_force, transient_decay
+from dahl_ident.elements import Dahl, hysteresis
+from dahl_ident.elements.hysteresis import force_history, transient_decay
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA
@@ -129,8 +129,7 @@ def test_memory_stays_small(alpha: float) -> None:
 
 
 def loop(amplitude: float, alpha: float, points: int) -> tuple[FloatArray, FloatArray]:
-    theta = np.linspace(0.0, 2.0 * np.pi, points)
-    return amplitude * np.cos(theta), steady_force(theta, amplitude, F_MAX, SIGMA, alpha)
+    return Dahl(F_MAX, SIGMA, alpha).loop(amplitude, points)
 
 
 @pytest.mark.parametrize("alpha", [0.25, 0.5, 1.0, 2.0, 4.0])

@@ -46,6 +46,7 @@ class Behaviour(ABC):
     has_memory: bool = False
     unique_response: bool = False
     parameters: tuple[Parameter, ...] = ()
+    optional: ClassVar[tuple[Parameter, float] | None] = None
     linear_parameters: tuple[str, ...] = ()
     scale_parameters: tuple[str, ...] = ()
     like_parts: tuple[tuple[str, ...], ...] = ()

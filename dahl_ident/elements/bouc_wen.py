@@ -10,16 +10,20 @@ dF/dx = sigma - q |F| and sigma + p |F|; q = p = sigma/f_max is then the linear 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
+
+_WITH_EXPONENT = (
+    "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
+    "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
+)
 
 
 class BoucWen(Friction):
@@ -79,6 +83,13 @@ class BoucWen(Friction):
         Parameter("q", "1/m", "rate of softening while loading (beta + gamma)"),
         Parameter("p", "1/m", "rate of stiffening while unloading (beta - gamma)"),
     )
+    optional = (
+        Parameter(
+            "exponent", "", "exponent of the force", lower=0.05, upper=100.0, transform="log",
+            scan=(0.5, 1.0, 2.0, 4.0), prior=(0.5, 5.0),
+        ),
+        1.0,
+    )  # fmt: skip
     scale_parameters = ("sigma",)
 
     def __init__(
@@ -91,21 +102,19 @@ class BoucWen(Friction):
         name: str | None = None,
     ) -> None:
         self._bind({"sigma": sigma, "q": q, "p": p, "exponent": exponent}, name)
-
-    def __new__(cls, *_: Any, exponent: float | None = 1.0, **__: Any) -> BoucWen:
-        """Return the element of exponent 1, or that with another one."""
-        return object.__new__(cls if exponent == 1.0 else _PowerBoucWen)
-
-    @classmethod
-    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
-        """Return the element that :meth:`describe` described."""
-        return BoucWen(exponent=None if "exponent" in rest else 1.0, name=name)._described(rest)
+        if self.has_optional:
+            self.equation = _WITH_EXPONENT
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
         """Return dF/dx."""
-        sigma, q, p = values
+        sigma, q, p, *exponent = values
         ahead = direction * force
-        return sigma - 0.5 * ((q + p) * ahead + (q - p) * np.fabs(ahead))
+        if not exponent:
+            return sigma - 0.5 * ((q + p) * ahead + (q - p) * np.fabs(ahead))
+        (n,) = exponent
+        softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))
+        rate = 0.5 * ((softening - stiffening) + (softening + stiffening) * np.sign(ahead))
+        return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return sigma/q for both directions where the force saturates, inf where it does not."""
@@ -136,30 +145,3 @@ class BoucWen(Friction):
         if values[1] + values[2] <= 0.0:
             return (f"{q.name} + {p.name} is not above 0: the loop would gain energy",)
         return ()
-
-
-class _PowerBoucWen(BoucWen):
-    """Bouc-Wen with an exponent."""
-
-    equation = (
-        "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
-        "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
-    )
-    parameters = (
-        *BoucWen.parameters,
-        Parameter(
-            "exponent", "", "exponent of the force", lower=0.05, upper=100.0, transform="log",
-            scan=(0.5, 1.0, 2.0, 4.0), prior=(0.5, 5.0),
-        ),
-    )  # fmt: skip
-
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
-        """Return dF/dx."""
-        sigma, q, p, n = values
-        softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))
-        side = np.sign(direction * force)
-        rate = 0.5 * ((softening - stiffening) + (softening + stiffening) * side)
-        return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
-
-    def __repr__(self) -> str:
-        return super().__repr__().replace(type(self).__name__, "BoucWen", 1)

@@ -10,7 +10,7 @@ takes one quadrature, see :mod:`dahl_ident.elements.general_dahl`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +26,6 @@ from dahl_ident.arrays import (
 from dahl_ident.elements import general_dahl, hysteresis, linear_dahl
 from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.bouc_wen import BoucWen
-from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import (
     Alternative,
     Asymptote,
@@ -57,6 +56,9 @@ _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
 _SHARP, _SOFT = 1e-6, 1e3  # alpha
 _ONE_SIDED = 0.9  # asymmetry
 _NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that is not asked for
+_TWO_LIMITS = (
+    "dF/dx = sigma |1 - s F/f|^alpha sgn(1 - s F/f), f = f_max (1 + s asymmetry), s = sgn(dx/dt)"
+)
 
 
 class Dahl(Friction):
@@ -119,6 +121,18 @@ class Dahl(Friction):
             prior=(0.5, 2.0),
         ),
     )
+    optional = (
+        Parameter(
+            "asymmetry",
+            "",
+            "difference of the limits over their sum",
+            lower=-1.0,
+            upper=1.0,
+            scan=(-0.3, 0.0, 0.3),
+            prior=(-0.5, 0.5),
+        ),
+        0.0,
+    )
     scale_parameters = ("f_max", "sigma")
     softens = True
 
@@ -135,20 +149,14 @@ class Dahl(Friction):
         self._bind(given, name)
         if alpha is not None:
             array_between(alpha, self.parameters[2].name, *_EXPONENTS)
-
-    def __new__(cls, *_: Any, asymmetry: float | None = 0.0, **__: Any) -> Dahl:
-        """Return the element of one limit, or that of two where an asymmetry is given."""
-        return object.__new__(cls if asymmetry == 0.0 else _AsymmetricDahl)
-
-    @classmethod
-    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
-        """Return the element that :meth:`describe` described."""
-        blank = Dahl(asymmetry=None if "asymmetry" in rest else 0.0, name=name)
-        return blank._described(rest)
+        if self.has_optional:
+            self.equation, self.unique_response = _TWO_LIMITS, False
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
-        """Return dF/dx (Eqn. 2)."""
-        f_max, sigma, alpha = values
+        """Return dF/dx (Eqn. 2), with the limit of the direction."""
+        f_max, sigma, alpha, *asymmetry = values
+        if asymmetry:
+            f_max = f_max * (1.0 + direction * asymmetry[0])
         margin = 1.0 - direction * force / f_max
         return sigma * np.sign(margin) * np.fabs(margin) ** alpha
 
@@ -202,56 +210,39 @@ class Dahl(Friction):
         return {name: every[name][()] for name in chosen}
 
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return F_k/X_1 at `values` (f_max, sigma, alpha), unchecked.
+        """Return F_k/X_1 at `values`, unchecked; the engine's where there are two limits.
 
         The derivative with respect to alpha costs a quadrature; while alpha is fixed it is left at
         zero, which no estimate uses.
         """
+        if self.has_optional:
+            return super().settled(values, sine, derivatives)
         f_max, sigma, alpha = values
         if bool(np.equal(alpha, 1.0).all()):
             return self._settled_linear(values, sine, derivatives)
-        beta, k = sigma * sine.amplitude / f_max, sine.harmonic
-        if not derivatives:
-            return StiffnessGradient(sigma * general_dahl.stiffness(beta, alpha, k), _NONE, ())
-        if derivatives == 1:
-            h, by_f_max = general_dahl.stiffness_slope(beta, alpha, k)
-            return StiffnessGradient(sigma * h, _by_amplitude(values, beta, k, by_f_max), ())
-        return self._scaled(values, sine, *general_dahl.stiffness_gradient(beta, alpha, k))
+        beta = sigma * sine.amplitude / f_max
+        return _scaled(
+            values, sine, general_dahl.stiffness(beta, alpha, sine.harmonic, derivatives)
+        )
 
     @each_harmonic
     def _settled_linear(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         f_max, sigma, alpha = values
         beta, k = sigma * sine.amplitude / f_max, int(sine.harmonic)
-        if not derivatives:
-            if k == 1:
-                h = linear_dahl.describing_function(beta)
-            else:
-                h = _per(linear_dahl.harmonic(beta, k), beta)
-            return StiffnessGradient(sigma * h, _NONE, ())
-        if k == 1:
-            h, by_f_max, by_sigma = linear_dahl.describing_function_gradient(beta)
-        else:
+        if k != 1:
             c, rise = linear_dahl.harmonic_gradient(beta, k)
-            h, by_f_max, by_sigma = _per(c, beta), _per(c - rise, beta), _per(rise, beta)
-        if derivatives == 1:
-            return StiffnessGradient(sigma * h, _by_amplitude(values, beta, k, by_f_max), ())
-        by_alpha = np.zeros(h.shape, dtype=np.complex128)
-        if self.parameters[2].free:
-            by_alpha = general_dahl.stiffness_gradient(beta, alpha, k)[3]
-        return self._scaled(values, sine, h, by_f_max, by_sigma, by_alpha)
-
-    @staticmethod
-    def _scaled(
-        values: Values, sine: Sine, h: ComplexArray, by_f_max: ComplexArray,
-        by_sigma: ComplexArray, by_alpha: ComplexArray,
-    ) -> StiffnessGradient:  # fmt: skip
-        """Return the stiffness from that over sigma, and its derivatives from those over sigma."""
-        f_max, sigma, _ = values
-        by_amplitude = _by_amplitude(
-            values, sigma * sine.amplitude / f_max, sine.harmonic, by_f_max
-        )
-        by = (sigma / f_max * by_f_max, by_sigma, sigma * by_alpha)
-        return StiffnessGradient(sigma * h, by_amplitude, by)
+            parts = tuple(_per(part, beta) for part in (c, c - rise, rise))
+        elif derivatives:
+            parts = linear_dahl.describing_function_gradient(beta)
+        else:
+            parts = (linear_dahl.describing_function(beta),)
+        if derivatives > 1:
+            if self.parameters[2].free:
+                by_alpha = general_dahl.stiffness(beta, alpha, k, derivatives)[3]
+            else:
+                by_alpha = np.zeros(beta.shape, dtype=np.complex128)
+            parts = (*parts, by_alpha)
+        return _scaled(values, sine, parts[: general_dahl.COUNTS[derivatives]])
 
     def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
         """Return f_max, sigma and one for each, with the numbers that shape the loop."""
@@ -262,23 +253,31 @@ class Dahl(Friction):
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
         """Return the force at every sample, exactly (Eqn. 3, segment by segment), unchecked."""
+        if self.has_optional:
+            return super().history(values, path, state, slopes=slopes)
         f_max, sigma, alpha = (float(v) for v in values)
         if not slopes:
             force = hysteresis.force_history(path.displacement, f_max, sigma, alpha, state)
             return HistoryGradient(force, force, ())
         if alpha != 1.0 or self.parameters[2].free:
             return super().history(values, path, state, slopes=True)
-        found = hysteresis.linear_history_gradient(path.displacement, f_max, sigma, state)
-        zero = np.zeros(found.value.shape)
-        return found._replace(by_parameter=(*found.by_parameter, zero))
+        linear = hysteresis.linear_history_gradient(path.displacement, f_max, sigma, state)
+        zero = np.zeros(linear.value.shape)
+        return linear._replace(by_parameter=(*linear.by_parameter, zero))
 
-    def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
-        return hysteresis.steady_force(theta, amplitude, *values)
+    def _top(self, values: Sequence[float], amplitude: float) -> float:
+        if self.has_optional:
+            return super()._top(values, amplitude)
+        f_max, sigma, alpha = values
+        beta = np.asarray(sigma * amplitude / f_max)
+        return f_max * float(general_dahl.turning_force(beta, np.asarray(alpha)))
 
     def branch(
         self, values: Sequence[float], start: FloatArray | float, path: FloatArray
     ) -> FloatArray | None:
         """Return the force on the way up from `start` and its slope (Eqn. 3)."""
+        if self.has_optional:
+            return None
         f_max, sigma, alpha = values
         margin = np.asarray(1.0 - start / f_max)
         change = hysteresis.margin_change(margin, sigma / f_max * path, alpha)
@@ -309,10 +308,11 @@ class Dahl(Friction):
         self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
+        if self.has_optional:
+            return super().transient_decay(values, amplitude, omega)
         f_max, sigma, alpha = values
-        return (
-            hysteresis.transient_decay(np.asarray(sigma * amplitude / f_max), alpha) + 0.0 * omega
-        )
+        beta = np.asarray(sigma * amplitude / f_max)
+        return hysteresis.transient_decay(beta, alpha) + 0.0 * omega
 
     def combinations(self) -> tuple[Combination, ...]:
         """Return what microslip and the knee determine."""
@@ -330,7 +330,7 @@ class Dahl(Friction):
         The distances are those at which the model is its limit to five digits or more, three for
         no full slip.
         """
-        labels = [p.name for p in type(self).parameters if self.parameter(p.name).free]
+        labels = [self.label(p) for p in self.parameters if p.free]
         linear = {"alpha": 1.0} if "alpha" in labels else {}
         alike = linear | ({"asymmetry": 0.0} if "asymmetry" in labels else {})
         loss = self.combinations()[0]
@@ -379,7 +379,7 @@ class Dahl(Friction):
         if not alpha.assumed and (alpha.free or alpha.value != 1.0):
             return found
         limits = Dahl(asymmetry=None, name=name).started((f_max, sigma, 1.0, 0.01))
-        if not isinstance(self, _AsymmetricDahl):
+        if not self.has_optional:
             found["two limits"] = Alternative((limits,), "asymmetry")
         gap = min(0.3 * f_max / sigma, smallest)
         behind = self.started(values)
@@ -392,58 +392,40 @@ class Dahl(Friction):
         found["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
         found["LuGre"] = Alternative((LuGre(name=name),), "speed")
         found["Maxwell slip"] = Alternative((MaxwellSlip(_JENKINS, name=name),), "masing")
-        if not isinstance(self, _AsymmetricDahl):
+        if not self.has_optional:
             both = Backlash(limits).started((f_max, sigma, 1.0, 0.01, gap))
             found["two limits and gap"] = Alternative((both,), "asymmetry")
         return found
 
     def universal_curve(self) -> UniversalCurve | None:
         """Return h(beta) = N/sigma of the linear Dahl model; None for another exponent."""
-        _, sigma, alpha = (float(v) for v in self.known_values())
-        return UniversalCurve(sigma, linear_dahl.describing_function) if alpha == 1.0 else None
-
-
-class _AsymmetricDahl(Dahl):
-    """Dahl friction with two limits; results that assume symmetry are computed from the slope."""
-
-    equation = (
-        "dF/dx = sigma |1 - s F/f|^alpha sgn(1 - s F/f), f = f_max (1 + s asymmetry), "
-        "s = sgn(dx/dt)"
-    )
-    unique_response = False
-    parameters = (
-        *Dahl.parameters,
-        Parameter(
-            "asymmetry",
-            "",
-            "difference of the limits over their sum",
-            lower=-1.0,
-            upper=1.0,
-            scan=(-0.3, 0.0, 0.3),
-            prior=(-0.5, 0.5),
-        ),
-    )
-
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
-        """Return dF/dx (Eqn. 2), with the limit of the direction."""
-        f_max, sigma, alpha, asymmetry = values
-        limit = f_max * (1.0 + direction * asymmetry)
-        return super().slope(force, direction, velocity, (limit, sigma, alpha))
+        _, sigma, alpha, *asymmetry = (float(v) for v in self.known_values())
+        if alpha != 1.0 or asymmetry:
+            return None
+        return UniversalCurve(sigma, linear_dahl.describing_function)
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to an almost vanishing limit."""
-        if abs(values[3]) < _ONE_SIDED:
+        if not self.has_optional or abs(values[3]) < _ONE_SIDED:
             return ()
         return (f"{self.parameters[3].name} leaves almost no friction in one direction",)
 
-    def __repr__(self) -> str:
-        return super().__repr__().replace(type(self).__name__, "Dahl", 1)
 
-    settled = Friction.settled
-    history = Friction.history
-    transient_decay = Friction.transient_decay
-    branch = Friction.branch
-    _loop = Friction._loop
+def _scaled(values: Values, sine: Sine, parts: Sequence[ComplexArray]) -> StiffnessGradient:
+    """Return the stiffness and its derivatives from those over sigma.
+
+    By ln f_max, ln sigma and alpha, as many as there are; the first gives that by the amplitude.
+    """
+    f_max, sigma, _ = values
+    h, *by = parts
+    by_amplitude: ComplexArray = _NONE
+    by_parameter: tuple[ComplexArray, ...] = ()
+    if by:
+        beta = sigma * sine.amplitude / f_max
+        by_amplitude = _by_amplitude(values, beta, sine.harmonic, by[0])
+    if len(by) > 1:
+        by_parameter = (sigma / f_max * by[0], by[1], sigma * by[2])
+    return StiffnessGradient(sigma * h, by_amplitude, by_parameter)
 
 
 def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:

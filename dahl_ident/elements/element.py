@@ -61,6 +61,8 @@ class Element(Behaviour):
         A abs(L + N(A)) rises with A.
     parameters : tuple of Parameter
         In the order of the constructor: declarations on the class, with values on an element.
+    optional : (Parameter, float) or None
+        One more parameter, and the number at which an element does not have it.
     linear_parameters : tuple of str
         Labels in each of which the force is proportional, the others held.
     scale_parameters : tuple of str
@@ -89,10 +91,17 @@ class Element(Behaviour):
     def _bind(self, given: Mapping[str, float | None], name: str | None) -> None:
         """Give the declared parameters their full names and values."""
         self._name = name
+        declared = type(self).parameters
+        if self.optional and given[self.optional[0].name] != self.optional[1]:
+            declared = (*declared, self.optional[0])
         self.parameters = tuple(
-            declared.bound(prefixed(name, declared.name), given.get(declared.name, declared.value))
-            for declared in type(self).parameters
+            p.bound(prefixed(name, p.name), given.get(p.name, p.value)) for p in declared
         )
+
+    @property
+    def has_optional(self) -> bool:
+        """Whether the element has the parameter that is optional."""
+        return self.optional is not None and self.optional[0].name in self.labels
 
     def with_bound(self, parameters: tuple[Parameter, ...]) -> Self:
         """Return a copy of this element with other values, bounds or free flags."""
@@ -119,8 +128,10 @@ class Element(Behaviour):
     @classmethod
     def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
         """Return the element that :meth:`describe` described; `rest` has neither kind nor name."""
-        element: Element = cls(name=name)  # type: ignore[call-arg]  # every element takes a name
-        return element._described(rest)
+        options: dict[str, Any] = {"name": name}
+        if cls.optional and cls.optional[0].name in rest:
+            options[cls.optional[0].name] = None
+        return cls(**options)._described(rest)
 
     def _described(self, rest: Mapping[str, Any]) -> Self:
         """Return this element with the parameters that plain data describe, by label."""

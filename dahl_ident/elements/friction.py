@@ -321,10 +321,15 @@ class Friction(Element):
             )
 
     def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
-        """Return the force on the settled loop at angles from 0 to 2 pi."""
-        top = self._loops(np.array([[amplitude, 1.0, *values]])).tops[0]
-        x = amplitude * np.cos(theta)
-        return self.force_history(values, x, -amplitude * np.sin(theta), float(top))
+        """Return the force on the settled loop at rising angles from 0 to 2 pi."""
+        angle = np.union1d(theta, np.pi)  # where the motion turns
+        x, v = amplitude * np.cos(angle), -amplitude * np.sin(angle)
+        force = self.force_history(values, x, v, self._top(values, amplitude))
+        return force[np.searchsorted(angle, theta)]
+
+    def _top(self, values: Sequence[float], amplitude: float) -> float:
+        """Return the force of the settled loop at the largest displacement."""
+        return float(self._loops(np.array([[amplitude, 1.0, *values]])).tops[0])
 
     def _coefficients(self, amplitude: FloatArray, harmonic: int) -> ComplexArray:
         """Return F_k/X_1, refused where no loop settles."""

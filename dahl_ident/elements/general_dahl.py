@@ -59,15 +59,21 @@ _LEAST_BETA = 1e-200
 _DEEPEST = 44.0
 """Integrals over l end here: exp(-44) is nothing, even over a root where slip sets in."""
 
-_COUNTS = 1, 2, 4
-"""Of what is returned with 0, 1 and 2 derivatives."""
+COUNTS = 1, 2, 4
+"""How many arrays are returned with 0, 1 and 2 derivatives."""
 
 _NODES_PER_BLOCK = 8192
 """Nodes in work at once, so that the scratch arrays stay small and in the cache."""
 
 
-def stiffness(beta: FloatArray, alpha: FloatArray, k: Orders = 1) -> ComplexArray:
-    """Return h_k = N_k/sigma = c_k/beta (Eqns. 51 and 52, for any exponent); 0 for even k.
+def stiffness(
+    beta: FloatArray, alpha: FloatArray, k: Orders = 1, derivatives: int = 0
+) -> tuple[ComplexArray, ...]:
+    """Return h_k = N_k/sigma = c_k/beta (Eqns. 51 and 52, for any exponent), and derivatives.
+
+    1: and, over sigma, dN_k/d ln f_max = -beta dh/dbeta; 2: and dN_k/d ln sigma = h + beta dh/dbeta
+    and dN_k/d alpha = dh/dalpha. All are 0 for even k. A block of loops at a time has the nodes of
+    its highest harmonic.
 
     Parameters
     ----------
@@ -77,38 +83,30 @@ def stiffness(beta: FloatArray, alpha: FloatArray, k: Orders = 1) -> ComplexArra
         Exponent of Eqn. 2, > 0; unchecked.
     k : int or ndarray of int, default 1
         Harmonic; broadcast with `beta`.
+    derivatives : int, default 0
+        0, 1 or 2, see above.
 
     Examples
     --------
-    >>> stiffness(np.array([0.0, 1.0]), np.array(2.0)).round(6)
-    array([1.      +0.j      , 0.544039+0.354193j])
-    """
-    return _by_blocks(beta, alpha, k, 0)[0]
-
-
-def stiffness_gradient(
-    beta: FloatArray, alpha: FloatArray, k: Orders = 1
-) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Return h_k and, over sigma, dN_k/d ln f_max, dN_k/d ln sigma and dN_k/d alpha.
-
-    These are h, ``-beta dh/dbeta``, ``h + beta dh/dbeta`` and ``dh/dalpha``.
-
-    Examples
-    --------
-    >>> h, by_f_max, by_sigma, by_alpha = stiffness_gradient(np.array(1.0), np.array(2.0))
+    >>> h, by_f_max, by_sigma, by_alpha = stiffness(np.array(1.0), np.array(2.0), 1, 2)
+    >>> h.round(6)
+    np.complex128(0.544039+0.354193j)
     >>> bool(abs(by_f_max + by_sigma - h) < 1e-15)  # N is homogeneous in f_max, sigma at fixed A
     True
     """
-    h, by_ln_f_max, by_ln_sigma, by_alpha = _by_blocks(beta, alpha, k, 2)
-    return h, by_ln_f_max, by_ln_sigma, by_alpha
-
-
-def stiffness_slope(
-    beta: FloatArray, alpha: FloatArray, k: Orders = 1
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return h_k and, over sigma, dN_k/d ln f_max; see :func:`stiffness_gradient`."""
-    h, by_ln_f_max = _by_blocks(beta, alpha, k, 1)
-    return h, by_ln_f_max
+    shape = np.broadcast_shapes(beta.shape, alpha.shape, np.shape(k))
+    b, a = (np.broadcast_to(v, shape).reshape(-1, 1) for v in (beta, alpha))
+    order = np.broadcast_to(np.asarray(k), shape).reshape(-1, 1)
+    odd = np.flatnonzero(order % 2)
+    odd = odd[np.argsort(order[odd, 0], kind="stable")]
+    rows = max(1, _NODES_PER_BLOCK // quadrature_rule(int(order.max(initial=1))).rise.size)
+    whole = [np.zeros(b.size, dtype=np.complex128) for _ in range(COUNTS[derivatives])]
+    for i in range(0, odd.size, rows):
+        some = odd[i : i + rows]
+        pieces = _stiffness(b[some], a[some], order[some], derivatives)
+        for target, piece in zip(whole, pieces, strict=True):
+            target[some] = piece[:, 0]
+    return tuple(target.reshape(shape) for target in whole)
 
 
 def turning_force(beta: FloatArray, alpha: FloatArray) -> FloatArray:
@@ -242,25 +240,3 @@ def _log_slope(u: FloatArray) -> FloatArray:
     v = np.where(small, u * u, 0.0)
     series = 1.0 - v / 60.0 * (1.0 - v / 42.0 * (1.0 - v / 40.0 * (1.0 - v / 39.6)))
     return np.where(small, u / 12.0 * series - 0.5, 1.0 / np.expm1(large) - 1.0 / large)
-
-
-def _by_blocks(
-    beta: FloatArray, alpha: FloatArray, k: Orders, derivatives: int
-) -> list[ComplexArray]:
-    """Return what :func:`_stiffness` gives for all loops, a block of loops at a time.
-
-    A block has the nodes of its highest harmonic; even harmonics are zero.
-    """
-    shape = np.broadcast_shapes(beta.shape, alpha.shape, np.shape(k))
-    b, a = (np.broadcast_to(v, shape).reshape(-1, 1) for v in (beta, alpha))
-    order = np.broadcast_to(np.asarray(k), shape).reshape(-1, 1)
-    odd = np.flatnonzero(order % 2)
-    odd = odd[np.argsort(order[odd, 0], kind="stable")]
-    rows = max(1, _NODES_PER_BLOCK // quadrature_rule(int(order.max(initial=1))).rise.size)
-    whole = [np.zeros(b.size, dtype=np.complex128) for _ in range(_COUNTS[derivatives])]
-    for i in range(0, odd.size, rows):
-        some = odd[i : i + rows]
-        pieces = _stiffness(b[some], a[some], order[some], derivatives)
-        for target, piece in zip(whole, pieces, strict=True):
-            target[some] = piece[:, 0]
-    return [target.reshape(shape) for target in whole]

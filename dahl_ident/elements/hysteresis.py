@@ -86,26 +86,6 @@ def linear_history_gradient(
     return HistoryGradient(force, gradient[:, 0], tuple(gradient[:, 1:].T))
 
 
-def steady_force(
-    theta: FloatArray, amplitude: float, f_max: float, sigma: float, alpha: float
-) -> FloatArray:
-    """Return the force on the closed loop of x = A cos(theta), theta from 0 to 2 pi.
-
-    Eqns. 10 and 11 for alpha = 1.
-
-    Examples
-    --------
-    >>> steady_force(np.linspace(0.0, 2.0 * np.pi, 5), 1.0, 1.0, 1.0, 1.0).round(6)
-    array([ 0.761594, -0.351946, -0.761594,  0.351946,  0.761594])
-    """
-    beta = sigma * amplitude / f_max
-    margin = np.full(theta.shape, 1.0 + float(turning_force(np.asarray(beta), np.asarray(alpha))))
-    back = theta <= np.pi
-    path = 2.0 * beta * np.where(back, np.sin(theta / 2.0), np.cos(theta / 2.0)) ** 2
-    margin += margin_change(margin, path, alpha)
-    return np.asarray(f_max * np.where(back, margin - 1.0, 1.0 - margin))
-
-
 def transient_decay(beta: FloatArray, alpha: FloatArray | float) -> FloatArray:
     """Return the factor by which a deviation from the steady loop shrinks in one cycle.
 

@@ -215,25 +215,17 @@ def _polynomial(u: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
     return value
 
 
-def harmonic(beta: FloatArray, k: int) -> ComplexArray:
-    """Return c_k = (a_k - j b_k)/f_max, the k-th Fourier coefficient of the steady loop.
+def harmonic_gradient(beta: FloatArray, k: int) -> tuple[ComplexArray, ComplexArray]:
+    """Return c_k = (a_k - j b_k)/f_max, the k-th Fourier coefficient, and beta dc_k/dbeta.
 
     Exactly 0 for even `k`; ``beta h(beta)`` for ``k = 1``; else within 1e-12 of the larger part up
-    to ``k = 15`` and 1e-9 at 101, with the derivatives of :func:`harmonic_gradient`.
+    to ``k = 15`` and 1e-9 at 101. ``a_k - j b_k = f_max c_k`` changes with ln sigma by
+    ``f_max by_ln_beta``, with ln f_max by ``f_max (c_k - by_ln_beta)``.
 
     Examples
     --------
-    >>> harmonic(np.array([0.5, 50.0]), 3).round(6)
+    >>> harmonic_gradient(np.array([0.5, 50.0]), 3)[0].round(6)
     array([0.004691-0.01893j , 0.206589+0.352012j])
-    """
-    return harmonic_gradient(beta, k)[0]
-
-
-def harmonic_gradient(beta: FloatArray, k: int) -> tuple[ComplexArray, ComplexArray]:
-    """Return c_k and beta dc_k/dbeta.
-
-    ``a_k - j b_k = f_max c_k`` changes with ln sigma by ``f_max by_ln_beta``, with ln f_max by
-    ``f_max (c_k - by_ln_beta)``.
     """
     if k == 1:
         h, _, by_ln_sigma = describing_function_gradient(beta)

@@ -146,20 +146,8 @@ class Masing(Friction):
         """Return 0: the first full swing erases the history."""
         return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
 
-    def steady_force(self, values: Values, path: FloatArray, cycles: int) -> FloatArray:
-        """Return the force along closed paths of displacement, (..., n), loaded from rest."""
-        n = path.shape[-1]
-        rows = path.reshape(-1, n)
-        loaded = [np.append(0.0, np.tile(x, 2)) for x in rows]
-        return np.reshape([self.force_history(values, x)[n + 1 :] for x in loaded], path.shape)
-
-    def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
-        at = [np.asarray(v, dtype=np.float64) for v in values]
-        back = theta <= np.pi
-        gone = amplitude * np.where(back, np.sin(theta / 2.0), np.cos(theta / 2.0)) ** 2
-        top = self.backbone(at, np.asarray(amplitude))
-        force = top - 2.0 * self.backbone(at, gone)
-        return np.asarray(np.where(back, force, -force))
+    def _top(self, values: Sequence[float], amplitude: float) -> float:
+        return float(self.backbone([np.asarray(v) for v in values], np.asarray(amplitude)))
 
 
 class _Paths:
