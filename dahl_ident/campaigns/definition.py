@@ -32,7 +32,6 @@ import inspect
 import json
 import math
 import re
-import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -40,7 +39,7 @@ from pathlib import Path
 from typing import Any
 
 from dahl_ident.data.columns import one_of
-from dahl_ident.data.storage import regular
+from dahl_ident.data.storage import read_toml, regular
 from dahl_ident.errors import DataError, ValidationError, choices
 
 _TABLES = {"laws", "files", "read", "extract", "fit", "posterior", "model", "output"}
@@ -103,10 +102,7 @@ def read_definition(source: str | Path | Mapping[str, Any]) -> Definition:
         content, name, folder = dict(source), "the campaign", Path.cwd()
     else:
         path = Path(source)
-        try:
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as exc:
-            raise DataError(f"{path}: cannot be read as a campaign in TOML: {exc}") from exc
+        content = read_toml(path, "the campaign")
         name, folder = str(path), path.resolve().parent
     try:
         return _checked(name, folder, content)

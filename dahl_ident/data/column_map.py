@@ -22,7 +22,6 @@ one level: ``column = "FRdata.*[*].frequency"``. Indices count from 0.
 from __future__ import annotations
 
 import json
-import tomllib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -33,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, non_negative_number, positive_number
-from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, RECORD_COLUMNS, FileColumn, one_of
+from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, RECORD_COLUMNS, Column, one_of
 from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
-from dahl_ident.data.storage import read_text
+from dahl_ident.data.storage import read_toml
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import (
     ANY,
@@ -142,11 +141,7 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
     """
     name, entries = "columns", value or {}
     if not isinstance(entries, Mapping):
-        name = str(entries)
-        try:
-            entries = tomllib.loads(read_text(name, "the column map"))
-        except tomllib.TOMLDecodeError as exc:
-            raise DataError(f"{name}: not a TOML file: {exc}") from exc
+        name, entries = str(entries), read_toml(entries, "the column map")
     entries = {**entries, **{key: entry for key, entry in overrides.items() if entry is not None}}
     roles: dict[str, MappedColumn] = {}
     settings: dict[str, Any] = {}
@@ -199,7 +194,7 @@ class Binding:
 
     source: RawFile
     map: ColumnMap
-    columns: Mapping[str, FileColumn]
+    columns: Mapping[str, Column]
     motions: dict[str, Motion] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
@@ -329,13 +324,16 @@ class Binding:
             raise UnitError(f"{self.source.name}: column {channel.name!r}: {exc}") from exc
 
     def kind(self, role: str, unit: Unit) -> tuple[str, float]:
-        """Return which kind a role's unit is, and its factor; its motion is remembered."""
+        """Return which kind a role's unit is, and its factor, for angular frequency to Hz.
+
+        Its motion is remembered.
+        """
         kind, motion, factor = kind_of(
             unit, self.columns[role].kinds, f"{self.source.name}: the {role}"
         )
         if kind in MECHANICAL_KINDS:
             self.motions[role] = motion
-        return kind, factor
+        return kind, factor / (2.0 * np.pi) if kind == "angular_frequency" else factor
 
     def force_per(self, kind: str) -> tuple[float, float]:
         """Return the force for one SI unit of a drive, and its relative uncertainty."""

@@ -1,12 +1,12 @@
 """The columns of tables, each declared once, and the checks of what they may hold.
 
-:data:`COLUMNS` are those of a frequency response in memory. :data:`RESPONSE_COLUMNS` and
-:data:`RECORD_COLUMNS` are those of files: how each is called, its unit, and what is saved in it.
+From a declaration follow how a column is found in a file, converted and checked, what a message
+says of it, and how it is saved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any
@@ -163,26 +163,51 @@ def check_covariance(
         )
 
 
+Table = Any
+"""A frequency response, whose own module uses this one."""
+Source = str | Callable[[Table], NDArray[Any] | None]
+
+
 @dataclass(frozen=True)
 class Column:
-    """A column of a frequency response or a record in memory.
+    """A column of tables: what it may hold, its name and unit in files, and how it is saved.
 
-    `check` returns an array of allowed values, or raises an error that names the column; `shape` is
-    that of one row's value; where it `repeats`, one value may be given for all rows; without the
-    columns that it `needs` it means nothing.
+    In files it has the first of its `names`, and is found under the others without a map. `unit`
+    is that in which it is saved, such as ``({displacement})*({response})``; where a header has
+    none, the first column of `like` gives it. `kinds` are those that a file's unit may be of, where
+    they are several. `least` is the smallest number that is allowed, and `expected` says so.
+
+    Its values are those of the attribute `source` of a table, the `part` of each row's, or what a
+    function makes of the table. `form` is the only form of table in which it is saved:
+    "rectangular", "polar", "backbone", or "complex", which no file has. It is saved under `header`,
+    by default its name with its unit in brackets.
+
+    A column in memory has a `check`, which returns an array of allowed values, or raises an error
+    that names the column; `shape` is that of one row's value; where it `repeats`, one value may be
+    given for all rows; without the columns that it `needs` it means nothing.
     """
 
-    check: Check
+    names: tuple[str, ...] = ()
+    unit: str = ""
+    source: Source = ""
+    check: Check | None = None
     shape: tuple[int, ...] = ()
     repeats: bool = False
     needs: tuple[str, ...] = ()
+    part: tuple[int, ...] = ()
+    form: str = ""
+    header: str = ""
+    kinds: tuple[str, ...] = ()
+    like: tuple[str, ...] = ()
+    expected: str = ""
+    least: float = 0.0
 
     def checked(self, value: ArrayLike | None, name: str, n: int) -> NDArray[Any] | None:
         """Return a read-only array of n rows, or None for None."""
         if value is None:
             return None
         refuse_masked(value, name)
-        array = self.check(value, name)
+        array = np.asarray(value) if self.check is None else self.check(value, name)
         if self.repeats and not array.ndim:
             array = np.full(n, array)
         if array.shape != (n, *self.shape):
@@ -192,51 +217,12 @@ class Column:
             )
         return frozen_copy(array)
 
-
-COLUMNS = {
-    "frequency_hz": Column(positive_array),
-    "response": Column(complex_values),
-    "amplitude": Column(positive_array),
-    "drive": Column(positive_array),
-    "covariance": Column(finite_array, (2, 2)),
-    "dof": Column(degrees_of_freedom, repeats=True, needs=("covariance",)),
-    "amplitude_std": Column(non_negative_array, needs=("amplitude",)),
-    "amplitude_covariance": Column(finite_array, (2,), needs=("amplitude_std", "covariance")),
-    "drive_std": Column(non_negative_array, needs=("drive",)),
-    "drive_covariance": Column(finite_array, (2,), needs=("drive_std", "covariance")),
-    "level": Column(labels, repeats=True),
-    "run": Column(run_labels, repeats=True),
-    "controlled": Column(controlled_words, repeats=True),
-    "harmonic": Column(harmonic_numbers, repeats=True),
-}
-
-
-Table = Any
-"""A frequency response, whose own module uses this one."""
-Saved = Callable[[Table], NDArray[Any] | None]
-
-
-@dataclass(frozen=True)
-class FileColumn:
-    """A column of a file, with its name and others under which it is found without a map.
-
-    `unit` is that in which it is saved, such as ``({displacement})*({response})``; where a header
-    has none, the first column of `like` gives it. `kinds` are those that a file's unit may be of,
-    where they are several. `least` is the smallest number that is allowed, and `expected` says so.
-    `saved` returns its values in a frequency response; `form` is the only form of table that has
-    it: "rectangular", "polar" or "backbone". It is saved under `header`, by default its name with
-    its unit in brackets.
-    """
-
-    names: tuple[str, ...]
-    unit: str = ""
-    saved: Saved | None = None
-    form: str = ""
-    header: str = ""
-    kinds: tuple[str, ...] = ()
-    like: tuple[str, ...] = ()
-    expected: str = ""
-    least: float = 0.0
+    def saved(self, data: Table) -> NDArray[Any] | None:
+        """Return its values in a table, None where that has none."""
+        if not isinstance(self.source, str):
+            return self.source(data)
+        values = getattr(data, self.source, None)
+        return None if values is None else np.asarray(values[(slice(None), *self.part)])
 
     def unit_of(self, motion: Motion, quantity: str) -> str:
         """Return the SI unit in tables of a quantity, of translation or rotation."""
@@ -264,17 +250,7 @@ class FileColumn:
         return self.unit.format(displacement="um", force="N", response="N/m")
 
 
-def _of(name: str, *part: int) -> Saved:
-    """Return a function of a frequency response that gives a column, or a part of each row's."""
-
-    def saved(data: Table) -> NDArray[Any] | None:
-        values = getattr(data, name)
-        return None if values is None else values[(slice(None), *part)]
-
-    return saved
-
-
-def _polar(axis: int) -> Saved:
+def _polar(axis: int) -> Source:
     """Return a function that gives the standard deviation of gain (0) or phase, in degrees (1)."""
 
     def saved(data: Table) -> NDArray[Any] | None:
@@ -293,93 +269,191 @@ def backbone_std(data: Table, axis: int) -> FloatArray:
     return np.asarray(std if axis else data.frequency_hz * std)
 
 
+def check_table(data: Table) -> None:
+    """Refuse a table without a column that it needs, or with an impossible row."""
+    if data.amplitude is None and data.drive is None:
+        raise ValidationError(
+            "neither amplitude nor drive is given; a response with friction means nothing "
+            "without the amplitude it was measured at"
+        )
+    for name, column in COLUMNS.items():
+        absent = [need for need in column.needs if getattr(data, need) is None]
+        if absent and getattr(data, name) is not None:
+            raise ValidationError(f"{name} is given without {' and '.join(absent)}")
+    if data.quantity == "backbone":
+        if data.amplitude is None or data.covariance is None:
+            raise ValidationError(
+                "a backbone needs amplitudes, and standard deviations of the natural "
+                "frequencies and of the damping ratios"
+            )
+        wrong = (data.response.imag < 0.0) | (data.controlled == "force")
+        for row in np.flatnonzero(wrong)[:1]:
+            raise ValidationError(
+                f"row {row} has the damping ratio {data.response.imag[row]:g} and "
+                f"controlled {data.controlled[row]!r}; expected a ratio >= 0, and "
+                "'displacement', at whose amplitude the frequency was found"
+            )
+    held = {"dynamic_stiffness": "displacement", "receptance": "force"}.get(data.quantity)
+    wrong = (data.harmonic != 1) & (data.controlled != held)
+    if data.quantity != "dynamic_stiffness":  # extraction judges those
+        for row in np.flatnonzero(wrong)[:1]:
+            raise ValidationError(
+                f"harmonic[{row}] is {data.harmonic[row]} in a table of {data.quantity}, "
+                f"{data.controlled[row]} controlled; harmonics of the force are rows of "
+                "dynamic stiffness, F_k/X_1, those of the displacement rows of receptance, "
+                "X_k/F_1, with the force controlled"
+            )
+    mean = data.harmonic == 0
+    for row in np.flatnonzero(mean & (data.response.imag != 0.0))[:1]:
+        raise ValidationError(
+            f"response[{row}] is {data.response[row]}; expected a real number, as a row with "
+            "harmonic 0 holds a mean over the amplitude of what was controlled"
+        )
+    if data.covariance is not None:
+        imaginary = np.abs(data.covariance[:, 1, :]).sum(axis=1)
+        if data.amplitude_covariance is not None:
+            imaginary = imaginary + np.abs(data.amplitude_covariance[:, 1])
+        for row in np.flatnonzero(mean & (imaginary != 0.0))[:1]:
+            raise ValidationError(
+                f"covariance[{row}] gives the imaginary part an error; expected 0, as a row "
+                "with harmonic 0 is a real number"
+            )
+        check_covariance(data.covariance, data.amplitude_std, data.amplitude_covariance)
+        check_covariance(data.covariance, data.drive_std, data.drive_covariance)
+
+
 _A, _F, _R = "{displacement}", "{force}", "{response}"
 _STD: dict[str, Any] = {"expected": "a standard deviation >= 0"}
-_PEAK: dict[str, Any] = {"expected": "a value > 0", "least": SMALLEST}
+_PEAK: dict[str, Any] = {"check": positive_array, "expected": "a value > 0", "least": SMALLEST}
 _OF_RESPONSE: dict[str, Any] = {"kinds": QUANTITIES}
 _RESPONSE = (
-    FileColumn(
-        ("frequency", "freq", "frequency_hz", "freq_hz"), "Hz", _of("frequency_hz"),
+    Column(
+        ("frequency", "freq", "frequency_hz", "freq_hz"), "Hz", "frequency_hz", positive_array,
         header="frequency_hz", kinds=("frequency", "angular_frequency"), least=SMALLEST,
         expected="a frequency > 0",
     ),
-    FileColumn(("level",), saved=_of("level")),
-    FileColumn(("run", "test", "file", "day"), saved=_of("run")),
-    FileColumn(
-        ("amplitude", "displacement_amplitude"), _A, _of("amplitude"), kinds=MOTION_KINDS, **_PEAK
+    Column(("level",), "", "level", labels, repeats=True),
+    Column(("run", "test", "file", "day"), "", "run", run_labels, repeats=True),
+    Column(
+        ("amplitude", "displacement_amplitude"), _A, "amplitude", kinds=MOTION_KINDS, **_PEAK
     ),
-    FileColumn(
-        ("drive", "force", "force_amplitude", "drive_amplitude", "torque"), _F, _of("drive"),
+    Column(
+        ("drive", "force", "force_amplitude", "drive_amplitude", "torque"), _F, "drive",
         kinds=DRIVE_KINDS, **_PEAK,
     ),
-    FileColumn(("response", "frf"), _R, **_OF_RESPONSE),
-    FileColumn(
+    Column(("response", "frf"), _R, "response", complex_values, form="complex", **_OF_RESPONSE),
+    Column(
         (
             "real", "re", "real_part",
             *(f"{q}_{part}" for q in QUANTITIES for part in ("re", "real")),
         ),
-        _R, lambda d: d.response.real, "rectangular", **_OF_RESPONSE,
+        _R, lambda d: d.response.real, form="rectangular", **_OF_RESPONSE,
     ),
-    FileColumn(
+    Column(
         (
             "imag", "im", "imaginary", "imag_part",
             *(f"{q}_{part}" for q in QUANTITIES for part in ("im", "imag")),
         ),
-        _R, lambda d: d.response.imag, "rectangular", like=("real",), **_OF_RESPONSE,
+        _R, lambda d: d.response.imag, form="rectangular", like=("real",), **_OF_RESPONSE,
     ),
+    Column(source="covariance", check=finite_array, shape=(2, 2)),
     *(
-        FileColumn((f"covariance_{name}",), f"({_R})^2", _of("covariance", *part), "rectangular")
+        Column((f"covariance_{name}",), f"({_R})^2", "covariance", part=part, form="rectangular")
         for name, part in (("real_real", (0, 0)), ("real_imag", (0, 1)), ("imag_imag", (1, 1)))
     ),
-    FileColumn(
-        ("damping_ratio", "zeta"), "1", lambda d: d.response.imag, "backbone", "damping_ratio",
-        expected="a damping ratio >= 0",
+    Column(
+        ("damping_ratio", "zeta"), "1", lambda d: d.response.imag, form="backbone",
+        header="damping_ratio", expected="a damping ratio >= 0",
     ),
-    FileColumn(
-        ("frequency_std",), "Hz", lambda d: backbone_std(d, 0), "backbone", like=("frequency",),
-        **_STD,
+    Column(
+        ("frequency_std",), "Hz", lambda d: backbone_std(d, 0), form="backbone",
+        like=("frequency",), **_STD,
     ),
-    FileColumn(
-        ("damping_ratio_std", "zeta_std"), "1", lambda d: backbone_std(d, 1), "backbone",
-        "damping_ratio_std", **_STD,
+    Column(
+        ("damping_ratio_std", "zeta_std"), "1", lambda d: backbone_std(d, 1), form="backbone",
+        header="damping_ratio_std", **_STD,
     ),
-    FileColumn(("gain", "magnitude", "mag"), _R, lambda d: d.gain, "polar", **_OF_RESPONSE),
-    FileColumn(("gain_db", "magnitude_db", "mag_db"), _R, **_OF_RESPONSE),
-    FileColumn(
-        ("phase", "phase_deg", "phase_rad"), "deg", lambda d: np.degrees(d.phase), "polar",
-        "phase_deg", ("angle",),
+    Column(("gain", "magnitude", "mag"), _R, "gain", form="polar", **_OF_RESPONSE),
+    Column(("gain_db", "magnitude_db", "mag_db"), _R, **_OF_RESPONSE),
+    Column(
+        ("phase", "phase_deg", "phase_rad"), "deg", lambda d: np.degrees(d.phase), form="polar",
+        header="phase_deg", kinds=("angle",),
     ),
-    FileColumn(("std",), _R, like=("gain", "real", "response"), **_STD),
-    FileColumn(("real_std",), _R, like=("real", "response"), **_STD),
-    FileColumn(("imag_std",), _R, like=("real", "response"), **_STD),
-    FileColumn(("gain_std",), _R, _polar(0), "polar", like=("gain",), **_STD),
-    FileColumn(
-        ("phase_std", "phase_std_deg", "phase_std_rad"), "rad", _polar(1), "polar",
-        "phase_std_deg", **_STD,
+    Column(("std",), _R, like=("gain", "real", "response"), **_STD),
+    Column(("real_std",), _R, like=("real", "response"), **_STD),
+    Column(("imag_std",), _R, like=("real", "response"), **_STD),
+    Column(("gain_std",), _R, _polar(0), form="polar", like=("gain",), **_STD),
+    Column(
+        ("phase_std", "phase_std_deg", "phase_std_rad"), "rad", _polar(1), form="polar",
+        header="phase_std_deg", **_STD,
     ),
-    FileColumn(("dof",), saved=_of("dof")),
-    FileColumn(("amplitude_std",), _A, _of("amplitude_std"), like=("amplitude",), **_STD),
-    FileColumn(("drive_std",), _F, _of("drive_std"), like=("drive",), **_STD),
+    Column(("dof",), "", "dof", degrees_of_freedom, repeats=True, needs=("covariance",)),
     *(
-        FileColumn(
-            (f"covariance_{level}_{part}",), f"({unit})*({_R})", _of(f"{level}_covariance", i),
-            "rectangular",
+        Column(
+            (f"{level}_std",), unit, f"{level}_std", non_negative_array, needs=(level,),
+            like=(level,), **_STD,
+        )
+        for level, unit in (("amplitude", _A), ("drive", _F))
+    ),
+    *(
+        Column(
+            source=f"{level}_covariance", check=finite_array, shape=(2,),
+            needs=(f"{level}_std", "covariance"),
+        )
+        for level in ("amplitude", "drive")
+    ),
+    *(
+        Column(
+            (f"covariance_{level}_{part}",), f"({unit})*({_R})", f"{level}_covariance", part=(i,),
+            form="rectangular",
         )
         for level, unit in (("amplitude", _A), ("drive", _F))
         for i, part in enumerate(("real", "imag"))
     ),
-    FileColumn(("controlled",), saved=_of("controlled")),
-    FileColumn(("harmonic",), saved=_of("harmonic")),
+    Column(("controlled",), "", "controlled", controlled_words, repeats=True),
+    Column(("harmonic",), "", "harmonic", harmonic_numbers, repeats=True),
 )  # fmt: skip
-_RECORD = (
-    FileColumn(("time", "t", "time_s", "timestamp"), "s", kinds=("time",)),
-    FileColumn(("displacement", "disp", "position", "x"), "um", kinds=("displacement",)),
-    FileColumn(("velocity", "vel", "v"), "mm/s", kinds=("velocity",)),
-    FileColumn(("acceleration", "accel", "acc", "a"), "m/s^2", kinds=("acceleration",)),
-    FileColumn(("force", "f", "torque"), _F, kinds=("force",)),
-    FileColumn(("drive", "voltage", "current"), _F, kinds=DRIVE_KINDS),
+_RECORD = tuple(
+    Column(names, unit, names[0], finite_array, kinds=kinds)
+    for names, unit, kinds in (
+        (("time", "t", "time_s", "timestamp"), "s", ("time",)),
+        (("displacement", "disp", "position", "x"), "um", ("displacement",)),
+        (("velocity", "vel", "v"), "mm/s", ("velocity",)),
+        (("acceleration", "accel", "acc", "a"), "m/s^2", ("acceleration",)),
+        (("force", "f", "torque"), _F, ("force",)),
+        (("drive", "voltage", "current"), _F, DRIVE_KINDS),
+    )
 )
-RESPONSE_COLUMNS = {column.names[0]: column for column in _RESPONSE}
-"""Of tables of responses, in the order in which they are saved."""
+COLUMNS = {str(column.source): column for column in _RESPONSE if column.check}
+"""Of a frequency response in memory."""
+RESPONSE_COLUMNS = {column.names[0]: column for column in _RESPONSE if column.names}
+"""Of files of responses, in the order in which they are saved."""
 RECORD_COLUMNS = {column.names[0]: column for column in _RECORD}
+"""Of a record, in memory and in files."""
 FILE_COLUMNS = RECORD_COLUMNS | RESPONSE_COLUMNS
+
+
+def combined(
+    parts: Sequence[Table], combine: Callable[[list[NDArray[Any]]], NDArray[Any]]
+) -> dict[str, Any]:
+    """Apply `combine` to each column of all parts; returns constructor arguments."""
+    columns: dict[str, Any] = {
+        name: combine([getattr(part, name) for part in parts])
+        for name in COLUMNS
+        if getattr(parts[0], name) is not None
+    }
+    columns["quality"] = {
+        name: combine([part.quality[name] for part in parts])
+        for name in parts[0].quality
+        if all(name in part.quality for part in parts)
+    }
+    return columns
+
+
+def shared_properties(data: Table) -> set[str]:
+    """Return the properties that two tables must share to be concatenated."""
+    columns = {name for name in COLUMNS if getattr(data, name) is not None}
+    columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
+    if data.level is not None:
+        columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")
+    return columns | {data.quantity, data.motion}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.columns import Table
+from dahl_ident.data.columns import Table, backbone_std
 from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import engineering, si_unit
@@ -37,11 +37,15 @@ def draw(
 ) -> tuple[Any, Any]:
     """Draw gain and phase of the fundamental, over amplitude or frequency as suits the table.
 
+    Of a backbone natural frequency and damping ratio are drawn.
+
     `stds` gives the standard deviations of gain and phase of some rows, by default those of
     their covariance; `fitted` gives a curve through some rows, over frequency or not.
     """
     from dahl_ident.plots import plot_amplitude_response, plot_frequency_response
 
+    if data.quantity == "backbone":
+        return _draw_backbone(data, ax)
     fundamental = data.select(harmonic=1)
     errors = _stds if stds is None else stds
     over_frequency = is_over_frequency(fundamental)
@@ -69,14 +73,13 @@ def draw(
     )
 
 
-def draw_backbone(
-    data: Table, stds: tuple[FloatArray, FloatArray], ax: Any = None
-) -> tuple[Any, Any]:
+def _draw_backbone(data: Table, ax: Any) -> tuple[Any, Any]:
     """Draw natural frequency and damping ratio over amplitude, with their standard deviations."""
     from dahl_ident.plots import plot_backbone
 
     labels = ("natural frequency [Hz]", "damping ratio [1]")
     values = (data.frequency_hz, data.response.imag)
+    stds = (backbone_std(data, 0), backbone_std(data, 1))
     return plot_backbone(
         held_amplitude(data),
         list(zip(labels, values, stds, strict=True)),

@@ -9,7 +9,7 @@ has a positive imaginary part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,12 +28,13 @@ from dahl_ident.data.columns import (
     FILE_COLUMNS,
     RESPONSE_COLUMNS,
     Column,
-    backbone_std,
-    check_covariance,
+    check_table,
+    combined,
     frozen_copy,
     frozen_mapping,
     one_of,
     plain_values,
+    shared_properties,
 )
 from dahl_ident.data.quantities import converted, jacobian
 from dahl_ident.data.storage import plain_data
@@ -173,7 +174,7 @@ class FrequencyResponse(Tabular):
             ),
             "quality": frozen_mapping(
                 {
-                    name: Column(plain_values).checked(verdict, f"quality {name!r}", n)
+                    name: Column(check=plain_values).checked(verdict, f"quality {name!r}", n)
                     for name, verdict in (quality or {}).items()
                 }
             ),
@@ -181,62 +182,10 @@ class FrequencyResponse(Tabular):
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        if self.amplitude is None and self.drive is None:
-            raise ValidationError(
-                "neither amplitude nor drive is given; a response with friction means nothing "
-                "without the amplitude it was measured at"
-            )
-        for name, one in COLUMNS.items():
-            absent = [need for need in one.needs if values[need] is None]
-            if absent and values[name] is not None:
-                raise ValidationError(f"{name} is given without {' and '.join(absent)}")
-        self._check_rows()
+        check_table(self)
         if self.covariance is not None:
-            check_covariance(self.covariance, self.amplitude_std, self.amplitude_covariance)
-            check_covariance(self.covariance, self.drive_std, self.drive_covariance)
             even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
             object.__setattr__(self, "covariance", frozen_copy(even))
-
-    def _check_rows(self) -> None:
-        """Check rows of a backbone, of harmonics and of the mean force."""
-        if self.quantity == "backbone":
-            if self.amplitude is None or self.covariance is None:
-                raise ValidationError(
-                    "a backbone needs amplitudes, and standard deviations of the natural "
-                    "frequencies and of the damping ratios"
-                )
-            wrong = (self.response.imag < 0.0) | (self.controlled == "force")
-            for row in np.flatnonzero(wrong)[:1]:
-                raise ValidationError(
-                    f"row {row} has the damping ratio {self.response.imag[row]:g} and "
-                    f"controlled {self.controlled[row]!r}; expected a ratio >= 0, and "
-                    "'displacement', at whose amplitude the frequency was found"
-                )
-        held = {"dynamic_stiffness": "displacement", "receptance": "force"}.get(self.quantity)
-        wrong = (self.harmonic != 1) & (self.controlled != held)
-        if self.quantity != "dynamic_stiffness":  # of which extraction tells
-            for row in np.flatnonzero(wrong)[:1]:
-                raise ValidationError(
-                    f"harmonic[{row}] is {self.harmonic[row]} in a table of {self.quantity}, "
-                    f"{self.controlled[row]} controlled; harmonics of the force are rows of "
-                    "dynamic stiffness, F_k/X_1, those of the displacement rows of receptance, "
-                    "X_k/F_1, with the force controlled"
-                )
-        mean = self.harmonic == 0
-        for row in np.flatnonzero(mean & (self.response.imag != 0.0))[:1]:
-            raise ValidationError(
-                f"response[{row}] is {self.response[row]}; expected a real number, as a row with "
-                "harmonic 0 holds a mean over the amplitude of what was controlled"
-            )
-        if self.covariance is not None:
-            imaginary = np.abs(self.covariance[:, 1, :]).sum(axis=1)
-            if self.amplitude_covariance is not None:
-                imaginary = imaginary + np.abs(self.amplitude_covariance[:, 1])
-            for row in np.flatnonzero(mean & (imaginary != 0.0))[:1]:
-                raise ValidationError(
-                    f"covariance[{row}] gives the imaginary part an error; expected 0, as a row "
-                    "with harmonic 0 is a real number"
-                )
 
     @classmethod
     def backbone(
@@ -500,7 +449,7 @@ class FrequencyResponse(Tabular):
             keep &= mask
         if not keep.any():
             raise ValidationError(f"none of the {self.n} points meets the conditions")
-        return replace(self, **_combined([self], lambda arrays: arrays[0][keep]))
+        return replace(self, **combined([self], lambda arrays: arrays[0][keep]))
 
     @staticmethod
     def concatenate(parts: Sequence[FrequencyResponse]) -> FrequencyResponse:
@@ -531,7 +480,7 @@ class FrequencyResponse(Tabular):
             raise ValidationError("concatenate needs at least one table, got none")
         first = parts[0]
         for i, part in enumerate(parts):
-            ours, theirs = _shape_of(first), _shape_of(part)
+            ours, theirs = shared_properties(first), shared_properties(part)
             if ours != theirs:
                 raise ValidationError(
                     f"parts[{i}] ({listed(sorted(theirs - ours)) or 'less'}) does not go with "
@@ -540,7 +489,7 @@ class FrequencyResponse(Tabular):
                 )
         sources = [dict(p.provenance) for p in parts if p.provenance is not None]
         provenance = {"parts": sources} if sources else None
-        return replace(first, **_combined(parts, np.concatenate), provenance=provenance)
+        return replace(first, **combined(parts, np.concatenate), provenance=provenance)
 
     def to_frame(self, *, polar: bool = False) -> pd.DataFrame:
         """Return a pandas table with one row for each point and units in the headers.
@@ -572,7 +521,7 @@ class FrequencyResponse(Tabular):
         columns: dict[str, Any] = {
             one.header_of(self): one.saved(self)
             for one in RESPONSE_COLUMNS.values()
-            if one.saved is not None and one.form in ("", form)
+            if one.form in ("", form)
         }
         columns = {n: c for n, c in (columns | dict(self.quality)).items() if c is not None}
         frame = pd.DataFrame(columns)
@@ -645,34 +594,6 @@ class FrequencyResponse(Tabular):
         >>> top.get_ylabel()
         'dynamic stiffness [N/m]'
         """
-        from dahl_ident.data.curves import draw, draw_backbone
+        from dahl_ident.data.curves import draw
 
-        if self.quantity == "backbone":
-            return draw_backbone(self, (backbone_std(self, 0), backbone_std(self, 1)), ax)
         return draw(self, ax)
-
-
-def _combined(
-    parts: Sequence[FrequencyResponse], combine: Callable[[list[NDArray[Any]]], NDArray[Any]]
-) -> dict[str, Any]:
-    """Apply `combine` to each column of all parts; returns constructor arguments."""
-    columns: dict[str, Any] = {
-        name: combine([getattr(part, name) for part in parts])
-        for name in COLUMNS
-        if getattr(parts[0], name) is not None
-    }
-    columns["quality"] = {
-        name: combine([part.quality[name] for part in parts])
-        for name in parts[0].quality
-        if all(name in part.quality for part in parts)
-    }
-    return columns
-
-
-def _shape_of(data: FrequencyResponse) -> set[str]:
-    """Return the properties that two tables must share to be concatenated."""
-    columns = {name for name in COLUMNS if getattr(data, name) is not None}
-    columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
-    if data.level is not None:
-        columns.add("text levels" if data.level.dtype.kind == "U" else "numeric levels")
-    return columns | {data.quantity, data.motion}

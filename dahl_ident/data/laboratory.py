@@ -8,14 +8,13 @@ from __future__ import annotations
 import contextlib
 import datetime
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dahl_ident.data.storage import read_text
-from dahl_ident.errors import DahlIdentError, DataError, ValidationError, choices
+from dahl_ident.data.storage import read_toml
+from dahl_ident.errors import DahlIdentError, ValidationError, choices
 from dahl_ident.units import parse_quantity
 
 CHANNELS = {"force": "force_gain", "displacement": "displacement_gain", "delay": "delay"}
@@ -124,13 +123,9 @@ class Metadata:
 
 def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
     """Return metadata from a mapping or a TOML file."""
-    if source is None or isinstance(source, Mapping):
-        entries, where = source or {}, ""
-    else:
-        try:
-            entries, where = tomllib.loads(read_text(Path(source))), f"{source}: "
-        except tomllib.TOMLDecodeError as exc:
-            raise DataError(f"{source}: is not a TOML file: {exc}") from exc
+    entries, where = source or {}, ""
+    if not isinstance(entries, Mapping):
+        entries, where = read_toml(entries), f"{source}: "
     texts = _texts(entries, _TEXTS, _LISTS, f"{where}metadata", where)
     ambient, instruments = entries.get("ambient", ()), entries.get("instruments", ())
     if isinstance(ambient, Mapping):  # such as {temperature = "22 °C"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -38,15 +39,13 @@ def labelled(parts: Sequence[FrequencyResponse], names: Sequence[str]) -> list[F
     A level that was measured in a file of its own is not a run of its own: how such files differ
     is what the levels are for, and scatter between runs cannot be told from it.
     """
-    if any(part.run is not None for part in parts) or not _one_level_each(parts):
-        return [
-            part if part.run is not None else replace(part, run=np.full(part.n, name))
-            for part, name in zip(parts, names, strict=True)
-        ]
-    return [
-        part if part.level is not None else replace(part, level=np.full(part.n, name))
+    runs = any(part.run is not None for part in parts) or not _one_level_each(parts)
+    column = "run" if runs else "level"
+    labels: list[dict[str, Any]] = [
+        {} if getattr(part, column) is not None else {column: np.full(part.n, name)}
         for part, name in zip(parts, names, strict=True)
     ]
+    return [replace(part, **label) for part, label in zip(parts, labels, strict=True)]
 
 
 def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:

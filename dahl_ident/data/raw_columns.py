@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
-from dahl_ident.data.columns import FileColumn
+from dahl_ident.data.columns import Column
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DahlIdentError, DataError, UnitError
 from dahl_ident.units import parse_unit
@@ -112,7 +113,7 @@ class RawChannel:
             return None
         return _SUFFIXES.get(match[2].casefold(), match[2].replace("_per_", "/"))
 
-    def is_called(self, declared: FileColumn) -> bool:
+    def is_called(self, declared: Column) -> bool:
         """Return whether the format says that it is this column, or else its name does.
 
         A unit of the column's kinds may stand at the end of the name.
@@ -309,9 +310,24 @@ class RawFile:
         return numbers
 
 
-def words(cells: Iterable[str]) -> NDArray[np.str_]:
+def cell_text(cell: Any) -> str:
+    """Return a cell as text; an empty one, or NaN, has none."""
+    return "" if cell is None or cell != cell else str(cell)
+
+
+def column_of(cells: Sequence[Any]) -> NDArray[Any]:
+    """Return numbers where every filled cell is one, else text."""
+    filled = [cell for cell in cells if cell_text(cell)]
+    if all(isinstance(cell, (int, float)) and not isinstance(cell, bool) for cell in filled):
+        with contextlib.suppress(OverflowError):  # whole numbers beyond all floats stay text
+            return np.array([c if cell_text(c) else np.nan for c in cells], dtype=np.float64)
+    return words(cells)
+
+
+def words(cells: Iterable[Any]) -> NDArray[np.str_]:
     """Return cells as text; of a longer one the first letters, and a mark that no number has."""
-    short = [c if len(c) <= _LONGEST_WORD else f"{c[:_LONGEST_WORD]}..." for c in cells]
+    texts = map(cell_text, cells)
+    short = [t if len(t) <= _LONGEST_WORD else f"{t[:_LONGEST_WORD]}..." for t in texts]
     lengths = [len(cell) for cell in short]
     if 4 * len(short) * max(lengths, default=0) > max(_PADDING[0], _PADDING[1] * sum(lengths)):
         raise MemoryError

@@ -22,7 +22,7 @@ from dahl_ident.arrays import (
     non_negative_number,
     positive_number,
 )
-from dahl_ident.data.columns import RECORD_COLUMNS, Column, frozen_copy, frozen_mapping, one_of
+from dahl_ident.data.columns import RECORD_COLUMNS, frozen_copy, frozen_mapping, one_of
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, extent, noted
 from dahl_ident.errors import DataWarning, ValidationError
@@ -109,7 +109,7 @@ class Record(Tabular):
         columns = {name: value for name, value in locals().items() if name in RECORD_COLUMNS}
         seconds = _time(columns.pop("time"))
         values: dict[str, Any] = {
-            name: Column(finite_array).checked(value, name, seconds.size)
+            name: RECORD_COLUMNS[name].checked(value, name, seconds.size)
             for name, value in columns.items()
         }
         for name, samples in values.items():

@@ -174,12 +174,12 @@ class _TableBinding(Binding):
         self.same_length({r: c for r in RESPONSE_COLUMNS if (c := self.channel(r)) is not None})
         if options.frequency_hz is not None:  # before anything is judged
             low, high = options.frequency_hz
-            frequency_hz = self._frequency(least=False)
+            frequency_hz = self.si("frequency", least=False)
             keep = (frequency_hz >= low) & (frequency_hz <= high)
             if not keep.any():
                 raise ValidationError(f"no frequency lies from {low:g} to {high:g} Hz")
             self.source = self.source.rows(keep)
-        frequency_hz = self._frequency()
+        frequency_hz = self.si("frequency")
         amplitude, drive = self._amplitude(frequency_hz), self._drive()
         if amplitude is None and drive is None:
             raise ValidationError(
@@ -308,12 +308,6 @@ class _TableBinding(Binding):
         return FrequencyResponse.backbone(
             amplitude, frequency_hz, ratio, frequency_std=frequency_std, damping_ratio_std=ratio_std
         )
-
-    def _frequency(self, *, least: bool = True) -> FloatArray:
-        channel = self.required("frequency")
-        values = self.si("frequency", least=least)
-        kind, _ = self.kind("frequency", self.unit("frequency", channel))
-        return np.asarray(values / (2.0 * np.pi if kind == "angular_frequency" else 1.0))
 
     def _peak_kind(self, role: str) -> str:
         """Return the kind of a column of amplitudes, and note what is assumed of unmarked ones."""

@@ -17,6 +17,7 @@ import os
 import stat
 import sys
 import threading
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -42,14 +43,10 @@ _IRREGULAR = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "sock
 def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a table in the format of the path's extension."""
     place = Path(path)
-    packed = place.suffix.lower() == ".gz"
-    suffix = (place.with_suffix("") if packed else place).suffix.lower()
-    if suffix not in _WRITERS or (packed and suffix not in (".csv", ".tsv")):
-        raise ValidationError(
-            f"{place}: tables are written as {', '.join(_WRITERS)}, and .csv.gz; got "
-            f"{place.suffix or 'no extension'!r}"
-        )
-    content = _WRITERS[suffix](frame)
+    packed = place.suffix.lower() == ".gz" and Path(place.stem).suffix.lower() in (".csv", ".tsv")
+    if not packed:
+        place_of(place, "a table", (*_WRITERS, ".csv.gz"))
+    content = _WRITERS[Path(place.stem if packed else place.name).suffix.lower()](frame)
     packing = gzip.compress(content, mtime=0) if packed else content
     write_whole(place, packing, overwrite=overwrite)
     return place
@@ -89,6 +86,14 @@ def read_text(path: str | Path, what: str = "the file") -> str:
     except (OSError, UnicodeDecodeError) as exc:
         why = exc.strerror if isinstance(exc, OSError) else "it is not text"
         raise DataError(f"{path}: {what} cannot be read: {why}") from exc
+
+
+def read_toml(path: str | Path, what: str = "the file") -> dict[str, Any]:
+    """Return the entries of a TOML file."""
+    try:
+        return tomllib.loads(read_text(path, what))
+    except tomllib.TOMLDecodeError as exc:
+        raise DataError(f"{path}: is not a TOML file: {exc}") from exc
 
 
 def refuse_existing(path: Path) -> None:

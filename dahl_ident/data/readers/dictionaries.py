@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import RawChannel, RawFile, plain, split_header, words
+from dahl_ident.data.raw_columns import RawChannel, RawFile, column_of, plain, split_header
 from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
@@ -166,13 +166,7 @@ def _array(values: Any, what: str) -> NDArray[Any]:
         return array
     if not isinstance(values, (list, tuple)) or any(isinstance(v, (list, dict)) for v in values):
         raise DataError(f"{what} is nested; expected a list of numbers")
-    try:
-        if all(v is None or (isinstance(v, (int, float)) and v is not True and v is not False)
-               for v in values):  # fmt: skip
-            return np.array([np.nan if v is None else float(v) for v in values], dtype=np.float64)
-    except OverflowError:
-        pass  # whole numbers beyond all floats are refused as text
-    return words("" if v is None else str(v) for v in values)
+    return column_of(values)
 
 
 def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[RawChannel]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS, FileColumn
+from dahl_ident.data.columns import RECORD_COLUMNS, RESPONSE_COLUMNS, Column
 from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
 from dahl_ident.data.record import gaps, is_even, sample_rate
 from dahl_ident.data.record_table import is_stamped
@@ -206,7 +206,7 @@ def _stated_rate(source: RawFile) -> str:
 def _is_response(channels: Collection[RawChannel]) -> bool:
     """Return whether channels are a table of response; f is force only with time or motion."""
 
-    def any_is(column: FileColumn) -> bool:
+    def any_is(column: Column) -> bool:
         return any(c.is_called(column) or column.measures(c.unit, c.name) for c in channels)
 
     sampled = any(any_is(_RECORD[role]) for role in ("time", *MOTION_KINDS))

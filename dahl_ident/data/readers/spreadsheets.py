@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
-from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
+from dahl_ident.data.raw_columns import (
+    RawChannel,
+    RawFile,
+    Stored,
+    cell_text,
+    column_of,
+    split_header,
+    words,
+)
 from dahl_ident.data.readers.file import ZIP_ERRORS, File, apart, refuse_many
 from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
 from dahl_ident.data.storage import library, read_metadata
@@ -82,7 +90,7 @@ def _rows(book: Any, name: str) -> list[list[Any]]:  # pragma: no cover
 
 
 def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
-    texts = [[_text(cell) for cell in row] for row in cells[:_HEAD_ROWS]]
+    texts = [[cell_text(cell) for cell in row] for row in cells[:_HEAD_ROWS]]
     rows = [row if any(row) else None for row in texts]
     run = best_run(rows, ".")
     if run is None:
@@ -91,8 +99,8 @@ def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
     refuse_second_header(rows, run.start, ".", lambda i: f"{where}, row {i + 1}")
     above = [row for row in rows[: run.start] if row is not None]
     named = header(above, run.width)
-    filled = [i for i in range(run.start, len(cells)) if any(_text(c) for c in cells[i])]
-    columns = [_column([cells[i][k] for i in filled]) for k in range(run.width)]
+    filled = [i for i in range(run.start, len(cells)) if any(cell_text(c) for c in cells[i])]
+    columns = [column_of([cells[i][k] for i in filled]) for k in range(run.width)]
     return file.source(
         "workbook",
         named_channels(columns, named, where),
@@ -100,22 +108,6 @@ def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
         row_name=lambda i: f"sheet {sheet!r}, row {filled[i] + 1}",
         stated=stated_levels(";".join(filter(None, row)) for row in above),
     )
-
-
-def _text(cell: Any) -> str:
-    return "" if cell is None or cell != cell else str(cell)
-
-
-def _column(cells: list[Any]) -> NDArray[Any]:
-    """Return numbers where every filled cell is one, else text."""
-    texts = [_text(cell) for cell in cells]
-    numeric = [isinstance(c, (int, float)) and not isinstance(c, bool) for c in cells]
-    if all(n or not t for n, t in zip(numeric, texts, strict=True)):
-        with contextlib.suppress(OverflowError):  # whole numbers beyond all floats stay text
-            return np.array(
-                [c if t else np.nan for c, t in zip(cells, texts, strict=True)], dtype=float
-            )
-    return words(texts)
 
 
 def read_parquet(file: File) -> RawFile:
@@ -206,4 +198,4 @@ def _plain(series: pd.Series[Any]) -> NDArray[Any]:
 
     if is_numeric_dtype(series.dtype):
         return series.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' nullable numbers
-    return words(map(_text, values))
+    return words(values)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import TRACE, RawChannel, RawFile, plain, split_header, words
-from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
+from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.readers.header import (
     CELL,
     Header,
@@ -112,11 +112,7 @@ def read_text_table(file: File) -> RawFile:
         for _, t in lines
     ]
     refuse_second_header(rows, layout.line - 1, layout.mark, lambda i: f"{name}, line {i + 1}")
-    if layout.width > MOST_CHANNELS:
-        raise DataError(
-            f"{name}: line {layout.line} has {layout.width} fields; at most {MOST_CHANNELS} are "
-            "read"
-        )
+    refuse_many(name, layout.width, "fields")
     metadata = _metadata(lines, name)
     body, runs, notes = _body(data, layout, name)
     _refuse_cut_end(body, layout, name)
@@ -505,11 +501,5 @@ def _parse(
         raise DataError(f"{name}: the table cannot be read: {exc}") from exc
     if metadata:  # written by this package
         frame = as_before_inert(frame)
-    return [_plain(frame[key].to_numpy()) for key in keys]
-
-
-def _plain(values: NDArray[Any]) -> NDArray[Any]:
-    """Return numbers or truth values as they are, anything else as text, empty cells as ''."""
-    if values.dtype.kind in "fiub":
-        return values
-    return words("" if v is None or v != v else str(v) for v in values)
+    columns = (frame[key].to_numpy() for key in keys)
+    return [c if c.dtype.kind in "fiub" else words(c) for c in columns]
