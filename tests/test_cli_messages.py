@@ -70,7 +70,7 @@ def test_a_long_task_shows_that_it_goes_on(quiet: bool, monkeypatch: pytest.Monk
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setattr("dahl_ident.progress.PATIENCE", 0.01)
-    monkeypatch.setattr(console._session, "quiet", quiet)
+    monkeypatch.setattr(console.session, "quiet", quiet)
     monkeypatch.setenv("TERM", "xterm-256color")
     with console.busy("writing the report") as progress:
         progress(1, 4)

@@ -61,7 +61,7 @@ def common(
     ] = False,
 ) -> None:
     """Identify friction from measurements, with an uncertainty budget."""
-    console.use_color(color)
+    console.session.color = color
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -43,12 +43,14 @@ INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 @dataclass
 class _Session:
+    """What holds for all output of a command; `quiet` leaves out all but errors and data."""
+
     color: bool = True
     quiet: bool = False
     typed: Sequence[str] = ()
 
 
-_session = _Session()
+session = _Session()
 
 
 def begin(typed: Sequence[str]) -> None:
@@ -57,7 +59,7 @@ def begin(typed: Sequence[str]) -> None:
     def show(message: Warning | str, *_: Any) -> None:
         note(f"warning: {message}")
 
-    _session.typed, _session.quiet = typed, False
+    session.typed, session.quiet = typed, False
     if isinstance(sys.stdout, io.TextIOWrapper):
         # the name of a file, or a unit, may hold what the terminal's encoding does not
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -101,20 +103,10 @@ def changed(*groups: Any) -> list[str]:
 
 def typed_command() -> str:
     """Return the command of this run, as typed."""
-    command = shlex.join(["dahl-ident", *_session.typed])
+    command = shlex.join(["dahl-ident", *session.typed])
     command = command.encode(errors="backslashreplace").decode()  # as names of files are told
-    piped = STANDARD in _session.typed
+    piped = STANDARD in session.typed
     return f"{command}  # its input came through standard input" if piped else command
-
-
-def use_color(color: bool) -> None:
-    """Turn colour on or off for all further output."""
-    _session.color = color
-
-
-def be_quiet(quiet: bool) -> None:
-    """Leave out everything but errors, JSON, and files on standard output."""
-    _session.quiet = quiet
 
 
 def _terminal() -> Console:
@@ -123,17 +115,17 @@ def _terminal() -> Console:
 
     terminal = sys.stdout.isatty()
     return Console(
-        no_color=None if _session.color else True,
+        no_color=None if session.color else True,
         highlight=False,
         soft_wrap=True,
         width=None if terminal else 100,
-        quiet=_session.quiet,
+        quiet=session.quiet,
     )
 
 
 def write(text: str) -> None:
     """Print a text unchanged, the status of a result in colour where there is a terminal."""
-    if _session.quiet:
+    if session.quiet:
         return
     status = _STATUS.match(text) if sys.stdout.isatty() else None
     if status is None:
@@ -165,7 +157,7 @@ def busy(task: str) -> Iterator[Callable[[float, float], None]]:
     The function that is yielded takes the steps done and their number: then these, and the time
     left, are shown as well.
     """
-    if _session.quiet or not sys.stderr.isatty():
+    if session.quiet or not sys.stderr.isatty():
         yield lambda _done, _total: None
         return
     with spinner(task) as show:
@@ -179,7 +171,7 @@ def write_error(text: str) -> None:
 
 def note(text: str) -> None:
     """Print one line on standard error that --quiet leaves out."""
-    if not _session.quiet:
+    if not session.quiet:
         write_error(text)
 
 

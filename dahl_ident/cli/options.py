@@ -190,7 +190,7 @@ def quantity(help_text: str, unit: str, panel: str | None = None) -> Any:
 
 
 def _silence(quiet: bool) -> bool:
-    console.be_quiet(quiet)
+    console.session.quiet = quiet
     return quiet
 
 

@@ -147,7 +147,7 @@ def plot_frequency_response(
     with_errors = [*errors, *[(None, None)] * (len(levels) - len(errors))]
     points = [Points(x, R, *std) for (_, x, R), std in zip(levels, with_errors, strict=True)]
     for i, (part, (label, x, _)) in enumerate(zip(points, levels, strict=True)):
-        joined = not fitted and _is_one_curve(x)
+        joined = not fitted and np.unique(x).size == np.size(x)  # no two share a position
         look = lines[i] | ({"marker": marker} if marker else {}) if joined else markers[i]
         name = label if label and i in labelled else None
         draw_points(pair, part, label=name, **look)
@@ -162,12 +162,6 @@ def plot_frequency_response(
     if any(label for label, _, _ in levels):
         style.legend_above(top)
     return top, bottom
-
-
-def _is_one_curve(x: ArrayLike) -> bool:
-    """Return whether no two points of a level share a position on the axis."""
-    places = np.ravel(np.asarray(x))
-    return bool(np.unique(places).size == places.size)
 
 
 @style.house_style()

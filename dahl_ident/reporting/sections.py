@@ -409,5 +409,5 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
             }
             for name, e in fit.params.items()
         },
-        "priors": tables.priors(fit),
+        "priors": {n: tables.prior_text(prior) for n, prior in fit.problem.priors.items()},
     }

@@ -142,11 +142,6 @@ def _dof(dof: float) -> Cell:
     return Cell(degrees_text([dof]), dof if np.isfinite(dof) else None)
 
 
-def priors(fit: FitResult) -> dict[str, str]:
-    """Return the prior of each parameter that has one, as it is typed."""
-    return {name: prior_text(prior) for name, prior in fit.problem.priors.items()}
-
-
 def priors_in_words(fit: FitResult) -> Iterator[tuple[str, str]]:
     """Yield each parameter with a prior, and the prior as a reader of a certificate knows it."""
     known: Mapping[str, Any] = fit.problem.priors
@@ -290,7 +285,9 @@ def measured(data: FrequencyResponse) -> TextTable:
         ("frequency [Hz]", [number(v, 5) for v in data.frequency_hz])
     ]
     if data.level is not None:
-        columns.append(("level", [_label(v) for v in data.level]))
+        numbered = data.level.dtype.kind in "fiu"
+        labels = [number(v) if numbered else Cell(str(v)) for v in data.level]
+        columns.append(("level", labels))
     for name, kind in (("amplitude", "displacement"), ("drive", "force")):
         values = getattr(data, name)
         if values is not None:
@@ -363,12 +360,6 @@ def goodness(fit: FitResult) -> TextTable:
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and np.isfinite(value) else None
-
-
-def _label(value: object) -> Cell:
-    if isinstance(value, (int, float, np.number)):
-        return number(float(value))
-    return Cell(str(value))
 
 
 def _expanded(stated: ParameterBudget) -> Cell:

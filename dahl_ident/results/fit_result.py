@@ -152,6 +152,17 @@ class FitResult(Result):
     stderr_noise: Mapping[str, float] = part(
         "assessment.stderr_noise", "Standard errors of the estimate from noise alone, by name."
     )
+    residual: FloatArray = part(
+        "assessment.estimate.residuals", "Whitened residuals at the estimate."
+    )
+    redchi: float = part(
+        "assessment.redchi",
+        "`chisqr` over its degrees of freedom; the squared scale where that was estimated.",
+    )
+    scale: float = part(
+        "assessment.estimate.scale",
+        "Standard deviation of the residuals: 1 where known beforehand.",
+    )
     residuals: tuple[FloatArray, ...] = part(
         "assessment.residuals", "Of records: measured minus predicted, record by record."
     )
@@ -196,24 +207,9 @@ class FitResult(Result):
         }
 
     @property
-    def residual(self) -> FloatArray:
-        """Whitened residuals at the estimate."""
-        return self.assessment.estimate.residuals
-
-    @property
     def chisqr(self) -> float:
         """Sum of squared residuals; chi-square of `goodness` where the noise is known."""
         return self.assessment.chi_square[0]
-
-    @property
-    def redchi(self) -> float:
-        """`chisqr` over its degrees of freedom; the squared scale where that was estimated."""
-        return self.assessment.redchi
-
-    @property
-    def scale(self) -> float:
-        """Standard deviation of the residuals: 1 where known beforehand."""
-        return self.assessment.estimate.scale
 
     @property
     def nvarys(self) -> int:
@@ -579,8 +575,7 @@ class FitResult(Result):
         ModelError
             If a law of the model is not known here.
         """
-        optimum, first_order = fit_storage.from_json(text)
-        return cls(optimum, first_order=first_order)
+        return cls(**fit_storage.from_json(text))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -594,8 +589,7 @@ class FitResult(Result):
         ModelError
             If a law of the model is not known here.
         """
-        optimum, first_order = fit_storage.from_json(read_text(path), str(path))
-        return cls(optimum, first_order=first_order)
+        return cls(**fit_storage.from_json(read_text(path), str(path)))
 
     def __str__(self) -> str:
         return self.fit_report()

@@ -54,8 +54,8 @@ def to_json(optimum: Optimum, first_order: bool) -> str:
     return json.dumps({**content, "digest": digest(content)}, allow_nan=False, indent=indent)
 
 
-def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
-    """Return the fit that JSON text holds, and whether it is of first order alone."""
+def from_json(text: str, source: str = "the text") -> dict[str, Any]:
+    """Return the arguments of the fit that JSON text holds."""
     try:
         content = json.loads(text)
     except json.JSONDecodeError as exc:
@@ -74,7 +74,7 @@ def from_json(text: str, source: str = "the text") -> tuple[Optimum, bool]:
             f"{source}: the law {laws[0]['kind']!r} does not give the residuals that the fit was "
             "saved with; take the file of the law as it was, or repeat the fit"
         )
-    return optimum, first_order
+    return {"optimum": optimum, "first_order": first_order}
 
 
 def _check(content: Any, source: str) -> None:
