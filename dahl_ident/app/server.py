@@ -29,10 +29,9 @@ from dahl_ident import reporting
 from dahl_ident.app import commands
 from dahl_ident.app.commands import JobStep
 from dahl_ident.app.guard import Guard
-from dahl_ident.app.jobs import Jobs, output
 from dahl_ident.app.pages import blocks, laws, loop_of
 from dahl_ident.app.preview import NOTHING_FOUND
-from dahl_ident.app.work import Work
+from dahl_ident.app.work import Jobs, Work, output
 from dahl_ident.data.storage import save_frame
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.results import FitResult

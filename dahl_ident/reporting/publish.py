@@ -19,9 +19,8 @@ from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write
 from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.document import Block, Document, Picture
-from dahl_ident.reporting.overlay import overlay
 from dahl_ident.reporting.pages import html, markdown
-from dahl_ident.reporting.sections import Result, document
+from dahl_ident.reporting.sections import Result, document, overlay
 from dahl_ident.results import FitResult, Posterior
 
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
