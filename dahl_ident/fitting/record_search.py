@@ -327,8 +327,8 @@ class RecordSearch:
         """Return the optimum where a search has ended, exponents that nobody stated held there."""
         if problem.ranges:
             values = dict(zip(problem.names, problem.to_values(end.theta[0]), strict=True))
-            problem = problem.held({name: values.pop(name) for name in problem.ranges})
-            theta = problem.to_search(list(values.values()))[None]
+            theta = end.theta[:, [name not in problem.ranges for name in problem.names]]
+            problem = problem.held({name: values[name] for name in problem.ranges})
             cost, _, hessian = problem.quadratic(theta, self.scale, self.rho)
             end = replace(end, theta=theta, cost=cost, hessian=hessian)
         end = replace(end, evaluations=np.array([self.evaluations]))
@@ -345,20 +345,22 @@ class RecordSearch:
         exact = 2.0 * held.cost[0] < EXACT * problem.n_residuals
         if not assumed or exact or not held.converged[0]:
             return problem, held
-        wider, end, last = problem, held, 0.0
+        values = problem.to_values(held.theta[0]).tolist()
+        known = {p.name: float(p.value or 0.0) for p in problem.exponents}
+        known |= dict(zip(problem.names, values, strict=True))
+        wider, end, last = problem.freed(assumed, 1.0), held, 0.0  # whose rows hold no prior
+        theta = wider.to_search([known[name] for name in wider.names])
         for _ in range(_PRIORS):
-            values = wider.to_values(end.theta[0])
-            residuals = wider.split_residuals(values)
+            # with derivatives, which the search and what follows it need at the same place
+            residuals = [wider.rows(theta, i)[0] for i in range(len(wider.records))]
             noise = noise_power(float(end.cost[0]), problem.n_residuals, residuals) ** 0.5
             if last / _SAME_NOISE < noise < last * _SAME_NOISE:
                 break
-            known = dict(zip(wider.names, values.tolist(), strict=True))
             wider, last = problem.freed(assumed, noise), noise
-            known = {p.name: p.value for p in problem.exponents} | known
-            begin = wider.to_search([known[name] for name in wider.names])
-            end = self.descend(wider, begin, STEPS)
+            end = self.descend(wider, theta, STEPS)
             if not end.converged[0]:
                 return problem, held
+            theta = end.theta[0]
         return wider, end
 
     def robust(self, problem: RecordProblem, plain: Minima) -> Minima:

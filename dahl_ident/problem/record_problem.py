@@ -291,8 +291,9 @@ class RecordProblem(Problem):
         parameters = (*free, *self.parameters[self.n_reported :])
         inside = np.array([p.name not in ranges for p in parameters])
         space = Space(parameters, bends(free, len(parameters), self.records), inside=inside)
-        stale = ("system", "coefficients", "first", "chosen", "latest")
-        return self.altered(*stale, model=model, free=free, space=space, ranges=ranges)
+        stale = ("system", "coefficients", "first", "chosen")
+        changes = {"free": free, "space": space, "ranges": ranges, "latest": dict(self.latest)}
+        return self.altered(*stale, model=model, **changes)
 
     def _prior_rows(self, theta: FloatArray) -> FloatArray:
         """Return the residuals of priors, and below them their derivatives."""
@@ -521,15 +522,23 @@ class RecordProblem(Problem):
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
         """Return what the samples of record `number` should be."""
         predicted = force_of if self.output == "force" else motion_of
-        key, known = values.tobytes(), self.latest.get(number)
-        if known is None or known[0] != key or (derivatives and not known[1].by.size):
-            known = key, predicted(self, values, number, derivatives=derivatives)
+        names = self.names if derivatives else ()
+        key = np.append(self.full_values(values), self.own(values, number)).tobytes()
+        known = self.latest.get(number)
+        if known is None or known[0] != key or not set(names) <= set(known[1]):
+            known = key, names, predicted(self, values, number, derivatives=derivatives)
             self.latest[number] = known
-        return known[1]
+        _, columns, at = known
+        if not names or names == columns:
+            return at
+        return replace(at, by=at.by[:, [columns.index(name) for name in names]])
 
     @cached_property
-    def latest(self) -> dict[int, tuple[bytes, Predicted]]:
-        """The last prediction of each record, and its values: it is asked for more than once."""
+    def latest(self) -> dict[int, tuple[bytes, tuple[str, ...], Predicted]]:
+        """The last prediction of each record: its values, and the names of what it is derived by.
+
+        It is asked for more than once, also by problems in which other parameters are free.
+        """
         return {}
 
     @cached_property
