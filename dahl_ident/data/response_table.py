@@ -488,16 +488,18 @@ class _TableBinding(Binding):
     def _quality(self, n: int) -> dict[str, NDArray[Any]]:
         """Return columns without a role, as covariates: those of an earlier save in their types."""
         kinds = self.source.metadata.get("quality", {})
-        found = {name: _typed(self.source.find(name).values, kind) for name, kind in kinds.items()}
+        covariates = {
+            name: _typed(self.source.find(name).values, kind) for name, kind in kinds.items()
+        }
         for channel in self.source.channels:
             other = channel.name in self.used or channel.short is not None  # of another level
-            if other or channel.name in found or channel.content.shape != (n,):
+            if other or channel.name in covariates or channel.content.shape != (n,):
                 continue
             numeric = channel.kind in "biuf" and np.isfinite(channel.values).all()
             if numeric and not any(map(channel.is_called, RESPONSE_COLUMNS.values())):
-                found[channel.name] = channel.values
-        self.used |= found.keys()
-        return found
+                covariates[channel.name] = channel.values
+        self.used |= covariates.keys()
+        return covariates
 
 
 def _per_drive(text: str) -> tuple[str, str, int] | None:

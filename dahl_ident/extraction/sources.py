@@ -194,10 +194,10 @@ def extract_all(
 
     Several tasks without runs get their names as runs, or as levels.
     """
-    given = {name: value for name, value in how.items() if value is not None}
+    stated = {name: value for name, value in how.items() if value is not None}
     if how.get("controlled") == "force":
-        given.setdefault("harmonics", (1,))
-    settings = Settings(**given)
+        stated.setdefault("harmonics", (1,))
+    settings = Settings(**stated)
     refuse_repeated([task.source for task in tasks])
     jobs = min(whole_number(jobs, "jobs", 1), len(tasks))
     if jobs == 1:

@@ -45,9 +45,9 @@ def tree_source(
         if unit is None:
             path, unit = split_header(path)
         file.refuse_above_limit(8 * math.prod(np.shape(value)), path)  # as numbers, once read
-        those = list(_channels(path, value, unit))
-        channels += those
-        if not those:
+        columns = list(_channels(path, value, unit))
+        channels += columns
+        if not columns:
             dtype = getattr(value, "dtype", type(value).__name__)
             notes.append(f"{path} ({np.shape(value)}, {dtype}) is not used")
         refuse_many(file.name, len(channels) + len(notes), "arrays")
@@ -143,7 +143,7 @@ def _fields(path: str, array: NDArray[Any], mapped: File | None = None) -> Itera
 
 
 def read_matlab(file: File) -> RawFile:
-    """Return the arrays of a MATLAB v4, v5 or v7 file; those of v7.3 are HDF5."""
+    """Return the arrays of a MATLAB v4, v5 or v7 file; v7.3 is HDF5."""
     from scipy.io import loadmat
 
     def load() -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Run:
 class Header:
     """Names and units of the columns; no names for a table without a header.
 
-    `cells` is how many columns the header line has; rows may end in a delimiter besides.
+    `cells` is how many columns the header line has; rows may also end in a delimiter.
     `contradicted` is whether another line above the numbers names the columns differently.
     """
 
