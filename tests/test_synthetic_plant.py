@@ -62,6 +62,17 @@ def test_forces_balance_at_every_instant(plant: Element, level: float) -> None:
     assert np.max(misfit) < 5e-3 * level
 
 
+@pytest.mark.parametrize("plant", [Spring(3.0), Spring(3.0) + Damper(0.1)])
+@pytest.mark.parametrize("law", [Dahl(*FRICTION), BoucWen(30.0, 200.0, 100.0)])
+def test_a_plant_without_mass_follows_a_jump_of_the_force(law: Element, plant: Element) -> None:
+    sweep = FrequencySweep((0.05, 0.3), 1.0, 1.37, 2.3, ramp_periods=0.0)
+    force = sweep.waveform(seed=0)
+    time = np.linspace(0.0, force.duration, 20_001)
+    x = Mechanism.of(law + plant).displacement_under(force)(time)
+    total = (law + plant).force(x, velocity=np.gradient(x, time))
+    assert np.quantile(np.abs(total - force.value(time)), 0.99) < 1e-4
+
+
 @pytest.mark.parametrize("controlled", ["force", "displacement"])
 @pytest.mark.parametrize(
     ("system", "quantity"),

@@ -231,16 +231,6 @@ class Behaviour(ABC):
         """Return the force from each state of a linear element at the first sample, (n, states)."""
         return np.zeros((samples, 0))
 
-    def branch(
-        self, values: Sequence[float], start: FloatArray | float, path: FloatArray
-    ) -> FloatArray | None:
-        """Return the force on the way up from `start`, in closed form, and its slope, (2, n).
-
-        `path` is the displacement since then, m, and may be below 0. A law whose two directions
-        are alike answers; None from any other.
-        """
-        return None
-
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return what abs(N) and A abs(N) never exceed, over all amplitudes; inf where nothing."""
         return np.full((), np.inf), np.full((), np.inf)

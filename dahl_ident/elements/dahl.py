@@ -272,17 +272,6 @@ class Dahl(Friction):
         beta = np.asarray(sigma * amplitude / f_max)
         return f_max * float(general_dahl.turning_force(beta, np.asarray(alpha)))
 
-    def branch(
-        self, values: Sequence[float], start: FloatArray | float, path: FloatArray
-    ) -> FloatArray | None:
-        """Return the force on the way up from `start` and its slope (Eqn. 3)."""
-        if self.has_optional:
-            return None
-        f_max, sigma, alpha = values
-        margin = np.asarray(1.0 - start / f_max)
-        change = hysteresis.margin_change(margin, sigma / f_max * path, alpha)
-        return np.array([start - f_max * change, sigma * (margin + change) ** alpha])
-
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return f_max, with its asymmetry, for both directions."""
         f_max, _, _, *asymmetry = values

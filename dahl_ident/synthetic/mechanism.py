@@ -10,7 +10,8 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, LinearSystem, Model
 from dahl_ident.elements.element import as_model
-from dahl_ident.elements.equations import law_equations, plant_equations
+from dahl_ident.elements.equations import law_equations, numpy_names, plant_equations
+from dahl_ident.elements.law_checks import traced
 from dahl_ident.elements.rational import Rational
 from dahl_ident.engine import Equations, march, translate
 from dahl_ident.errors import FitError, ModelError
@@ -18,8 +19,6 @@ from dahl_ident.synthetic.waveform import SineStep, Waveform
 
 _PER_PERIOD, _POINTS = 24, 8  # polynomials, and their points: they miss 1e-13 of a sine
 _FINER = 1e4  # than records are fitted: motions are right to about 1e-11
-_DAMPED = 1e-9  # relative error of a motion without mass in a step
-_HALVINGS = 60  # of a path; beyond, it is exact to rounding
 
 Signal = Callable[[FloatArray], FloatArray]
 """A channel's true value at any times, (n,) -> (n,)."""
@@ -67,23 +66,22 @@ class Mechanism:
 
     def _without_mass(self, force: Waveform, progress: Progress | None) -> Signal:
         """Return x(t) of friction with a spring, a damper or both."""
+        polynomial, proper = self.linear.split()
         if not np.any(self.linear.numerator):
             raise ModelError(
                 "friction alone slides without bound under a force above f_max; give the plant a "
                 "mass, a damper or a spring, or control its displacement"
             )
-        polynomial, proper = self.linear.split()
         if np.any(proper.numerator) or any(
-            law.branch(_values(law), 0.0, np.zeros(1)) is None for law in self.laws
+            not getattr(law, "rate_independent", False) for law in self.laws
         ):
             raise ModelError(
                 f"{self.plant!r} has no state-space form; give the plant a mass, or control its "
                 "displacement"
             )
         stiffness, damping = [*polynomial[::-1].tolist(), 0.0][:2]
-        if damping:
-            return DampedMotion(self.laws, stiffness, damping, force, progress)
-        return SpringMotion(self.laws, stiffness, force)
+        equations = _massless(self.laws, stiffness, damping)
+        return EngineMotion(equations, (), force, progress, damping=damping)
 
     def force_under(self, displacement: Waveform, progress: Progress | None = None) -> Signal:
         """Return the force F(t) for a displacement x(t), from rest."""
@@ -112,115 +110,32 @@ class Mechanism:
         return force
 
 
-class SpringMotion:
-    """The displacement of laws in parallel with a spring under a force, k x + F(x) = u."""
+def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equations:
+    """Return the motion of laws with a spring, a damper or both, without a mass.
 
-    def __init__(self, laws: Sequence[Element], stiffness: float, force: Waveform) -> None:
-        self._laws, self._stiffness, self._force = laws, stiffness, force
-        self._times = force.turning_times()
-        self._u = force.value(self._times)
-        self._heading = np.sign(np.diff(self._u, append=self._u[-1]))
-        self._x = np.zeros(self._times.size)
-        self._at_turn = np.zeros((self._times.size, len(laws)))
-        for i in range(self._times.size - 1):
-            x, forces = self._on_stroke(i, self._u[i + 1 : i + 2])
-            self._x[i + 1], self._at_turn[i + 1] = x[0], forces[:, 0]
-
-    def __call__(self, time: FloatArray) -> FloatArray:
-        """Return the displacement at any times; that of the ends outside."""
-        which = np.searchsorted(self._times, time, side="right") - 1
-        which = np.clip(which, 0, self._times.size - 1)
-        u, x = self._force.value(time), np.empty(np.shape(time))
-        for i in np.unique(which).tolist():
-            x[which == i] = self._on_stroke(i, u[which == i])[0]
-        return x
-
-    def _on_stroke(self, i: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return displacements, and the laws' forces, where the force has some values."""
-        heading, start = self._heading[i], self._at_turn[i]
-        low, high = np.zeros(u.shape), np.abs(u - self._u[i]) / self._stiffness
-        forces = np.zeros((len(self._laws), u.size))
-        for _ in range(_HALVINGS):
-            path = 0.5 * (low + high)
-            x = self._x[i] + heading * path
-            for j, law in enumerate(self._laws):
-                branch = law.branch(_values(law), heading * start[j], path)
-                assert branch is not None  # such laws alone come here
-                forces[j] = heading * branch[0]
-            beyond = heading * (self._stiffness * x + forces.sum(axis=0) - u) > 0.0
-            low, high = np.where(beyond, low, path), np.where(beyond, path, high)
-        return x, forces
-
-
-class DampedMotion:
-    """The displacement of laws in parallel with a damper, and perhaps a spring, under a force.
-
-    Between two turning points the laws' force is known in closed form. There the equation
-    c dx/dt = u - k x - F(x) is integrated.
+    ``k v + c dv/dt + (rate of the laws' force) = du/dt``, driven by du/dt; without a damper the
+    force takes the place of a displacement that is held, since all turn where it turns.
     """
+    import casadi as ca
 
-    def __init__(
-        self,
-        laws: Sequence[Element],
-        stiffness: float,
-        damping: float,
-        force: Waveform,
-        progress: Progress | None,
-    ) -> None:
-        from scipy.integrate import solve_ivp
-
-        self._stop = force.duration
-        self._starts: list[float] = []
-        self._pieces: list[Signal] = []
-        turned_at, at_turn = 0.0, [0.0] * len(laws)
-        levels = [level for segment in force.segments for level in segment.amplitude]
-        omega = 2.0 * np.pi * force.highest_frequency_hz
-        error = _DAMPED * max(levels) / float(np.hypot(stiffness, damping * omega))
-        soon = force.segments[0].start + 1e-3 * force.segments[0].duration
-        heading = -1.0 if force.value(np.array([soon]))[0] < 0.0 else 1.0
-
-        def friction(x: FloatArray) -> list[float]:
-            path = heading * (x - turned_at)
-            branches = (
-                law.branch(_values(law), heading * start, path)
-                for law, start in zip(laws, at_turn, strict=True)
-            )
-            return [heading * float(branch[0]) for branch in branches if branch is not None]
-
-        def speed(t: float, x: FloatArray) -> float:
-            spring = stiffness * float(x[0])
-            u = float(segment.value(np.asarray(t)))
-            return (u - spring - sum(friction(x[0]))) / damping
-
-        def turning(t: float, x: FloatArray) -> float:
-            return heading * speed(t, x)
-
-        turning.terminal, turning.direction = True, -1.0  # type: ignore[attr-defined]
-        x = np.zeros(1)
-        for segment in force.segments:
-            t = segment.start
-            while t < segment.stop:
-                run = solve_ivp(
-                    speed, (t, segment.stop), x, "LSODA", dense_output=True, events=turning,
-                    rtol=_DAMPED, atol=error, max_step=0.02 / max(segment.frequency_hz),
-                )  # fmt: skip
-                self._starts.append(t)
-                assert run.sol is not None  # a dense output was asked for
-                self._pieces.append(run.sol)
-                t, x = float(run.t[-1]), run.y[:, -1]
-                if run.status == 1:
-                    at_turn, turned_at, heading = friction(x[0]), float(x[0]), -heading
-            if progress is not None:
-                progress(segment.stop / force.duration)
-
-    def __call__(self, time: FloatArray) -> FloatArray:
-        """Return the displacement at any times; that of the ends outside."""
-        t = np.clip(time, 0.0, self._stop)
-        which = np.searchsorted(self._starts, t, side="right") - 1
-        x = np.empty(t.shape)
-        for i in np.unique(which).tolist():
-            x[which == i] = self._pieces[i](t[which == i])[0]
-        return x
+    x, v, s, u = (ca.SX.sym(name) for name in ("x", "v", "s", "u"))
+    states: list[ca.SX] = []
+    slopes: list[ca.SX] = []
+    tangent = ca.SX(stiffness)
+    with numpy_names():
+        for law in laws:
+            own = [ca.SX.sym(f"y{len(states) + i}") for i in range(law.n_states)]
+            part = traced(law, _values(law), x, s, s, own)
+            rates = ca.vertcat(*part.rates) * s  # over the displacement
+            tangent += ca.mtimes(ca.jacobian(part.force, ca.vertcat(*own)), rates)
+            states, slopes = [*states, *own], [*slopes, rates]
+    if damping:
+        rates = ca.vertcat(v, (u - tangent * v) / damping, *(slope * v for slope in slopes))
+        return Equations([x, v, *states], u, s, [], rates, x, held=False)
+    moved = ca.SX.sym("moved")
+    speed = v / tangent
+    rates = ca.vertcat(v, 0.0, speed, *(slope * speed for slope in slopes))
+    return Equations([x, v, moved, *states], u, s, [], rates, moved, held=True)
 
 
 class EngineMotion:
@@ -232,14 +147,19 @@ class EngineMotion:
         values: Sequence[float],
         waveform: Waveform,
         progress: Progress | None,
+        *,
+        damping: float | None = None,
     ) -> None:
         self._system = translate(equations)
+        self._damping = damping  # of a plant without mass, which follows a jump of the force
         self._values = np.array(values, dtype=np.float64)
         self._waveform = waveform
         self._first = [np.zeros(self._system.order)]  # the states at the start of each segment
         for segment in waveform.segments:
             _, last = self._along(segment, self._first[-1], np.array([segment.stop]))
             self._first.append(last)
+            if damping is not None and len(self._first) <= len(waveform.segments):
+                self._jump(segment, waveform.segments[len(self._first) - 1], damping)
             if progress is not None:
                 progress(segment.stop / waveform.duration)
 
@@ -255,6 +175,18 @@ class EngineMotion:
             output[here], _ = self._along(segment, self._first[i], t[here])
         return output
 
+    def _jump(self, before: SineStep, after: SineStep, damping: float) -> None:
+        """Take the states at the start of a segment over the jump of the force there."""
+        at = np.array([before.stop])
+        jump = after.value(at) - before.value(at)
+        if damping:
+            self._first[-1][1] += jump[0] / damping
+        elif jump[0]:
+            ends, signal = np.array([0.0, 1.0]), np.array([before.value(at), jump])
+            first = np.append([signal[0, 0], 0.0], self._first[-1][2:])
+            moved = march(self._system, ends, signal, ends, first, self._values, finer=_FINER)
+            self._first[-1] = moved.states[-1]
+
     def _along(
         self, segment: SineStep, first: FloatArray, time: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -263,7 +195,8 @@ class EngineMotion:
         knots = np.linspace(segment.start, segment.stop, steps + 1)
         place = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
         at = knots[:-1, None] + np.diff(knots)[:, None] * place
-        values = segment.value(at.ravel()).reshape(at.shape)
+        wave = segment.motion(at.ravel())
+        values = (wave.velocity if self._damping else wave.value).reshape(at.shape)
         signal: FloatArray = np.linalg.inv(np.vander(place, increasing=True)) @ values.T
         samples, back = np.unique(np.concatenate([knots, time]), return_inverse=True)
         if self._system.held:
