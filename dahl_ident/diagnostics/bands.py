@@ -24,7 +24,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.held_out import band_factor
 from dahl_ident.diagnostics.information import Information, values_at
 from dahl_ident.diagnostics.prediction_error import prediction_error, stated_noise
-from dahl_ident.elements import Element, Model
+from dahl_ident.elements import Model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem, TableProblem
@@ -272,9 +272,10 @@ def quantities(
     amplitudes: Sequence[float],
     frequency_hz: float | None,
 ) -> Iterator[tuple[str, str, float | None, FloatArray]]:
-    """Yield name, unit, amplitude and values of what :func:`derived` has, without errors.
+    """Yield name, unit, amplitude and values of what follows from an estimate.
 
-    At (n,) values of the free parameters, by name.
+    That is x_c of each law that has one, then loss, stiffness and damping at each amplitude, at
+    (n,) values of the free parameters, by name.
     """
     motion, size = problem.motion, len(next(iter(by_name.values())))
     friction = [
@@ -284,17 +285,36 @@ def quantities(
     ]
     for element, at in friction:
         low, high = (np.broadcast_to(k, size) for k in element.knee(at))
-        if np.array_equal(low, high):
+        if np.array_equal(low, high):  # a law with a range of knees has no single x_c
             label = "x_c" if element.name is None else f"{element.name}_x_c"
             yield label, shown_unit("m", motion), None, low
     omega = 2.0 * np.pi * float(positive_array(1.0 if frequency_hz is None else frequency_hz, "f"))
+    responses = []
     for A in positive_array(amplitudes, "amplitudes").ravel().tolist():
         sine = np.full(size, A), np.full(size, omega)
-        N = sum((e.stiffness(at, *sine) for e, at in friction), np.zeros(size, np.complex128))
+        parts = (e.stiffness(at, *sine) for e, at in friction)
+        responses.append((A, sum(parts, np.zeros(size, np.complex128))))
+    for A, N in responses:
         yield ENERGY, "J", A, np.pi * A**2 * N.imag
+    for A, N in responses:
         yield "equivalent stiffness", shown_unit("N/m", motion), A, N.real
-        if frequency_hz is not None:
-            yield "equivalent damping", shown_unit("N s/m", motion), A, N.imag / omega
+    for A, N in responses if frequency_hz is not None else ():
+        yield "equivalent damping", shown_unit("N s/m", motion), A, N.imag / omega
+
+
+def quantities_and_slopes(
+    problem: Problem,
+    values: FloatArray,
+    amplitudes: Sequence[float],
+    frequency_hz: float | None,
+) -> Iterator[tuple[str, str, float | None, float, FloatArray]]:
+    """Yield the same at one estimate, (P,), with the derivatives with respect to it, (P,)."""
+    steps, count = _STEP * np.maximum(np.abs(values), SMALLEST), values.size
+    points = np.vstack([values, values + np.diag(steps), values - np.diag(steps)])
+    by_name = dict(zip(problem.names, points.T, strict=False))
+    for name, unit, A, at in quantities(problem, by_name, amplitudes, frequency_hz):
+        slopes = (at[1 : count + 1] - at[count + 1 :]) / (2.0 * steps)
+        yield name, unit, A, float(at[0]), slopes
 
 
 def derived(
@@ -303,66 +323,25 @@ def derived(
     frequency_hz: float | None,
     errors: ErrorModel | None = None,
 ) -> Iterator[DerivedQuantity]:
-    """Yield x_c of each law that has one, and at each amplitude stiffness, loss and damping."""
-    motion = optimum.problem.data.motion
-    yield from _characteristic_displacements(optimum, errors)
-    A = positive_array(amplitudes, "amplitudes").ravel()
-    if not A.size:
-        return
-    band = describing_function_band(optimum, A, errors)
-    N, loss = band.response, np.pi * A**2
-    rows = [
-        (ENERGY, "J", loss * N.imag, loss * band.imag_std),
-        ("equivalent stiffness", shown_unit("N/m", motion), N.real, band.real_std),
-    ]
-    if frequency_hz is not None:
-        omega = 2.0 * np.pi * float(positive_array(frequency_hz, "frequency_hz"))
-        unit = shown_unit("N s/m", motion)
-        rows.append(("equivalent damping", unit, N.imag / omega, band.imag_std / omega))
-    for name, unit, value, error in rows:
-        for a, v, e in zip(A.tolist(), value.tolist(), error.tolist(), strict=True):
-            yield DerivedQuantity(name, unit, a, v, e)
-
-
-def _characteristic_displacements(
-    optimum: Optimum, errors: ErrorModel | None
-) -> Iterator[DerivedQuantity]:
+    """Yield x_c of each law that has one, then loss, stiffness and damping at each amplitude."""
     problem, theta = _estimate(optimum, errors)
-    names = problem.names
-    values = values_at(problem, theta)
-    slopes = dict(zip(names, problem.value_slopes(theta), strict=True))
     found = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    for element in problem.model.elements:
-        own = [float(values[p.name]) for p in element.parameters]
-        x_c, high = _knee(element, own)
-        if not element.has_memory or x_c != high:
-            continue  # a law with a range of knees has no single characteristic displacement
-        direction = np.zeros(len(names))
-        for i, parameter in enumerate(element.parameters):
-            if parameter.free:
-                step = _STEP * abs(own[i])
-                up, down = (
-                    _knee(element, [*own[:i], own[i] + by, *own[i + 1 :]])[0]
-                    for by in (step, -step)
-                )
-                slope = np.log(up / down) / (2.0 * step)
-                direction[names.index(parameter.name)] = slope * slopes[parameter.name]
-        if any(
-            d and not np.isfinite(found.get(n, 1.0)) for d, n in zip(direction, names, strict=True)
-        ):
+    infinite = np.array([not np.isfinite(found.get(name, 1.0)) for name in problem.names])
+    by_search = problem.value_slopes(theta)
+    A, stds = np.asarray(amplitudes, dtype=np.float64).ravel(), iter(())
+    if A.size:
+        band = describing_function_band(optimum, A, errors)
+        damping = band.imag_std / (2.0 * np.pi * (frequency_hz or 1.0))
+        stds = iter([*np.pi * A**2 * band.imag_std, *band.real_std, *damping])
+    for name, unit, at, value, slopes in quantities_and_slopes(
+        problem, problem.to_values(theta), amplitudes, frequency_hz
+    ):
+        if at is None and (slopes[infinite] != 0.0).any():
             continue
-        if errors is None:
-            error = x_c * float(Information(optimum).std(direction))
-        else:
-            error = x_c * float(direction @ errors.covariance @ direction) ** 0.5
-        label = "x_c" if element.name is None else f"{element.name}_x_c"
-        unit = shown_unit("m", optimum.problem.data.motion)
-        yield DerivedQuantity(label, unit, None, x_c, error)
-
-
-def _knee(element: Element, values: Sequence[float]) -> tuple[float, float]:
-    low, high = element.knee([np.asarray(v) for v in values])
-    return float(low), float(high)
+        directions = slopes * by_search
+        known = Information(optimum).std if errors is None else errors.std
+        error = known(directions) if at is None else next(stds)
+        yield DerivedQuantity(name, unit, at, value, float(error))
 
 
 def _noise_band(

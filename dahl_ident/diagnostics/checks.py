@@ -6,7 +6,7 @@ what the result depends on and the data cannot test.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,18 +18,16 @@ from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import in_order_of_level
 from dahl_ident.diagnostics.goodness import Goodness
 from dahl_ident.diagnostics.held_out import CrossValidation
-from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
     below_zero,
     beyond_friction_limit,
-    is_single,
     slight,
     steady_findings,
 )
 from dahl_ident.diagnostics.verdicts import Identifiability
-from dahl_ident.elements import Model
+from dahl_ident.elements import Element, Model
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.fitting.optimum import ConstraintCost
@@ -59,6 +57,25 @@ class Judged(Protocol):
         """The model with the estimates put in."""
 
     @property
+    def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
+        """Estimates and combined standard uncertainties by name."""
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the data come from."""
+
+    @property
+    def constraint_cost(self) -> ConstraintCost | None:
+        """What constraints cost."""
+
+    def assumptions(self) -> Iterable[Finding]:
+        """Return what the result depends on."""
+
+
+class JudgedTable(Judged, Protocol):
+    """The input of the verdict on a fit of a table."""
+
+    @property
     def goodness(self) -> Goodness:
         """Tests of the residuals."""
 
@@ -75,11 +92,11 @@ class Judged(Protocol):
         """The check of the bands."""
 
     @property
-    def with_less(self) -> Judged | None:
+    def with_less(self) -> JudgedTable | None:
         """The fit without harmonics, or without a covariance; None where there is neither."""
 
 
-def judgement(fit: Judged) -> Judgement:
+def judgement(fit: JudgedTable) -> Judgement:
     """Return the findings of every check, and with them the status.
 
     Neither harmonics nor a covariance hide what the fundamentals show without them.
@@ -97,7 +114,7 @@ def judgement(fit: Judged) -> Judgement:
 # Determined?
 
 
-def _parameters(fit: Judged) -> Iterator[Finding]:
+def _parameters(fit: JudgedTable) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
         return  # what the numbers leave undetermined says nothing of the mechanism
@@ -127,13 +144,13 @@ def _parameters(fit: Judged) -> Iterator[Finding]:
 # Described?
 
 
-def _is_determined(fit: Judged) -> bool:
+def _is_determined(fit: JudgedTable) -> bool:
     optimum, goodness = fit.optimum, fit.goodness
     determined = optimum.success and optimum.dof > 0 and goodness.judged and not goodness.sign
     return determined and fit.identifiability.complete
 
 
-def _residuals(fit: Judged) -> Iterator[Finding]:
+def _residuals(fit: JudgedTable) -> Iterator[Finding]:
     """Yield the size and kind of the misfit."""
     goodness = fit.goodness
     lost = (
@@ -150,7 +167,7 @@ def _residuals(fit: Judged) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, severity, "large_misfit", {"rms": goodness.rms_misfit})
 
 
-def _stated_exponent_is_wrong(fit: Judged) -> bool:
+def _stated_exponent_is_wrong(fit: JudgedTable) -> bool:
     """Return whether the data contradict an exponent that the user gave."""
     exponent = fit.goodness.exponent
     if exponent is None or exponent.p_value > fit.goodness.level:
@@ -159,7 +176,7 @@ def _stated_exponent_is_wrong(fit: Judged) -> bool:
     return not given[exponent.name].assumed
 
 
-def _bands(fit: Judged) -> Iterator[Finding]:
+def _bands(fit: JudgedTable) -> Iterator[Finding]:
     """Yield whether the bands hold for what was held out, where anything speaks against the fit."""
     goodness = fit.goodness
     speaks_against = (goodness.objections, goodness.flagged, *_reservations(fit))
@@ -190,28 +207,16 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     return min(rms_misfit_of(errors.problem, each) for each in fitted)
 
 
-def _reservations(fit: Judged) -> Iterator[Finding]:
+def _reservations(fit: JudgedTable) -> Iterator[Finding]:
     """Yield what keeps a fit from being trusted although its residuals may look like noise."""
     yield from _beyond_limit(fit)
-    yield from _below_zero(fit)
+    yield from negative(fit)
     yield from _contradicted_priors(fit)
     yield from _beyond_range(fit)
     yield from _moved_by_outliers(fit)
 
 
-def _estimates(fit: Judged) -> tuple[dict[str, float], Mapping[str, float]]:
-    """Return the values of all parameters, and standard uncertainties of those estimated."""
-    optimum, errors = fit.optimum, fit.errors
-    values = parameter_values(optimum)
-    values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    return (
-        (values, optimum.stderr)
-        if errors is None
-        else (values | dict(errors.values), errors.stderr)
-    )
-
-
-def _beyond_limit(fit: Judged) -> Iterator[Finding]:
+def _beyond_limit(fit: JudgedTable) -> Iterator[Finding]:
     """Yield where a force exceeds what friction can carry; not rows that a loss sets aside."""
     errors, differ = fit.errors, fit.goodness.runs_differ
     scatter = 0.0 if differ is None else sum(differ.scatter.values())
@@ -220,42 +225,31 @@ def _beyond_limit(fit: Judged) -> Iterator[Finding]:
     yield from beyond_friction_limit(optimum, scatter, aside)
 
 
-def _below_zero(fit: Judged) -> Iterator[Finding]:
+def negative(fit: Judged) -> Iterator[Finding]:
     """Yield a finding for every mass, damping or stiffness clearly below zero."""
-    values, stderr = _estimates(fit)
-    problem = fit.optimum.problem
-    single = [e.parameters[0] for e in problem.model.elements if is_single(e)]
-    yield from below_zero(single, values, stderr, problem.data.motion)
+    yield from below_zero(fit.optimum.problem, *fit.known)
 
 
-def _slight(fit: Judged) -> Iterator[Finding]:
+def _slight(fit: JudgedTable) -> Iterator[Finding]:
     """Yield a finding for every mass, damper or spring of less force than the model misses."""
-    if not (fit.goodness.objections and _is_determined(fit)):
+    view = fit.optimum.problem.stiffness_data
+    rows = view.harmonic == 1
+    if not (fit.goodness.objections and _is_determined(fit) and rows.any()):
         return
-    values, stderr = _estimates(fit)
     misfit = within = fit.goodness.rms_misfit
     if fit.errors is not None:  # what runs differ by is not missed
         within = min(misfit, rms_misfit_of(fit.errors.problem, fit.errors.within_runs))
-    view = fit.optimum.problem.stiffness_data
-    rows = view.harmonic == 1
-    for element in fit.optimum.problem.model.elements:
-        if is_single(element) and rows.any():
-            (parameter,) = element.parameters
-            value = values[parameter.name]
-            part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
-            share = float(np.sqrt(np.mean(np.abs(part) ** 2)))
-            error = float(stderr.get(parameter.name, 0.0))
-            if share < within:
-                yield from slight(parameter, value, error, share, misfit)
+
+    def share_of(element: Element, value: float) -> float:
+        part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
+        return float(np.sqrt(np.mean(np.abs(part) ** 2)))
+
+    yield from slight(fit.optimum.problem, *fit.known, share_of, within, misfit)
 
 
-def _constraints(fit: Judged) -> Iterator[Finding]:
-    """Yield the constraints that the data contradict."""
-    yield from contradicted(fit.optimum.constraint_cost)
-
-
-def contradicted(cost: ConstraintCost | None) -> Iterator[Finding]:
-    """Yield constraints whose cost is not due to chance."""
+def constraints(fit: Judged) -> Iterator[Finding]:
+    """Yield the constraints that the data contradict: their cost is not due to chance."""
+    cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
         values = {
             "texts": tuple(cost.texts),
@@ -266,7 +260,7 @@ def contradicted(cost: ConstraintCost | None) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "constraint", values)
 
 
-def _contradicted_priors(fit: Judged) -> Iterator[Finding]:
+def _contradicted_priors(fit: JudgedTable) -> Iterator[Finding]:
     """Yield every prior that the data contradict."""
     optimum = fit.optimum
     estimates = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
@@ -281,7 +275,7 @@ def _contradicted_priors(fit: Judged) -> Iterator[Finding]:
             yield Finding(_DESCRIBED, _APPROXIMATE, "prior", values)
 
 
-def _beyond_range(fit: Judged) -> Iterator[Finding]:
+def _beyond_range(fit: JudgedTable) -> Iterator[Finding]:
     """Yield every assumed exponent that the data put outside its range."""
     errors = fit.errors
     if errors is None:
@@ -295,7 +289,7 @@ def _beyond_range(fit: Judged) -> Iterator[Finding]:
             yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_range", values)
 
 
-def _moved_by_outliers(fit: Judged) -> Iterator[Finding]:
+def _moved_by_outliers(fit: JudgedTable) -> Iterator[Finding]:
     """Yield which parameters a robust fit moves by more than one uncertainty."""
     optimum, errors = fit.optimum, fit.errors
     if optimum.loss != "linear" or errors is None:
@@ -350,7 +344,7 @@ def robust_values(
     )
 
 
-def _steady(fit: Judged) -> Iterator[Finding]:
+def _steady(fit: JudgedTable) -> Iterator[Finding]:
     """Yield how rows of held force were predicted."""
     yield from steady_findings(fit.optimum, fit.model)
 
@@ -358,9 +352,9 @@ def _steady(fit: Judged) -> Iterator[Finding]:
 # Assumed?
 
 
-def _warnings(fit: Judged) -> Iterator[Finding]:
+def reading(fit: Judged) -> Iterator[Finding]:
     """Yield the warnings on reading the data."""
-    yield from doubted(fit.optimum.problem.data.provenance)
+    yield from doubted(*fit.provenances)
 
 
 def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
@@ -373,9 +367,9 @@ def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, _TRUSTED, "more_warnings", values)
 
 
-def _assumed(fit: Judged) -> Iterator[Finding]:
-    """Yield the assumptions of a fit."""
-    yield from assumptions(fit.optimum, fit.errors)
+def assumed(fit: Judged) -> Iterable[Finding]:
+    """Return the assumptions of a fit."""
+    return fit.assumptions()
 
 
 def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding]:
@@ -414,14 +408,14 @@ def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding
         yield Finding(_ASSUMED, _TRUSTED, "assumed", values)
 
 
-CHECKS: tuple[Callable[[Judged], Iterator[Finding]], ...] = (
-    _constraints,
+CHECKS: tuple[Callable[[JudgedTable], Iterable[Finding]], ...] = (
+    constraints,
     _parameters,
     _residuals,
     _bands,
     _reservations,
     _slight,
     _steady,
-    _warnings,
-    _assumed,
+    reading,
+    assumed,
 )

@@ -43,13 +43,10 @@ class Information:
         size = np.sqrt(np.diagonal(information))
         self._size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
         scaled = information / np.outer(self._size, self._size)
-        self.eigenvalues, self._vectors = np.linalg.eigh(np.where(np.isfinite(scaled), scaled, 0.0))
-        self._null = self.eigenvalues <= _NULL * max(1.0, float(self.eigenvalues[-1]))
-
-    @property
-    def rank(self) -> int:
-        """Number of directions that the data determine at all."""
-        return int((~self._null).sum())
+        self._eigenvalues, self._vectors = np.linalg.eigh(
+            np.where(np.isfinite(scaled), scaled, 0.0)
+        )
+        self._null = self._eigenvalues <= _NULL * max(1.0, float(self._eigenvalues[-1]))
 
     def variance(self, directions: FloatArray) -> FloatArray:
         """Return the variance of directions . theta, shape (...), for directions (..., P)."""
@@ -62,7 +59,7 @@ class Information:
         parts = scaled @ self._vectors
         length = np.linalg.norm(scaled, axis=-1, keepdims=True)
         lost = np.abs(parts[..., self._null]) > _PART * length
-        known = parts[..., ~self._null] ** 2 / self.eigenvalues[~self._null]
+        known = parts[..., ~self._null] ** 2 / self._eigenvalues[~self._null]
         return np.where(lost.any(axis=-1), np.inf, known.sum(axis=-1))
 
     def std(self, directions: FloatArray) -> FloatArray:
@@ -71,7 +68,7 @@ class Information:
 
     def weakest(self, natural: FloatArray) -> FloatArray:
         """Return the least determined direction of theta/natural, a unit vector, shape (P,)."""
-        information = (self._vectors * np.maximum(self.eigenvalues, 0.0)) @ self._vectors.T
+        information = (self._vectors * np.maximum(self._eigenvalues, 0.0)) @ self._vectors.T
         lever = self._size * natural
         vector = np.linalg.eigh(information * np.outer(lever, lever))[1][:, 0]
         return np.asarray(vector * np.sign(vector[np.argmax(np.abs(vector))]))

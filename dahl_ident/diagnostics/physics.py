@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -18,9 +18,10 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
+from dahl_ident.problem import Problem
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.steady_state import response
-from dahl_ident.units import Motion, engineering, percent, shown_unit
+from dahl_ident.units import engineering, percent, shown_unit
 
 _SEEN = 1e-3  # relative difference that is worth a place
 _DISTORTED = 0.05  # of a force: less changes the fundamental by well below 1 %
@@ -276,40 +277,54 @@ def is_single(element: Element) -> bool:
     )
 
 
+def _estimated_singles(problem: Problem) -> list[tuple[Element, Parameter]]:
+    """Return every mass, damper and spring that is estimated, with its parameter."""
+    singles = ((e, e.parameters[0]) for e in problem.model.elements if is_single(e))
+    return [(element, parameter) for element, parameter in singles if parameter.free]
+
+
 def below_zero(
-    parameters: Sequence[Parameter],
-    values: Mapping[str, float],
-    stderr: Mapping[str, float],
-    motion: Motion = "translation",
+    problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
 ) -> Iterator[Finding]:
-    """Yield a finding for every estimate clearly below zero, with what to do."""
-    for parameter in parameters:
-        value, error = values[parameter.name], stderr.get(parameter.name, 0.0)
-        if parameter.free and np.isfinite(value) and value < -_CLEARLY * error:
-            given = {
+    """Yield a finding for every mass, damping or stiffness clearly below zero, with what to do."""
+    for _, parameter in _estimated_singles(problem):
+        value, error = values[parameter.name], stderr[parameter.name]
+        if np.isfinite(value) and value < -_CLEARLY * error:
+            negative = {
                 "name": parameter.name,
                 "value": value,
                 "stderr": error,
-                "unit": shown_unit(parameter.unit, motion),
+                "unit": shown_unit(parameter.unit, problem.motion),
                 "instead": _INSTEAD[parameter.dimension],
             }
-            yield Finding(Question.DESCRIBED, VerdictStatus.APPROXIMATE, "negative", given)
+            yield Finding(_DESCRIBED, _APPROXIMATE, "negative", negative)
 
 
 def slight(
-    parameter: Parameter, value: float, error: float, share: float, misfit: float
+    problem: Problem,
+    values: Mapping[str, float],
+    stderr: Mapping[str, float],
+    share_of: Callable[[Element, float], float],
+    missed: float,
+    misfit: float,
 ) -> Iterator[Finding]:
-    """Yield a finding where an element carries less force than the model misses."""
-    if parameter.free and share < misfit and value >= -_CLEARLY * error:
-        values = {
-            "name": parameter.name,
-            "value": value,
-            "stderr": error,
-            "unit": parameter.unit,
-            "share": share,
-            "misfit": misfit,
-        }
-        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "slight", values)
+    """Yield a finding for every mass, damper or spring of less force than the model has `missed`.
+
+    `share_of` returns the rms force of an element at its value over the whole; `misfit` is shown.
+    """
+    for element, parameter in _estimated_singles(problem):
+        value, error = values[parameter.name], stderr[parameter.name]
+        share = share_of(element, value)
+        if share < missed and value >= -_CLEARLY * error:
+            shown = {
+                "name": parameter.name,
+                "value": value,
+                "stderr": error,
+                "unit": shown_unit(parameter.unit, problem.motion),
+                "share": share,
+                "misfit": misfit,
+            }
+            yield Finding(_DESCRIBED, VerdictStatus.TRUSTED, "slight", shown)
 
 
 # Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.

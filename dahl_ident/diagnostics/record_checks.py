@@ -6,25 +6,24 @@ the result rests on that the records cannot test.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.checks import contradicted, doubted
+from dahl_ident.diagnostics.checks import Judged, assumed, constraints, negative, reading
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
-from dahl_ident.diagnostics.physics import below_zero, is_single, slight
-from dahl_ident.diagnostics.record_errors import MODEL, NOISE, RecordErrors, record_assumptions
-from dahl_ident.elements import Element, Model
+from dahl_ident.diagnostics.physics import is_single, slight
+from dahl_ident.diagnostics.record_errors import MODEL, NOISE, RecordErrors
+from dahl_ident.elements import Element
 from dahl_ident.elements.recursion import Stretches, stretches
-from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
-from dahl_ident.units import Motion, percent, si_unit
+from dahl_ident.units import Motion, percent, shown_unit, si_unit
 
 _SEGMENTS = 50  # the worst one is 2 % of a record
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
@@ -142,20 +141,12 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     )
 
 
-class JudgedRecords(Protocol):
+class JudgedRecords(Judged, Protocol):
     """The input of the verdict on a fit to records."""
-
-    @property
-    def optimum(self) -> Optimum:
-        """The solver's result."""
 
     @property
     def problem(self) -> RecordProblem:
         """Records and model as they were fitted."""
-
-    @property
-    def model(self) -> Model:
-        """The model with the estimates put in."""
 
     @property
     def errors(self) -> RecordErrors:
@@ -164,10 +155,6 @@ class JudgedRecords(Protocol):
     @property
     def goodness(self) -> RecordGoodness:
         """Statistics of the residuals."""
-
-    @property
-    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        """Where each record comes from."""
 
 
 def record_judgement(fit: JudgedRecords) -> Judgement:
@@ -202,7 +189,8 @@ def undetermined(fit: JudgedRecords) -> Iterator[Finding]:
                 continue
             why = _motion_that_lacks(element, paths, problem.motion, known=error < value)
             why = why or _reason(fit, place)
-            values = {"name": parameter.name, "stderr": error, "unit": parameter.unit, "why": why}
+            unit = shown_unit(parameter.unit, problem.motion)
+            values = {"name": parameter.name, "stderr": error, "unit": unit, "why": why}
             yield Finding(_DETERMINED, _NOT_DETERMINED, "record_parameter", values)
 
 
@@ -250,15 +238,6 @@ def _reason(fit: JudgedRecords, place: int) -> str:
     return ": its effect is small compared with the residuals; fix it, or leave the element out"
 
 
-def _constraints(fit: JudgedRecords) -> Iterator[Finding]:
-    """Yield the constraints that the records contradict; correlated samples count as few."""
-    cost = fit.optimum.constraint_cost
-    if cost is not None:
-        share = fit.errors.effective / fit.problem.n_samples
-        cost = replace(cost, rise=cost.rise * share, dof=cost.dof * share)
-    yield from contradicted(cost)
-
-
 def _misfit(fit: JudgedRecords) -> Iterator[Finding]:
     """Yield whether the model describes the records."""
     far, converged = fit.goodness.share_in_band > _FAIRLY, fit.optimum.converged
@@ -278,12 +257,7 @@ def _misfit(fit: JudgedRecords) -> Iterator[Finding]:
 
 
 def _physics(fit: JudgedRecords) -> Iterator[Finding]:
-    """Yield what speaks against the estimates physically, or against an exponent."""
-    names, u2 = fit.problem.names, fit.errors.covariance.diagonal().tolist()
-    values = dict(zip(names, fit.optimum.values.tolist(), strict=True))
-    stderr = {name: v**0.5 for name, v in zip(names, u2, strict=True)}
-    single = [e for e in fit.problem.model.elements if is_single(e) and e.parameters[0].free]
-    yield from below_zero([e.parameters[0] for e in single], values, stderr)
+    """Yield what speaks against a law's estimates physically, or against an exponent."""
     for element in fit.model.elements:
         if not is_single(element):
             for text in element.physics([p.value or 0.0 for p in element.parameters]):
@@ -304,20 +278,15 @@ def _slight(fit: JudgedRecords) -> Iterator[Finding]:
     if problem.output == "motion" or not misses(fit):
         return
     size = np.concatenate([y - y.mean() for y in problem.measured]).std()
-    for element in fit.model.elements:
-        parameter, values = element.parameters[0], [p.value or 0.0 for p in element.parameters]
-        if parameter.name in problem.names and is_single(element):
-            force = [
-                element.force_history(values, x, v, 0.0, acceleration=a)
-                for x, v, a in problem.motions
-            ]
-            share = float(np.concatenate([f - f.mean() for f in force]).std() / size)
-            place = problem.names.index(parameter.name)
-            yield from slight(
-                problem.free[place], float(fit.optimum.values[place]),
-                float(fit.errors.covariance[place, place]) ** 0.5, share,
-                fit.goodness.share_in_band**0.5,
-            )  # fmt: skip
+
+    def share_of(element: Element, value: float) -> float:
+        force = [
+            element.force_history([value], x, v, 0.0, acceleration=a) for x, v, a in problem.motions
+        ]
+        return float(np.concatenate([f - f.mean() for f in force]).std() / size)
+
+    misfit = fit.goodness.share_in_band**0.5
+    yield from slight(problem, *fit.known, share_of, misfit, misfit)
 
 
 def _notes(fit: JudgedRecords) -> Iterator[Finding]:
@@ -341,15 +310,18 @@ def _notes(fit: JudgedRecords) -> Iterator[Finding]:
         samples = problem.delay * problem.records[0].sample_rate
         lag = {"delay": problem.delay, "samples": samples}
         yield Finding(_DESCRIBED, _TRUSTED, "delay", lag)
-    yield from doubted(*fit.provenances)
+    yield from reading(fit)
     size = {"effective": fit.errors.effective, "samples": problem.n_samples}
     yield Finding(_DESCRIBED, _TRUSTED, "effective_samples", size)
 
 
-def _assumptions(fit: JudgedRecords) -> Iterator[Finding]:
-    yield record_assumptions(fit.problem, fit.errors)
-
-
-CHECKS: tuple[Callable[[JudgedRecords], Iterator[Finding]], ...] = (
-    _constraints, _misfit, undetermined, _physics, _slight, _notes, _assumptions,
-)  # fmt: skip
+CHECKS: tuple[Callable[[JudgedRecords], Iterable[Finding]], ...] = (
+    constraints,
+    _misfit,
+    undetermined,
+    negative,
+    _physics,
+    _slight,
+    _notes,
+    assumed,
+)

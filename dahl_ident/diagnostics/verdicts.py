@@ -35,7 +35,7 @@ from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import with_unit
-from dahl_ident.diagnostics.information import Information, shares
+from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, wald_intervals
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum, Status
@@ -91,9 +91,6 @@ class ParameterVerdict:
         The parameter.
     verdict : Verdict
         Identified, weakly or not.
-    fisher_std, profile_std : float
-        Standard deviation of its logarithm, first order and by its profile; infinite where open,
-        both alike where no profile was searched.
     interval : Interval
         The 95.45 % interval: the profile's (first order where none was searched), or the combined
         one where a fit states it.
@@ -104,8 +101,6 @@ class ParameterVerdict:
     name: str
     unit: str
     verdict: Verdict
-    fisher_std: float
-    profile_std: float
     interval: Interval
     reason: str
 
@@ -138,13 +133,9 @@ class Identifiability:
         By name.
     combinations : tuple of StatedCombination
         Determined combinations of parameters that are not.
-    rank : int
-        Directions that the data determine at all, to first order.
     direction : mapping of str to float
         Where no combination is known: the least determined direction in the parameters'
         logarithms (in sizes that matter for those that have none).
-    information_shares : mapping of str to ndarray, shape (n,)
-        What part of the information on each parameter each row of data carries.
 
     Examples
     --------
@@ -156,9 +147,7 @@ class Identifiability:
 
     parameters: Mapping[str, ParameterVerdict]
     combinations: tuple[StatedCombination, ...]
-    rank: int
     direction: Mapping[str, float]
-    information_shares: Mapping[str, FloatArray]
 
     def named(self, verdict: Verdict) -> list[str]:
         """Return the names of the parameters with this verdict."""
@@ -268,10 +257,10 @@ def judged(
         intervals = wald_intervals(optimum, LEVELS)
     else:
         intervals = profile_of()
-    profile = _profile_std(optimum, intervals, natural)
+    spread = np.maximum(fisher, _profile_std(optimum, intervals, natural)).tolist()
     verdicts = {
-        name: _verdict(float(f), float(p), intervals[name][-1])
-        for name, f, p in zip(problem.names, fisher, profile, strict=True)
+        name: _verdict(std, intervals[name][-1])
+        for name, std in zip(problem.names, spread, strict=True)
     }
     beyond = {} if errors is None else _lost_beyond_noise(errors, verdicts, natural)
     blind = _unseen(optimum)
@@ -290,7 +279,7 @@ def judged(
     loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
     determined = _determined(optimum, information, lost, loose, errors)
     parameters = {}
-    for i, (name, parameter) in enumerate(zip(problem.names, problem.parameters, strict=True)):
+    for name, parameter in zip(problem.names, problem.parameters, strict=True):
         unit = parameter.unit
         _, limits, widest = (stated or intervals)[name]
         within = _within(limits, unit)
@@ -303,17 +292,14 @@ def judged(
             reason = f"{shown}, not determined, {beyond[name]}"
         if name in blind:
             reason = blind[name]
-        parameters[name] = ParameterVerdict(
-            name, unit, verdicts[name], float(fisher[i]), float(profile[i]), limits, reason
-        )
+        parameters[name] = ParameterVerdict(name, unit, verdicts[name], limits, reason)
     direction = {}
     if lost - blind.keys() and not determined:
         vector = information.weakest(natural)
         parts = zip(problem.names, vector.tolist(), strict=True)
         direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
         direction = direction if len(direction) > 1 else {}
-    rows = dict(zip(problem.names, shares(optimum), strict=True))
-    return Identifiability(parameters, determined, information.rank, direction, rows)
+    return Identifiability(parameters, determined, direction)
 
 
 def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
@@ -438,16 +424,11 @@ def _profile_std(
     return np.where(np.isnan(std), np.inf, std)
 
 
-def _verdict(fisher: float, profile: float, widest: Interval) -> Verdict:
-    spread = max(fisher, profile)
-    if spread < IDENTIFIED_BELOW:
+def _verdict(std: float, widest: Interval) -> Verdict:
+    if std < IDENTIFIED_BELOW:
         return Verdict.IDENTIFIED
-    closed = _is_closed(widest) and spread <= NOT_IDENTIFIED_ABOVE
+    closed = np.isfinite([widest.lower, widest.upper]).all() and std <= NOT_IDENTIFIED_ABOVE
     return Verdict.WEAK if closed else Verdict.NOT_IDENTIFIED
-
-
-def _is_closed(interval: Interval) -> bool:
-    return bool(np.isfinite(interval.upper) and np.isfinite(interval.lower))
 
 
 def _determined(

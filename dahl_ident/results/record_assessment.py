@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.bands import (
     ResponseBand,
     describing_function_band,
     predicted_backbone,
-    quantities,
+    quantities_and_slopes,
     response_band,
 )
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
@@ -35,7 +35,6 @@ from dahl_ident.diagnostics.record_checks import (
 )
 from dahl_ident.diagnostics.record_errors import (
     NOISE,
-    RELATIVE_STEP,
     RecordErrors,
     errors_on_constraints,
     record_assumptions,
@@ -48,7 +47,7 @@ from dahl_ident.elements import Model
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.losses import loss_named
-from dahl_ident.fitting.optimum import Optimum
+from dahl_ident.fitting.optimum import ConstraintCost, Optimum
 from dahl_ident.fitting.record_search import hold_model
 from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.results.assessment import Assessment
@@ -204,14 +203,19 @@ class RecordAssessment(Assessment):
         """Which parameters the records determine."""
         lost = {finding.values["name"]: str(finding) for finding in undetermined(self)}
         limits = self.intervals("combined", LEVELS, None, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            relative = np.sqrt(np.diagonal(self.covar)) / np.abs(self.optimum.values)
         verdicts: dict[str, ParameterVerdict] = {}
-        for name, u in zip(limits, relative.tolist(), strict=True):
+        for name, unit in zip(limits, limits.units, strict=True):
             verdict = Verdict.NOT_IDENTIFIED if name in lost else Verdict.IDENTIFIED
-            reason, unit = lost.get(name, verdict.value), limits.units[len(verdicts)]
-            verdicts[name] = ParameterVerdict(name, unit, verdict, u, u, limits[name][1], reason)
-        return Identifiability(verdicts, (), len(verdicts) - len(lost), {}, {})
+            reason = lost.get(name, verdict.value)
+            verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], reason)
+        return Identifiability(verdicts, (), {})
+
+    @property
+    def constraint_cost(self) -> ConstraintCost | None:
+        """What constraints cost; correlated samples count as few."""
+        cost = self.optimum.constraint_cost
+        share = self.errors.effective / self.problem.n_samples
+        return cost and replace(cost, rise=cost.rise * share, dof=cost.dof * share)
 
     @cached_property
     def goodness(self) -> RecordGoodness:
@@ -263,15 +267,12 @@ class RecordAssessment(Assessment):
     ) -> tuple[DerivedQuantity, ...]:
         """Return x_c, energy per cycle, equivalent stiffness and damping."""
         count = self.problem.n_reported
-        values = self.optimum.values[:count]
-        steps = RELATIVE_STEP * np.maximum(np.abs(values), 1e-300)
-        points = np.vstack([values, values + np.diag(steps), values - np.diag(steps)])
-        by_name = dict(zip(self.problem.names, points.T, strict=False))
         numbers = []
-        for name, unit, A, at in quantities(self.problem, by_name, amplitudes, frequency_hz):
-            slopes = (at[1 : count + 1] - at[count + 1 :]) / (2.0 * steps)
+        for name, unit, A, value, slopes in quantities_and_slopes(
+            self.problem, self.optimum.values[:count], amplitudes, frequency_hz
+        ):
             (variance,) = variances(slopes[None], self.covar[:count, :count])
-            numbers.append(DerivedQuantity(name, unit, A, float(at[0]), float(variance) ** 0.5))
+            numbers.append(DerivedQuantity(name, unit, A, value, float(variance) ** 0.5))
         return tuple(numbers)
 
     @cached_property

@@ -35,7 +35,7 @@ from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError
 from dahl_ident.fitting import solve
-from dahl_ident.fitting.optimum import Optimum, propagated
+from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
 from dahl_ident.problem import TableProblem
 from dahl_ident.results.assessment import Assessment
 
@@ -111,6 +111,16 @@ class TableAssessment(Assessment):
         """The estimate as an optimum whose covariance is that of noise alone."""
         errors = self.errors_of_combinations
         return self.optimum if errors is None else errors.by_noise
+
+    @property
+    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
+        """Where the table comes from."""
+        return (self.problem.data.provenance,)
+
+    @property
+    def constraint_cost(self) -> ConstraintCost | None:
+        """What constraints cost."""
+        return self.optimum.constraint_cost
 
     @property
     def success(self) -> bool:
