@@ -26,6 +26,7 @@ from dahl_ident.diagnostics.error_sources import (
     RUNS,
     TESTS,
 )
+from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import (
     degrees_text,
     html_table,
@@ -370,7 +371,8 @@ def _parameter(
         own = float(direction @ covariance @ direction)
         own = own if own > _ROUNDING * total else 0.0
         kind: Literal["A", "B"] = "A" if source in _TYPE_A else "B"
-        dof = errors.dof(direction, [source]) if kind == "A" and own else np.inf
+        estimated = source in {*_TYPE_A, EXPONENT}
+        dof = errors.dof(direction, [source]) if estimated and own else np.inf
         rows.append(BudgetRow(source, kind, own**0.5, dof, own / total if total > 0.0 else 0.0))
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)

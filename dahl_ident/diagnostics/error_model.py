@@ -192,13 +192,16 @@ class ErrorModel:
 
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
         less than 1; fewer where the interval would be narrower than that of the runs alone.
-        `sources` leaves only these; infinite where all variances are known.
+        `sources` leaves only these; infinite where all variances are known. What an assumed
+        exponent adds depends on the variances as well.
         """
         direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
-        every = self._levers[0 if sources is None else 1]
         names = [NOISE] * self.state.model.noises + [s.name for s in self.sources]
-        counted = np.array([sources is None or name in sources for name in names], dtype=bool)
-        slopes = np.einsum("i,kij,j->k", direction, every, direction) * counted
+        every, given = (np.einsum("i,kij,j->k", direction, C, direction) for C in self._levers)
+        slopes = every
+        if sources is not None:
+            counted = np.array([name in sources for name in names], dtype=bool)
+            slopes = given * counted + (every - given) * (EXPONENT in sources)
         spread = float(slopes @ self.state.variances_covariance @ slopes)
         total = 0.0
         for name in self.contributions if sources is None else sources:
