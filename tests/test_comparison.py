@@ -114,13 +114,16 @@ def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl() -> None:
     assert not sentences(0.2)
 
 
-def test_what_is_stated_stands_next_to_what_noise_alone_gives() -> None:
+def test_the_model_that_was_fitted_stands_with_what_it_states() -> None:
     result = fit(table(noise=1e-3), Dahl() + Mass(0.01))
     found = compare_models(result, {"spring": Dahl() + Spring()})
-    assert found.stated is not None
-    assert found.stated["force limit"] == pytest.approx(result.params["f_max"].value)
-    assert [row[0] for row in found.meanings] == ["every source", "as fitted", "spring"]
-    assert float(found.meanings[0][1]) == pytest.approx(result.params["f_max"].value, rel=5e-3)
+    f_max = result.params["f_max"]
+    assert found.models[0].meaning["force limit"] == pytest.approx(f_max.value, rel=1e-12)
+    assert [row[0] for row in found.meanings] == ["as fitted", "spring"]
+    assert found.models[0].estimates.startswith(str(f_max))
+    assert found.models[0].estimates.endswith(
+        str(result.params["alpha"]).removesuffix(" (assumed)")
+    )
 
 
 def test_what_runs_away_is_not_determined() -> None:

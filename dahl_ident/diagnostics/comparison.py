@@ -53,7 +53,6 @@ _RATES = 1.05  # highest over lowest frequency that can show a dependence on the
 _SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
-_STATED = "every source"  # of error is counted in what the fit states
 _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
 _UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
 _DISAGREE = 0.2  # of a force limit: what else friction is then depends on the choice
@@ -88,12 +87,16 @@ class ComparedModel:
         How it predicts tests left out.
     reason : str
         What in the data speaks for trying it.
+    stated : mapping of str to Estimate or None
+        The parameters as the fit states them, every source of error counted, of the model that was
+        fitted. The others count noise alone.
     """
 
     name: str
     optimum: Optimum
     density: PredictiveDensity
     reason: str = ""
+    stated: Mapping[str, Any] | None = None
 
     @property
     def aic(self) -> float:
@@ -109,6 +112,11 @@ class ComparedModel:
     def estimates(self) -> str:
         """The free parameters in one line; a number without an error is none."""
         rows = [(p.name, with_unit(v, e, p.unit), np.isfinite(e)) for p, v, e in self._of_device]
+        if self.stated is not None:
+            every = [p for p in self.stated.values() if p.stderr is not None]
+            rows = [
+                (p.name, with_unit(p.value, p.stderr, p.unit), np.isfinite(p.stderr)) for p in every
+            ]
         known = [f"{name} = {text}" for name, text, is_known in rows if is_known]
         unknown = [name for name, _, is_known in rows if not is_known]
         return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
@@ -159,8 +167,12 @@ class ComparedModel:
         the middle and the largest amplitude, of records at their rms displacements. Infinite where
         a law never slips, NaN where these data do not determine it.
         """
-        found = _meaning(self.optimum.problem, parameter_values(self.optimum))
-        return found | dict.fromkeys(_undetermined(self.optimum, found), np.nan)
+        problem = self.optimum.problem
+        every = _meaning(problem, parameter_values(self.optimum))
+        undetermined = _undetermined(self.optimum, every)
+        if self.stated is not None:
+            every = _meaning(problem, {name: p.value for name, p in self.stated.items()})
+        return every | dict.fromkeys(undetermined, np.nan)
 
     @property
     def resemblances(self) -> list[str]:
@@ -180,7 +192,7 @@ class ComparedModel:
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Models side by side; the first is the one that was fitted.
+    """Models side by side; the first is the one that was fitted, with what it states.
 
     Attributes
     ----------
@@ -188,9 +200,6 @@ class ModelComparison:
         Those that could be fitted.
     failed : mapping of str to str
         Why the others could not.
-    stated : mapping of str to float or None
-        What all laws have in common, at the estimate of the first that counts every source of
-        error; None where there is none. The models compared weigh rows by their noise alone.
 
     Examples
     --------
@@ -202,7 +211,6 @@ class ModelComparison:
 
     models: tuple[ComparedModel, ...]
     failed: Mapping[str, str]
-    stated: Mapping[str, float] | None = None
 
     @cached_property
     def best(self) -> ComparedModel:
@@ -294,8 +302,6 @@ class ModelComparison:
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
         lines.append(table([["", *self.common], *self.meanings]))
-        if self.stated is not None:
-            lines.append(f"{_STATED}: the parameters as stated; the others weigh noise alone.")
         lines += [text for m in self.models for text in m.resemblances]
         lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
@@ -329,10 +335,8 @@ class ModelComparison:
 
     @property
     def meanings(self) -> list[list[str]]:
-        """Quantities common to all laws, one row a model, the stated estimate first."""
-        pairs = [] if self.stated is None else [(_STATED, self.stated)]
-        pairs += [(m.name, m.meaning) for m in self.models]
-        return [[name, *(_number(meaning[key]) for key in self.common)] for name, meaning in pairs]
+        """Quantities common to all laws, one row a model."""
+        return [[m.name, *(_number(m.meaning[key]) for key in self.common)] for m in self.models]
 
     def to_frame(self) -> Any:
         """Return a pandas table: one row a model."""
@@ -387,12 +391,12 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     }
 
 
-def _undetermined(optimum: Optimum, found: Mapping[str, float]) -> list[str]:
+def _undetermined(optimum: Optimum, every: Mapping[str, float]) -> list[str]:
     """Return which quantities are not determined, by the first-order error of their logarithms."""
-    names, theta = [key for key in found if not key.startswith("energy")], optimum.theta
+    names, theta = [key for key in every if not key.startswith("energy")], optimum.theta
     if not optimum.converged:
         return names
-    before = np.array([found[name] for name in names])
+    before = np.array([every[name] for name in names])
     changes = np.zeros((len(names), len(theta)))
     for i, size in enumerate(np.maximum(1.0, np.abs(theta)).tolist()):
         for step in (-RELATIVE_STEP * size, RELATIVE_STEP * size):
@@ -474,7 +478,7 @@ def compare_models(
             "{'stiff': Dahl() + Spring()}"
         )
     optimum, failed = fit.optimum, {}
-    fitted = [ComparedModel("as fitted", optimum, predictive_density(optimum))]
+    fitted = [ComparedModel("as fitted", optimum, predictive_density(optimum), stated=fit.params)]
     if models is None:
         offered = dict(_candidates(optimum, fitted[0].density))
     else:
@@ -486,11 +490,7 @@ def compare_models(
             fitted.append(ComparedModel(name, other, density, reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
-    first = fitted[0].meaning
-    stated = _meaning(optimum.problem, {name: p.value for name, p in fit.params.items()})
-    stated |= {key: value for key, value in first.items() if np.isnan(value)}
-    same = stated == first
-    return ModelComparison(tuple(fitted), failed, None if same else stated)
+    return ModelComparison(tuple(fitted), failed)
 
 
 def _solved(optimum: Optimum, model: Model, *, own: bool) -> Optimum:

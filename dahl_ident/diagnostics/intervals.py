@@ -278,6 +278,15 @@ class Disagreement(NamedTuple):
 class IntervalComparison:
     """Intervals of several methods side by side, with the limits on which they disagree.
 
+    Attributes
+    ----------
+    intervals : tuple of ConfidenceIntervals
+        Those that count noise alone, the most trusted last.
+    disagreements : tuple of Disagreement
+        Limits on which one of them differs from the last.
+    stated : ConfidenceIntervals
+        Those that count every source of error, as the fit states them.
+
     Examples
     --------
     >>> import dahl_ident as di
@@ -289,19 +298,24 @@ class IntervalComparison:
 
     intervals: tuple[ConfidenceIntervals, ...]
     disagreements: tuple[Disagreement, ...]
+    stated: ConfidenceIntervals
 
     def __str__(self) -> str:
-        parts = [str(one) for one in self.intervals]
+        parts = [str(one) for one in (self.stated, *self.intervals)]
         if not self.disagreements:
-            return "\n\n".join([*parts, "The methods agree."])
+            return "\n\n".join([*parts, "The methods that count noise alone agree."])
         by_interest = sorted(self.disagreements, key=lambda d: -abs(d.level - LEVELS[1]))
         shown = {(d.name, d.methods[0], d.side): d for d in by_interest}  # one level is enough
         lines = [str(shown[key]) for key in sorted(shown)]
-        return "\n\n".join([*parts, "\n".join(["The methods disagree:", *lines])])
+        lines.insert(0, "The methods that count noise alone disagree:")
+        return "\n\n".join([*parts, "\n".join(lines)])
 
 
 def compare(
-    optimum: Optimum, intervals: Sequence[ConfidenceIntervals], tolerance: float = 0.2
+    optimum: Optimum,
+    intervals: Sequence[ConfidenceIntervals],
+    stated: ConfidenceIntervals,
+    tolerance: float = 0.2,
 ) -> IntervalComparison:
     """Return where each method differs from the last by more than `tolerance` half widths."""
     if len(intervals) < 2:
@@ -331,7 +345,7 @@ def compare(
                 )
                 for level, i in np.argwhere(apart).tolist()
             ]
-    return IntervalComparison(tuple(intervals), tuple(found))
+    return IntervalComparison(tuple(intervals), tuple(found), stated)
 
 
 def _search(optimum: Optimum, values: FloatArray) -> FloatArray:

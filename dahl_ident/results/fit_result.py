@@ -265,7 +265,8 @@ class FitResult(Result):
         Parameters
         ----------
         methods : sequence of str, default ("wald", "bootstrap", "profile")
-            The last is the most trusted; each of the others is compared with it.
+            Those that count noise alone. The last is the most trusted; each of the others is
+            compared with it. The combined intervals stand in front of them.
         levels : float or sequence of float, default 0.6827, 0.9545, 0.9973
             Confidence levels.
 
@@ -279,9 +280,8 @@ class FitResult(Result):
         ValidationError
             If there are fewer than two methods, one is unknown, or a level is impossible.
         """
-        return compare(
-            self.assessment.by_noise, [self.conf_interval(method, levels) for method in methods]
-        )
+        intervals = [self.conf_interval(method, levels) for method in methods]
+        return compare(self.assessment.by_noise, intervals, self.conf_interval(levels=levels))
 
     def budget(self) -> Budget:
         """Return the uncertainty budget: each parameter's sources, combined and expanded.
