@@ -24,6 +24,7 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.error_model import error_model
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
@@ -128,12 +129,16 @@ class ComparedModel:
         parameters = o.problem.parameters[:count]
         return list(zip(parameters, o.values.tolist(), o.stderr.values(), strict=False))
 
-    @property
+    @cached_property
     def is_determined(self) -> bool:
         """Whether the data determine every parameter to a factor, or how near to zero it is.
 
-        Not each of a law's like parts, as Maxwell slip has them: their sums are what it says.
+        By every source of error of a table's fit. Not each of a law's like parts, as Maxwell slip
+        has them: their sums are what it says.
         """
+        errors = None
+        if self.optimum.problem.kind == "table":
+            errors = error_model(self.optimum)
         parts = set[str]()
         for element in self.optimum.problem.model.elements:
             labels = {label for part in element.like_parts for label in part}
@@ -146,7 +151,12 @@ class ComparedModel:
             return float(np.median(sizes)) * may_be_zero
 
         return all(
-            np.isfinite(value) and (p.name in parts or error < _VAGUE * max(abs(value), size(p)))
+            np.isfinite(value)
+            and (
+                p.name in parts
+                or (error if errors is None else errors.stderr[p.name])
+                < _VAGUE * max(abs(value), size(p))
+            )
             for p, value, error in self._of_device
         )
 
@@ -247,17 +257,16 @@ class ModelComparison:
 
     @cached_property
     def _likeliest(self) -> ComparedModel:
-        first = self.models[0]
-        possible = [m for m in self.models if m is first or self._is_sound(m)]
-        return max(possible, key=lambda model: model.density.total)
+        falling = sorted(self.models, key=lambda model: -model.density.total)
+        return next(m for m in falling if m is self.models[0] or self._is_sound(m))
 
     @cached_property
     def _simplest(self) -> ComparedModel:
-        first, alike = self.models[0], []
+        alike = []
         for model in self.models:
             gain, error = self._likeliest.density.gain_over(model.density)
-            sound = model is first or self._is_sound(model)
-            if sound and gain <= max(error, _BY_CHANCE):
+            near = gain <= max(error, _BY_CHANCE)
+            if near and (model is self.models[0] or self._is_sound(model)):
                 alike.append(model)
         return min(alike, key=lambda model: (len(model.optimum.names), -model.density.total))
 
@@ -266,7 +275,7 @@ class ModelComparison:
         sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in keys]
         absurd = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
         worse = model.density.loss_of_fundamentals(self.models[0].density) > _WORSE
-        return model.is_determined and model.is_physical and not absurd and not worse
+        return model.is_physical and not absurd and not worse and model.is_determined
 
     @property
     def headline(self) -> str:
