@@ -100,6 +100,25 @@ def test_each_device_is_a_row_and_a_failure_is_one_too(tmp_path: Path) -> None:
     assert (table["seconds"] > 0).all()
 
 
+def test_a_fit_without_an_uncertainty_is_left_out_and_named(tmp_path: Path) -> None:
+    """Data without noise leave nothing to estimate an uncertainty from, but a trusted fit."""
+    make_tables(tmp_path, 4)
+    di.load_dataset("clean").save(tmp_path / "d001_r0.csv", overwrite=True)
+    content = definition(tmp_path) | {"model": [{"kind": "dahl", "alpha": 1}]}
+    done = di.campaign(content, jobs=1)
+    assert done.table["status"].tolist() == ["trusted"] * 4
+    evaluated = population(done.table)
+    assert (evaluated.used, sum(evaluated.left_out.values())) == (3, 1)
+    assert evaluated["f_max"].devices.index.tolist() == ["d000", "d002", "d003"]
+    text = done.report(tmp_path / "campaign.html").read_text(encoding="utf-8")
+    assert "Population: f_max" in text
+    assert "d001: trusted without a finite uncertainty" in text
+    for device in (0, 2, 3):
+        di.load_dataset("clean").save(tmp_path / f"d00{device}_r0.csv", overwrite=True)
+    nobody = di.campaign(content, jobs=1).report(tmp_path / "campaign.html", overwrite=True)
+    assert "there is no population" in nobody.read_text(encoding="utf-8")
+
+
 def test_one_fit_a_run(tmp_path: Path) -> None:
     make_tables(tmp_path, 2, runs=3)
     table = di.campaign(definition(tmp_path, output__per="run"), jobs=1).table

@@ -289,9 +289,9 @@ def population(
 
     Notes
     -----
-    Fits whose status is neither trusted nor approximate are left out, and counted. Devices outside
-    the population are named, and take no part in its mean, scatter and coefficients, nor in the
-    limits of control charts.
+    Fits whose status is neither trusted nor approximate, or that have no finite uncertainty, are
+    left out, and counted. Devices outside the population are named, and take no part in its mean,
+    scatter and coefficients, nor in the limits of control charts.
 
     Examples
     --------
@@ -307,6 +307,7 @@ def population(
     """
     names = _parameters(table, parameters)
     _require(table, ["device", "status", *covariates, *([order] if order else [])])
+    table = marked(table, names)
     usable = table["status"].isin(USABLE).to_numpy()
     left_out = table.loc[~usable, "status"].value_counts().to_dict()
     chosen = table.loc[usable]
@@ -321,15 +322,27 @@ def population(
     return Population(evaluated, len(chosen), {str(k): int(v) for k, v in left_out.items()})
 
 
+def marked(table: pd.DataFrame, parameters: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return the table with a status that says so where a usable fit has no finite uncertainty."""
+    names = _estimated(table) if parameters is None else parameters
+    u = table[[f"u_{name}" for name in names]].replace(np.inf, np.nan)
+    without = table["status"].isin(USABLE) & (u.isna().any(axis=1) | u.empty)
+    status = table["status"].astype(str)
+    return table.assign(status=status.mask(without, status + " without a finite uncertainty"))
+
+
 def _parameters(table: pd.DataFrame, names: Sequence[str] | None) -> list[str]:
     if names is not None:
         _require(table, [column for name in names for column in (name, f"u_{name}")])
         return list(names)
-    columns = [str(c) for c in table if f"u_{c}" in table]
-    estimated = [c for c in columns if not c.startswith("posterior_")]
-    if not estimated:
+    if not (estimated := _estimated(table)):
         raise DataError("the table has no parameter with an uncertainty (columns p and u_p)")
     return estimated
+
+
+def _estimated(table: pd.DataFrame) -> list[str]:
+    columns = [str(c) for c in table if f"u_{c}" in table]
+    return [c for c in columns if not c.startswith("posterior_")]
 
 
 def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:

@@ -130,9 +130,9 @@ class Campaign:
             `overwrite` is not set.
         """
         from dahl_ident.campaigns.campaign_report import write_campaign_report
-        from dahl_ident.campaigns.population import USABLE, population
+        from dahl_ident.campaigns.population import USABLE, marked, population
 
-        table = self.table
+        table = marked(self.table)
         enough = table.loc[table["status"].isin(USABLE), "device"].nunique() >= 3
         evaluated = population(table, covariates=covariates, order=order) if enough else None
         reports = self.folder / "reports"
