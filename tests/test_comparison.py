@@ -285,3 +285,20 @@ def test_a_model_that_spoils_the_fundamental_is_not_better() -> None:
     assert gap.density.gain_over(plain.density)[0] > 20.0
     assert gap.density.misfit > 1.5 * plain.density.misfit
     assert comparison.best is plain
+
+
+def test_a_force_that_falls_with_the_speed_asks_for_lugre() -> None:
+    """From no guess, next to harmonics that say nothing."""
+    law, n = LuGre(0.1, 350.0, 1.94, 0.01), 10
+    A = np.tile(np.repeat(0.1 / 350.0 * np.geomspace(0.1, 10.0, n), 2), 3)
+    f, rng, parts = np.tile([1.0, 3.0], 3 * n), np.random.default_rng(3), []
+    size = 0.01 * np.abs(law.dynamic_stiffness(A, 2.0 * np.pi * f))
+    for order in (1, 2, 3):
+        N = law.dynamic_stiffness(A, 2.0 * np.pi * f, harmonic=order)
+        N = N + size * (rng.standard_normal((len(A), 2)) @ [1.0, 1.0j])
+        noise, which = size[:, None, None] ** 2 * np.eye(2), np.full(len(A), order)
+        parts.append(FrequencyResponse(f, N, A, harmonic=which, covariance=noise))
+    given = fit(FrequencyResponse.concatenate(parts), Dahl(), throw=False)
+    best = compare_models(given).best
+    assert best.name == "LuGre"
+    assert best.optimum.values[:3] == pytest.approx([0.1, 350.0, 1.94], rel=0.05)

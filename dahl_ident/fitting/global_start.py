@@ -57,7 +57,7 @@ _LEAST, _TOGETHER = 4, 20  # amplitudes of a table; those that are computed toge
 _HIGHEST = 3  # harmonic that takes part in a start; higher ones cost more and tell little more
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
-_MOST_LOOPS, _MOST_ROWS = 10_000, 40  # of a law that depends on the rate: a second or two
+_MOST_LOOPS, _MOST_ROWS = 10_000, 20  # of a law that depends on the rate: a second or two
 _MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
 _ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
@@ -297,8 +297,12 @@ def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
     rows = np.flatnonzero(view.harmonic <= _HIGHEST)
     rows = rows if rows.size else np.arange(view.harmonic.size)
     if any(_takes_loops(d) for d in searched) and rows.size > _MOST_ROWS:
-        chosen = np.random.default_rng(1).choice(rows.size, _MOST_ROWS, replace=False)
-        rows = rows[np.sort(chosen)]
+        first = view.harmonic[rows] == 1
+        rows = rows[first] if first.any() else rows
+        amplitude = view.amplitude.reshape(-1, view.harmonic.size)[0]
+        order = np.lexsort((amplitude[rows], view.omega[rows]))
+        chosen = np.linspace(0, rows.size - 1, min(rows.size, _MOST_ROWS)).round().astype(int)
+        rows = np.sort(rows[order[chosen]])
     if rows.size < view.harmonic.size:
         view = view.of_rows(rows)
     each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
