@@ -292,6 +292,22 @@ def test_an_exponent_stated_wrongly_is_not_described(alpha: float) -> None:
     assert right.trusted, right.verdict
 
 
+@pytest.mark.parametrize(("alpha", "seed"), [(0.9, 0), (0.7, 1)])
+def test_misfit_of_a_stated_exponent_does_not_pass_as_noise(alpha: float, seed: int) -> None:
+    """A motion of twelve tones, both channels noisy."""
+    rng, t = np.random.default_rng(seed), np.arange(4000) / 500.0
+    tones = np.array([0.3, 0.5, 0.8, 1.1, 1.7, 2.3, 2.9, 3.7, 4.4, 5.3, 6.1, 7.3])
+    phases, sizes = rng.uniform(0.0, 2.0 * np.pi, 12), 3e-3 * rng.uniform(0.5, 1.0, 12)
+    x = np.sin(2.0 * np.pi * np.outer(t, tones) + phases) @ (sizes / tones**0.7)
+    force = di.Dahl(0.1, 30.0, alpha).force(x) + 5e-4 * rng.standard_normal(t.size)
+    record = di.Record(t, displacement=x + 1e-6 * rng.standard_normal(t.size), force=force)
+    wrong, right = (di.fit(record, di.Dahl(alpha=one)) for one in (1.0, alpha))
+    assert wrong.status == "not described"
+    (found,) = (f.values["wanted"] for f in wrong.findings if f.code == "stated_exponent")
+    assert float(found.split()[0]) == pytest.approx(alpha, abs=0.005)
+    assert right.trusted, right.verdict
+
+
 def test_the_window_of_differentiation_is_in_the_budget() -> None:
     """A mass that moves in jerks, of which the filter of the acceleration takes a part away."""
     t, x = moving(4)

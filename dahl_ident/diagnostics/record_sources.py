@@ -89,9 +89,9 @@ def held_exponents(
 ) -> tuple[HeldValue, ...]:
     """Return what the records say of each exponent that the fit holds, stated or not.
 
-    By a Gauss-Newton step from the estimate, or by a search where they contradict it. As for
-    tables, the range counts as a uniform distribution of the logarithm, and for less where the
-    records say more.
+    By a search with a stated exponent free; with an assumed one, which the estimate fits already,
+    by a Gauss-Newton step, and a search where that leads far. As for tables, the range counts as a
+    uniform distribution of the logarithm, and for less where the records say more.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def held_exponents(
         asked, s = float(step[place]), (high - low) / 12.0**0.5
         mean = float(np.clip(asked, low, high))
         std, by_records, contribution = _counted(joint, residuals, noise, place, mean, s, moved)
-        if abs(asked) > max(_LONG, _CONTRADICTED * by_records):
+        if not p.assumed or abs(asked) > max(_LONG, _CONTRADICTED * by_records):
             asked, by_records = _asked(problem, p.name, values) or (asked, by_records)
         held.append(
             HeldValue(
@@ -147,14 +147,20 @@ def _exponent_slopes(
 
 
 def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float, float] | None:
-    """Return the logarithm of an exponent's estimate over its value, and its standard deviation."""
-    free = problem.freed([name])
+    """Return the logarithm of an exponent's estimate over its value, and its standard deviation.
+
+    The displacement's noise is estimated anew: what was taken out of the records with the exponent
+    held may be misfit. None where that describes the records better.
+    """
+    search, free = RecordSearch("lm", "linear"), problem.freed([name])
     place = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
-    end = RecordSearch("lm", "linear").descend(
-        free, free.to_search(np.insert(values, place, value)), STEPS
-    )
-    if not end.converged[0]:
+    begin = free.to_search(np.insert(values, place, value))
+    held, free = float(free.quadratic(begin).cost), free.without_noise(0.0)
+    end = search.descend(free, begin, STEPS)
+    if problem.output == "force":
+        free, end = search.without_noise(free, end)
+    if not end.converged[0] or not end.cost[0] < held:
         return None
     at = free.to_values(end.theta[0])
     predicted = [free.predict(at, number) for number in range(len(problem.records))]
