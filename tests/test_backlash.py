@@ -150,21 +150,21 @@ def test_two_limits_behind_a_gap_are_those_of_the_general_loop() -> None:
             assert np.all(error < 1e-6 * size * A / (A - 0.5 * gap))
 
 
-@pytest.mark.parametrize("start", [0.4, -0.4])
+@pytest.mark.parametrize("start", [0.55, -0.55])
 def test_a_history_that_starts_in_contact_changes_with_the_gap(start: float) -> None:
     """The engine's derivative, for a law without a closed form."""
     x = 2.0 * np.sin(0.05 * np.arange(300.0))
     law = Backlash(Dahl(1.0, 3.0, 1.5))
     values = [1.0, 3.0, 1.5, 0.8]
     by_gap = law.force_history_gradient(values, x, state=start).by_parameter[-1]
-    ends = [law.force_history([*values[:3], 0.8 + h], x, state=start) for h in (1e-5, -1e-5)]
-    slope = (ends[0] - ends[1]) / 2e-5
+    ends = [law.force_history([*values[:3], 0.8 + h], x, state=start) for h in (1e-4, -1e-4)]
+    slope = (ends[0] - ends[1]) / 2e-4
     assert np.max(np.abs(slope)) > 0.1
     np.testing.assert_allclose(by_gap, slope, atol=1e-6)
 
 
 @pytest.mark.parametrize("asymmetry", [0.0, 0.3])
-@pytest.mark.parametrize("start", [0.0, 0.4])
+@pytest.mark.parametrize("start", [0.0, 0.3, 0.5])
 def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None:
     """Against the tables that every law takes, and its derivatives against differences."""
     rng = np.random.default_rng(5)

@@ -95,6 +95,19 @@ def test_a_gap_in_a_driven_record_makes_two_parts() -> None:
         assert_found(case._replace(record=with_gap(case.record, 350, 430)))
 
 
+@pytest.mark.parametrize("seed", [414, 416])
+def test_springs_have_forces_of_their_own_after_a_gap(seed: int) -> None:
+    case = cold.slips(seed)
+    with pytest.warns(DataWarning, match="2 parts are fitted"):
+        assert_found(case._replace(record=with_gap(case.record, 200, 260)))
+
+
+def test_friction_slips_behind_a_gap_where_a_record_goes_on() -> None:
+    case = cold.play(2.0, 412)
+    with pytest.warns(DataWarning, match="2 parts are fitted"):
+        assert_found(case._replace(record=with_gap(case.record, 700, 1100)))
+
+
 def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers() -> None:
     """In the gap the displacement turns several times: a straight way through it is wrong."""
     case = cold.play(0.5, 0)

@@ -14,6 +14,7 @@ from dahl_ident.elements import (
     Dahl,
     Damper,
     Element,
+    Iwan,
     Mass,
     MaxwellSlip,
     Model,
@@ -78,30 +79,34 @@ def test_the_slope_of_a_delay_is_a_difference_of_later_drives() -> None:
 @pytest.mark.parametrize(
     ("law", "values", "start"),
     [
-        (MaxwellSlip(2) + LINEAR, [*STIFFNESSES, *SLIPS], 3.0),
-        (Backlash(Dahl()) + LINEAR, [F_MAX, SIGMA, GAP], 2.5e-4),
+        (MaxwellSlip(2) + LINEAR, [*STIFFNESSES, *SLIPS], [0.3, -0.6]),
+        (Backlash(Dahl()) + LINEAR, [F_MAX, SIGMA, GAP], [2.5e-4]),
     ],
 )
 def test_sensitivities_of_slips_and_gaps_are_derivatives(
-    law: Element, values: list[float], start: float
+    law: Element, values: list[float], start: list[float]
 ) -> None:
     driven = Driven(law, multisine(64)[0], RATE)
-    starts = np.array([1e-4, 0.01, start])
+    starts = np.array([1e-4, 0.01, *start])
     _, found = slopes(driven, starts, np.array(values))
     for i, expected in enumerate(differences(driven, starts, np.array(values), 1e-3)):
         error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
         assert error < 2e-6, i
 
 
-def test_springs_start_where_the_backbone_has_the_force() -> None:
-    law = MaxwellSlip(SLIPS, STIFFNESSES)
-    values = [*STIFFNESSES, *SLIPS]
+def test_sliders_of_iwan_start_where_their_backbone_has_the_force() -> None:
+    law, values = Iwan(), [F_MAX, SIGMA, -0.5, 1.0]
+    stiffnesses, places = law.sliders(values)
     for x in (-3e-4, 1e-4, 4e-4, 9e-4):
-        force = float(
-            np.sign(x) * law.backbone([np.asarray(v) for v in values], np.asarray(abs(x)))
-        )
-        expected = [k * np.clip(x, -d, d) for k, d in zip(STIFFNESSES, SLIPS, strict=True)]
-        assert law.initial_states(values, force) == pytest.approx(expected)
+        forces = [k * np.clip(x, -d, d) for k, d in zip(stiffnesses, places, strict=True)]
+        assert law.initial_states(values, [sum(forces)]) == pytest.approx(forces)
+
+
+def test_springs_start_with_shares_of_the_forces_at_which_they_slip() -> None:
+    law = MaxwellSlip(SLIPS, STIFFNESSES)
+    values, loads = [*STIFFNESSES, *SLIPS], np.linspace(0.9, -0.7, len(SLIPS))
+    expected = [k * d * load for k, d, load in zip(STIFFNESSES, SLIPS, loads, strict=True)]
+    assert law.initial_states(values, loads.tolist()) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("periodic", [True, False])

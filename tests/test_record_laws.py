@@ -79,9 +79,8 @@ def test_force_from_displacement(truth: Element, model: Element, kind: str) -> N
     samples = 600
     x = displacement(kind, samples)
     v, _ = differentiated(x, 1.0 / RATE)
-    values = [float(p.value or 0.0) for p in truth.parameters]
     start = 0.02 if truth.has_memory and not isinstance(truth, di.MaxwellSlip) else 0.0
-    force = truth.force_history(values, x, v, start)
+    force = truth.force(x, velocity=v, initial_force=start)
     force = force + 5e-4 * np.random.default_rng(1).standard_normal(samples)
     record = di.Record(np.arange(samples) / RATE, displacement=x, force=force)
     assert_recovered(di.fit(record, model, throw=False), truth)

@@ -71,7 +71,7 @@ class Backlash(Friction):
     """
 
     kind = "backlash"
-    start = ("initial_play", "m", "place in the gap at the first sample; beyond it in contact")
+    starts = (("initial_play", "m", "place in the gap at the first sample; beyond it in contact"),)
     equation = "F = F_element(y), y = x - play, abs(play) <= gap/2; the play moves at F = 0"
 
     def __init__(self, element: Element, gap: float | None = None) -> None:
@@ -123,18 +123,19 @@ class Backlash(Friction):
         """The force, and the place in the gap."""
         return 2
 
-    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
-        """Return the force and the place in the gap; beyond its ends the element is loaded."""
-        half = 0.5 * values[-1]
-        play = clipped(start, half)
+    def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
+        """Return the force and the place in the gap; beyond its ends the element is a spring."""
+        (start,) = starts
+        play = clipped(start, 0.5 * values[-1])
         return self.slope(0.0, 1.0, 0.0, values) * (start - play), play
 
-    def first_states(
-        self, values: Sequence[float], force: float
-    ) -> tuple[Sequence[float], Mapping[int, tuple[int, float]]]:
-        """Return the force, and the place in the gap: at its end in contact, or in the middle."""
-        end = 0.5 * float(np.sign(force))
-        return (force, end * float(values[-1])), {len(values) - 1: (1, end)}
+    def start_with(self, values: Sequence[Any], force: float) -> float:
+        """Return a place in contact, as far beyond the gap as a spring has the force, or 0."""
+        return float(np.sign(force) * 0.5 * values[-1] + force / self._stiffness(values))
+
+    def _stiffness(self, values: Sequence[Any]) -> float:
+        """Return the stiffness of the element at zero force."""
+        return float(self.slope(0.0, 1.0, 0.0, values))
 
     def _loops(
         self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
@@ -148,9 +149,11 @@ class Backlash(Friction):
         """Return the force at every sample with its derivatives, unchecked."""
         if float(values[-1]) >= _NARROWEST * float(np.abs(np.diff(path.displacement)).sum()):
             return super().history(values, path, state, slopes=slopes)
-        found = self.element.history(values[:-1], path, state, slopes=slopes)
+        stiffness = self._stiffness(values)
+        found = self.element.history(values[:-1], path, stiffness * state, slopes=slopes)
         zero = np.zeros(path.displacement.shape)
-        return found._replace(by_parameter=(*found.by_parameter, zero))
+        by_parameter = (*found.by_parameter, zero)
+        return found._replace(by_state=stiffness * found.by_state, by_parameter=by_parameter)
 
     def rest_stiffness(self, values: Values) -> FloatArray:
         """Return 0: small motions do not cross the gap."""

@@ -52,7 +52,9 @@ class Behaviour(ABC):
     like_parts: tuple[tuple[str, ...], ...] = ()
     softens: bool = False
     holds_at_rest: bool = True
-    start: tuple[str, str, str] = ("initial_force", "N", "friction at the first sample")
+    starts: tuple[tuple[str, str, str], ...] = (
+        ("initial_force", "N", "friction at the first sample"),
+    )
     _name: str | None = None
 
     @property
@@ -130,10 +132,11 @@ class Behaviour(ABC):
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force at every sample, `state` at the first, and its derivatives, unchecked.
+        """Return the force at every sample with its derivatives, unchecked.
 
-        Without `slopes` the derivatives are not looked at. An element that has none of its own
-        may leave them to :meth:`_differences`.
+        `state` is the unknown at the first sample: the force there, in most laws. Without `slopes`
+        the derivatives are not looked at. An element that has none of its own may leave them to
+        :meth:`_differences`.
         """
         raise ModelError(f"{self!r} has no force over time")
 
@@ -212,12 +215,16 @@ class Behaviour(ABC):
         """Whether a force determines the motion of the element."""
         return any(p.is_mass for p in self.parameters)
 
-    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
-        """Return the states at the first sample, in plain arithmetic, from the unknown there.
+    def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
+        """Return the states at the first sample, in plain arithmetic, from the unknowns there.
 
         The states of an element without memory are unknowns themselves.
         """
-        return (start,) * self.n_states
+        return starts
+
+    def start_with(self, values: Sequence[Any], force: float) -> float:
+        """Return the unknown at the first sample with which a history starts with a force."""
+        return force
 
     def sampled(self, interval: float) -> Self:
         """Return this element for histories of one sampling interval, s."""

@@ -251,6 +251,7 @@ class Element(Behaviour):
             a = np.gradient(v, t) if a is None else a
             if is_even(t):
                 element = self.sampled(float(t[-1] - t[0]) / (x.size - 1))
+        start = self.start_with(values, start)
         force = element.force_history(values, np.atleast_1d(x), v, start, acceleration=a)
         return force if x.ndim else force[0]
 
@@ -353,6 +354,10 @@ class Model(Element):
         value = np.asarray(sum(part.value for part in parts))
         by_state = np.asarray(sum(part.by_state for part in parts))
         return HistoryGradient(value, by_state, tuple(d for p in parts for d in p.by_parameter))
+
+    def start_with(self, values: Sequence[Any], force: float) -> float:
+        """Return the unknown of the friction, of which there is one if there is a force."""
+        return sum(e.start_with(own, force) for e, own in self.of(values) if e.has_memory)
 
     @property
     def has_inertia(self) -> bool:

@@ -143,9 +143,9 @@ class FirstState:
         states = list(unknown)
         with numpy_names():
             for element, own in model.of(values):
-                count = 1 if element.has_memory else element.n_states
+                count = len(element.starts) if element.has_memory else element.n_states
                 mine = [ca.SX.sym(f"start{len(unknown) + i}") for i in range(count)]
-                states += element.initial_states(own, mine[0]) if element.has_memory else mine
+                states += element.initial_states(own, mine)
                 unknown += mine
         first, starts, parameters = (ca.vertcat(*group) for group in (states, unknown, values))
         slopes = [ca.densify(ca.jacobian(first, group)) for group in (starts, parameters)]
@@ -159,7 +159,7 @@ class FirstState:
         Parameters
         ----------
         starts : ndarray, shape (m,)
-            Displacement, velocity, the start of each element with memory, and the states of those
+            Displacement, velocity, the starts of each element with memory, and the states of those
             without.
         values : ndarray, shape (P,)
             Of all parameters.

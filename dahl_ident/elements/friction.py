@@ -9,7 +9,7 @@ methods.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,6 +86,8 @@ class Friction(Element):
     has_memory = True
     one_state: bool = True
     """Whether the present force is the only state of the law."""
+    springs_start_apart: bool = False
+    """Whether the unknowns at the first sample of a record are loads of springs."""
 
     def __init__(
         self, *values: float | None, name: str | None = None, **named: float | None
@@ -160,14 +162,14 @@ class Friction(Element):
         slope = self.slope(force, direction, velocity, values)
         return Mechanics(0.0, self.output(force, slope, velocity, values), (slope * velocity,))
 
-    def first_states(
-        self, values: Sequence[float], force: float
-    ) -> tuple[Sequence[float], Mapping[int, tuple[int, float]]]:
-        """Return the states from which a held motion starts with a force.
+    def start_bounds(self, values: Values) -> tuple[float, float]:
+        """Return between which numbers the unknowns at the first sample are: forces of full slip.
 
-        And by parameter the state that changes with it, and its slope.
+        Beyond them friction falls back within a small part of x_c, so that hardly anything tells
+        how far beyond it began.
         """
-        return (force,), {}
+        up, down = (float(force) for force in self.force_limits(values))
+        return self.start_with(values, -down), self.start_with(values, up)
 
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 of the settled loop; derivatives are 0 where a parameter is fixed.
@@ -324,7 +326,8 @@ class Friction(Element):
         """Return the force on the settled loop at rising angles from 0 to 2 pi."""
         angle = np.union1d(theta, np.pi)  # where the motion turns
         x, v = amplitude * np.cos(angle), -amplitude * np.sin(angle)
-        force = self.force_history(values, x, v, self._top(values, amplitude))
+        start = self.start_with(values, self._top(values, amplitude))
+        force = self.force_history(values, x, v, start)
         return force[np.searchsorted(angle, theta)]
 
     def _top(self, values: Sequence[float], amplitude: float) -> float:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.equations import law_equations
+from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.equations import FirstState, law_equations
 from dahl_ident.elements.facts import HistoryGradient, Path
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _SYSTEMS: dict[Hashable, System] = {}
 """Compiled equations by law; not kept on the laws, which are sent to other processes."""
+_FIRST: dict[Hashable, FirstState] = {}
+"""How first states follow from what is unknown there, by law."""
 
 _SLOWEST = 1e-6  # of the largest speed
 _FINER = 10.0  # than a driven motion, where a step is not that across a narrow gap
@@ -42,6 +44,13 @@ def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -
 
         _SYSTEMS[form] = translate(law_equations(law))
     return _SYSTEMS[form]
+
+
+def _first_of(law: Element) -> FirstState:
+    form = _form(law)
+    if form not in _FIRST:
+        _FIRST[form] = FirstState(as_model(law))
+    return _FIRST[form]
 
 
 def _form(law: Element) -> Hashable:
@@ -73,13 +82,13 @@ def force_along(
     law: Friction,
     values: Sequence[Any],
     path: Path,
-    state: float,
+    state: float | FloatArray,
     chosen: Sequence[int] | None = None,
 ) -> HistoryGradient:
     """Return the force at every sample of a displacement, with the derivatives `chosen`, others 0.
 
     Between samples the displacement is monotone, and its speed constant: the mean of the two
-    samples where the law depends on it. `state` is the force at the first sample.
+    samples where the law depends on it. `state` is the unknown, or the unknowns, at the first.
     """
     from dahl_ident.engine import march
 
@@ -96,25 +105,25 @@ def force_along(
         heading = np.sign(steps[moves])
         corners = np.append(0, moves[1:][heading[1:] != heading[:-1]])
     corners = np.append(corners, x.size - 1)
-    by = np.zeros((len(values), x.size))
-    force, by_state = np.full(x.shape, state), np.ones(x.shape)
-    if moves.size:
+    starts = np.append([x[0], 0.0], state)
+    first, by_start, by_value = _first_of(law)(starts, numbers)
+    by, by_first = np.zeros((len(values), x.size)), np.zeros((x.size, first.size))
+    if not moves.size:
+        part = law.mechanics(values, x[0], 0.0, 1.0, first[2:].tolist())
+        force = np.full(x.shape, first[2] if velocity is not None else part.force)
+    else:
         samples, rows = np.unique(times, return_inverse=True)
-        states, change = law.first_states(numbers.tolist(), state)
         motion = march(
             system_of(law, values, chosen or ()), times[corners],
             np.stack([x[corners[:-1]], np.diff(x[corners])]), samples,
-            np.array([x[corners[0]], 0.0, *states]), numbers, chosen=chosen or (),
+            np.append([x[corners[0]], 0.0], first[2:]), numbers, chosen=chosen or (),
             derivatives=chosen is not None, finer=_FINER if law.n_states == 1 else 1.0,
         )  # fmt: skip
-        force = motion.states[rows, 2]
+        force = (motion.output if velocity is None else motion.states[:, 2])[rows]
         if chosen is not None:
-            by_first = motion.by_first[rows]
-            by_state, by[list(chosen)] = by_first[:, 2], motion.by_parameter[rows].T
-            for i, (place, slope) in change.items():
-                if i in chosen:
-                    by[i] += slope * by_first[:, 2 + place]
+            by_first, by[list(chosen)] = motion.by_first[rows], motion.by_parameter[rows].T
+            by[list(chosen)] += (by_first @ by_value[:, list(chosen)]).T
     if velocity is not None:
         slopes = law.slope(force, np.where(velocity < 0.0, -1.0, 1.0), velocity, values)
         force = np.asarray(law.output(force, slopes, velocity, values)) + 0.0 * force
-    return HistoryGradient(force, by_state, tuple(by))
+    return HistoryGradient(force, (by_first @ by_start[:, 2:]).squeeze(), tuple(by))

@@ -72,11 +72,11 @@ class Masing(Friction):
         ]
         return Mechanics(0.0, sum(states), rates)
 
-    def initial_states(self, values: Sequence[Any], start: Any) -> Sequence[Any]:
+    def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
         """Return the springs' forces where the backbone curve, loaded from rest, has a force."""
         stiffnesses, slips = self.sliders(values)
         place: Any = 0.0
-        reached, sticking, rest = place, sum(stiffnesses), start
+        reached, sticking, rest = place, sum(stiffnesses), starts[0]
         for k, d in zip(stiffnesses, slips, strict=True):
             taken = clipped(rest, sticking * (d - reached))
             place, rest = place + taken / sticking, rest - taken

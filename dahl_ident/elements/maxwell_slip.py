@@ -9,10 +9,20 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_array, whole_number
 from dahl_ident.elements.element import Element, prefixed
-from dahl_ident.elements.facts import Sine, StiffnessGradient, Values, each_harmonic
+from dahl_ident.elements.facts import (
+    HistoryGradient,
+    Path,
+    Sine,
+    StiffnessGradient,
+    Values,
+    each_harmonic,
+)
+from dahl_ident.elements.held_motion import force_along
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
+
+_NEARLY_SLIPS = 1.0 - 1e-6
 
 
 class MaxwellSlip(Masing):
@@ -56,6 +66,7 @@ class MaxwellSlip(Masing):
 
     kind = "maxwell_slip"
     equation = "F = sum of f_i, df_i/dx = k_i, |f_i| <= k_i d_i"
+    springs_start_apart = True
 
     def __init__(
         self,
@@ -141,6 +152,29 @@ class MaxwellSlip(Masing):
         """Return stiffnesses and slip displacements."""
         n = len(values) // 2
         return values[:n], values[n:]
+
+    @property
+    def starts(self) -> tuple[tuple[str, str, str], ...]:  # type: ignore[override]
+        """A load of every spring."""
+        meaning = "force of a spring at the first sample, over that at which it slips"
+        return tuple((f"initial_load_{i + 1}", "", meaning) for i in range(self.n_states))
+
+    def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
+        """Return the springs' forces."""
+        return [k * d * load for k, d, load in zip(*self.sliders(values), starts, strict=True)]
+
+    def start_bounds(self, values: Values) -> tuple[float, float]:
+        """Return those of the loads, just below slip: at slip a spring forgets its load."""
+        return -_NEARLY_SLIPS, _NEARLY_SLIPS
+
+    def history(
+        self, values: Sequence[Any], path: Path, state: float | FloatArray, *, slopes: bool
+    ) -> HistoryGradient:
+        """Return the force at every sample, unchecked: from loads of the springs, or a force."""
+        if not isinstance(state, np.ndarray):
+            return super().history(values, path, state, slopes=slopes)
+        free = [i for i, p in enumerate(self.parameters) if p.free]
+        return force_along(self, values, path, state, free if slopes else None)
 
     def __repr__(self) -> str:
         own = {

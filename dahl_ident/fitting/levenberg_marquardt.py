@@ -41,6 +41,8 @@ _LONGEST_STEP = 2.0  # of a logarithm
 _NOISE_TOLERANCE = 1e-8  # of a standard deviation of the residuals
 _REMAINDER = 3e-7  # standard deviations that the last step may leave
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
+_FLAT = 1e-3  # of the residuals' size, by which a coordinate from bound to bound changes them
+_NEAR = 0.01  # of the way between bounds: a last step of theirs
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
 _OF_ACCURACY = 0.3  # the same, where predictions are less accurate: of that accuracy
 _OVERTIME = 2.0  # times the steps of another search that has converged, and lower
@@ -229,6 +231,8 @@ def _minimise(
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
         short = settled
+        if bounds is not None:  # far steps of what hardly has an effect may lead anywhere
+            short = short & (np.abs(step) <= _NEAR * (bounds[1] - bounds[0])).all(axis=1)
         settled = settled | (enough is not None and predicted < enough(at.cost))
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
@@ -320,6 +324,7 @@ def _step(
     if bounds is not None:
         low, high = bounds
         held = ((at.theta <= low) & (g > 0.0)) | ((at.theta >= high) & (g < 0.0))
+        held |= size * (high - low) <= _FLAT * np.sqrt(at.cost)[:, None]
         g = np.where(held, 0.0, g)
         H = np.where(held[:, :, None] | held[:, None, :], np.eye(P), H)
     damped = H + damping[:, None, None] * np.eye(P)
@@ -334,7 +339,18 @@ def _step(
     if longest.max() > _LONGEST_STEP:
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
     if bounds is not None:
-        delta = (np.clip(at.theta + delta / size, low, high) - at.theta) * size
+        wide = delta
+        delta = (np.clip(at.theta + wide / size, low, high) - at.theta) * size
+        cut = delta != wide
+        if cut.any():  # the others' steps are best for those that end at a bound
+            at_bounds = np.where(cut, delta, 0.0)
+            g_there = np.where(cut, 0.0, g + (damped @ at_bounds[:, :, None])[:, :, 0])
+            free = np.where(cut[:, :, None] | cut[:, None, :], np.eye(P), damped)
+            rest = -np.linalg.solve(free + _ROUNDING * np.eye(P), g_there[:, :, None])[:, :, 0]
+            furthest = np.abs(rest / size * logarithmic).max(axis=1)
+            rest *= np.minimum(1.0, _LONGEST_STEP / np.maximum(furthest, 1e-300))[:, None]
+            delta = (np.clip(at.theta + (at_bounds + rest) / size, low, high) - at.theta) * size
+            longest = np.maximum(longest, furthest)
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     predicted = -(delta * g).sum(axis=1) - 0.5 * moves
     return delta / size, moves, np.maximum(predicted, 1e-300), longest

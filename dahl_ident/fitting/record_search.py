@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.behaviour import Behaviour
+from dahl_ident.elements import Friction
 from dahl_ident.errors import FitError, FitInterrupted, argument
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
@@ -137,9 +137,16 @@ class RecordSearch:
             if bool(end.converged[0]) or not np.isfinite(end.cost[0]) or steps == ROUGH:
                 return end
             if problem.output == "motion" and end.cost[0] > (1.0 - _STAGNANT) * before:
-                break
+                end = self._judged(problem, end)
+                if end.converged[0] or 2.0 * end.cost[0] > _GOOD * problem.n_residuals:
+                    return end
             begin, before = end.theta, float(end.cost[0])
+        return self._judged(problem, end)
+
+    def _judged(self, problem: RecordProblem, end: Minima) -> Minima:
+        """Return an end that has converged if the next step would not matter."""
         noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+        low, high = problem.step_bounds(problem.to_values(end.theta[0]), of_starts=True)
         # where a motion comes to rest, errors of its integration hide the last falls of the cost
         with np.errstate(all="ignore"):
             at = problem.quadratic(end.theta[0], self.scale, self.rho)
@@ -147,7 +154,10 @@ class RecordSearch:
                 return end
             size = np.sqrt(at.hessian.diagonal())
             size[size == 0.0] = 1.0  # what vanishes, such as a damper that these data do not need
-            slope = at.gradient / size
+            out = ((end.theta[0] <= low) & (at.gradient > 0.0)) | (
+                (end.theta[0] >= high) & (at.gradient < 0.0)
+            )
+            slope = np.where(out, 0.0, at.gradient / size)
             left = slope @ np.linalg.pinv(at.hessian / np.outer(size, size), hermitian=True) @ slope
         return replace(end, converged=np.array([bool(left < SETTLED**2 * noise)]))
 
@@ -490,9 +500,11 @@ def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
     """
     values = problem.to_values(theta)
     limits = {
-        e.start[0] if e.name is None else f"{e.name}_{e.start[0]}": float(e.force_bounds(at)[1])
+        e.starts[0][0] if e.name is None else f"{e.name}_{e.starts[0][0]}": e.start_with(
+            at, float(e.force_bounds(at)[1])
+        )
         for e, at in problem.model.of([np.asarray(v) for v in problem.full_values(values)])
-        if e.has_memory and e.start is Behaviour.start
+        if isinstance(e, Friction) and not e.springs_start_apart
     }
     return any(
         abs(value) > limits.get(name.rstrip("0123456789").removesuffix("_"), np.inf)

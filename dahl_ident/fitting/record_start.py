@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element, LinearSystem
-from dahl_ident.errors import ModelError, argument
+from dahl_ident.elements import Element, Friction, LinearSystem
+from dahl_ident.errors import FitError, ModelError, argument
 from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
@@ -28,6 +28,7 @@ STARTS = 4
 """Starts that are tried at first, as for tables."""
 MORE_STARTS = 24
 """Where no motion from those is finite: a contact too stiff for the samples' interval is one."""
+_LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: at rest, or nearly slipping
 _DECAY = 1e-3  # of a decay's largest amplitude in its spectrum: below, it has none
 _BAND = 1e-5  # of the drive's largest power: below, it has none
 
@@ -294,7 +295,30 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
         if problem.output == "motion":
             x, v, _ = in_band(problem.records[number], measured)
             of_record[0], of_record[1] = x[0], v[0]
-        else:
+        _load_springs(problem, full, number)
+        if problem.output == "force":
             total = problem.predict(full, number, derivatives=False).output
             of_record[-2] = float(np.mean(measured - total))
     return full
+
+
+def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None:
+    """Load the springs of a law that has several as the record's first samples want it."""
+    of_record, place = problem.own(full, number), 2 if problem.output == "motion" else 0
+
+    def misfit() -> float:
+        try:
+            output = problem.predict(full, number, derivatives=False).output
+        except FitError:
+            return np.inf
+        return float(np.var(problem.measured[number] - output))
+
+    for element in problem.model.elements:
+        stop = place + (len(element.starts) if element.has_memory else element.n_states)
+        if isinstance(element, Friction) and element.springs_start_apart:
+            tried = []
+            for load in _LOADS:
+                of_record[place:stop] = load
+                tried.append(misfit())
+            of_record[place:stop] = _LOADS[int(np.argmin(tried))]
+        place = stop

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
-from dahl_ident.elements import Element, Model, Parameter
-from dahl_ident.elements.behaviour import Behaviour
-from dahl_ident.elements.facts import HistoryGradient
+from dahl_ident.elements import Friction, Model, Parameter
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
     from dahl_ident.problem.record_problem import RecordProblem
-
-_PLAY_STEP = 1e-6  # of the motion's range, for derivatives with respect to the place in a gap
 
 
 @dataclass(frozen=True)
@@ -49,40 +45,35 @@ def force_of(
     record = problem.records[number]
     of_record = problem.own(values, number)
     time = record.time - record.time[0]
-    *states, offset, drift = of_record.tolist()
+    offset, drift = of_record[-2:].tolist()
     total = offset + drift * time
     by = np.zeros((x.size, len(problem.parameters) if derivatives else 0))
     start, column = 0, 0
     first = len(problem.free) + number * problem.per_record
     model = problem.model.sampled(1.0 / problem.rates[number])
     for element, at in model.of(problem.full_values(values)):
-        state, moved = (states[start], path) if element.has_memory else (0.0, x)
-        in_gap = element.has_memory and element.start is not Behaviour.start
+        stop = start + (len(element.starts) if element.has_memory else element.n_states)
+        states, moved = of_record[start:stop], x
+        state: Any = 0.0  # or several
+        if isinstance(element, Friction):
+            state, moved = states if element.springs_start_apart else float(states[0]), path
         if derivatives:
-            if in_gap:
-                history = _from_middle(element, at, moved, state)
-            else:
-                history = element.force_history_gradient(at, moved, v, state, acceleration=a)
+            history = element.force_history_gradient(at, moved, v, state, acceleration=a)
             total = total + history.value
             for parameter, slope in zip(element.parameters, history.by_parameter, strict=True):
                 if parameter.free:
                     by[:, column] = slope
                     column += 1
             if element.has_memory:
-                by[:, first + start] = history.by_state
-        elif in_gap:
-            total = total + element.force_history(at, _before(moved, state))[1:]
+                by[:, first + start : first + stop] = history.by_state.reshape(x.size, -1)
         else:
             total = total + element.force_history(at, moved, v, state, acceleration=a)
-        if element.has_memory:
-            start += 1
-        elif element.n_states:
-            stop = start + element.n_states
+        if element.n_states and not element.has_memory:
             free = element.free_responses(x.size)
-            total = total + free @ states[start:stop]
+            total = total + free @ states
             if derivatives:
                 by[:, first + start : first + stop] = free
-            start = stop
+        start = stop
     if derivatives:
         by[:, first + start] = 1.0
         by[:, first + start + 1] = time
@@ -115,25 +106,6 @@ def motion_of(
     return Predicted(motion.output + of_record[starts], by, motion.by_delay)
 
 
-def _before(path: FloatArray, play: float) -> FloatArray:
-    """Return a path that comes to its first sample from the middle of a gap."""
-    return np.concatenate([[path[0] - play], path])
-
-
-def _from_middle(
-    element: Element, values: Sequence[float], path: FloatArray, play: float
-) -> HistoryGradient:
-    """Return the force of an element that starts somewhere in its gap, with its derivatives.
-
-    That with respect to the place is a central difference.
-    """
-    step = _PLAY_STEP * float(np.ptp(path))
-    history = element.force_history_gradient(values, _before(path, play))
-    high, low = (element.force_history(values, _before(path, play + s)) for s in (step, -step))
-    by_play = (high - low)[1:] / (2.0 * step)
-    return HistoryGradient(history.value[1:], by_play, tuple(s[1:] for s in history.by_parameter))
-
-
 _SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
 
 
@@ -156,7 +128,10 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
         for element in model.elements:
             name = f"{element.name}_" if element.name else ""
             if element.has_memory:
-                unknowns.append(Parameter(f"{name}{element.start[0]}{tail}", *element.start[1:]))
+                unknowns += [
+                    Parameter(f"{name}{start}{tail}", unit, meaning)
+                    for start, unit, meaning in element.starts
+                ]
             else:
                 unknowns += [
                     Parameter(f"{name}state_{i + 1}{tail}", "m", "at the first sample")

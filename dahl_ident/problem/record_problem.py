@@ -486,27 +486,23 @@ class RecordProblem(Problem):
     def step_bounds(self, values: FloatArray, *, of_starts: bool) -> tuple[FloatArray, FloatArray]:
         """Return between which search coordinates steps may lead.
 
-        Exponents with a prior stay within their ranges, and on request friction at the first sample
-        below the forces of full slip at the values. Beyond them friction falls back within a small
-        part of x_c, so that the motion hardly tells how far beyond it began.
+        Exponents with a prior stay within their ranges, loads of several springs at the first
+        sample below slip, and on request other friction there below full slip at the values.
         """
         low, high = np.full((2, values.size), np.inf) * [[-1.0], [1.0]]
         for i in map(self.names.index, self.ranges):
             low[i], high[i] = (end[i] for end in self.bounds())
-        if not of_starts:
-            return low, high
         of_model = zip(self.model.parameters, self.full_values(values), strict=True)
         by_name = {p.name: np.asarray(value) for p, value in of_model}
         for element in self.with_memory:
-            name, unit, _ = element.start
-            if unit != "N":
+            if not (of_starts or element.springs_start_apart):
                 continue
-            limits = element.force_limits([by_name[p.name] for p in element.parameters])
-            up, down = (float(force) for force in limits)
+            ends = element.start_bounds([by_name[p.name] for p in element.parameters])
             prefix = f"{element.name}_" if element.name else ""
-            for i, known in enumerate(self.names):
-                if known == f"{prefix}{name}" or known.startswith(f"{prefix}{name}_"):
-                    low[i], high[i] = -down, up
+            for start, *_ in element.starts:
+                for i, known in enumerate(self.names):
+                    if known == f"{prefix}{start}" or known.startswith(f"{prefix}{start}_"):
+                        low[i], high[i] = ends
         return low, high
 
     def full_values(self, values: FloatArray) -> list[float]:
