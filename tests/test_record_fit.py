@@ -294,7 +294,7 @@ def test_a_fit_that_is_stopped_keeps_what_it_found(
         return own(self, *given, **how)  # type: ignore[arg-type]
 
     monkeypatch.setattr(RecordProblem, "predict", predict)
-    monkeypatch.setattr("dahl_ident.results.progress._PATIENCE", 0.0)
+    monkeypatch.setattr("dahl_ident.progress.PATIENCE", 0.0)
     with pytest.raises(KeyboardInterrupt) as stop:
         di.fit(record, di.Dahl(), progress=True, start={"f_max": 0.2, "sigma": 10.0})
     monkeypatch.undo()

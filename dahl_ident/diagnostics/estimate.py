@@ -255,7 +255,9 @@ def weighted_estimate(
 ) -> WeightedEstimate:
     """Return the estimate, searched from an optimum."""
     known = dict(zip(optimum.names, optimum.theta, strict=True))
-    theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in problem.parameters])
+    theta = np.array(
+        [known[p.name] if p.name in known else np.log(p.value or 1.0) for p in problem.parameters]
+    )
     stated, basis = problem.widened(np.zeros(problem.data.n)), None
     loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
     if not determined:
