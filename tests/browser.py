@@ -114,7 +114,7 @@ class Page:
         )  # fmt: skip
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
 
-    def wait(self, condition: str, seconds: float = 60.0) -> None:
+    def wait(self, condition: str, seconds: float = 180.0) -> None:
         """Wait until a JavaScript expression is true, over changes of the page as well."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
