@@ -112,14 +112,12 @@ class ComparedModel:
     @property
     def estimates(self) -> str:
         """The free parameters in one line; a number without an error is none."""
-        rows = [(p.name, with_unit(v, e, p.unit), np.isfinite(e)) for p, v, e in self._of_device]
+        rows = [(p.name, v, e, p.unit) for p, v, e in self._of_device]
         if self.stated is not None:
-            every = [p for p in self.stated.values() if p.stderr is not None]
-            rows = [
-                (p.name, with_unit(p.value, p.stderr, p.unit), np.isfinite(p.stderr)) for p in every
-            ]
-        known = [f"{name} = {text}" for name, text, is_known in rows if is_known]
-        unknown = [name for name, _, is_known in rows if not is_known]
+            every = self.stated.values()
+            rows = [(p.name, p.value, p.stderr, p.unit) for p in every if p.stderr is not None]
+        known = [f"{name} = {with_unit(v, e, unit)}" for name, v, e, unit in rows if np.isfinite(e)]
+        unknown = [name for name, _, e, _ in rows if not np.isfinite(e)]
         return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
 
     @property
@@ -136,9 +134,9 @@ class ComparedModel:
         By every source of error of a table's fit. Not each of a law's like parts, as Maxwell slip
         has them: their sums are what it says.
         """
-        errors = None
-        if self.optimum.problem.kind == "table":
-            errors = error_model(self.optimum)
+        is_table = self.optimum.problem.kind == "table"
+        errors = error_model(self.optimum) if is_table else None
+        stderr = self.optimum.stderr if errors is None else errors.stderr
         parts = set[str]()
         for element in self.optimum.problem.model.elements:
             labels = {label for part in element.like_parts for label in part}
@@ -152,12 +150,8 @@ class ComparedModel:
 
         return all(
             np.isfinite(value)
-            and (
-                p.name in parts
-                or (error if errors is None else errors.stderr[p.name])
-                < _VAGUE * max(abs(value), size(p))
-            )
-            for p, value, error in self._of_device
+            and (p.name in parts or stderr[p.name] < _VAGUE * max(abs(value), size(p)))
+            for p, value, _ in self._of_device
         )
 
     @property
