@@ -114,7 +114,7 @@ class TestDepartures:
             judge(FrequencyResponse(f, N * relative_noise(10, 0.02, seed), A)) for seed in range(20)
         ]
         alarmed = [g.headline for g in found if not g.acceptable]
-        assert sum("over frequency, from 0.25 to 2 Hz" in text for text in alarmed) >= 12
+        assert sum("over frequency " in text for text in alarmed) >= 12
         known = ("over frequency", "depart smoothly")  # the latter where the trend is too vague
         assert all(any(each in text for each in known) for text in alarmed)
 
@@ -148,7 +148,7 @@ class TestDepartures:
     def test_a_missing_spring(self) -> None:
         found = judge(table(model=FRICTION + Spring(1.0)))
         assert not found.acceptable
-        assert "over amplitude, from 0.000333 to 0.0333 m" in found.headline
+        assert "these data are not linear Dahl: over amplitude " in found.headline
 
     def test_noise_larger_than_the_covariance_says(self) -> None:
         data = table(noise=0.03)

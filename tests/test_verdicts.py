@@ -306,7 +306,26 @@ class TestNamed:
         assert check is not None
         assert check.rows == 16
         text = f"{check.gains} of 16 held-out gains and {check.phases} of 16 phases of fundamentals"
-        assert text in found.verdict
+        assert text in found.fit_report()
+
+    def test_the_verdict_is_five_sentences_and_the_rest_stands_below(self) -> None:
+        """Runs that differ, rows that were flagged or are suspicious, and a wrong law."""
+        law = MaxwellSlip([0.3 * X_C, 3.0 * X_C], [25.0, 8.0])
+        A = np.tile(np.geomspace(0.3, 10.0, 12) * X_C, 2)
+        R = law.describing_function(A) * relative_noise(24, 0.01, 4) * np.repeat([1.0, 1.1], 12)
+        R[5] *= 1.3
+        data = FrequencyResponse(
+            np.ones(24), R, A, run=np.repeat(["a", "b"], 12),
+            quality={"verdict": np.array(["not settled", *["good"] * 23])},
+        )  # fmt: skip
+        found = fit(data, Dahl() + Spring())
+        assert len(found.findings) > 5
+        assert len(found.judgement.told) == 5
+        below = found.fit_report().partition("Further findings")[2]
+        shorter = [text for text in map(str, found.findings) if text not in found.verdict]
+        assert len(shorter) == len(found.findings) - 5
+        assert all(text in below for text in shorter)
+        assert all(len(text.split()) <= 35 for text in map(str, found.judgement.told))
 
     @pytest.mark.parametrize("law", [
         MaxwellSlip([0.3 * X_C, 3.0 * X_C], [25.0, 8.0]),

@@ -180,7 +180,7 @@ def _print(result: Any, *, verbose: bool, compare: bool, of_records: bool) -> No
     if compare and (result.goodness.acceptable or not verbose):  # else it is there already
         console.write(str(compare_models(result)))
     if not verbose:
-        more = "tests of the residuals, other models and the solver's numbers"
+        more = "further findings, tests of the residuals, other models and the solver's numbers"
         if of_records:
             more = "the budget, the records' own values and the residuals"
         console.write(f"-v prints {more}")

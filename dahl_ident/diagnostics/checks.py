@@ -136,9 +136,11 @@ def _parameters(fit: JudgedTable) -> Iterator[Finding]:
         }
         yield Finding(_DETERMINED, _NOT_DETERMINED, "no_degrees_of_freedom", values)
     if can_tell:
-        for parameter in known.open:
-            values = {"name": parameter.name, "reason": parameter.reason}
-            yield Finding(_DETERMINED, _NOT_DETERMINED, "undetermined_parameter", values)
+        for why in dict.fromkeys(parameter.why for parameter in known.open):
+            alike = [parameter for parameter in known.open if parameter.why == why]
+            shown = {parameter.name: parameter.known_as for parameter in alike}
+            values = {"shown": shown, "why": why}
+            yield Finding(_DETERMINED, _NOT_DETERMINED, "undetermined_parameters", values)
 
 
 # Described?

@@ -304,25 +304,26 @@ class Goodness:
         return tuple(self._departures(_HINT / _FALSE_ALARM * self.level))
 
     def _departures(self, level: float) -> Iterator[str]:
-        """Yield every departure whose p-value is below `level`, those over frequency first."""
+        """Yield every departure whose p-value is below `level`, those that say most first."""
+        yield from (str(one) for one in self.groups if one.p_value < level)
         if self.runs_differ is not None:
             yield str(self.runs_differ)
-        yield from (str(one) for one in self.groups if one.p_value < level)
         found = [trend for trend in self.trends if trend.p_value < level]
         rate = [trend for trend in found if trend.covariate == "frequency"]
+        yield from (f"{t.brief}, which no rate-independent model can describe" for t in rate)
+        if self.stiffening is not None and self.stiffening.p_value < level:
+            yield str(self.stiffening)
         if self.beyond_any_sensor and self.noise_share is not None:
             yield (
                 f"the scatter is {percent(self.noise_share)} of the response, "
                 "more than any sensor's noise"
             )
-        yield from (f"{trend}, which no rate-independent model can describe" for trend in rate)
-        if self.stiffening is not None and self.stiffening.p_value < level:
-            yield str(self.stiffening)
         curve = [test for test in (self.exponent,) if test is not None and test.p_value < level]
         over = [trend for trend in found if trend not in rate]
-        if self.exponent is not None and self.exponent.fixed == 1.0 and (curve or over):
-            yield "these data are not linear Dahl"
-        yield from map(str, (*over, *curve))
+        of_curve = [*(trend.brief for trend in over), *map(str, curve)]
+        if self.exponent is not None and self.exponent.fixed == 1.0 and of_curve:
+            of_curve[0] = f"these data are not linear Dahl: {of_curve[0]}"
+        yield from of_curve
         if self.smooth is not None and self.smooth.p_value < level and not found:
             yield str(self.smooth)
         for test in (self.third_harmonic, self.chi_square):

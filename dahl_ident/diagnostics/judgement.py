@@ -79,6 +79,9 @@ class Finding:
         }
 
 
+_MOST_TOLD = 5  # sentences that are read
+
+
 class Judgement:
     """What was found about a result, the most serious first.
 
@@ -89,21 +92,29 @@ class Judgement:
     findings : tuple of Finding
         All of them.
     told : tuple of Finding
-        Those of the verdict: of an unusable result without what only a usable one needs, which is
-        what is identified or assumed.
+        Those of the verdict, at most five: of an unusable result without what only a usable one
+        needs, which is what is identified or assumed; of a usable one with what is assumed.
+    further : tuple of Finding
+        The others, which back it.
     """
 
     def __init__(self, findings: Iterable[Finding]) -> None:
         every = sorted(findings, key=lambda finding: -finding.severity.rank)
         self.status = every[0].severity if every else VerdictStatus.TRUSTED
         self.findings = tuple(every)
-        self.told = tuple(
+        usable, assumed = self.status.usable, Question.ASSUMED
+        needed = [
             finding
             for finding in every
-            if self.status.usable
+            if usable
             or finding.severity is not VerdictStatus.TRUSTED
             or finding.question is Question.DESCRIBED
-        )
+        ]
+        last = [finding for finding in needed if finding.question is assumed]
+        first = [finding for finding in needed if finding.question is not assumed]
+        room = _MOST_TOLD - len(last)
+        self.told = (*first[:room], *last)
+        self.further = tuple(finding for finding in every if finding not in self.told)
 
     @property
     def statements(self) -> tuple[str, ...]:

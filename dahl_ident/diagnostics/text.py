@@ -12,7 +12,7 @@ from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
 from dahl_ident.units import percent
 
-_MOST_DEPARTURES = 3  # in the verdict; the details list all
+_MOST_DEPARTURES = 1  # in the verdict; the details list all
 _MOST_ROWS = 3  # the same
 _LEVEL = level_text(CONFIDENCE)
 
@@ -35,7 +35,7 @@ def joined(parts: Sequence[str], most: int = 100) -> str:
 
 
 def departures(objections: Sequence[str]) -> str:
-    """Return the most serious objections, and how many more there are."""
+    """Return the most serious objection, and how many more there are."""
     more = len(objections) - _MOST_DEPARTURES
     tests = f"; {more} more test{'s' if more > 1 else ''} failed" if more > 0 else ""
     return f"{'; '.join(objections[:_MOST_DEPARTURES])}{tests}"
@@ -141,7 +141,7 @@ def _suspicious(names: Sequence[str], neighbours: str) -> str:
 
 
 def _flagged(points: Sequence[str], every: bool) -> str:
-    which = joined(points, _MOST_ROWS)
+    which = joined(points, 1)
     if every:
         return f"The extraction flagged every point fitted ({which}): measure them again."
     return (
@@ -159,17 +159,17 @@ def _beyond_limit(row: str, carried: str, limit: str) -> str:
 
 def _beyond_slip(row: str, force: str, limit: str) -> str:
     return (
-        f"At {row} friction's fundamental is {force}, more than full slip can give ({limit}, 4/pi "
-        "of its limit): an element is missing."
+        f"At {row} friction's fundamental is {force}, more than full slip can give ({limit}): an "
+        "element is missing."
     )
 
 
 def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, width: float) -> str:
     of = "" if tests == available else f" of {available}"
     return (
-        f"Fitted without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and "
-        f"{phases} of {rows} phases of fundamentals are inside their {_LEVEL} bands "
-        f"(half width {percent(width)})."
+        f"Without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and {phases} "
+        f"of {rows} phases of fundamentals are inside their {_LEVEL} bands (half width "
+        f"{percent(width)})."
     )
 
 
@@ -214,8 +214,7 @@ def _negative(name: str, value: float, stderr: float, unit: str, instead: str) -
 def _slight(name: str, value: float, stderr: float, unit: str, share: float, misfit: float) -> str:
     return (
         f"{name} = {with_unit(value, stderr, unit)} rests on {percent(share)} rms of the force, "
-        f"less than the model misses ({percent(misfit)}), and may stand for that: give it if it "
-        "is known, or leave it out."
+        f"less than the model misses ({percent(misfit)}): give it, or leave it out."
     )
 
 
@@ -319,7 +318,10 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "identified": _identified,
     "undetermined": _undetermined,
     "combinations": lambda combinations: f"Determined: {'; '.join(combinations)}.",
-    "undetermined_parameter": lambda name, reason: f"{name}: {reason}.",
+    "undetermined_parameters": lambda shown, why: (
+        f"{'; '.join(f'{name}: {known}' for name, known in shown.items())}"
+        f"{f', not determined, {why}' if why else ''}."
+    ),
     "solver": lambda message: message,
     "no_degrees_of_freedom": _no_degrees_of_freedom,
     "sign": lambda convention: f"{convention}. Do not use the numbers of this fit.",

@@ -161,18 +161,32 @@ class Trend:
     largest: float  # largest relative departure of the response that the smooth curve finds
     p_value: float  # probability of as much departure by noise alone
 
-    def __str__(self) -> str:
-        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
-        size = "more than tenfold"
-        if self.largest < _FARTHEST:
-            size = f"by up to {percent(self.largest)}"
-        text = f"over {self.covariate}, {ends}, the data depart from the model {size}"
+    @property
+    def brief(self) -> str:
+        """The departure without its range."""
+        return f"over {self.covariate} {self._changes or self._departure}"
+
+    @property
+    def _changes(self) -> str:
+        """How friction's stiffness and loss change against the model's, where they do."""
         parts = [
-            f"friction's {name} {_change(part)}"
+            f"{name} {_change(part)}"
             for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
             if abs(part.value) > 2.0 * part.stderr
         ]
-        return f"{text} ({', '.join(parts)} relative to it)" if parts else text
+        return f"friction's {' and '.join(parts)} against the model's" if parts else ""
+
+    @property
+    def _departure(self) -> str:
+        size = "more than tenfold"
+        if self.largest < _FARTHEST:
+            size = f"by up to {percent(self.largest)}"
+        return f"the data depart from the model {size}"
+
+    def __str__(self) -> str:
+        ends = f"from {self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
+        text = f"over {self.covariate}, {ends}, {self._departure}"
+        return f"{text} ({self._changes})" if self._changes else text
 
 
 @dataclass(frozen=True)

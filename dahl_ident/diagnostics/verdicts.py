@@ -94,15 +94,23 @@ class ParameterVerdict:
     interval : Interval
         The 95.45 % interval: the profile's (first order where none was searched), or the combined
         one where a fit states it.
-    reason : str
-        Interval and verdict in words, with the reason and what to do where it is not identified.
+    known_as : str
+        What is known of it, in words: interval and verdict.
+    why : str
+        The reason, and what to do, where it is not identified.
     """
 
     name: str
     unit: str
     verdict: Verdict
     interval: Interval
-    reason: str
+    known_as: str
+    why: str = ""
+
+    @property
+    def reason(self) -> str:
+        """What is known in words, with the reason where it is not identified."""
+        return f"{self.known_as}, not determined, {self.why}" if self.why else self.known_as
 
     @property
     def text(self) -> str:
@@ -282,17 +290,16 @@ def judged(
     for name, parameter in zip(problem.names, problem.parameters, strict=True):
         unit = parameter.unit
         _, limits, widest = (stated or intervals)[name]
-        within = _within(limits, unit)
-        if verdicts[name] is Verdict.NOT_IDENTIFIED:
-            reason = f"{within}, not determined, {advice(optimum, name, widest, lost)}"
-        else:
-            reason = f"{within}, {verdicts[name].value}"
-        if name in beyond and errors is not None:
-            shown = with_unit(errors.values[name], errors.stderr[name], unit)
-            reason = f"{shown}, not determined, {beyond[name]}"
+        shown, why = _within(limits, unit), ""
         if name in blind:
-            reason = blind[name]
-        parameters[name] = ParameterVerdict(name, unit, verdicts[name], limits, reason)
+            shown = blind[name]
+        elif name in beyond and errors is not None:
+            shown, why = with_unit(errors.values[name], errors.stderr[name], unit), beyond[name]
+        elif verdicts[name] is Verdict.NOT_IDENTIFIED:
+            why = advice(optimum, name, widest, lost)
+        else:
+            shown = f"{shown}, {verdicts[name].value}"
+        parameters[name] = ParameterVerdict(name, unit, verdicts[name], limits, shown, why)
     direction = {}
     if lost - blind.keys() and not determined:
         vector = information.weakest(natural)

@@ -313,7 +313,7 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
 
 
 def _goodness(fit: FitResult) -> Iterator[Block]:
-    yield Bullets(tuple(fit.goodness.details))
+    yield Bullets((*map(str, fit.judgement.further), *fit.goodness.details))
     yield tables.goodness(fit)
     if not fit.goodness.acceptable:
         compared = compare_models(fit)

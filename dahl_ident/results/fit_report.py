@@ -81,6 +81,7 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[ReportPart]
     yield ReportPart("Verdict", [first, *warnings, *others])
     yield ReportPart("Parameters", _parameters(fit, intervals, fit.params))
     further = {
+        "Further findings": list(map(str, fit.judgement.further)),
         "Determined combinations": list(map(str, fit.identifiability.combinations)),
         "Derived": list(map(str, fit.derived())),
         "Uncertainty budget": str(fit.stated_budget or "").splitlines(),
