@@ -102,6 +102,20 @@ def test_springs_have_forces_of_their_own_after_a_gap(seed: int) -> None:
         assert_found(case._replace(record=with_gap(case.record, 200, 260)))
 
 
+def test_iwan_is_loaded_within_full_slip_after_a_gap() -> None:
+    """Beyond it the load has no effect, and a search from there once ended 7 u off."""
+    case = cold.iwan(3)
+    with pytest.warns(DataWarning, match="2 parts are fitted"):
+        assert_found(case._replace(record=with_gap(case.record, 150, 200)))
+
+
+def test_a_free_decay_goes_on_after_a_gap() -> None:
+    """The second part is much smaller than the first, the noise the same."""
+    case = cold.decay("dahl", "spring", 2)
+    with pytest.warns(DataWarning, match="2 parts are fitted"):
+        assert_found(case._replace(record=with_gap(case.record, 120, 180)))
+
+
 def test_friction_slips_behind_a_gap_where_a_record_goes_on() -> None:
     case = cold.play(2.0, 412)
     with pytest.warns(DataWarning, match="2 parts are fitted"):

@@ -43,6 +43,22 @@ def test_a_parameter_called_as_one_of_the_records_is_refused(label: str) -> None
             di.fit(record(TRUE + NOISE), model)
 
 
+def test_unknowns_of_two_elements_have_names_of_their_own() -> None:
+    class Own(di.Friction):
+        parameters = (
+            di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
+            di.Parameter("limit", "N", "friction limit", lower=0.0, transform="log"),
+        )
+
+        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+            return values[0] * (1.0 - direction * force / values[1])
+
+    with pytest.raises(ModelError, match="unknown of several elements initial_force; give each a"):
+        di.fit(record(TRUE + NOISE), MODEL + Own())
+    problem = di.fit(record(TRUE + NOISE), MODEL + Own(3.0, 1e-3, name="own")).problem
+    assert {"initial_force", "own_initial_force"} < set(problem.names)
+
+
 @pytest.mark.parametrize("method", ["scipy", "ipopt"])
 def test_every_method_finds_the_same_optimum(method: str, fit: di.FitResult) -> None:
     other = di.fit(record(TRUE + NOISE), MODEL, method=method)

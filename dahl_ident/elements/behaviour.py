@@ -182,7 +182,8 @@ class Behaviour(ABC):
         value = self.history(at, path, state, slopes=False).value
         by_state = np.zeros(value.shape)
         if self.has_memory:
-            by_state = slope(len(at), STEP * float(np.max(np.abs(value), initial=0.0)) or 1.0)
+            largest = self.start_with(at, float(np.max(np.abs(value), initial=0.0)))
+            by_state = slope(len(at), STEP * largest or 1.0)
         by = tuple(slope(i, STEP * (abs(size) or 1.0)) for i, size in enumerate(at))
         return HistoryGradient(value, by_state, by)
 

@@ -86,8 +86,6 @@ class Friction(Element):
     has_memory = True
     one_state: bool = True
     """Whether the present force is the only state of the law."""
-    springs_start_apart: bool = False
-    """Whether the unknowns at the first sample of a record are loads of springs."""
 
     def __init__(
         self, *values: float | None, name: str | None = None, **named: float | None

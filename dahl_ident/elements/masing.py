@@ -31,6 +31,7 @@ from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError
 
 _SERIES = 0.1  # angle below which y - sin(y) loses digits
+_NEARLY_SLIPS = 1.0 - 1e-6
 _BISECTIONS = 200  # more than a number has digits
 
 
@@ -38,6 +39,7 @@ class Masing(Friction):
     """Parallel Jenkins elements, defined by the force of a first loading; see the module."""
 
     one_state = False
+    starts = (("initial_load", "", "way from rest to the first sample, over that to full slip"),)
     unique_response = True
 
     @abstractmethod
@@ -73,30 +75,35 @@ class Masing(Friction):
         return Mechanics(0.0, sum(states), rates)
 
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
-        """Return the springs' forces where the backbone curve, loaded from rest, has a force."""
+        """Return the springs' forces on the backbone curve, loaded from rest."""
         stiffnesses, slips = self.sliders(values)
-        place: Any = 0.0
-        reached, sticking, rest = place, sum(stiffnesses), starts[0]
-        for k, d in zip(stiffnesses, slips, strict=True):
-            taken = clipped(rest, sticking * (d - reached))
-            place, rest = place + taken / sticking, rest - taken
-            reached, sticking = d, sticking - k
-        return [k * clipped(place, d) for k, d in zip(stiffnesses, slips, strict=True)]
+        way = starts[0] * slips[-1]
+        return [k * clipped(way, d) for k, d in zip(stiffnesses, slips, strict=True)]
+
+    def start_with(self, values: Sequence[Any], force: float) -> float:
+        """Return the way along the backbone curve to a force, over that to full slip."""
+        at = [np.asarray(v, dtype=np.float64) for v in values]
+        return float(np.sign(force) * self._loaded_to(at, abs(force)) / self.knee(at)[1])
+
+    def start_bounds(self, values: Values) -> tuple[float, float]:
+        """Return those of loads, just below slip: at slip a spring forgets its load."""
+        return -_NEARLY_SLIPS, _NEARLY_SLIPS
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
         """Return the force at every sample by Masing's rules, exactly, unchecked.
 
-        The element comes from rest along the backbone curve to the force `state`.
+        The element comes from rest along the backbone curve; `state` is its load there.
         """
         if slopes:
             return self._differences(values, path, state)
         at = [np.asarray(v, dtype=np.float64) for v in values]
         x = path.displacement
+        start = state * float(self.knee(at)[1])
+        begun = np.sign(start) * self.backbone(at, np.abs(start))
         if x.size < 2:
-            return HistoryGradient(np.full(x.shape, state), np.ones(x.shape), ())
-        start = np.sign(state) * self._loaded_to(at, abs(state))
+            return HistoryGradient(np.full(x.shape, begun), np.ones(x.shape), ())
         u = x - x[0] + start
         paths = _Paths(start)
         cut = stretches(x)
@@ -105,7 +112,7 @@ class Masing(Friction):
             stop = min(last + 1, u.size - 1)
             paths.follow(u[first + 1 : stop + 1], heading)
             first = stop
-        force = np.append(state, paths.force(lambda x: self.backbone(at, x)))
+        force = np.append(begun, paths.force(lambda x: self.backbone(at, x)))
         return HistoryGradient(force, force, ())
 
     def _loaded_to(self, values: Values, force: float) -> float:

@@ -22,8 +22,6 @@ from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ValidationError
 
-_NEARLY_SLIPS = 1.0 - 1e-6
-
 
 class MaxwellSlip(Masing):
     """n parallel springs, each of which slips at a different displacement.
@@ -66,7 +64,6 @@ class MaxwellSlip(Masing):
 
     kind = "maxwell_slip"
     equation = "F = sum of f_i, df_i/dx = k_i, |f_i| <= k_i d_i"
-    springs_start_apart = True
 
     def __init__(
         self,
@@ -162,10 +159,6 @@ class MaxwellSlip(Masing):
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
         """Return the springs' forces."""
         return [k * d * load for k, d, load in zip(*self.sliders(values), starts, strict=True)]
-
-    def start_bounds(self, values: Values) -> tuple[float, float]:
-        """Return those of the loads, just below slip: at slip a spring forgets its load."""
-        return -_NEARLY_SLIPS, _NEARLY_SLIPS
 
     def history(
         self, values: Sequence[Any], path: Path, state: float | FloatArray, *, slopes: bool

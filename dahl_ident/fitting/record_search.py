@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Friction
 from dahl_ident.errors import FitError, FitInterrupted, argument
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
@@ -494,22 +493,12 @@ def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, flo
 
 
 def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
-    """Return whether a friction force at a first sample is beyond that of full slip.
+    """Return whether friction at a first sample is at full slip or beyond.
 
-    There it has no effect, so that a search cannot come back.
+    There it has hardly an effect, so that a search cannot come back.
     """
-    values = problem.to_values(theta)
-    limits = {
-        e.starts[0][0] if e.name is None else f"{e.name}_{e.starts[0][0]}": e.start_with(
-            at, float(e.force_bounds(at)[1])
-        )
-        for e, at in problem.model.of([np.asarray(v) for v in problem.full_values(values)])
-        if isinstance(e, Friction) and not e.springs_start_apart
-    }
-    return any(
-        abs(value) > limits.get(name.rstrip("0123456789").removesuffix("_"), np.inf)
-        for name, value in zip(problem.names, values.tolist(), strict=True)
-    )
+    low, high = problem.step_bounds(problem.to_values(theta), of_starts=True)
+    return bool(((theta <= low) | (theta >= high)).any())
 
 
 def _first_states_again(problem: RecordProblem, theta: FloatArray) -> FloatArray:

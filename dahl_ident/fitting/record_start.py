@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element, Friction, LinearSystem
+from dahl_ident.elements import Element, LinearSystem
 from dahl_ident.errors import FitError, ModelError, argument
 from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
@@ -29,7 +29,7 @@ STARTS = 4
 MORE_STARTS = 24
 """Where no motion from those is finite: a contact too stiff for the samples' interval is one."""
 _LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: at rest, or nearly slipping
-_DECAY = 1e-3  # of a decay's largest amplitude in its spectrum: below, it has none
+_DECAY = 1e-3  # of the largest decay's amplitude in its spectrum: below, there is none
 _BAND = 1e-5  # of the drive's largest power: below, it has none
 
 
@@ -268,7 +268,8 @@ class _Scan:
         window = np.hanning(x.size)
         X, F = (np.abs(np.fft.rfft(window * (w - w.mean()))) for w in (x, force))
         if not F.any():  # a free decay: the forces balance by themselves
-            return np.asarray(_DECAY * X.max() < X, dtype=np.float64)
+            least = _DECAY * X.max() * self.length / (np.abs(x - x.mean()).max() or 1.0)
+            return np.asarray(least < X, dtype=np.float64)
         smooth = max(3, x.size // 256)
         kernel = np.ones(smooth) / smooth
         X, F = (np.sqrt(np.convolve(s**2, kernel, "same")) for s in (X, F))
@@ -315,7 +316,7 @@ def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None
 
     for element in problem.model.elements:
         stop = place + (len(element.starts) if element.has_memory else element.n_states)
-        if isinstance(element, Friction) and element.springs_start_apart:
+        if element.has_memory and len(element.starts) > 1:
             tried = []
             for load in _LOADS:
                 of_record[place:stop] = load

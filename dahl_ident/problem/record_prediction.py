@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,7 @@ def force_of(
         states, moved = of_record[start:stop], x
         state: Any = 0.0  # or several
         if isinstance(element, Friction):
-            state, moved = states if element.springs_start_apart else float(states[0]), path
+            state, moved = states if states.size > 1 else float(states[0]), path
         if derivatives:
             history = element.force_history_gradient(at, moved, v, state, acceleration=a)
             total = total + history.value
@@ -115,7 +116,7 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
     Raises
     ------
     ModelError
-        If one is called as a parameter of the model.
+        If one is called as a parameter of the model, or as one of another element.
     """
     unknowns = []
     channel = records[0].motion_channel
@@ -142,7 +143,13 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
             unknowns.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
         else:
             unknowns.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
-    own = {p.name for p in unknowns}
+    own = Counter(p.name for p in unknowns)
+    name, count = own.most_common(1)[0]
+    if count > 1:
+        raise ModelError(
+            f"a fit of records calls an unknown of several elements {name}; give each a name, "
+            "such as Dahl(name='pivot')"
+        )
     for p in model.parameters:
         if p.name in own:
             raise ModelError(

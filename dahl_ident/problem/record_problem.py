@@ -495,7 +495,7 @@ class RecordProblem(Problem):
         of_model = zip(self.model.parameters, self.full_values(values), strict=True)
         by_name = {p.name: np.asarray(value) for p, value in of_model}
         for element in self.with_memory:
-            if not (of_starts or element.springs_start_apart):
+            if element.one_state and not of_starts:
                 continue
             ends = element.start_bounds([by_name[p.name] for p in element.parameters])
             prefix = f"{element.name}_" if element.name else ""
