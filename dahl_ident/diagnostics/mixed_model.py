@@ -289,7 +289,10 @@ class MixedState:
     def variances_covariance(self) -> FloatArray:
         """Covariance of the variances, zero for those at zero.
 
-        No number between 0 and its bound has a standard deviation above half the bound (Popoviciu).
+        No source is more uncertain than its size: a positive number of which the estimate alone is
+        known is distributed exponentially (JCGM 101:2008, 6.4.10). One column alone has chi-square
+        with one degree of freedom. And no number between 0 and its bound has a standard deviation
+        above half the bound (Popoviciu).
         """
         found = np.zeros_like(self.information)
         every = np.sqrt(np.maximum(np.diagonal(self.information), 0.0))
@@ -298,7 +301,10 @@ class MixedState:
         units = np.outer(size, size)
         inverse = np.linalg.pinv(self.information[part] / units, hermitian=True) / units
         std = np.sqrt(np.maximum(np.diagonal(inverse), TINY))
-        least = np.minimum(1.0, 0.5 * self.model.most[kept] / std)
+        most, G = 0.5 * self.model.most, self.model.noises
+        own = self.variances[G:] * np.sqrt(2.0 / np.minimum(self.degrees, 2.0))
+        most[G:] = np.minimum(most[G:], own)
+        least = np.minimum(1.0, most[kept] / std)
         found[part] = inverse * np.outer(least, least)
         return found
 
