@@ -109,6 +109,10 @@ def test_iwan_is_loaded_within_full_slip_after_a_gap() -> None:
         assert_found(case._replace(record=with_gap(case.record, 150, 200)))
 
 
+def test_first_states_are_begun_again_as_long_as_it_helps() -> None:
+    assert_found(cold.decay("maxwell_slip", "spring", 5))
+
+
 def test_a_free_decay_goes_on_after_a_gap() -> None:
     """The second part is much smaller than the first, the noise the same."""
     case = cold.decay("dahl", "spring", 2)

@@ -22,6 +22,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 _SHORT = {"force": 8192, "motion": 4096}  # samples with which a long record is begun
 _COMPARED = 8  # steps after which starts of a driven motion are compared
 _GOOD = 0.01  # share of variance left at which no further start is tried, if it may be noise
+_BETTER = 0.1  # relative fall of the cost, after which first states are begun once more
 _SAME = 1e-3  # relative difference of the costs of one minimum
 _PRIORS = 4  # descents until the noise is known of which a prior is one more sample
 _SAME_NOISE = 1.3  # factor within which it is
@@ -397,8 +398,9 @@ class RecordSearch:
                 raise
             best = self.best(problem, _changed(more, problem, start))
         near = 2.0 * best.cost[0] < _GOOD * problem.n_residuals
-        if near and (_slips_at_first(problem, best.theta[0]) or _structured(problem, best)):
+        while near and (_slips_at_first(problem, best.theta[0]) or _structured(problem, best)):
             end = self.descend(problem, _first_states_again(problem, best.theta[0]), STEPS)
+            near = bool(end.cost[0] < (1.0 - _BETTER) * best.cost[0])
             best = end if end.cost[0] < best.cost[0] else best
         return best
 
