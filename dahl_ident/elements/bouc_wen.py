@@ -86,7 +86,7 @@ class BoucWen(Friction):
     optional = (
         Parameter(
             "exponent", "", "exponent of the force", lower=0.05, upper=100.0, transform="log",
-            scan=(0.5, 1.0, 2.0, 4.0), prior=(0.5, 5.0),
+            scan=(0.7, 1.5, 3.0), prior=(0.5, 5.0),
         ),
         1.0,
     )  # fmt: skip

@@ -38,7 +38,7 @@ def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -
             for i, (p, v) in enumerate(zip(law.parameters, values, strict=True))
         )
     )
-    form = _form(law)
+    form = form_of(law)
     if form not in _SYSTEMS:
         from dahl_ident.engine import translate
 
@@ -47,17 +47,17 @@ def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -
 
 
 def _first_of(law: Element) -> FirstState:
-    form = _form(law)
+    form = form_of(law)
     if form not in _FIRST:
         _FIRST[form] = FirstState(as_model(law))
     return _FIRST[form]
 
 
-def _form(law: Element) -> Hashable:
+def form_of(law: Element) -> Hashable:
     """Return what the equations of a law depend on: its class, constants and other attributes."""
     constants = tuple(None if p.free else p.value for p in law.parameters)
     others = tuple(
-        (name, _form(value) if isinstance(value, Element) else repr(value))
+        (name, form_of(value) if isinstance(value, Element) else repr(value))
         for name, value in sorted(law.__dict__.items())
         if name not in ("parameters", "_name")
     )

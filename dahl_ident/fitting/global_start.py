@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
 from dahl_ident.elements import Element, Friction, Parameter
+from dahl_ident.elements.held_motion import form_of
 from dahl_ident.errors import FitError, argument
 from dahl_ident.fitting.directions import Direction, Directions, directions, is_positive
 from dahl_ident.problem import TableProblem
@@ -46,8 +47,8 @@ _LOWEST, _NODES = -3200, 6400  # of ln(A/length) in a table, in steps
 _DECADE = np.log(10.0) / _STEP  # in steps
 _FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
 _FINE_ENDS = (6, 4)  # coarse nodes at either end
-_COMPUTED = 10  # steps between the amplitudes at which a table is computed; cubics between
-_AROUND_KNEE = 1e3  # how far a table is computed beyond the knee; power laws beyond that
+_COMPUTED = 15  # steps between the amplitudes at which a table is computed; cubics between
+_AROUND_KNEE = 30.0  # how far a table is computed beyond the knee; power laws beyond that
 _NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
 _LARGEST = 1e150  # weighted columns, whose squares are numbers still
 _DEPENDENT = 1e-12  # of a column's length that others leave
@@ -57,7 +58,7 @@ _LEAST, _TOGETHER = 4, 20  # amplitudes of a table; those that are computed toge
 _HIGHEST = 3  # harmonic that takes part in a start; higher ones cost more and tell little more
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
-_MOST_LOOPS, _MOST_ROWS = 10_000, 20  # of a law that depends on the rate: a second or two
+_MOST_LOOPS, _MOST_ROWS = 5000, 10  # of a law that depends on the rate: half a second
 _MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
 _ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
@@ -559,15 +560,11 @@ def _table(
         np.asarray(at_unit.get(p.name, 1.0 if p.free or p.value is None else p.value), np.float64)
         for p in element.parameters
     ]
-    plain = set(vars(element)) <= {"_name", "parameters", "scale_parameters"}
-    key = (type(element), element.labels, tuple(float(v) for v in values), orders)
-    if not plain or key not in _TABLES:
-        table = _computed_table(element, values, np.array(orders))
-        if not plain:
-            return table
+    key = (form_of(element), tuple(float(v) for v in values), orders)
+    if key not in _TABLES:
         if len(_TABLES) >= _MOST_TABLES:
             _TABLES.clear()
-        _TABLES[key] = table
+        _TABLES[key] = _computed_table(element, values, np.array(orders))
     return _TABLES[key]
 
 
