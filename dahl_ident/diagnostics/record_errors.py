@@ -170,7 +170,7 @@ def record_errors(
         if problem.with_memory and not problem.displacement_noise:
             more = noise_at_turns(problem, values, white, left, noise)
             count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
-            count(SAMPLING, _between_samples(problem, values, jacobians))
+            count(SAMPLING, _between_samples(problem, values, jacobians, residuals))
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -326,7 +326,7 @@ def _by_displacement(
         low, high = (problem.without_noise(noise, lead) for lead in LEADS[::2])
         change = 0.5 * moved(low.outputs(values), high)[0]
         return np.outer(change, change)
-    plain = problem.outputs(values)
+    plain = [y - e for y, e in zip(problem.measured, residuals, strict=True)]
 
     def noisier(noise: float) -> tuple[FloatArray, float]:
         again = [moved(plain, problem.with_more_noise(noise, draw)) for draw in range(_DRAWS)]
@@ -343,7 +343,10 @@ def _by_displacement(
 
 
 def _between_samples(
-    problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
+    problem: RecordProblem,
+    values: FloatArray,
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
 ) -> FloatArray:
     """Return the covariance of the estimate through turning points that lie between samples.
 
@@ -362,11 +365,8 @@ def _between_samples(
         farther = x.copy()
         farther[1:-1][turns] -= middle[turns] ** 2 / (4.0 * bend[turns])
         motions.append((farther, v, a))
-    plain, other = (
-        problem.outputs(values),
-        problem.altered("latest", motions=tuple(motions)).outputs(values),
-    )
-    change = _change_of(problem, jacobians)([b - a for a, b in zip(plain, other, strict=True)])
+    other = problem.altered("latest", motions=tuple(motions)).split_residuals(values)
+    change = _change_of(problem, jacobians)([a - b for a, b in zip(residuals, other, strict=True)])
     return np.outer(change, change)
 
 

@@ -312,8 +312,8 @@ def _beyond(
         excess = _beyond(visible, inside, int((seen < count).sum()), level)
         return None if excess is None else _embedded(excess, seen, len(noise))
     size = np.sqrt(noise.diagonal())
-    scores = [(J * size).T @ e for J, e in blocks]
-    parts = [(J * size).T @ (J * size) for J, _ in blocks]
+    scores = [size * (J.T @ e) for J, e in blocks]
+    parts = [np.outer(size, size) * (J.T @ J) for J, _ in blocks]
     inverse = np.linalg.inv(sum(parts))
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
