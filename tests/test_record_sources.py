@@ -250,6 +250,19 @@ def test_a_delay_that_nobody_stated_is_estimated(delay: float) -> None:
     assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
 
 
+def test_outliers_that_a_loss_sets_aside_are_no_error_of_the_displacement() -> None:
+    """The motion is exact, so that what it adds is as small as without outliers."""
+    rng, t = np.random.default_rng(1), np.arange(2000) / 200.0
+    x = 0.01 * np.sin(2.0 * np.pi * t) * np.sin(0.26 * np.pi * t)
+    clean = di.Dahl(0.1, 30.0).force_history([0.1, 30.0, 1.0], x) + 1e-3 * rng.standard_normal(2000)
+    force = clean.copy()
+    force[rng.choice(2000, 20)] += 0.05
+    plain = di.fit(di.Record(t, displacement=x, force=clean), di.Dahl(alpha=1.0))
+    robust = di.fit(di.Record(t, displacement=x, force=force), di.Dahl(alpha=1.0), loss="huber")
+    for name in ("f_max", "sigma"):
+        assert robust.params[name].stderr == pytest.approx(plain.params[name].stderr, rel=0.3)
+
+
 def test_motions_that_turn_between_samples_are_covered() -> None:
     """At 0.1 % noise, what the samples miss of the turning points moves f_max by two of its u."""
     away = []

@@ -160,17 +160,19 @@ def record_errors(
         with suppress(FitError):  # no motion next to the estimate
             count(DELAY, by_delay(problem, values, white, left, noise))
     if problem.output == "force":
-        moved = _by_displacement(problem, values, jacobians, residuals)
+        plain, change_of = problem.outputs(values), _change_of(problem, jacobians)
+        moved = _by_displacement(problem, values, plain, jacobians, residuals)
         count(DISPLACEMENT, moved)
         if not problem.model.rate_independent:
-            plain, change_of = problem.outputs(values), _change_of(problem, jacobians)
             other = problem.differentiated_in(_OTHER_WINDOW * problem.window).outputs(values)
             change = change_of([b - a for a, b in zip(plain, other, strict=True)])
             count(WINDOW, np.outer(change, change))
         if problem.with_memory and not problem.displacement_noise:
             more = noise_at_turns(problem, values, white, left, noise)
             count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
-            count(SAMPLING, _between_samples(problem, values, jacobians, residuals))
+            farther = problem.altered("latest", motions=_beyond_samples(problem)).outputs(values)
+            change = change_of([b - a for a, b in zip(plain, farther, strict=True)])
+            count(SAMPLING, np.outer(change, change))
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -304,13 +306,14 @@ def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArr
 def _by_displacement(
     problem: RecordProblem,
     values: FloatArray,
+    plain: Sequence[FloatArray],
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
 ) -> FloatArray:
     """Return the mean square change of the estimate with the displacement's noise.
 
-    As large as that of as much noise again; or, with a dead band, from where in it the true
-    displacement may be.
+    As large as that of as much noise again, in addition to the `plain` prediction; or, with a dead
+    band, from where in it the true displacement may be.
     """
     change_of = _change_of(problem, jacobians)
 
@@ -326,7 +329,6 @@ def _by_displacement(
         low, high = (problem.without_noise(noise, lead) for lead in LEADS[::2])
         change = 0.5 * moved(low.outputs(values), high)[0]
         return np.outer(change, change)
-    plain = [y - e for y, e in zip(problem.measured, residuals, strict=True)]
 
     def noisier(noise: float) -> tuple[FloatArray, float]:
         again = [moved(plain, problem.with_more_noise(noise, draw)) for draw in range(_DRAWS)]
@@ -342,13 +344,8 @@ def _by_displacement(
     return noisier(noise * (squares / left) ** 0.5)[0]
 
 
-def _between_samples(
-    problem: RecordProblem,
-    values: FloatArray,
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-) -> FloatArray:
-    """Return the covariance of the estimate through turning points that lie between samples.
+def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...]:
+    """Return the motions with the turning points that lie between samples.
 
     The motion is taken to turn at a sample. By how much it went farther follows from the parabola
     through three samples, unless noise bends it as much.
@@ -365,9 +362,7 @@ def _between_samples(
         farther = x.copy()
         farther[1:-1][turns] -= middle[turns] ** 2 / (4.0 * bend[turns])
         motions.append((farther, v, a))
-    other = problem.altered("latest", motions=tuple(motions)).split_residuals(values)
-    change = _change_of(problem, jacobians)([a - b for a, b in zip(residuals, other, strict=True)])
-    return np.outer(change, change)
+    return tuple(motions)
 
 
 def _change_of(
