@@ -208,15 +208,6 @@ class TestBudget:
             widest = max(widest, *(p.k for p in found.parameters))
         assert 2.3 < widest < stats.t(2.5).ppf(0.97725)
 
-    def test_a_spring_beside_friction_is_no_less_likely_where_tests_agree(self) -> None:
-        """It moves every test alike: leaving one out does not show it."""
-        A = np.geomspace(0.1, 10.0, 12) * X_C
-        for seed in range(2, 6):
-            N = FRICTION.describing_function(A) + 0.02 * 30.0
-            data = FrequencyResponse(np.ones(12), N * relative_noise(12, 0.01, seed), A)
-            limits = fit(data, Dahl(), throw=False).conf_interval()["f_max"][1]
-            assert limits.lower < 0.1 < limits.upper
-
     def test_a_stated_calibration_is_a_type_b_source(self) -> None:
         sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
         found = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)

@@ -88,7 +88,7 @@ class TestRows:
         found = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl())
         assert found.goodness.cause == ""
         assert "do not cover the misfit" in found.verdict
-        assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in found.verdict
+        assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in found.fit_report()
         robust = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl(), loss="huber")
         assert robust.status is VerdictStatus.APPROXIMATE
         assert "they are neighbours, amplitude from 0.0243 to 0.0333 m" in robust.verdict

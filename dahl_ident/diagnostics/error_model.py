@@ -14,10 +14,9 @@ each. Variances follow from restricted maximum likelihood
     G = (J'J)^-1 J',
 
 the covariance of the estimate is the sum of G V_k G' over the sources: the rows of an uncertainty
-budget (JCGM 100:2008). A force in parallel with friction alone is one force, the same for all rows:
-its V_k is the mean square that it has given the residuals. Sources widen the estimate and never
-move it. From five tests on no parameter's uncertainty is below that of leaving out each test in
-turn (the jackknife), and what it adds is one more row.
+budget (JCGM 100:2008). Sources widen the estimate and never move it. From five tests on no
+parameter's uncertainty is below that of leaving out each test in turn (the jackknife), and what it
+adds is one more row.
 
 Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Huber, *Robust Statistics*,
 1981, section 7.6 (the sandwich); Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
@@ -460,12 +459,6 @@ def _by_source(
     names = [NOISE] * noises + [source.name for source in sources]
     for name, part, variance in zip(names, each, state.variances.tolist(), strict=True):
         found[name] = found.get(name, 0.0) + variance * part
-    for k, source in enumerate(sources):
-        if source.in_common:
-            own = state.model.columns(k)
-            made, force = lever @ state.model.U[:, own], state.predicted[own]
-            square = np.outer(force, force) + state.K[own, own]
-            found[source.name] = found[source.name] + made @ square @ made.T
     priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
     priors += [one.source for one in assumed.values()]
     for row, name in enumerate(priors, start=problem.n_residuals):
@@ -476,20 +469,11 @@ def _by_source(
 def _limited_shares(
     sources: Sequence[Source], state: MixedState, lever: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return shares of the covariance, those of the model error by its `limit` of parameters.
-
-    A force in common to all tests has none: it is one force, and no variance of many.
-    """
+    """Return shares of the covariance, those of the model error by its `limit` of parameters."""
     each, known = shares(state, lever)
-    each[_limited(sources, state)] *= np.outer(limit, limit)
-    each[[k for k, s in enumerate(sources, state.model.noises) if s.in_common]] = 0.0
+    model = [k for k, s in enumerate(sources, state.model.noises) if s.name == MODEL_ERROR]
+    each[model] *= np.outer(limit, limit)
     return each, known
-
-
-def _limited(sources: Sequence[Source], state: MixedState) -> list[int]:
-    """Return the numbers of model errors that tests left out would show."""
-    every = enumerate(sources, state.model.noises)
-    return [k for k, s in every if s.name == MODEL_ERROR and not s.in_common]
 
 
 def _limit_of_model_error(
@@ -497,7 +481,7 @@ def _limit_of_model_error(
 ) -> FloatArray:
     """Return the factors, (Q,), that bring the model error to what tests left out make likely."""
     each, _ = shares(state, lever)
-    model = _limited(sources, state)
+    model = [k for k, s in enumerate(sources, state.model.noises) if s.name == MODEL_ERROR]
     size = np.einsum("kii,k->i", each[model], state.variances[model])
     most = _SHARED_BY * np.diagonal(by_tests)
     return np.asarray(np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most)))

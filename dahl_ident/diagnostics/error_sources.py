@@ -213,11 +213,6 @@ class Source:
         """Whether it is a force in parallel with the model."""
         return self.shapes is not None and self.shapes.parallel
 
-    @property
-    def in_common(self) -> bool:
-        """Whether it is one force for all tests: in parallel, and no linear part takes any."""
-        return self.parallel and self.absorbed is not None and not self.absorbed.any()
-
     def changes(
         self,
         names: Sequence[str],
