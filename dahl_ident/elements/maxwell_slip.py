@@ -163,7 +163,7 @@ class MaxwellSlip(Masing):
     def history(
         self, values: Sequence[Any], path: Path, state: float | FloatArray, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force at every sample, unchecked: from loads of the springs, or a force."""
+        """Return the force at every sample, unchecked: from a load of every spring, or of all."""
         if not isinstance(state, np.ndarray):
             return super().history(values, path, state, slopes=slopes)
         free = [i for i, p in enumerate(self.parameters) if p.free]
