@@ -79,7 +79,7 @@ class Finding:
         }
 
 
-_MOST_TOLD = 5  # sentences that are read
+_MOST_TOLD = 5  # findings of a verdict; more are not read
 
 
 class Judgement:
@@ -102,18 +102,16 @@ class Judgement:
         every = sorted(findings, key=lambda finding: -finding.severity.rank)
         self.status = every[0].severity if every else VerdictStatus.TRUSTED
         self.findings = tuple(every)
-        usable, assumed = self.status.usable, Question.ASSUMED
         needed = [
             finding
             for finding in every
-            if usable
+            if self.status.usable
             or finding.severity is not VerdictStatus.TRUSTED
             or finding.question is Question.DESCRIBED
         ]
-        last = [finding for finding in needed if finding.question is assumed]
-        first = [finding for finding in needed if finding.question is not assumed]
-        room = _MOST_TOLD - len(last)
-        self.told = (*first[:room], *last)
+        assumed = [finding for finding in needed if finding.question is Question.ASSUMED]
+        others = [finding for finding in needed if finding.question is not Question.ASSUMED]
+        self.told = (*others[: _MOST_TOLD - len(assumed)], *assumed)
         self.further = tuple(finding for finding in every if finding not in self.told)
 
     @property

@@ -289,10 +289,10 @@ class MixedState:
     def variances_covariance(self) -> FloatArray:
         """Covariance of the variances, zero for those at zero.
 
-        No source is more uncertain than its size: a positive number of which the estimate alone is
-        known is distributed exponentially (JCGM 101:2008, 6.4.10). One column alone has chi-square
-        with one degree of freedom. And no number between 0 and its bound has a standard deviation
-        above half the bound (Popoviciu).
+        The standard deviation of a source's variance is at most that variance: a positive quantity
+        of which only the best estimate is known has an exponential distribution (JCGM 101:2008,
+        6.4.10). For a source of one column it is at most sqrt(2) times as large (chi-square with
+        one degree of freedom). It is also at most half the bound of the variance (Popoviciu).
         """
         found = np.zeros_like(self.information)
         every = np.sqrt(np.maximum(np.diagonal(self.information), 0.0))

@@ -128,7 +128,8 @@ def record_errors(
     values : ndarray, shape (P,)
         The estimate.
     jacobians, residuals : sequence of ndarray
-        Derivatives of the prediction and measured minus predicted, of each record.
+        Derivatives of the prediction and measured minus predicted, of each record; of a robust
+        fit the scores in place of the latter, which then say nothing of the prediction.
 
     Returns
     -------
@@ -161,18 +162,21 @@ def record_errors(
             count(DELAY, by_delay(problem, values, white, left, noise))
     if problem.output == "force":
         plain, change_of = problem.outputs(values), _change_of(problem, jacobians)
+
+        def count_change(source: str, other: RecordProblem) -> None:
+            """Count how far the estimate moves if another problem is the right one."""
+            output = other.outputs(values)
+            change = change_of([b - a for a, b in zip(plain, output, strict=True)])
+            count(source, np.outer(change, change))
+
         moved = _by_displacement(problem, values, plain, jacobians, residuals)
         count(DISPLACEMENT, moved)
         if not problem.model.rate_independent:
-            other = problem.differentiated_in(_OTHER_WINDOW * problem.window).outputs(values)
-            change = change_of([b - a for a, b in zip(plain, other, strict=True)])
-            count(WINDOW, np.outer(change, change))
+            count_change(WINDOW, problem.differentiated_in(_OTHER_WINDOW * problem.window))
         if problem.with_memory and not problem.displacement_noise:
             more = noise_at_turns(problem, values, white, left, noise)
             count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
-            farther = problem.altered("latest", motions=_beyond_samples(problem)).outputs(values)
-            change = change_of([b - a for a, b in zip(plain, farther, strict=True)])
-            count(SAMPLING, np.outer(change, change))
+            count_change(SAMPLING, problem.altered("latest", motions=_beyond_samples(problem)))
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]

@@ -12,8 +12,7 @@ from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
 from dahl_ident.units import percent
 
-_MOST_DEPARTURES = 1  # in the verdict; the details list all
-_MOST_ROWS = 3  # the same
+_MOST_ROWS = 3  # in the verdict; the details list all
 _LEVEL = level_text(CONFIDENCE)
 
 
@@ -36,9 +35,9 @@ def joined(parts: Sequence[str], most: int = 100) -> str:
 
 def departures(objections: Sequence[str]) -> str:
     """Return the most serious objection, and how many more there are."""
-    more = len(objections) - _MOST_DEPARTURES
-    tests = f"; {more} more test{'s' if more > 1 else ''} failed" if more > 0 else ""
-    return f"{'; '.join(objections[:_MOST_DEPARTURES])}{tests}"
+    first, *others = objections
+    more = len(others)
+    return f"{first}; {more} more test{'s' if more > 1 else ''} failed" if more else first
 
 
 def _are(names: Sequence[str]) -> str:
