@@ -29,7 +29,8 @@ def spinner(task: str) -> Iterator[Show]:
     from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), Remaining())
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    console = Console(stderr=True, force_jupyter=False)  # plain text in notebooks too
+    bar = Progress(*columns, console=console, transient=True)
     number = bar.add_task(task, total=None)
 
     def show(words: str, done: float = 0.0, total: float | None = None) -> None:

@@ -30,8 +30,8 @@ def progress_bar(settings: ChainSettings) -> Iterator[Listener]:
     from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (TextColumn("sampling"), BarColumn(), MofNCompleteColumn(), Remaining())
-    # standard output is for results
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True, force_jupyter=False)  # standard output is for results
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("sampling", total=settings.steps)
 
         def update(chain: Chain, verdict: Convergence | None) -> None:
