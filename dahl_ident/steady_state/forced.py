@@ -200,12 +200,14 @@ def response(
     with np.errstate(over="ignore"):
         points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
         _check_reach(np.minimum(points.bounds()[0], 1.0))  # infinite without any stiffness
-        roots, force = find_roots(points)
+        roots = find_roots(points)
         _check_reach(roots)
         amplitude = roots * points.unit[:, None]
         _check_reach(amplitude)
-    with np.errstate(invalid="ignore"):  # NaN where there is no amplitude
-        X = amplitude * (force.conj() / np.abs(force))
+    found = np.isfinite(roots)
+    force = points.at(np.nonzero(found)[0]).force(roots[found])
+    X: ComplexArray = np.full(roots.shape, np.nan, dtype=np.complex128)
+    X[found] = amplitude[found] * (force.conj() / np.abs(force))
     harmonics = np.where(np.array(HARMONICS) == 1, X[..., None], 0.0)
     multiplier = np.full(X.shape, np.nan)
     chosen = np.zeros(X.shape[0], dtype=np.intp)

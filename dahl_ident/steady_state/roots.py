@@ -12,30 +12,17 @@ other than the grid's nodes, 1.8 % in amplitude, may be missed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.element import Element
 from dahl_ident.steady_state.plant import EPS, BoolArray, IntArray, Nonlinear, Plant, flatten
 
-_Scalar = TypeVar("_Scalar", bound=np.generic)
-
 _SCAN_PER_DECADE = 128  # 1.8 % apart: closer pairs of roots may be missed
 _COARSE_SCAN = 32  # the same where only one amplitude is needed
 _SCAN_CELLS = 2**15  # points times nodes of the scan that are processed at once
-
-
-class Roots(NamedTuple):
-    """Amplitudes A and force phasors A Z(A) in the plant's units, shape (points, most).
-
-    Amplitudes rise along a row; a row with fewer than the most is filled up with NaN.
-    """
-
-    amplitude: FloatArray
-    force: ComplexArray
 
 
 def solve(
@@ -53,7 +40,7 @@ def solve(
     missed where A |Z| turns twice within 7.5 % of amplitude.
     """
     plant, shape = flatten(model, values, omega, drive)
-    roots = find_roots(plant, _COARSE_SCAN).amplitude * plant.unit[:, None]
+    roots = find_roots(plant, _COARSE_SCAN) * plant.unit[:, None]
     if start is None or roots.shape[1] == 1:
         return roots[:, 0].reshape(shape)
     near = np.broadcast_to(start, shape).reshape(-1, 1)
@@ -64,16 +51,16 @@ def solve(
     return np.take_along_axis(roots, nearest, axis=1).reshape(shape)
 
 
-def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
-    """Return every amplitude of every point, and the corresponding force.
+def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> FloatArray:
+    """Return every amplitude of every point in the plant's units, shape (points, most).
 
-    `per_decade` is the number of nodes a decade of amplitude in the search at active points.
+    They rise along a row; a row with fewer than the most is filled up with NaN. `per_decade` is
+    the number of nodes a decade of amplitude in the search at active points.
     """
     resonant = np.abs(plant.linear) <= plant.rounding
     if not plant.friction.elements:
         with np.errstate(divide="ignore", over="ignore"):
-            amplitude = np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))
-        return Roots(amplitude[:, None], (amplitude * plant.linear)[:, None])
+            return np.where(resonant, np.nan, plant.drive / np.abs(plant.linear))[:, None]
     known = np.isfinite(plant.linear)
     if plant.friction.unique:
         sound = _sound(plant.friction)
@@ -81,20 +68,17 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> Roots:
     passive = known & plant.friction.unique & (plant.linear.imag >= -plant.rounding)
     single = passive & ~(resonant & (plant.drive >= plant.largest_friction()))
     amplitude = np.full(plant.drive.shape, np.nan)
-    force = np.full(plant.drive.shape, np.nan, dtype=np.complex128)
     alone = np.flatnonzero(single)
     if alone.size:
         amplitude[alone] = _single_roots(plant.at(alone))
-        force[alone] = plant.at(alone).force(amplitude[alone])
     active = np.flatnonzero(known & ~passive)
     if not active.size:
-        return Roots(amplitude[:, None], force[:, None])
+        return amplitude[:, None]
     point, found = _scan(plant, active, per_decade)
     column = _places(point)
-    most = 1 + int(column.max(initial=0))
-    roots = Roots(_widened(amplitude, most), _widened(force, most))
-    roots.amplitude[point, column] = found
-    roots.force[point, column] = plant.at(point).force(found)
+    roots = np.full((amplitude.size, 1 + int(column.max(initial=0))), np.nan)
+    roots[:, 0] = amplitude
+    roots[point, column] = found
     return roots
 
 
@@ -278,10 +262,3 @@ def _places(point: IntArray) -> IntArray:
     """Return the index of each entry within its point; equal points are adjacent."""
     _, first, counts = np.unique(point, return_index=True, return_counts=True)
     return np.arange(point.size) - np.repeat(first, counts)
-
-
-def _widened(column: NDArray[_Scalar], most: int) -> NDArray[_Scalar]:
-    """Return a column with NaN to its right, `most` columns in all."""
-    wide = np.full((column.size, most), np.nan, dtype=column.dtype)
-    wide[:, 0] = column
-    return wide
