@@ -157,6 +157,26 @@ class Pinched(di.Friction):
         return k * (1.0 - 0.9 * (np.fabs(y - 0.3) < 0.0025)) * (y < 1.0)
 
 
+class PinchedBySquares(Pinched):
+    """The same dip by a function that touches zero within a step."""
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        k, f_max = values
+        y = direction * force / f_max
+        return k * (1.0 - 0.9 * ((np.fabs(y) - 0.3) ** 2 < 0.0025**2) * (y > 0.0)) * (y < 1.0)
+
+
+class Preloaded(di.Friction):
+    """Half as stiff beyond 10 N in one direction."""
+
+    kind = "preloaded_of_tests"
+    parameters = (STIFFNESS, F_MAX)
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        k, f_max = values
+        return k * (1.0 - direction * force / f_max) * (0.75 - 0.25 * np.tanh(2.0 * (force - 10.0)))
+
+
 class Drifting(di.Friction):
     """Depends on rate and direction: even harmonics."""
 
@@ -198,12 +218,13 @@ def test_bilinear_slopes_by_comparisons() -> None:
             assert np.max(np.abs(found - c)) < 1e-8 * np.max(np.abs(c))
 
 
-def test_pinched_slopes() -> None:
+@pytest.mark.parametrize("law", [Pinched, PinchedBySquares])
+def test_pinched_slopes(law: type[di.Friction]) -> None:
     for A in (0.002, 0.006, 0.03):
-        result = loop_of(Pinched(), A, [100.0, 1.0], harmonics=HARMONICS)
+        result = loop_of(law(), A, [100.0, 1.0], harmonics=HARMONICS)
         hand = PiecewiseByHand(1.0, [0.2975, 0.3025, 1.0], [100.0, 10.0, 100.0, 0.0])
         c = by_oracle(hand, A, result, True, 1.0)
-        for found in (result.coefficients[0], harmonics_of(Pinched(100.0, 1.0), A)):
+        for found in (result.coefficients[0], harmonics_of(law(100.0, 1.0), A)):
             assert np.max(np.abs(found - c)) < 1e-8 * np.max(np.abs(c))
 
 
@@ -219,6 +240,20 @@ def test_even_harmonics_of_a_rate_dependent_law() -> None:
     c = by_oracle(ByHand(1.0, 3.0, asymmetry=0.4), 2.0, result, False, 1.0)
     assert abs(c[2]) > 1e-2
     for found in (result.coefficients[0], harmonics_of(Drifting(3.0, 1.0, 0.4), 2.0)):
+        assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
+
+
+def test_even_harmonics_where_directions_differ_at_large_forces_alone() -> None:
+    class ByHand(DahlByHand):
+        def _slope(self, v: float, s: float, F: float) -> float:
+            softer = 0.75 - 0.25 * np.tanh(2.0 * (F - 10.0))
+            return float(self.sigma * (1.0 - s * F / 30.0) * softer)
+
+    law, amplitude = Preloaded(1e4, 30.0), 2.1e-3
+    result = loop_of(law, amplitude, [1e4, 30.0], harmonics=HARMONICS)
+    c = by_oracle(ByHand(30.0, 1e4), amplitude, result, False, 30.0)
+    assert abs(c[2]) > 1.0
+    for found in (result.coefficients[0], harmonics_of(law, amplitude)):
         assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
 
 

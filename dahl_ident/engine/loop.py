@@ -39,7 +39,7 @@ from dahl_ident.engine.radau import (
 _NEWTON, _SOLVED = 15, 1e-7  # iterations of the stages; the change whose square is rounding
 _SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
 _LOCATED = 1e-14  # rad: shorter steps are none
-_MOST = 4000  # steps of a half cycle
+_MOST = 500  # steps of a half cycle, but for those that the highest harmonic takes
 _ITERATIONS = 60  # of shooting with coarse steps; one is the rule, three without a guess
 _CONVERGED = 1e-5  # change of the first force over the largest; its square is left
 _CLOSE = 1e-7  # the same in the last pass: derivatives err by as much
@@ -185,28 +185,33 @@ def _error(f, psi, h, F, output, at):
 
 
 @compiled
+def _change(x, changes):
+    """Return the change of the force at a place x of a step, 0 to 1, from those at the stages."""
+    value = 0.0
+    for j in range(STAGES):
+        weight = x / NODES[j]
+        for k in range(STAGES):
+            if k != j:
+                weight *= (x - NODES[k]) / (NODES[j] - NODES[k])
+        value += weight * changes[j]
+    return value
+
+
+@compiled
 def _guess(h, last, rate, at):
     """Set the stages to the last step's polynomial, or where there is none to a constant rate."""
-    if last > 0.0:
-        for i in range(STAGES):
-            x = 1.0 + NODES[i] * h / last
-            value = -at.last[STAGES - 1]
-            for j in range(STAGES):
-                weight = x / NODES[j]
-                for k in range(STAGES):
-                    if k != j:
-                        weight *= (x - NODES[k]) / (NODES[j] - NODES[k])
-                value += weight * at.last[j]
-            at.stages[i] = value
-    else:
-        for i in range(STAGES):
+    for i in range(STAGES):
+        if last > 0.0:
+            at.stages[i] = _change(1.0 + NODES[i] * h / last, at.last) - at.last[STAGES - 1]
+        else:
             at.stages[i] = h * NODES[i] * rate
 
 
 @compiled
-def _first_event(F, gap, at):
+def _first_event(f, psi, h, F, gap, at):
     """Return which function passes through zero first in the step, or -1, and at which place.
 
+    A function is looked at by its polynomial between the stages; where it is smallest, itself.
     Functions beyond the switches: the force where a gap is to be crossed.
     """
     which, where = -1, 2.0
@@ -219,7 +224,7 @@ def _first_event(F, gap, at):
             side, near, before = at.w[6 + e], NEAR * at.scale[e], at.before[e]
         if side == 0.0:
             continue
-        low, old = 0.0, before * side
+        lower, older, low, old = 0.0, np.inf, 0.0, before * side
         for i in range(WITHIN.shape[0]):
             high, value = PLACES[i], WITHIN[i, 0] * before * side
             for j in range(STAGES):
@@ -227,6 +232,13 @@ def _first_event(F, gap, at):
                 value += WITHIN[i, 1 + j] * there * side
             if low >= where:
                 break
+            if i and e < at.k and older > old < value:
+                one, two = (old - older) / (low - lower), (value - old) / (high - low)
+                least = 0.5 * (lower + low - one * (high - lower) / (two - one))
+                angle, there = psi + least * h, F + _change(least, at.stages)
+                _evaluate(f, 0.0, np.cos(angle), np.sin(angle), there, at)
+                if at.w[at.o + 4 + e] * side < -near:
+                    low, old, high, value = lower, older, least, at.w[at.o + 4 + e] * side
             if value < -near or (e == at.k and value <= 0.0):
                 if old > 0.0:  # by the chord: the step that ends there is then solved
                     high = low + (high - low) * old / (old - value)
@@ -235,7 +247,7 @@ def _first_event(F, gap, at):
                 if high < where:
                     which, where = e, high
                 break
-            low, old = high, value
+            lower, older, low, old = low, old, high, value
     return which, where
 
 
@@ -393,7 +405,7 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
     if crossing and heading * F >= 0.0:
         psi = _cross_gap(f, gap, psi, chosen, columns, at)
         crossing, F = False, 0.0
-    for _ in range(_MOST):
+    for _ in range(_MOST + int(2.0 * np.pi / longest)):
         if np.pi - psi <= _LOCATED:
             return F, after_turn
         if tries == 0:  # else the step's end is being moved to an event
@@ -423,7 +435,7 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
             step, last, tries, event = h * factor, 0.0, 0, -1
             continue
         if tries == 0:
-            event, place = _first_event(F, crossing, at)
+            event, place = _first_event(f, psi, h, F, crossing, at)
             if _fades(at):
                 step, last = 0.5 * h, 0.0
                 continue

@@ -156,32 +156,81 @@ def _followers(
     return found
 
 
+def _factors(function: ca.Function, inputs: Sequence[float]) -> list[float]:
+    """Return by which factors outputs change where the inputs change by theirs.
+
+    That is read from the expression, whatever the numbers: NaN where it is not a factor, or does
+    not show as one; 0 where the output is zero.
+    """
+    work: dict[int, float] = {}
+    power: dict[int, float] = {}  # constants
+    found = [0.0] * function.nnz_out(0)
+    for k in range(function.n_instructions()):
+        code, source = function.instruction_id(k), function.instruction_input(k)
+        (*_, target), factor = function.instruction_output(k), np.nan
+        if code == ca.OP_OUTPUT:
+            found[target] = work[source[0]]
+            continue
+        exponent = power.get(source[-1], np.nan) if source else np.nan
+        power.pop(target, None)
+        if code == ca.OP_CONST:
+            power[target] = function.instruction_constant(k)
+            factor = float(power[target] != 0.0)
+        elif code == ca.OP_INPUT:
+            factor = inputs[source[0]]
+        else:
+            a = [work[i] for i in source]
+            one, other = a[0], a[-1]
+            alike = one if one == other else np.nan
+            if code in (ca.OP_ADD, ca.OP_SUB):
+                factor = one + other if 0.0 in a else alike
+            elif code == ca.OP_MUL:
+                factor = 0.0 if 0.0 in a else one * other
+            elif code == ca.OP_DIV and other:
+                factor = one / other
+            elif code == ca.OP_INV and one:
+                factor = 1.0 / one
+            elif code == ca.OP_IF_ELSE_ZERO and one == 1.0:
+                factor = other
+            elif code in (ca.OP_NEG, ca.OP_TWICE):
+                factor = one
+            elif code == ca.OP_SQ:
+                factor = one**2
+            elif code == ca.OP_FABS:
+                factor = abs(one)
+            elif code == ca.OP_SIGN:
+                factor = np.sign(one)
+            elif code in (ca.OP_FMIN, ca.OP_FMAX) and alike > 0.0:
+                factor = one
+            elif (code in (ca.OP_LT, ca.OP_LE) and alike > 0.0) or all(
+                value in (0.0, 1.0) for value in a
+            ):
+                factor = 1.0
+            elif code in (ca.OP_POW, ca.OP_CONSTPOW) and exponent.is_integer():
+                factor = one**exponent
+            elif abs(one) == 1.0 and code in (*_ODD, *_EVEN):
+                factor = one if code in _ODD else 1.0
+        work[target] = factor
+    return found
+
+
+_ODD = (
+    ca.OP_SIN, ca.OP_TAN, ca.OP_SINH, ca.OP_TANH, ca.OP_ASIN, ca.OP_ATAN, ca.OP_ASINH, ca.OP_ATANH,
+    ca.OP_ERF,
+)  # fmt: skip
+_EVEN = (ca.OP_COS, ca.OP_COSH)
+
+
 def _is_odd(function: ca.Function, order: int, parameters: int) -> bool:
     """Return whether rates and output change sign with states, drive and direction."""
-    rng = np.random.default_rng(1)
-    with np.errstate(all="ignore"):
-        for _ in range(4):
-            state, p = rng.standard_normal(order + 2), rng.uniform(0.3, 0.7, parameters)
-            state[1], state[-1] = abs(state[1]), 1.0
-            one, other = (function(*(sign * state), *p).full() for sign in (1.0, -1.0))
-            if not np.allclose(one, -other, rtol=1e-9, atol=1e-12, equal_nan=True):
-                return False
-    return True
+    factors = _factors(function, [-1.0] * (order + 2) + [1.0] * parameters)
+    return all(factor in (-1.0, 0.0) for factor in factors)
 
 
 def _goes_with_speed(function: ca.Function, order: int, parameters: int) -> bool:
     """Return whether rates are in proportion to the speed, and the output does not depend on it."""
-    rng = np.random.default_rng(2)
-    for _ in range(4):
-        state, p = rng.standard_normal(order + 2), rng.uniform(0.3, 0.7, parameters)
-        state[1], state[-1] = abs(state[1]), 1.0
-        one = function(*state, *p).full()
-        state[1] *= 2.0
-        other = function(*state, *p).full()
-        other[:order] *= 0.5
-        if not np.allclose(one, other, rtol=1e-9, atol=1e-12, equal_nan=True):
-            return False
-    return True
+    *rates, output = _factors(function, [1.0, 2.0] + [1.0] * (order + parameters))
+    return output in (0.0, 1.0) and all(rate in (2.0, 0.0) for rate in rates)
 
 
 def _places(n_inputs: int, n_rows: int, graph: ca.Function) -> list[list[int]]:
