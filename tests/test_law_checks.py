@@ -179,8 +179,15 @@ def test_no_loop_is_an_error_and_not_a_number() -> None:
         ((positive("a b", "N"),), "a parameter called 'a b'; expected letters, digits"),
         ((positive("name", "N"),), "a parameter called 'name'"),
         ((positive("lambda", "N"),), "a parameter called 'lambda'; expected"),
-        ((di.Parameter("a", "N", "", lower=2.0, upper=1.0),), "bounds of a are 2 and 1; expected"),
-        ((di.Parameter("a", "N", "", prior=(2.0, 1.0)),), "prior of a are 2 and 1"),
+        (
+            (di.Parameter("a", "N", "", lower=2.0, upper=1.0),),
+            r"a has the bounds \(2.0, 1.0\); expected",
+        ),
+        ((di.Parameter("a", None, ""),), "unit of a is None"),  # type: ignore[arg-type]
+        ((di.Parameter("a", "N", "", lower="0"),), "a has the bounds"),  # type: ignore[arg-type]
+        ((di.Parameter("a", "N", "", prior=5),), "a has the prior 5"),  # type: ignore[arg-type]
+        ((di.Parameter("a", "N", "", lower=0.0, upper=1.0, scan=(5.0,)),), "a is scanned at 5"),
+        ((di.Parameter("a", "N", "", prior=(2.0, 1.0)),), r"a has the prior \(2.0, 1.0\)"),
         ((di.Parameter("a", "N", "", upper=-1.0, transform="log"),), "its upper bound is -1"),
         (
             (di.Parameter("a", "N", "", lower=-1.0, transform="log"),),

@@ -101,7 +101,7 @@ def test_options_files_take_it(file: Path, run: Runner) -> None:
          "A has the kind 'dahl', which .*Dahl has already; choose another"),
         ("import dahl_ident as di\nclass A(di.Friction):\n"
          "    parameters = (di.Parameter('a', 'N', 'a', lower=2.0, upper=1.0),)\n"
-         "    def slope(self, *_):\n        return 1.0\n", "A: the bounds of a are 2 and 1"),
+         "    def slope(self, *_):\n        return 1.0\n", r"A: a has the bounds \(2.0, 1.0\)"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: str) -> None:

@@ -231,7 +231,7 @@ class Element(Behaviour):
         array([6.])
         """
         x = finite_array(displacement, "displacement")
-        if x.ndim > 1:
+        if x.ndim > 1 or not x.size:
             raise ValidationError(
                 f"displacement has shape {x.shape}; expected one history, shape (n,)"
             )

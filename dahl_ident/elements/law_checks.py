@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from keyword import iskeyword
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -89,12 +90,22 @@ def check_declarations(law: type[Element]) -> None:
                 f"underscores, such as 'f_max', no word of Python, and none of "
                 f"{', '.join(_RESERVED)}"
             )
-        for what, (low, high) in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
-            if not low < high:
+        if not isinstance(p.unit, str):
+            raise ValidationError(
+                f"{name}: the unit of {p.name} is {p.unit!r}; expected text, such as 'N/m'"
+            )
+        for what, pair in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
+            numbers = isinstance(pair, tuple) and len(pair) == 2
+            if not (numbers and all(isinstance(x, Real) for x in pair) and pair[0] < pair[1]):
                 raise ValidationError(
-                    f"{name}: the {what} of {p.name} are {low:g} and {high:g}; expected the lower "
+                    f"{name}: {p.name} has the {what} {pair!r}; expected two numbers, the lower "
                     "one first"
                 )
+        beyond = [value for value in p.scan if not p.lower <= value <= p.upper]
+        if beyond:
+            raise ValidationError(
+                f"{name}: {p.name} is scanned at {beyond[0]:g}, which is outside its bounds"
+            )
         if p.transform not in ("log", "linear"):
             raise ValidationError(
                 f"{name}: the transform of {p.name} is {p.transform!r}; expected 'log' or 'linear'"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -285,6 +287,7 @@ def kernels(name: str) -> ModuleType:
         writable = False
     if not writable:
         folder = Path(tempfile.mkdtemp(prefix="dahl_ident-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     if not any(folder.rglob(f"{name}.*.nbi")):
         print("compiling the engine, once (half a minute) ...", file=sys.stderr)  # noqa: T201 - users wait
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
