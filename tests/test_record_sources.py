@@ -245,7 +245,8 @@ def test_a_delay_that_nobody_stated_is_estimated(delay: float) -> None:
             assert abs(fit.params[name].value - value) < 3.0 * (fit.params[name].stderr or 0.0)
     assert "delay between the channels" in sources(fit, "sigma")
     if abs(delay) == 0.5:
-        assert "The motion lags the force by" in fit.verdict
+        side = "lags" if delay > 0.0 else "leads"
+        assert f"The motion {side} the force by" in fit.verdict
     again = di.FitResult.from_json(fit.to_json())
     assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
 

@@ -92,8 +92,11 @@ def linearization(problem: TableProblem, theta: FloatArray, runs: RunDeviations)
 def run_deviations(
     estimate: WeightedEstimate, mean: FloatArray, effects: FloatArray, spread: FloatArray,
     noise: float,
-) -> RunDeviations:  # fmt: skip
-    """Return how runs deviate, where each run's residuals and deviations together are least."""
+) -> RunDeviations | None:  # fmt: skip
+    """Return how runs deviate, where each run's residuals and deviations together are least.
+
+    None where the model has no response at the `mean`, as beyond a parameter that is hardly known.
+    """
     problem, scale = estimate.problem, estimate.scale
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
     unit, b = spread[scatters], effects.copy()
@@ -102,6 +105,8 @@ def run_deviations(
         if last:
             break
         near = linearization(problem, estimate.theta, runs)
+        if not (np.isfinite(near.residuals).all() and np.isfinite(near.J).all()):
+            return None
         r = scale * scores_of(near.residuals / scale, len(near.residuals), estimate.loss)
         for i, (_, rows, _) in enumerate(near.parts):
             both, share = np.repeat(rows, 2), near.predicted * rows

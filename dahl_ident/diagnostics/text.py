@@ -60,9 +60,10 @@ def _identified(identified: Sequence[str], weak: Sequence[str], by_prior: Sequen
 def _undetermined(determined: Sequence[str], weak: Sequence[str], lost: Sequence[str]) -> str:
     if weak and not determined:
         return f"Only {_are(weak)} determined, and only weakly; not {listed(lost)}."
-    only = f"Only {_are(determined)} determined" if determined else "Nothing is determined"
+    if not determined:
+        return f"Nothing is determined of {listed(lost)}."
     weakly = f", {listed(weak)} weakly" if weak else ""
-    return f"{only}{weakly}; not {listed(lost)}."
+    return f"Only {_are(determined)} determined{weakly}; not {listed(lost)}."
 
 
 def _no_degrees_of_freedom(numbers: int, parameters: int, scale_known: bool) -> str:
@@ -297,11 +298,12 @@ def _assumed(
     no_drift: bool,
     noise_alone: bool,
 ) -> str:
-    parts = [
-        f"{r['name']} between {r['low']:g} and {r['high']:g} "
-        f"(here {with_unit(r['value'], r['stderr'], r['unit'])})"
-        for r in ranges
-    ]
+    parts = []
+    for r in ranges:
+        within = r["low"] <= r["value"] <= r["high"]
+        where = "here" if within else "beyond that range, the data ask for"
+        value = with_unit(r["value"], r["stderr"], r["unit"])
+        parts.append(f"{r['name']} between {r['low']:g} and {r['high']:g} ({where} {value})")
     parts += [f"{name} = {value:g} exactly" for name, value in stated.items()]
     parts += [f"the constraint {listed(constraints)}"] if constraints else []
     parts += [f"{listed(exact)} exact"] if exact else []
@@ -383,7 +385,8 @@ _TEXT: Mapping[str, Callable[..., str]] = {
         f"{unknowns} unknowns: record for longer."
     ),
     "delay": lambda delay, samples: (
-        f"The motion lags the force by {samples:.2g} samples ({delay:.2g} s): taken out."
+        f"The motion {'lags' if delay > 0.0 else 'leads'} the force by {abs(samples):.2g} samples "
+        f"({abs(delay):.2g} s): taken out."
     ),
     "record_residuals": lambda rms, output, worst: (
         f"The residuals are {percent(rms)} rms of the measured {output}; {worst}."
