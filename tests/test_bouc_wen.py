@@ -224,3 +224,18 @@ def test_a_table_with_harmonics_takes_seconds() -> None:
     for p in true.parameters:
         found = fit.params[p.name]
         assert abs(found.value - (p.value or 0.0)) < 3.5 * (found.stderr or 0.0), p.name
+
+
+@pytest.mark.parametrize("p", [1e12, 1e30])
+def test_a_force_that_vanishes_at_once_on_reversal(p: float) -> None:
+    """Each half cycle begins without a force: by quadrature."""
+    sigma, q, A = 2e4, 400.0, 0.01
+
+    def force(theta: float) -> float:  # x = A cos(theta) falls
+        return -sigma / q * -np.expm1(-q * A * (1.0 - np.cos(theta)))
+
+    in_phase, out = (
+        2.0 / np.pi * quad(lambda t: force(t) * wave(t), 0.0, np.pi)[0] for wave in (np.cos, np.sin)
+    )
+    N = BoucWen(sigma, q, p).describing_function(A)
+    assert N == pytest.approx((in_phase - 1j * out) / A, rel=2e-4)

@@ -11,7 +11,7 @@ dF/dx = sigma - q |F| and sigma + p |F|; q = p = sigma/f_max is then the linear 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,11 @@ from dahl_ident.elements.facts import Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
+if TYPE_CHECKING:
+    from dahl_ident.engine import Loops
+
+_P = 4  # column of p in rows of amplitude, frequency and values
+_AT_ONCE = 1e8  # p times amplitude; the loop is that of any larger one to 1e-4
 _WITH_EXPONENT = (
     "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
     "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
@@ -115,6 +120,24 @@ class BoucWen(Friction):
         softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))
         rate = 0.5 * ((softening - stiffening) + (softening + stiffening) * np.sign(ahead))
         return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
+
+    def _loops(
+        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+    ) -> Loops:
+        """Return settled loops; forces that vanish at once on reversal do so within rounding.
+
+        Data that cannot tell how fast they vanish let p grow without end.
+        """
+        most = _AT_ONCE / at[:, 0]
+        beyond = at[:, _P] > most
+        if beyond.any():
+            at = at.copy()
+            at[beyond, _P] = most[beyond]
+        loops = super()._loops(at, orders, chosen)
+        for place, parameter in enumerate(chosen):
+            if parameter == _P - 2:
+                loops.by_parameter[beyond, :, place] = 0.0
+        return loops
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return sigma/q for both directions where the force saturates, inf where it does not."""
