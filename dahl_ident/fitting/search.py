@@ -315,7 +315,13 @@ class TableSearch:
             search = TableSearch(
                 coarser, self.loss, self.method, self.tolerance, limits=self.limits
             )
-            near = Starts(np.arange(self.problem.n_tables), search._descend(begin, scale).theta)
+            theta = search._descend(begin, scale).theta
+            if not several:  # an end by the coarser problem may be no better than the beginning
+                costs = (
+                    self.problem.quadratic(t, scale, self.loss).cost for t in (begin.theta, theta)
+                )
+                theta = np.where(np.less_equal(*costs)[:, None], begin.theta, theta)
+            near = Starts(np.arange(self.problem.n_tables), theta)
         ends = Ends(self._descend(near, scale))
         if not self.limits:
             return ends
