@@ -129,3 +129,20 @@ def test_slopes_are_derivatives() -> None:
     for i, expected in enumerate(differences(plant, starts, values, 1e-4)):
         error = np.abs(found[:, i] - expected).max() / np.abs(expected).max()
         assert error < 2e-6, i
+
+
+def test_a_short_record_from_rest_is_fitted() -> None:
+    """Its three shape parameters lie in a long curved valley."""
+    rng, t = np.random.default_rng(0), np.arange(384) / 100.0
+    lines = 2.0 * np.pi * np.arange(1, 9) / t[-1]
+    drive = np.cos(lines[:, None] * t + rng.uniform(0.0, 6.3, (8, 1))).sum(axis=0)
+    drive *= 0.15 / drive.std()
+    plant = di.Iwan(0.1, 30.0, -0.3, 0.5) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+    driven = Driven(plant, drive, 100.0)
+    x = driven.motion(np.zeros(driven.order)).output
+    x = x + 1e-3 * x.std() * rng.standard_normal(t.size)
+    record = di.Record(t, displacement=x, force=drive)
+    fit = di.fit(record, di.Iwan() + di.Mass(0.3) + di.Damper() + di.Spring())
+    truth = {"f_max": 0.1, "sigma": 30.0, "chi": -0.3, "ratio": 0.5}
+    for name, value in truth.items():
+        assert abs(fit.params[name].value - value) < 3.0 * (fit.params[name].stderr or 0.0)

@@ -262,7 +262,8 @@ def _minimise(
         tiny = predicted <= unseen_change * at.cost
         better = (new.cost < at.cost) | (tiny & (new.cost <= (1.0 + unseen_change) * at.cost))
         gain = np.where(tiny, 1.0, at.cost - new.cost) / np.where(tiny, 1.0, predicted)
-        calmer = np.maximum(damping * np.maximum(0.05, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
+        least = np.where(growth > 2.0, 1.0 / 3.0, 0.05)  # what was needed a step ago still is
+        calmer = np.maximum(damping * np.maximum(least, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
         last = np.where(better, moves, 1e-300)
