@@ -301,7 +301,7 @@ def _assumed(
     parts = []
     for r in ranges:
         within = r["low"] <= r["value"] <= r["high"]
-        where = "here" if within else "beyond that range, the data ask for"
+        where = "here" if within else "the data ask for"
         value = with_unit(r["value"], r["stderr"], r["unit"])
         parts.append(f"{r['name']} between {r['low']:g} and {r['high']:g} ({where} {value})")
     parts += [f"{name} = {value:g} exactly" for name, value in stated.items()]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
 _P = 4  # column of p in rows of amplitude, frequency and values
-_AT_ONCE = 1e8  # p times amplitude; the loop is that of any larger one to 1e-4
+_AT_ONCE = 1e8  # p times amplitude, beyond which N changes by less than 1e-4
 _WITH_EXPONENT = (
     "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
     "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
@@ -124,19 +124,16 @@ class BoucWen(Friction):
     def _loops(
         self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
     ) -> Loops:
-        """Return settled loops; forces that vanish at once on reversal do so within rounding.
+        """Return settled loops; p times amplitude counts as at most `_AT_ONCE`.
 
-        Data that cannot tell how fast they vanish let p grow without end.
+        Data of gross slip leave p open, and searches let it grow without end.
         """
         most = _AT_ONCE / at[:, 0]
-        beyond = at[:, _P] > most
-        if beyond.any():
-            at = at.copy()
-            at[beyond, _P] = most[beyond]
+        beyond, at = at[:, _P] > most, at.copy()
+        at[:, _P] = np.minimum(at[:, _P], most)
         loops = super()._loops(at, orders, chosen)
-        for place, parameter in enumerate(chosen):
-            if parameter == _P - 2:
-                loops.by_parameter[beyond, :, place] = 0.0
+        if _P - 2 in chosen:
+            loops.by_parameter[beyond, :, chosen.index(_P - 2)] = 0.0
         return loops
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:

@@ -156,6 +156,13 @@ def _followers(
     return found
 
 
+_ODD = (
+    ca.OP_SIN, ca.OP_TAN, ca.OP_SINH, ca.OP_TANH, ca.OP_ASIN, ca.OP_ATAN, ca.OP_ASINH, ca.OP_ATANH,
+    ca.OP_ERF,
+)  # fmt: skip
+_EVEN = (ca.OP_COS, ca.OP_COSH)
+
+
 def _factors(function: ca.Function, inputs: Sequence[float]) -> list[float]:
     """Return by which factors outputs change where the inputs change by theirs.
 
@@ -202,23 +209,18 @@ def _factors(function: ca.Function, inputs: Sequence[float]) -> list[float]:
                 factor = np.sign(one)
             elif code in (ca.OP_FMIN, ca.OP_FMAX) and alike > 0.0:
                 factor = one
-            elif (code in (ca.OP_LT, ca.OP_LE) and alike > 0.0) or all(
-                value in (0.0, 1.0) for value in a
+            elif code in (ca.OP_POW, ca.OP_CONSTPOW) and one and exponent.is_integer():
+                factor = one**exponent
+            elif code in _ODD and abs(one) == 1.0:
+                factor = one
+            elif (
+                (code in (ca.OP_LT, ca.OP_LE) and alike > 0.0)
+                or (code in _EVEN and one == -1.0)
+                or all(value in (0.0, 1.0) for value in a)
             ):
                 factor = 1.0
-            elif code in (ca.OP_POW, ca.OP_CONSTPOW) and exponent.is_integer():
-                factor = one**exponent
-            elif abs(one) == 1.0 and code in (*_ODD, *_EVEN):
-                factor = one if code in _ODD else 1.0
         work[target] = factor
     return found
-
-
-_ODD = (
-    ca.OP_SIN, ca.OP_TAN, ca.OP_SINH, ca.OP_TANH, ca.OP_ASIN, ca.OP_ATAN, ca.OP_ASINH, ca.OP_ATANH,
-    ca.OP_ERF,
-)  # fmt: skip
-_EVEN = (ca.OP_COS, ca.OP_COSH)
 
 
 def _is_odd(function: ca.Function, order: int, parameters: int) -> bool:

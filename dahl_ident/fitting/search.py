@@ -317,10 +317,10 @@ class TableSearch:
             )
             theta = search._descend(begin, scale).theta
             if not several:  # an end by the coarser problem may be no better than the beginning
-                costs = (
+                began, ended = (
                     self.problem.quadratic(t, scale, self.loss).cost for t in (begin.theta, theta)
                 )
-                theta = np.where(np.less_equal(*costs)[:, None], begin.theta, theta)
+                theta = np.where((began <= ended)[:, None], begin.theta, theta)
             near = Starts(np.arange(self.problem.n_tables), theta)
         ends = Ends(self._descend(near, scale))
         if not self.limits:
