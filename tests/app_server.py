@@ -97,7 +97,6 @@ def started(folder: Path, *options: str) -> Iterator[Server]:
         [sys.executable, "-m", "dahl_ident.cli", "app", str(folder), "--no-browser", *options],
         stdout=subprocess.PIPE, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
-    assert child.stdout is not None
     try:
         yield Server(folder, child.stdout.readline().strip())
     finally:

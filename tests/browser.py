@@ -148,7 +148,6 @@ class Page:
 @contextmanager
 def chromium(profile: Path) -> Iterator[Page]:
     """Start the browser and yield an empty page."""
-    assert CHROMIUM is not None
     their_commands, commands = os.pipe()
     answers, their_answers = os.pipe()
     options = [

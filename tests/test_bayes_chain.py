@@ -130,7 +130,6 @@ def test_student_t_resists_an_outlier() -> None:
     data = friction_table(rows=20, noise=0.01)
     response = data.response.copy()
     response[10] *= 1.8
-    assert data.amplitude is not None
     dirty = di.FrequencyResponse(data.frequency_hz, response, data.amplitude)
     plain = di.posterior(dirty, di.Dahl(), seed=1, uncertainty="noise").values[:, 0]
     robust = di.posterior(dirty, di.Dahl(), seed=1, likelihood="student_t").values[:, 0]

@@ -84,7 +84,6 @@ def test_killed_at_random_moments_it_ends_with_the_same_chain(tmp_path: Path) ->
             stdout=subprocess.PIPE,
             env=environment,
         ) as process:
-            assert process.stdout is not None
             assert process.stdout.readline() == b"ready\n"
             time.sleep(random.uniform(0.1, 0.8))
             process.send_signal(signal.SIGKILL)

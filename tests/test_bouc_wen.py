@@ -28,7 +28,7 @@ def integrated(z: float, span: float, s: float, law: tuple[float, float, float])
     while start < span:
         loading = s * z >= 0.0
         rate = -q if loading else p
-        solution = solve_ivp(
+        solution = solve_ivp(  # type: ignore[call-overload]
             lambda _, y, rate=rate: [s * (sigma + rate * abs(y[0]))],
             (start, span),
             [z],

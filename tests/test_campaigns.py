@@ -414,7 +414,6 @@ class Cluster:
 
     def __enter__(self) -> Cluster:
         self.start()
-        assert self._process.stdout is not None
         assert self._process.stdout.readline().decode().strip() == self.address
         return self
 
@@ -693,7 +692,6 @@ def test_cells_that_spreadsheets_run_are_inert(tmp_path: Path) -> None:
     named.save(tmp_path / "table.csv")
     assert not re.search(r"(^|,)[=@+]|,-3 dB", (tmp_path / "table.csv").read_text(), re.MULTILINE)
     back = di.read_frequency_response(tmp_path / "table.csv")
-    assert back.level is not None
     assert back.level.tolist() == labels.tolist()
 
 

@@ -97,7 +97,6 @@ def test_time_to_spare_is_for_repeats(run: Runner) -> None:
     seconds = float(first.split()[3])
     assert "meets the target" in first
     left = re.search(r"(\d+) s are left; the whole time would give f_max (\S+) %", outcome.out)
-    assert left is not None
     assert float(left[1]) == pytest.approx(3600.0 - seconds, rel=1e-3)
     assert float(left[2]) < 0.2, "an hour instead of seconds"
     assert "Repeat the plan in 5 runs, each a new mounting" in outcome.out

@@ -188,7 +188,6 @@ def test_two_days_of_waveforms_are_compared(run: Runner) -> None:
     }
     assert set(changes) == {"f_max", "sigma"}
     found = re.search(r": (\S+) ± (\S+) N ", changes["f_max"])
-    assert found is not None
     assert abs(float(found[1]) - 0.02) < 4.0 * float(found[2])
     assert "Changes from each measurement" in Path("r.html").read_text(encoding="utf-8")
 

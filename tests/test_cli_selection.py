@@ -52,7 +52,6 @@ def kept(run: Runner, *options: str) -> di.FrequencyResponse:
 )
 def test_where_keeps_what_meets_the_condition(run: Runner, where: str, rows: list[int]) -> None:
     amplitude = table().amplitude
-    assert amplitude is not None
     assert kept(run, "--where", where).amplitude == pytest.approx(amplitude[rows], rel=1e-12)
 
 

@@ -40,7 +40,6 @@ def test_the_law_that_made_the_data_is_chosen(law: str) -> None:
 def test_tiny_covariances_of_harmonics_do_not_rule() -> None:
     """A third harmonic that is 5 % off, stated to 1e-5: a difference for BIC, none for tests."""
     data = table()
-    assert data.amplitude is not None
     third = FRICTION.dynamic_stiffness(data.amplitude, harmonic=3) * 1.05
     size = np.abs(data.response)
     both = FrequencyResponse(
@@ -268,7 +267,6 @@ def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere() -> None:
 def test_a_model_that_spoils_the_fundamental_is_not_better() -> None:
     """Fundamentals of Dahl's law, third harmonics of tiny covariance that only a gap explains."""
     data = table(noise=0.01, seed=23)
-    assert data.amplitude is not None
     third = Backlash(FRICTION, 2e-3).dynamic_stiffness(data.amplitude, harmonic=3)
     size = np.abs(data.response)
     both = FrequencyResponse(

@@ -137,7 +137,6 @@ def test_covariance_turns_with_the_controller() -> None:
     C = complex(controller(2j * np.pi * 2.0))
     data = closed_loop_response([2.0], 0.1, [0.5], controller, covariance=covariance[None])
     parts = (noise / C).view(np.float64).reshape(-1, 2)
-    assert data.covariance is not None
     sampled, size = np.cov(parts.T), float(np.var(parts))
     assert np.max(np.abs(data.covariance[0] - sampled)) < 0.02 * size
     assert data.response[0] == pytest.approx(0.5 / C)

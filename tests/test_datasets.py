@@ -135,7 +135,6 @@ def predicted(data: FrequencyResponse, plant: Model, sensors: dict[str, float]) 
     """Return the fundamental that the sensors would show."""
     gain, delay = sensors.get("force_gain", 1.0), sensors.get("delay", 0.0)
     if data.quantity == "receptance":
-        assert data.provenance is not None
         how = data.provenance["experiment"]["table"]["steady"]
         found = response(plant, data.frequency_hz, np.asarray(data.drive), steady=how)
         return np.asarray(found.receptance)

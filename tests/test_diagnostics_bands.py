@@ -34,7 +34,6 @@ def result() -> FitResult:
     """Data of a given exponent whose residuals ask for nothing but noise of one size."""
     for seed in range(1, 20):
         found = fit(table(seed=seed), Dahl(alpha=1.0))
-        assert found.errors is not None
         if not found.errors.sources and list(found.errors.contributions) == ["noise"]:
             return found
     pytest.fail("every table asks for more than noise")
@@ -110,7 +109,6 @@ class TestBands:
         sine: Steady = "describing function"
         model = Dahl() + Mass() + Damper() + Spring()
         result = fit(plant_table(steady=sine), model, steady=sine)
-        assert result.errors is not None
         law = Dahl(*(result.errors.values[name] for name in ("f_max", "sigma", "alpha")))
         band = result.describing_function(GRID)
         np.testing.assert_allclose(band.response, law.describing_function(GRID))
@@ -177,7 +175,6 @@ class TestHarmonics:
         alone = fit(data.select(rows=data.harmonic == 1), model, throw=False)
         for name, truth in (("f_max", 0.1), ("sigma", 30.0)):
             value, error = found.params[name].value, found.params[name].stderr
-            assert error is not None
             assert value == pytest.approx(truth, abs=2.0 * error)
             assert value == pytest.approx(alone.params[name].value, abs=1.7 * error)
             assert error < 0.1 * truth
@@ -201,7 +198,6 @@ class TestHarmonics:
             )  # fmt: skip
             found = fit(data, Dahl(), throw=False)
             stds.append(found.predict(1.0, amplitude=A).log_gain_std)
-        assert found.errors is not None
         assert "suspicious points" in found.errors.contributions
         np.testing.assert_allclose(stds[1], stds[0], rtol=0.05)
 

@@ -120,7 +120,6 @@ class TestStill:
         others = [self.of([*tests[:i], *tests[i + 1 :]], harmonics) for i in range(len(tests))]
         for name in ("f_max", "sigma"):
             value, u = whole.params[name].value, whole.params[name].stderr
-            assert u is not None
             estimates = np.array([found.params[name].value for found in others])
             assert np.abs(estimates - value).max() < 3.0 * u
             jackknife = float(np.sqrt((len(tests) - 1) * np.var(estimates)))
@@ -130,7 +129,6 @@ class TestStill:
         fundamentals, both = self.of(tests, 1), self.of(tests, 3)
         for name in ("f_max", "sigma"):
             u = fundamentals.params[name].stderr
-            assert u is not None
             assert both.params[name].value == pytest.approx(fundamentals.params[name].value, abs=u)
 
     def test_laws_are_compared_where_harmonics_are_rows(
@@ -193,7 +191,6 @@ class TestBeam:
             "chi: .*, not determined, because of (model error|jackknife over tests)", found.verdict
         )
         check = found.cross_validation
-        assert check is not None
         assert check.inside >= 0.88 * check.count  # of 95 %: less happens once in 200 times
         chi, bound = found.params["chi"], slip_density(data, Mass() + Damper()).least_misfit
         assert -1.0 < chi.value <= 3.0

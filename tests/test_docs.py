@@ -69,8 +69,6 @@ def test_files_that_the_manual_names_exist() -> None:
 
 def _offline() -> ModuleType:
     spec = importlib.util.spec_from_file_location("offline", DOCS / "extensions" / "offline.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

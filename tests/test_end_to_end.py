@@ -35,7 +35,6 @@ def points(name: str, **options: object) -> FrequencyResponse:
 
 def truth(name: str) -> Mapping[str, float]:
     provenance = di.load_dataset(name).provenance
-    assert provenance is not None
     return dict(provenance["truth"])
 
 
@@ -126,7 +125,6 @@ def test_coarse_sensor_steps_are_caught_and_the_other_points_recover_the_truth()
 
 def test_outliers_are_named_and_the_other_rows_recover_the_truth() -> None:
     data = table("outliers")
-    assert data.provenance is not None
     rows = list(data.provenance["outlier_rows"])
     fit = di.fit(data, di.Dahl())
     assert not fit.trusted

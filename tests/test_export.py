@@ -142,7 +142,6 @@ def test_urdf_is_a_limit_and_a_damping() -> None:
     fit = fitted(DAHL + di.Damper(0.2), di.Dahl(alpha=1.0) + di.Damper())
     text = str(fit.export("urdf"))
     read = ElementTree.fromstring(f"<joint>{text}</joint>").find("dynamics")
-    assert read is not None
     assert float(read.attrib["friction"]) == pytest.approx(fit.params["f_max"].value, rel=1e-9)
     assert float(read.attrib["damping"]) == pytest.approx(fit.params["damping"].value, rel=1e-9)
     assert "the contact stiffness sigma is left out" in text

@@ -27,7 +27,6 @@ def sampled(
 
 
 def error_and_std(data: FrequencyResponse, beta: float) -> tuple[float, float]:
-    assert data.covariance is not None
     exact = FRICTION.describing_function(beta)
     return abs(data.response[0] - exact), float(np.sqrt(np.trace(data.covariance[0])))
 

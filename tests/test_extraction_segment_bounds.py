@@ -66,7 +66,6 @@ def test_levels_of_a_plant_end_where_they_were_held() -> None:
     """Each is held for 30 periods; a ramp's first cycle and a half may hide in the noise."""
     record = di.load_dataset("plant_recording")
     assert isinstance(record, Record)
-    assert record.provenance is not None
     data = extract(record, controlled="force")
     windows = np.array(record.provenance["windows"])
     loud = windows[:, 0] >= 0.5

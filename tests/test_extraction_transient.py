@@ -129,7 +129,5 @@ def test_settling_periods_are_left_out_by_themselves() -> None:
     left_out = data.quality["settling_periods"]
     assert data.quality["settled"].all()
     assert left_out[2] > left_out[1] > 0
-    assert data.amplitude is not None
-    assert data.covariance is not None
     errors = np.abs(data.response - FRICTION.describing_function(data.amplitude))
     assert (errors < 4.0 * np.sqrt(np.trace(data.covariance, axis1=1, axis2=2))).all()

@@ -287,7 +287,6 @@ def test_data_without_noise_are_met_to_rounding(noise: str, loss: str, copies: i
     assert found.scale == pytest.approx(2.0**-46 * size, rel=1e-3)
     for name, truth in (("f_max", 0.1), ("sigma", 30.0)):
         estimate = found.params[name]
-        assert estimate.stderr is not None
         assert abs(estimate.value - truth) < 2.0 * estimate.stderr < 1e-13 * truth
     assert found.trusted, found.verdict
     assert "the limit of rounding" in found.fit_report()

@@ -132,7 +132,7 @@ def test_refusals() -> None:
     class Unknown(Spring):
         kind = ""
 
-        def mechanics(self, *args: object) -> None:  # type: ignore[override]
+        def mechanics(self, *args: object) -> None:
             Element.mechanics(self, *args)  # type: ignore[arg-type]
 
     with pytest.raises(ModelError, match="no equation of motion"):

@@ -51,9 +51,7 @@ def test_they_are_fitted_with_the_fundamental() -> None:
     assert fit.status.usable, fit.verdict
     for name, truth in (("f_max", 0.1), ("sigma", 30.0), ("damping", 0.24), ("stiffness", 0.3)):
         found = fit.params[name]
-        assert found.stderr is not None
         assert abs(found.value - truth) < 4.0 * found.stderr, name
-    assert fit.goodness.third_harmonic is not None
     assert fit.goodness.third_harmonic.ratio == pytest.approx(1.0, abs=0.2)
     assert fit.plot_residuals() is not None
     assert fit.plot() is not None
@@ -81,7 +79,6 @@ def test_means_and_second_harmonics_tell_the_asymmetry() -> None:
     assert fit.status.usable, fit.verdict
     for name, truth in (("f_max", 0.1), ("sigma", 30.0), ("asymmetry", 0.2), ("stiffness", 3.0)):
         found = fit.params[name]
-        assert found.stderr is not None
         assert abs(found.value - truth) < 4.0 * found.stderr, name
 
 

@@ -94,7 +94,6 @@ class TestLeftOut:
         """Universal kriging by its definition, about the estimate without the test."""
         errors = self.errors(n)
         found = errors.left_out
-        assert found is not None
         m, V = 2 * n, float(errors.noises[0]) * np.eye(2 * n)
         for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True):
             V += variance * source.columns[:m] @ source.columns[:m].T
@@ -125,10 +124,8 @@ class TestLeftOut:
         """One Gauss-Newton step from the whole estimate, which is a fraction of u away."""
         data = table(n=16, noise=0.02, seed=4)
         whole = fit(data, Dahl())
-        assert whole.errors is not None
         for row in (0, 7, 15):
             rest = fit(data.select(rows=np.arange(16) != row), Dahl())
-            assert rest.errors is not None
             refit = whole.errors.estimate.without(np.array([2 * row, 2 * row + 1]))
             apart = whole.errors.problem.to_values(refit.theta) - list(rest.errors.values.values())
             assert np.all(np.abs(apart) < 0.1 * np.array(list(rest.errors.stderr.values())))
@@ -150,7 +147,6 @@ class TestLeftOut:
 
     def test_without_tests_there_are_none(self) -> None:
         errors = error_model(fit(table(n=2), Dahl(alpha=1.0)).optimum)
-        assert errors is not None
         assert errors.left_out is None
 
 
@@ -172,7 +168,6 @@ class TestTestsThatScatter:
         for seed in range(6):
             data = scattering(100 + seed, n=40, tails=1e6)
             errors = error_model(fit(data, Dahl()).optimum)
-            assert errors is not None
             found.append(errors.rms(NOISE))
         assert np.sqrt(np.mean(np.square(found))) == pytest.approx(0.04, rel=0.2)
 
@@ -197,7 +192,6 @@ class TestAtInfinity:
             assert "sigma + stiffness" in found.budget()
             assert not {"f_max", "sigma", "stiffness", "f_max/sigma"} & set(found.budget())
             check = found.cross_validation
-            assert check is not None
             inside.append(check.inside / check.count)
             assert check.width < 4.0 * found.goodness.rms_misfit
         assert len(covered) >= 3

@@ -198,7 +198,6 @@ class TestProfile:
     @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
     def test_follow_the_units(self, force: float, length: float) -> None:
         data = table(n=6, noise=0.05)
-        assert data.amplitude is not None
         N, m = 10.0**force, 10.0**length
         other = FrequencyResponse(data.frequency_hz, data.response * N / m, data.amplitude * m)
         ours, theirs = (fit(d, Dahl()).conf_interval() for d in (data, other))
@@ -322,7 +321,6 @@ class TestOneInterval:
         again = FitResult.from_json(found.to_json())
         for i, name in enumerate(found.var_names):
             p, row, interval = found.params[name], found.budget()[name], intervals[name]
-            assert p.stderr is not None
             assert row.value == pytest.approx(p.value, rel=1e-12)
             assert row.u == pytest.approx(p.stderr, rel=1e-9)
             assert found.covar[i, i] ** 0.5 == pytest.approx(p.stderr, rel=1e-9)

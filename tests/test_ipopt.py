@@ -305,7 +305,6 @@ def test_noise_of_the_drive() -> None:
     """Against the joint least squares over parameters and true drives."""
     n, s, own = 24, 0.03, 0.02
     exact = plant_data(4, 6, size=0.0)
-    assert exact.drive is not None
     force_error = noise(n, s, seed=8)
     drive = exact.drive * np.exp(force_error.real)
     R = exact.response * np.exp(noise(n, own, seed=9) - force_error)
@@ -438,7 +437,6 @@ def test_what_is_no_list_of_constraints_is_refused(constraints: Any, message: st
 def test_noise_of_the_drive_is_judged_as_it_was_fitted() -> None:
     """Residuals, intervals and errors of an exact model count what its drive is off by."""
     exact = plant_data(3, 4, size=0.0)
-    assert exact.drive is not None
     drive = exact.drive * np.exp(noise(12, 0.05, seed=8).real)
     R = exact.response * np.exp(noise(12, 0.02, seed=9))
     C = np.abs(R)[:, None, None] ** 2 * 0.02**2 * np.eye(2)
@@ -479,7 +477,6 @@ def test_a_constraint_that_the_data_contradict_is_said_so(known: bool) -> None:
     assert str(wrong.status) == "not described"
     assert "The data contradict the constraint sigma==(330*f_max)" in wrong.verdict
     cost = wrong.optimum.constraint_cost
-    assert cost is not None
     rise = 2.0 * (wrong.optimum.cost - free.optimum.cost) / free.optimum.scale**2
     assert cost.rise == pytest.approx(rise, rel=1e-6)
     law = stats.chi2(1) if known else stats.f(1, free.optimum.dof)

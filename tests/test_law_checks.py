@@ -183,7 +183,7 @@ def test_no_loop_is_an_error_and_not_a_number() -> None:
             (di.Parameter("a", "N", "", lower=2.0, upper=1.0),),
             r"a has the bounds \(2.0, 1.0\); expected",
         ),
-        ((di.Parameter("a", None, ""),), "unit of a is None"),  # type: ignore[arg-type]
+        ((di.Parameter("a", None, ""),), "unit of a is None"),
         ((di.Parameter("a", "N", "", lower="0"),), "a has the bounds"),  # type: ignore[arg-type]
         ((di.Parameter("a", "N", "", prior=5),), "a has the prior 5"),  # type: ignore[arg-type]
         ((di.Parameter("a", "N", "", lower=0.0, upper=1.0, scan=(5.0,)),), "a is scanned at 5"),

@@ -98,7 +98,6 @@ def test_least_squares_finds_the_truth_and_knows_it(kind: str) -> None:
     assert fit.success
     for parameter in known(kind).parameters[:_FREE]:
         error = fit.stderr_noise[parameter.name]
-        assert parameter.value is not None
         assert abs(best(fit)[parameter.name] - parameter.value) < 4.5 * error
         assert error < 0.2 * parameter.value
     assert fit.identifiability.complete

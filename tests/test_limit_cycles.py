@@ -130,8 +130,6 @@ def swings(speed: float, duration: float) -> tuple[FloatArray, FloatArray]:
         rates, (0.0, duration), [0.0, speed, 0.0], "DOP853", events=[turns, far], rtol=1e-8,
         atol=1e-10, max_step=0.2,
     )  # fmt: skip
-    assert found.t_events is not None
-    assert found.y_events is not None
     return found.t_events[0], found.y_events[0][:, 0]
 
 

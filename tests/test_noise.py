@@ -234,7 +234,6 @@ def test_weights_of_a_covariance_count_the_parts_that_have_one() -> None:
     noise = noise_for(Rows.of(mean), None)
     assert isinstance(noise, Measured)
     np.testing.assert_allclose(noise.weights, [1.0, 2.0])
-    assert noise.tail is not None
     z = np.array([3.0, 3.0])
     np.testing.assert_allclose(noise.tail(z)[0], np.array([4.0, 5.0]) * np.log(1.5))
 

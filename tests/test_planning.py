@@ -126,7 +126,6 @@ class TestModelError:
         R = there.predict(errors.theta)
         slopes = there.prediction_jacobian(errors.theta) / R[:, None]
         found = prediction_error.departures(errors, slopes, A, omega, R)
-        assert found is not None
         assert not found.assumed
         lever = np.concatenate([np.stack([slopes.real, slopes.imag], 1), found.columns], axis=-1)
         covariance = lever @ np.linalg.inv(found.information) @ lever.swapaxes(1, 2)
@@ -167,7 +166,6 @@ class TestLevelsWithFixedCosts:
     def test_exchange_finds_what_brute_force_finds(self, seed: int) -> None:
         objective, bench, time = _objective(seed, 5, 2), _bench(seed, 5), 16.0
         found = Exchange(objective, bench, np.arange(5)).best(time)
-        assert found is not None
         assert bench.seconds(found.levels, found.cycles) <= time + 1e-9
         best = _brute_force(objective, bench, time, most=3)
         assert found.value >= best - 0.01
@@ -332,7 +330,6 @@ class TestPlan:
         after = di.plan(fit, limits=KNEE, target=target, noise=0.02)
         before = di.plan(LINEAR, ranges=NEAR, limits=KNEE, target=target, noise=0.02)
         assert after.seconds < before.seconds
-        assert fit.errors is not None
         assert after.expected["sigma"].before == pytest.approx(
             fit.errors.stderr["sigma"] / fit.errors.values["sigma"], rel=0.05
         )
@@ -375,7 +372,6 @@ class TestPlan:
         fit = di.fit(_measured(plan, 0.02, 1), di.Dahl())
         for name in ("f_max", "sigma"):
             found = fit.params[name]
-            assert found.stderr is not None
             assert found.stderr / found.value == pytest.approx(plan.expected[name].after, rel=0.25)
 
     def test_a_suspected_lack_of_symmetry_needs_even_harmonics(self) -> None:

@@ -125,7 +125,6 @@ class TestPlan:
             e.after <= u for e, u in zip(plan.expected.values(), (0.002, 0.003), strict=True)
         )
         for step in plan.steps:
-            assert step.motion is not None
             size, speed, pull = step.motion.peaks
             assert (size <= 0.03, speed <= 0.0301, pull <= 1.001) == (True, True, True)
         less = _plan(kind, {"speed": 0.03, "time": 0.5 * plan.seconds}, target={"sigma": 0.003})
@@ -233,7 +232,6 @@ class TestPlan:
             assert part.sum() == pytest.approx(
                 200.0 * step.measured_cycles / step.frequency_hz, abs=2
             )
-            assert step.motion is not None
             start = 1.0 + sum(s.seconds for s in plan.steps[: i - 1])
             assert x[part] == pytest.approx(step.motion.displacement(time[part] - start), abs=1e-9)
         with pytest.raises(ValidationError, match="write_waveform"):

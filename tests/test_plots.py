@@ -475,7 +475,6 @@ def test_axes_of_the_user_are_drawn_on_in_the_house_style() -> None:
         assert mpl.rcParams["legend.fontsize"] == 13.0
     (line,), legend = ax.lines, ax.get_legend()
     assert line.get_linewidth() == style.RC["lines.linewidth"]
-    assert legend is not None
     assert legend.get_texts()[0].get_fontsize() == style.RC["legend.fontsize"]
     plt.close(figure)
 

@@ -29,9 +29,7 @@ def test_the_likelihood_is_that_of_the_covariance_by_source(rows: int) -> None:
     """Of 36 rows, and of 108, which are compressed to what their errors share."""
     fit = di.fit(days(3, rows), LINEAR)
     errors = fit.errors
-    assert errors is not None
     found = row_errors(errors)
-    assert found is not None
     density = Density(fit.problem, joint_prior(fit.problem), errors=found)
     theta = errors.theta + np.array([[0.0, 0.0], [0.01, -0.002], [-0.03, 0.001]])
     m = fit.problem.n_residuals
@@ -145,6 +143,5 @@ def test_what_rows_share_may_be_all_there_is() -> None:
     fit = di.fit(data, LINEAR)
     grid = di.posterior(fit, method="grid", tolerance=1e-2)
     assert np.isfinite(grid.std()[:2]).all()
-    assert fit.errors is not None
     weighed = float(fit.errors.generalised[1, 1]) ** 0.5
     assert grid.std()[1] > 0.1 * weighed * fit.params["sigma"].value

@@ -398,7 +398,6 @@ class TestUniversalFile:
         function = uff_function(-RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=-3)
         data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
         np.testing.assert_allclose(data.response, RECEPTANCE, rtol=1e-11)
-        assert data.provenance is not None
         assert "FRF 1:-Z/2:+Z: sign turned, as its directions say" in data.provenance["notes"]
 
     def test_rotation(self, tmp_path: Path) -> None:

@@ -50,7 +50,6 @@ class TestBrakeReussBeam:
             kind, index = label.rstrip("]").split("[")
             raw, part = content[kind][int(index)], beam.select(level=label)
             displacement = raw["amplitude"] / (2 * np.pi * raw["frequency"]) ** 2
-            assert part.amplitude is not None
             np.testing.assert_allclose(part.amplitude, displacement, rtol=1e-14)
             np.testing.assert_array_equal(part.drive, raw["force"])
             expected = displacement / raw["force"] * np.exp(1j * raw["phase"])
@@ -67,8 +66,6 @@ class TestBrakeReussBeam:
     def test_force_of_a_response_controlled_level_varies(self, beam: FrequencyResponse) -> None:
         for label in beam.levels[4:]:
             part = beam.select(level=label)
-            assert part.drive is not None
-            assert part.amplitude is not None
             assert part.drive.min() < 0.5 * part.drive.max()
             assert part.amplitude.max() < 1.2 * part.amplitude.min()
 
@@ -92,14 +89,11 @@ class TestFrictionDamper:
         raw = np.loadtxt(path, delimiter=",", skiprows=1)
         np.testing.assert_array_equal(record.time, raw[:, 0])
         kip = 1000.0 * 0.45359237 * 9.80665
-        assert record.displacement is not None
-        assert record.force is not None
         np.testing.assert_allclose(record.displacement, raw[:, 1] * 0.0254, rtol=1e-14)
         np.testing.assert_allclose(record.force, raw[:, 2] * kip, rtol=1e-14)
         assert record.sample_rate == pytest.approx(1024.0, rel=1e-6)
         assert record.uniform
         assert not len(record.gaps)
-        assert record.provenance is not None
         assert record.provenance["notes"] == [
             "columns not used: velocity, actuator force 1, actuator force 2"
         ]
@@ -114,7 +108,6 @@ class TestFrictionDamper:
             displacement="displacement",
             force="friction force",
         )
-        assert record.displacement is not None
         work = float(trapezoid(record.force_samples, record.displacement))
         assert 1e3 < work < 1e5
 

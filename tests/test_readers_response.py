@@ -171,7 +171,6 @@ class TestForms:
 
     def test_what_is_assumed_is_said(self) -> None:
         data = read(RECTANGULAR)
-        assert data.provenance is not None
         assert data.provenance["notes"] == [
             "amplitude [mm] taken as zero to peak: the table does not say",
             "controlled: displacement, as the table does not say",
@@ -192,7 +191,6 @@ class TestForms:
 
 
 def known_provenance(data: FrequencyResponse) -> dict[str, Any]:
-    assert data.provenance is not None
     return dict(data.provenance)
 
 
@@ -618,8 +616,6 @@ class TestInspect:
         assert "# read by their names: covariance_real_real" in text
         columns.write_text(text)
         same = read_frequency_response(path, columns=columns)
-        assert same.covariance is not None
-        assert table.covariance is not None
         np.testing.assert_array_equal(same.covariance, table.covariance)
 
     def test_f_is_force_with_time_or_motion_and_frequency_else(self, tmp_path: Path) -> None:

@@ -27,8 +27,6 @@ def written(tmp_path: Path, text: str | bytes, name: str = "run.csv") -> Path:
 
 def assert_the_run(record: Record) -> None:
     np.testing.assert_allclose(record.time, TIME, rtol=1e-15)
-    assert record.displacement is not None
-    assert record.force is not None
     np.testing.assert_allclose(record.displacement, X, rtol=1e-15)
     np.testing.assert_allclose(record.force, F, rtol=1e-15)
 
@@ -87,7 +85,6 @@ class TestDialects:
     def test_encodings(self, tmp_path: Path, encoding: str) -> None:
         text = PLAIN.replace("mm", "µm").replace("1,-3", "1,-3")
         record = read_record(written(tmp_path, text.encode(encoding)))
-        assert record.displacement is not None
         np.testing.assert_allclose(record.displacement, np.array(X) * 1e-3)
 
     @pytest.mark.parametrize(
@@ -132,9 +129,9 @@ class TestColumns:
             '[drive]\ncolumn = "amp"\nunit = "mV"\n'
         )
         record = read_record(path, columns=columns)
-        np.testing.assert_allclose(record.displacement, -np.array(X))  # type: ignore[arg-type]
-        np.testing.assert_allclose(record.force, 2.0 * np.array(F))  # type: ignore[arg-type]
-        np.testing.assert_allclose(record.drive, [1e-3, 2e-3, 3e-3])  # type: ignore[arg-type]
+        np.testing.assert_allclose(record.displacement, -np.array(X))
+        np.testing.assert_allclose(record.force, 2.0 * np.array(F))
+        np.testing.assert_allclose(record.drive, [1e-3, 2e-3, 3e-3])
         assert (record.drive_unit, record.drive_factor) == ("V", 12.5)
         assert record.drive_factor_uncertainty == 0.01
 
@@ -156,7 +153,6 @@ class TestColumns:
             written(tmp_path, "x [mm],F [kN]\n1,1\n2.5,2\n-3,3.5\n"), sample_rate=2.0
         )
         assert_the_run(record)
-        assert record.provenance is not None
         assert record.provenance["notes"] == ["time counted from the sample rate of 2 Hz"]
 
     def test_provenance(self, tmp_path: Path) -> None:
@@ -168,7 +164,6 @@ class TestColumns:
             "sha256": hashlib.sha256(PLAIN.encode()).hexdigest(),
         }
         provenance = read_record(path, displacement="x", columns={"force": "F"}).provenance
-        assert provenance is not None
         assert provenance["options"] == {"columns": {"force": "F"}, "displacement": "x"}
 
     def test_rotation(self, tmp_path: Path) -> None:
@@ -176,7 +171,7 @@ class TestColumns:
             written(tmp_path, "t [s],position [deg],torque [lbf-in]\n0,90,1\n1,180,2\n")
         )
         assert record.motion == "rotation"
-        np.testing.assert_allclose(record.displacement, [np.pi / 2, np.pi])  # type: ignore[arg-type]
+        np.testing.assert_allclose(record.displacement, [np.pi / 2, np.pi])
 
     @pytest.mark.parametrize(
         ("header", "channel", "factor"),
@@ -194,7 +189,7 @@ class TestColumns:
             read_record(written(tmp_path, text))
         record = read_record(written(tmp_path, text), missing="drop")
         assert record.time.tolist() == [0.0, 2.0, 4.0, 5.0]
-        assert "2 samples with missing values left out" in record.provenance["notes"]  # type: ignore[index]
+        assert "2 samples with missing values left out" in record.provenance["notes"]
 
     def test_missing_samples_keep_their_place_in_counted_time(self, tmp_path: Path) -> None:
         path = written(tmp_path, "x [mm],F [N]\n1,1\n,2\n3,3\n4,4\n")
@@ -281,9 +276,7 @@ class TestUnusualTables:
         table = written(tmp_path, day + day + day.replace("1,2,2,1\n", ""))
         with pytest.warns(DataWarning, match="the header is repeated in the file: read as 3 runs"):
             data = read_frequency_response(table)
-        assert data.amplitude is not None
         assert data.amplitude.tolist() == [1, 2, 1, 2, 1]
-        assert data.run is not None
         assert data.run.tolist() == ["1", "1", "2", "2", "3"]
         units = "frequency,amplitude,real,imag\nHz,m,N/m,N/m\n1,1,2,1\n1,2,2,1\n"
         with pytest.warns(DataWarning, match="read as 2 runs"):

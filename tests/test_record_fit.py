@@ -101,7 +101,6 @@ def test_motion_from_force(channel: str) -> None:
     assert fit.trusted, fit.verdict
     for name, value in truth.items():
         found = fit.params[name]
-        assert found.stderr is not None
         assert abs(found.value - value) < 4.5 * found.stderr, fit
         assert found.stderr < 0.2 * value
 
@@ -112,7 +111,6 @@ def test_runs_are_fitted_together() -> None:
     single = di.fit(runs[0], di.Dahl())
     one, three = single.params["sigma"].stderr, fit.params["sigma"].stderr
     assert one is not None
-    assert three is not None
     assert three < 0.8 * one
     assert {"initial_force_1", "offset_3"} <= set(fit.params)
     assert fit.predict(recorded(DAHL, "multisine", 600, 0.0)).rms_error < 1e-3
@@ -178,7 +176,6 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
     assert fit.trusted, fit.verdict
     for name, value in truth.items():
         found = fit.params[name]
-        assert found.stderr is not None
         assert abs(found.value - value) < 4.0 * found.stderr, fit
     assert (fit.params["stiffness"].stderr or 0.0) < 0.6
     assert fit.budget()["mass"].rows[0].source == "noise"
@@ -222,7 +219,6 @@ def test_correlated_errors_of_the_displacement_show_at_turning_points() -> None:
 
 def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
     small = recorded(di.Dahl(0.1, 30.0), "random", 800, 1e-4)
-    assert small.displacement is not None
     x = small.displacement * 0.01  # far below x_c
     noise = 3e-4 * np.random.default_rng(0).standard_normal(800)
     force = DAHL.force(x) + noise

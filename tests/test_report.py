@@ -307,7 +307,6 @@ def test_measured_loops_and_settling_are_shown(tmp_path: Path) -> None:
     place = report(fit, tmp_path / "r.html", record=record)
     text = place.read_text(encoding="utf-8")
     told = re.search(r"measured loops are within ([0-9.]+) % rms", text)
-    assert told is not None
     assert 0.0 < float(told[1]) < 3.0, "harmonics up to the ninth make the loop"
     assert "Quality of each point" in text
     assert "Points measured from waveforms: 1, all good." in text

@@ -40,7 +40,6 @@ def command_of(result: di.FitResult | Posterior) -> str | None:
 
 def check_repeated(run: Runner, fit: di.FitResult) -> str:
     command = command_of(fit)
-    assert command is not None
     told: dict[str, Any] = json.loads(run.line(command, "--json").out)["params"]
     assert set(told) == set(fit.params)
     for name, estimate in fit.params.items():
@@ -113,7 +112,6 @@ def test_of_a_posterior(run: Runner) -> None:
     priors: dict[str, Any] = {"f_max": stats.lognorm(s=0.5, scale=0.1), "sigma": (1.0, 100.0)}
     posterior = di.posterior(data, di.Dahl(alpha=1.0), priors=priors, seed=4, steps=80)
     command = command_of(posterior)
-    assert command is not None
     told = json.loads(run.line(command, "--json").out)
     assert told["summary"]["sigma"]["mean"] == posterior.summary().loc["sigma", "mean"]
 
@@ -123,7 +121,6 @@ def test_of_what_the_command_line_wrote(run: Runner) -> None:
     run("report", "t.csv", "--stiffness", "free", "-o", "r.html", "-o", "one.json")
     page = Path("r.html").read_text(encoding="utf-8")
     found = re.search(r"<pre tabindex=\"0\">(dahl-ident [^<]*)</pre>", page)
-    assert found is not None
     first = Path("one.json").read_bytes()
     run.line(found[1], "--overwrite")
     one, two = (json.loads(text)["fits"] for text in (first, Path("one.json").read_bytes()))
@@ -148,7 +145,6 @@ def test_of_an_exponent_that_was_given(run: Runner) -> None:
     data = di.read_frequency_response("t.csv")
     for model, option in ((di.Dahl(), False), (di.Dahl(alpha=1.0), True)):
         found = command_of(di.fit(data, model))
-        assert found is not None
         assert ("--alpha 1.0" in found) is option
     alone = di.posterior(data, di.Dahl(), seed=4, steps=60, uncertainty="noise")
     assert "--uncertainty noise" in (command_of(alone) or "")

@@ -152,7 +152,6 @@ def test_the_order_is_answer_assumed_signature_details(fit: di.FitResult, tmp_pa
         "Sources of uncertainty", "Parameters"
     ]  # fmt: skip
     assumed = text.split("## What was assumed")[1].split("## ")[0]
-    assert fit.errors is not None
     alpha = f"{fit.errors.values['alpha']:.3f} ± {fit.errors.stderr['alpha']:.3f}"
     assert f"Not given, so that the uncertainty counts it: alpha, here {alpha}." in assumed
     (exact,) = re.findall(r"Taken as exact: (.*?)\.", assumed)
@@ -442,7 +441,6 @@ def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit: di.FitResu
     found = re.search(
         r"A cycle loses \S+ ± \S+ J at \S+ m and (\S+) ± (\S+) J at (\S+) m", text_of(fit)
     )
-    assert found is not None
     lost, u, A = map(float, found.groups())
     truth = di.Dahl(0.1, 30.0, alpha=1.0).loop(A, 20001)
     assert abs(lost - abs(float(trapezoid(truth[1], truth[0])))) < 3.0 * u

@@ -57,7 +57,6 @@ class TestFit:
     def test_names_of_lmfit(self, result: FitResult) -> None:
         f_max = result.params["f_max"]
         optimum = result.optimum
-        assert f_max.stderr is not None
         assert optimum.values[0] == pytest.approx(0.09976, rel=1e-4)
         assert optimum.stderr["f_max"] == pytest.approx(0.00024, rel=0.05)
         # the range of the assumed exponent and noise of the amplitudes widen it
@@ -90,7 +89,6 @@ class TestFit:
     def test_residuals_and_their_squares(self, result: FitResult) -> None:
         alpha = result.params["alpha"].value
         friction = Dahl(result.params["f_max"].value, result.params["sigma"].value, alpha)
-        assert result.data.amplitude is not None
         y = np.log(result.data.response / friction.describing_function(result.data.amplitude))
         range_of_alpha = np.log(4.0) / np.sqrt(12.0)  # uniform in ln alpha, from 0.5 to 2
         prior = result.scale * np.log(alpha) / range_of_alpha
@@ -110,7 +108,6 @@ class TestFit:
             data = replace(data, covariance=C)
         found = fit(data, Dahl())
         friction = Dahl(*(found.params[name].value for name in ("f_max", "sigma", "alpha")))
-        assert data.amplitude is not None
         expected = friction.describing_function(data.amplitude)
         predicted = found.predict(data.frequency_hz, amplitude=data.amplitude).response
         np.testing.assert_allclose(predicted, expected, rtol=1e-9)
@@ -476,7 +473,6 @@ class TestPictures:
         np.testing.assert_allclose(xy(points[2])[1], part.gain)
         ends = xy(curves[2])[1][[0, -1]]
         f, drive = plant.data.frequency_hz, plant.data.drive
-        assert drive is not None
         predicted = np.abs(plant.predict(f, drive=drive).response[24:36])[[0, -1]]
         np.testing.assert_allclose(ends, predicted, rtol=1e-9)
 

@@ -51,7 +51,6 @@ def rise(data: FrequencyResponse, model: Element | None = None) -> Any:
 class TestStiffening:
     def test_size_and_place_of_a_rise(self) -> None:
         found = rise(stiffened(0.2))
-        assert found is not None
         assert found.rise == pytest.approx(0.17, abs=0.02)
         assert found.low < 0.02 * X_C < 0.06 * X_C < found.high
         assert found.p_value < 1e-9
@@ -303,7 +302,6 @@ class TestNamed:
     def test_gains_and_phases_that_were_held_out(self) -> None:
         found = fit(_scattered(22, 1.1), Dahl())
         check = found.cross_validation
-        assert check is not None
         assert check.rows == 16
         text = f"{check.gains} of 16 held-out gains and {check.phases} of 16 phases of fundamentals"
         assert text in found.fit_report()
