@@ -1,10 +1,7 @@
 """Units of files and user input, and their conversion to SI.
 
-Inside the package all quantities are SI: m or rad, N or N m, s, Hz, zero-to-peak amplitudes. This
-module converts texts such as ``"um rms"``, ``"kip"``, ``"lbf-in"`` or ``"dB (m/s^2)/N"``. Besides
-the factor, a unit shows whether a motion is a displacement, a velocity or an acceleration, whether
-it is translation or rotation, and which of the six standard quantities a response is. A missing or
-inconsistent unit is an error; units are never guessed.
+Besides the factor, a unit shows whether a motion is a displacement, a velocity or an acceleration,
+translation or rotation, and which standard quantity a response is. Units are never guessed.
 """
 
 from __future__ import annotations
@@ -143,8 +140,7 @@ _LONGEST = 60  # characters; longer text in brackets is a remark
 class Unit:
     """A unit as it was written, and its value in SI units without the marker of an amplitude.
 
-    `dimension` has the exponents of the SI base units, the radian among them, sorted by name. The
-    marker is None where the text has none; `decibel` numbers are relative to this unit.
+    `dimension` has the exponents of the SI base units, the radian among them, sorted by name.
     """
 
     text: str
@@ -219,13 +215,7 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
 
 
 def factor_to(unit: Unit, si: str, what: str) -> float:
-    """Return the value of one `unit` in the SI unit `si`, angles counting as pure numbers.
-
-    Examples
-    --------
-    >>> factor_to(parse_unit("(kN/m)^2"), "(N/m)^2", "variance")
-    1000000.0
-    """
+    """Return the value of one `unit` in the SI unit `si`, angles counting as pure numbers."""
     wanted = _without_angle(parse_unit(si).dimension)
     for candidate in _readings(unit):
         if _without_angle(candidate.dimension) == wanted:
@@ -234,13 +224,7 @@ def factor_to(unit: Unit, si: str, what: str) -> float:
 
 
 def si_unit(kind: str, motion: Motion = "translation") -> str:
-    """Return the SI unit of a kind, as printed after its numbers.
-
-    Examples
-    --------
-    >>> si_unit("dynamic_stiffness", "rotation")
-    'N m/rad'
-    """
+    """Return the SI unit of a kind, as printed after its numbers."""
     return SI_UNITS[kind][motion == "rotation"]
 
 
@@ -248,15 +232,7 @@ _PREFIXES = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
 def engineering(value: float, unit: str) -> str:
-    """Return a number with an SI prefix, such as ``3.33 mm``.
-
-    Units that are not one symbol, such as N/m, take a power of ten instead of a prefix.
-
-    Examples
-    --------
-    >>> engineering(3.33e-3, "m")
-    '3.33 mm'
-    """
+    """Return a number with an SI prefix, such as ``3.33 mm``; with none for N/m and the like."""
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g} {unit}".strip()
     power, unit = prefix([value], unit)
@@ -264,15 +240,7 @@ def engineering(value: float, unit: str) -> str:
 
 
 def prefix(values: Iterable[float], unit: str) -> tuple[float, str]:
-    """Return the power of ten of a prefix that suits most of some numbers, and the unit with it.
-
-    Examples
-    --------
-    >>> prefix([2e-5, 3e-4, 5e-3], "m")
-    (1e-06, '\u00b5m')
-    >>> prefix([2e-5], "N/m")
-    (1.0, 'N/m')
-    """
+    """Return the power of ten of a prefix that suits most of some numbers, and the unit with it."""
     sizes = sorted(abs(v) for v in values if v != 0.0 and math.isfinite(v))
     if not sizes or unit not in ("N", "m", "s", "Hz", "J", "rad"):
         return 1.0, unit
@@ -328,15 +296,7 @@ def _normalised(text: str, written: str) -> str:
 
 
 def percent(share: float, digits: int = 2, *, sign: bool = False) -> str:
-    """Return a share as text, such as ``"9.2 %"``.
-
-    Examples
-    --------
-    >>> percent(0.0917), percent(1.04), percent(float("nan"))
-    ('9.2 %', '100 %', '-')
-    >>> percent(-0.998, sign=True), percent(0.01234, 3)
-    ('-100 %', '1.23 %')
-    """
+    """Return a share as text, such as ``"9.2 %"``; with `sign` also that."""
     rounded = float(f"{100.0 * share:.{digits}g}")
     return f"{rounded:{'+' if sign else ''}g} %" if math.isfinite(share) else "-"
 

@@ -132,13 +132,7 @@ def column_map_of(entries: Mapping[str, Any]) -> str:
 
 
 def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
-    """Read a column map from a mapping or a TOML file; `overrides` replace what it says.
-
-    Examples
-    --------
-    >>> column_map({"force": {"column": "F", "unit": "kN"}}).roles["force"].unit
-    'kN'
-    """
+    """Read a column map from a mapping or a TOML file; `overrides` replace what it says."""
     name, entries = "columns", value or {}
     if not isinstance(entries, Mapping):
         name, entries = str(entries), read_toml(entries, "the column map")
@@ -187,10 +181,7 @@ SETTINGS: dict[str, Callable[[Any, str], Any]] = {
 
 @dataclass
 class Binding:
-    """Roles looked up in one source, with the assumptions that were made.
-
-    `columns` are those that are looked for; `doubts` are the warnings that were shown.
-    """
+    """Roles looked up in one source, with the assumptions (`notes`) and warnings (`doubts`)."""
 
     source: RawFile
     map: ColumnMap
@@ -281,8 +272,8 @@ class Binding:
     def si(self, role: str, quantity: str = "dynamic_stiffness", *, least: bool = True) -> Any:
         """Return a column in SI units, amplitudes zero to peak; None where there is none.
 
-        Where its unit does not say of which kind it is, that of the declaration counts, in a table
-        of `quantity`. Without `least`, numbers below what is allowed are returned too.
+        `quantity` is the table's, for units that do not say their kind; `least` refuses smaller
+        numbers.
         """
         channel, declared = self.channel(role), self.columns[role]
         if channel is None:
@@ -324,10 +315,7 @@ class Binding:
             raise UnitError(f"{self.source.name}: column {channel.name!r}: {exc}") from exc
 
     def kind(self, role: str, unit: Unit) -> tuple[str, float]:
-        """Return which kind a role's unit is, and its factor, for angular frequency to Hz.
-
-        Its motion is remembered.
-        """
+        """Return which kind a role's unit is, and its factor, for angular frequency to Hz."""
         kind, motion, factor = kind_of(
             unit, self.columns[role].kinds, f"{self.source.name}: the {role}"
         )
@@ -350,11 +338,7 @@ class Binding:
         return positive_number(value, "drive_factor"), self.map.drive_factor_uncertainty
 
     def refuse_idle_factor(self, kind: str | None) -> None:
-        """Refuse keywords on the drive's factor if they would have no effect.
-
-        `kind` is that of the drive, None where there is none. A column map may serve other files
-        too, and is not refused.
-        """
+        """Refuse keywords on the factor of a drive of this kind if they have no effect."""
         names = ("drive_factor", "drive_factor_uncertainty")
         what = " and ".join(n for n in names if self.source.options.get(n) is not None)
         if what and kind in (None, "force"):

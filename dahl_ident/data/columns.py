@@ -1,8 +1,4 @@
-"""The columns of tables, each declared once, and the checks of what they may hold.
-
-From a declaration follow how a column is found in a file, converted and checked, what a message
-says of it, and how it is saved.
-"""
+"""The columns of tables, each declared once, and the checks of what they may hold."""
 
 from __future__ import annotations
 
@@ -90,10 +86,9 @@ def complex_values(value: ArrayLike, name: str) -> NDArray[np.complex128]:
 def degrees_of_freedom(value: ArrayLike, name: str) -> FloatArray:
     """Return numbers above zero, infinity among them."""
     array = real_array(value, name)
-    bad = np.flatnonzero(~(array > 0.0))
-    if bad.size:
+    for i in np.flatnonzero(~(array > 0.0))[:1]:
         raise ValidationError(
-            f"{name}[{bad[0]}] is {float(array.flat[bad[0]])!r}; expected a number > 0 or infinity"
+            f"{name}[{i}] is {float(array.flat[i])!r}; expected a number > 0 or infinity"
         )
     return array
 
@@ -123,9 +118,8 @@ def controlled_words(value: ArrayLike, name: str) -> NDArray[np.str_]:
 def harmonic_numbers(value: ArrayLike, name: str) -> NDArray[np.int64]:
     """Return whole numbers of 0 and above."""
     array = non_negative_array(value, name)
-    broken = array != np.round(array)
-    if broken.any():
-        raise ValidationError(f"{name}: expected whole numbers, got {float(array[broken][0])!r}")
+    for number in array[array != np.round(array)][:1]:
+        raise ValidationError(f"{name}: expected whole numbers, got {float(number)!r}")
     return array.astype(np.int64)
 
 
@@ -153,10 +147,8 @@ def check_covariance(
     scale[scale == 0.0] = 1.0
     correlation = joint / (scale[:, :, None] * scale[:, None, :])
     asymmetry = np.abs(correlation[:, 1, 2] - correlation[:, 2, 1])
-    smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    bad = (asymmetry > 1e-9) | (smallest < -1e-9)
-    if bad.any():
-        row = int(np.argmax(bad))
+    bad = (asymmetry > 1e-9) | (np.linalg.eigvalsh(correlation)[:, 0] < -1e-9)
+    for row in np.flatnonzero(bad)[:1]:
         raise ValidationError(
             f"covariance[{row}] is {covariance[row].tolist()}; expected a symmetric positive "
             "semidefinite matrix, also together with the amplitude's variance and covariance"
@@ -172,19 +164,15 @@ Source = str | Callable[[Table], NDArray[Any] | None]
 class Column:
     """A column of tables: what it may hold, its name and unit in files, and how it is saved.
 
-    In files it has the first of its `names`, and is found under the others without a map. `unit`
-    is that in which it is saved, such as ``({displacement})*({response})``; where a header has
-    none, the first column of `like` gives it. `kinds` are those that a file's unit may be of, where
-    they are several. `least` is the smallest number that is allowed, and `expected` says so.
+    In files it has the first of its `names`, and is found under the others without a map. `unit` is
+    that in which it is saved; where a header has none, the first column of `like` gives it. `kinds`
+    are those that a file's unit may be of. `least` is the smallest number allowed, as `expected`
+    says.
 
     Its values are those of the attribute `source` of a table, the `part` of each row's, or what a
-    function makes of the table. `form` is the only form of table in which it is saved:
-    "rectangular", "polar", "backbone", or "complex", which no file has. It is saved under `header`,
-    by default its name with its unit in brackets.
-
-    A column in memory has a `check`, which returns an array of allowed values, or raises an error
-    that names the column; `shape` is that of one row's value; where it `repeats`, one value may be
-    given for all rows; without the columns that it `needs` it means nothing.
+    function makes of the table. `form` is the only form of table in which it is saved, `header`
+    what it is saved under. In memory it has a `check`; `shape` is that of one row's value; where it
+    `repeats`, one value may be given for all rows; without what it `needs` it means nothing.
     """
 
     names: tuple[str, ...] = ()
@@ -256,8 +244,7 @@ def _polar(axis: int) -> Source:
     def saved(data: Table) -> NDArray[Any] | None:
         if data.covariance is None:
             return None
-        std = polar_std(data.response, data.covariance)[axis]
-        return np.degrees(std) if axis else std
+        return polar_std(data.response, data.covariance)[axis] * (180.0 / np.pi) ** axis
 
     return saved
 

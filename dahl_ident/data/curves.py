@@ -1,8 +1,6 @@
 """Curves of a frequency response: over which axis, and which rows make one curve.
 
-:func:`draw` is the only import from a higher layer: it uses the plot functions. The import happens
-when a plot is requested, so that this module stays fast to import; the import contract names this
-exception.
+The plot functions, of a higher layer, are imported when a plot is requested.
 """
 
 from __future__ import annotations
@@ -35,12 +33,10 @@ def draw(
     stds: Callable[[Table], Stds] | None = None,
     fitted: Callable[[Table, bool], Any] | None = None,
 ) -> tuple[Any, Any]:
-    """Draw gain and phase of the fundamental, over amplitude or frequency as suits the table.
+    """Draw gain and phase of the fundamental, or a backbone, over amplitude or frequency.
 
-    Of a backbone natural frequency and damping ratio are drawn.
-
-    `stds` gives the standard deviations of gain and phase of some rows, by default those of
-    their covariance; `fitted` gives a curve through some rows, over frequency or not.
+    `stds` gives the standard deviations of gain and phase of some rows, by default those of their
+    covariance; `fitted` gives a curve through some rows, over frequency or not.
     """
     from dahl_ident.plots import plot_amplitude_response, plot_frequency_response
 
@@ -142,10 +138,7 @@ def is_over_frequency(data: Table) -> bool:
 
 
 def curves(data: Table) -> list[tuple[str, Table]]:
-    """Return the parts of the table that make one curve each, with their labels.
-
-    One a level over frequency, or one a frequency over amplitude.
-    """
+    """Return the parts of the table that make one curve each, with their labels."""
     if is_over_frequency(data):
         levels = [(label, data.select(level=label)) for label in data.levels]
         return [(_level(label, part), part) for label, part in levels] or [("", data)]

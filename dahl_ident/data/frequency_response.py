@@ -1,10 +1,7 @@
 """Complex response against amplitude and frequency: the data of a fit.
 
-The gain and phase of a structure with friction depend on the amplitude, so one curve over frequency
-does not describe it. A :class:`FrequencyResponse` therefore has one row for each measured point,
-and each row includes its amplitude. SI units throughout: m or rad, N or N m, Hz. Amplitudes are
-zero to peak. Phasors refer to exp(+j omega t), so the dynamic stiffness of a dissipating element
-has a positive imaginary part.
+Each row includes its amplitude. SI units, Hz, amplitudes zero to peak; phasors refer to
+exp(+j omega t), so the dynamic stiffness of a dissipating element has a positive imaginary part.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Metadata from the laboratory: what a test report names, and the calibration of the instruments.
-
-The fields are those that ISO/IEC 17025:2017, 7.8.2 and 7.8.3, asks for.
-"""
+"""Metadata that a test report names (ISO/IEC 17025:2017, 7.8.2 and 7.8.3), and calibrations."""
 
 from __future__ import annotations
 
@@ -51,11 +48,7 @@ _INSTRUMENT = ("name", "quantity", "model", "serial", "calibration", "channel", 
 
 @dataclass(frozen=True)
 class Instrument:
-    """An instrument and its calibration, described in one line.
-
-    `u` is the standard uncertainty of its channel, "force", "displacement" or "delay": a share of
-    force or displacement, s of a delay; 0 where none is stated.
-    """
+    """An instrument in one line; `u` is the standard uncertainty of its channel, or 0."""
 
     text: str
     channel: str = ""
@@ -64,10 +57,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Metadata that a laboratory states; the usual fields left out are printed as blank lines.
-
-    `texts` are those of title, number, laboratory and so on, by their names in the file.
-    """
+    """Metadata that a laboratory states; the usual fields left out are printed as blank lines."""
 
     texts: Mapping[str, str] = field(default_factory=dict)
     ambient: tuple[str, ...] = ()
@@ -108,11 +98,7 @@ class Metadata:
         }
 
     def calibrations(self) -> dict[str, float]:
-        """Return the standard uncertainty of each parameter of the sensors that has one.
-
-        Several instruments of one channel, such as a sensor and its amplifier, combine as the root
-        of the sum of their squares.
-        """
+        """Return the standard uncertainty of each parameter of the sensors, root sum of squares."""
         squares: dict[str, float] = {}
         for one in self.instruments:
             if one.u > 0.0:

@@ -36,8 +36,8 @@ _SIZES = {"level", "amplitude"}
 def labelled(parts: Sequence[FrequencyResponse], names: Sequence[str]) -> list[FrequencyResponse]:
     """Return the tables of several files with their names as levels, or else as runs.
 
-    A level that was measured in a file of its own is not a run of its own: how such files differ
-    is what the levels are for, and scatter between runs cannot be told from it.
+    A level measured in a file of its own is not a run: how such files differ is what levels are
+    for.
     """
     runs = any(part.run is not None for part in parts) or not _one_level_each(parts)
     column = "run" if runs else "level"
@@ -67,11 +67,7 @@ def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:
 
 
 def one_run(records: Sequence[Record]) -> bool:
-    """Return whether each record is a sine or a sweep at one level, and no two are alike.
-
-    A sine that keeps its amplitude has a largest value of the square root of two times its root
-    mean square. Such records of several levels are one run, as such tables are.
-    """
+    """Return whether each record is a sine or a sweep at one level, and no two are alike."""
     for channel in ("force_samples", "motion_samples"):
         waves = [getattr(record, channel) - getattr(record, channel).mean() for record in records]
         largest = np.array([np.quantile(np.abs(wave), _NEARLY_ALL) for wave in waves])
@@ -105,17 +101,7 @@ def _held(part: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None
 
 
 def stated_levels(lines: Iterable[str]) -> dict[str, str]:
-    """Return the drive and the amplitude that lines of a header state, if each states one only.
-
-    Such a line is ``Excitation level: 0.2 N rms``, ``Control amplitude;5;um`` or ``DRIVE = 1 V``.
-
-    Examples
-    --------
-    >>> stated_levels(["Date: 2024-01-01", "Excitation level: 0.2 N rms"])
-    {'drive': '0.2 N rms'}
-    >>> stated_levels(["Control amplitude (um),5"])
-    {'amplitude': '5 um'}
-    """
+    """Return the drive and the amplitude that lines of a header state, if each states one only."""
     stated: dict[str, set[str]] = {}
     for line in lines:
         match = _LINE.match(line[:200])

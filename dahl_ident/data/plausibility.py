@@ -1,9 +1,7 @@
 """Plausibility of a table: warnings that list the rows, an error where a table must be wrong.
 
-A passive structure takes energy from its drive: each cycle dissipates ``pi A^2 Im Z`` at the
-fundamental, where Z is the dynamic stiffness. Single negative rows may be noise; if the sum of a
-whole table is negative by more than its noise, the sign of the phase or the choice of columns is
-wrong.
+A passive structure dissipates ``pi A^2 Im Z`` a cycle. Single negative rows may be noise; a sum
+that is negative by more than its noise means a wrong sign of the phase, or wrong columns.
 """
 
 from __future__ import annotations
@@ -112,8 +110,7 @@ def _against_the_others(part: FrequencyResponse) -> NDArray[np.bool_]:
 def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
     """Warn where the gain falls with the amplitude and the phase is far too small for it.
 
-    Friction that takes a share d off the gain at one frequency turns the phase by about d rad;
-    radians read as degrees are 57 times too small.
+    Friction that takes a share d off the gain turns the phase by about d rad.
     """
     fundamental = data.harmonic == 1
     if data.amplitude is None and data.drive is None:

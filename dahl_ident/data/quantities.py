@@ -1,9 +1,6 @@
-"""The six standard quantities, and the conversion of their errors.
+"""The six standard quantities R = s^p Z^q of ISO 7626-1, and the conversion of their errors.
 
-With X the displacement phasor, F the force phasor and s = j omega, the receptance is X/F, the
-mobility s X/F and the accelerance s^2 X/F; their inverses are the dynamic stiffness Z = F/X, the
-mechanical impedance F/(s X) and the apparent mass F/(s^2 X) (ISO 7626-1). So every one of them is
-R = s^p Z^q with q = 1 or -1, and Z = s^(-p q) R^q.
+Z = F/X is the dynamic stiffness, s = j omega and q = 1 or -1, so that Z = s^(-p q) R^q.
 """
 
 from __future__ import annotations

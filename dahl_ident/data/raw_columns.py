@@ -48,10 +48,7 @@ _PADDING = (1 << 26, 16)  # bytes, and bytes a letter, that a column of text may
 
 @dataclass(frozen=True)
 class Stored:
-    """An array that is read from its file when it is used; `what` names it in messages.
-
-    `read` returns a part of it, given by a slice of its only axis.
-    """
+    """An array that is read from its file when it is used; `what` names it in messages."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -76,8 +73,8 @@ class Stored:
 class RawChannel:
     """One named array of a file.
 
-    `role` is set where the format itself says what the channel is (UFF does), in the words of
-    a column map; `short` is the last part of a path, by which a role is found without a map.
+    `role` is set where the format says what the channel is, in the words of a column map; `short`
+    is the last part of a path, by which a role is found without a map.
     """
 
     name: str
@@ -114,10 +111,7 @@ class RawChannel:
         return _SUFFIXES.get(match[2].casefold(), match[2].replace("_per_", "/"))
 
     def is_called(self, declared: Column) -> bool:
-        """Return whether the format says that it is this column, or else its name does.
-
-        A unit of the column's kinds may stand at the end of the name.
-        """
+        """Return whether the format says that it is this column, or else its name does."""
         name = self.short or self.name
         if self.role is not None:
             return self.role == declared.names[0]
@@ -141,11 +135,10 @@ TRACE = "analyser's trace"
 class RawFile:
     """All channels of one file.
 
-    `row_name` turns the index of a value into the words that find it in the file. `decimal` is
-    the decimal mark of numbers in columns of text. `metadata` is what an earlier save of this
-    package left in the file, `options` what the user said. `runs` are the rows at which a header
-    that is repeated within the file begins another run. `doubts` are the warnings that its reader
-    has shown. `stated` are the drive and the amplitude of all rows, as the file's header says.
+    `row_name` turns the index of a value into words that find it in the file. `decimal` is the
+    decimal mark in columns of text. `metadata` is what an earlier save left in the file, `options`
+    what the user said, `stated` the drive and amplitude in the header. At `runs` a repeated header
+    begins another run. `doubts` are the warnings shown.
     """
 
     name: str
@@ -176,11 +169,7 @@ class RawFile:
         return f"{self.name}, {self.row_name(index)}, column {channel.name!r}"
 
     def find(self, text: str) -> RawChannel:
-        """Return the one channel that `text` names, with or without its unit in brackets.
-
-        The last part of a path is enough where it is the only one of its name; ``column 2`` is the
-        second channel where none is called so.
-        """
+        """Return the one channel of this name, header, last part of a path, or number."""
         exact = [c for c in self.channels if text in (c.name, c.header)]
         loose = [c for c in self.channels if plain(c.name) == plain(text)]
         for matches in (exact, loose):
@@ -335,10 +324,7 @@ def words(cells: Iterable[Any]) -> NDArray[np.str_]:
 
 
 def missing_marks(values: FloatArray) -> dict[float, float]:
-    """Return numbers that stand for a missing one, and the size of the largest other number.
-
-    They are far from all others, and -9999, 9.9e37 or the like.
-    """
+    """Return marks of a missing value such as -9999, with the size of the largest other number."""
     if values.size < _FEWEST_FOR_CODES:
         return {}
     marks = {}
@@ -358,8 +344,7 @@ def plain(name: str) -> str:
 def split_header(text: str) -> tuple[str, str | None]:
     """Split ``"force [kN]"``, ``"force (kN)"``, ``"F / kN"`` or ``"force in kN"``.
 
-    What stands in square brackets is the unit, unless it is an index; the other ways count
-    only where they lead to a unit.
+    What stands in square brackets is the unit, unless it is an index.
     """
     if len(text) > _LONGEST_HEADER:
         return text.strip(), None

@@ -1,8 +1,4 @@
-"""Sampled waveforms of motion and force, as a laboratory stored them.
-
-A :class:`Record` keeps every sample at its time: samples need not be evenly spaced, and gaps are
-listed, not filled. Motion may be displacement, velocity or acceleration. SI units throughout.
-"""
+"""Sampled waveforms of motion and force, as a laboratory stored them, in SI units."""
 
 from __future__ import annotations
 
@@ -307,9 +303,9 @@ class Record(Tabular):
 def unbroken(record: Record, shortest: int) -> list[Record]:
     """Return the parts of a record between long gaps, and warn where there are several.
 
-    What happened in a gap is not known, so that nothing with a memory can be followed through it.
-    Parts of fewer than `shortest` samples are left out. A record of which no part is long enough,
-    or whose steps differ everywhere, has no gaps but uneven times.
+    Nothing with a memory can be followed through a gap. Parts of fewer than `shortest` samples are
+    left out; a record without a part so long, or whose steps differ everywhere, has uneven times,
+    not gaps.
     """
     steps = np.diff(record.time)
     after = np.flatnonzero(steps > _LONG_GAP * np.median(steps)) + 1

@@ -1,11 +1,7 @@
 """From the columns of a table to a frequency response.
 
-A row holds a frequency, an amplitude or a drive, and a response: ``real`` and ``imag``,
-``gain`` or ``gain_db`` with ``phase``, or complex numbers; where amplitude and drive are both
-there, ``phase`` alone will do. The unit of the response says which quantity it is: N/m is a
-dynamic stiffness, (m/s^2)/N an accelerance. Amplitudes may be those of a velocity or an
-acceleration; they are divided by the angular frequency, and the phase stays that of the
-response. Standard deviations without a unit have that of their column.
+The unit of the response says which quantity it is. Amplitudes may be those of a velocity or an
+acceleration, divided by the angular frequency; the phase stays that of the response.
 """
 
 from __future__ import annotations

@@ -20,10 +20,7 @@ from dahl_ident.units import Quantity, engineering, shown_unit
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns of shape (n,), or (tables, n) where tables are stacked; None where not given.
-
-    `harmonic` and `forced` (force-controlled) have shape (n,): stacked tables agree in them.
-    """
+    """Columns of shape (n,), or (tables, n) where tables are stacked; None where not given."""
 
     quantity: Quantity
     harmonic: NDArray[np.int64]
@@ -95,10 +92,7 @@ class Rows:
 
     @classmethod
     def stack(cls, tables: Sequence[FrequencyResponse]) -> Rows:
-        """Return the columns of many tables that have the same shape and kind of rows.
-
-        A column in which all tables agree keeps the shape (n,), which saves work later.
-        """
+        """Return the columns of many tables of one kind of rows; shared ones have the shape (n,)."""
         first = tables[0]
         for index, table in enumerate(tables):
             if table.n != first.n or table.quantity != first.quantity:

@@ -1,8 +1,4 @@
-"""Tables to files and nothing lost: CSV, TSV, Parquet and HDF5.
-
-Files are written in their folder under another name and moved there when complete, so that
-an interrupted run leaves no half table. What was there before is replaced on request only.
-"""
+"""Tables to files with nothing lost: CSV, TSV, Parquet and HDF5; no half files are left."""
 
 from __future__ import annotations
 
@@ -123,8 +119,8 @@ def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
 def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool = True) -> None:
     """Write a file under another name, flush it to the disk, and rename it when complete.
 
-    `write` gets the path to write to. Whatever it raises is passed on, and leaves `path` alone.
-    Of several writers without `overwrite`, all but the first get a FileExistsError.
+    `write` gets the path to write to; whatever it raises leaves `path` alone. Of several writers
+    without `overwrite`, all but the first get a FileExistsError.
     """
     # not a file of tempfile, which nobody else may read
     part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.part")
@@ -157,10 +153,7 @@ def _move_to_new(part: Path, path: Path) -> None:
 
 @contextlib.contextmanager
 def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
-    """Hold the lock ``<file>.lock``; raise `error` where another process holds it.
-
-    It is released when the process ends, whichever way. On Windows there is no such lock.
-    """
+    """Hold the lock ``<file>.lock`` (not on Windows); raise `error` where another process does."""
     if sys.platform == "win32":
         yield
         return
@@ -197,14 +190,7 @@ def _is_still(path: Path, file: IO[str]) -> bool:
 
 
 def inert(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose texts no spreadsheet takes for formulas: those get an apostrophe.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> inert(pd.DataFrame({"device": ["=1+2", "-3.5", "d1"]}))["device"].tolist()
-    ["'=1+2", '-3.5', 'd1']
-    """
+    """Return a table whose texts no spreadsheet takes for formulas: those get an apostrophe."""
     return _texts(frame, lambda text: f"'{text}" if _runs(text) else text)
 
 
@@ -252,13 +238,7 @@ def library(module: str, extra: str | None = None) -> Any:
 
 
 def digest(value: Any) -> str:
-    """Return the SHA-256 of plain data, the same whatever the order of mappings.
-
-    Examples
-    --------
-    >>> digest({"a": 1, "b": [2.5]}) == digest({"b": [2.5], "a": 1})
-    True
-    """
+    """Return the SHA-256 of plain data, the same whatever the order of mappings."""
     text = json.dumps(plain_data(value), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
@@ -305,10 +285,9 @@ _KNOWN_METADATA: dict[str, Callable[[Any], bool]] = {
 
 
 def plain_data(value: Any, *, not_finite: Callable[[float], Any] = float) -> Any:
-    """Return mappings as dicts and sequences as lists, down to what JSON holds.
+    """Return mappings as dicts, sequences as lists and complex numbers as pairs, as JSON has them.
 
-    A complex number becomes the pair of its parts; `not_finite` says what becomes of NaN and
-    infinity, which strict JSON does not know: `str` makes them text.
+    `not_finite` says what becomes of NaN and infinity, which strict JSON does not know.
     """
     if isinstance(value, Mapping):
         return {str(k): plain_data(v, not_finite=not_finite) for k, v in value.items()}

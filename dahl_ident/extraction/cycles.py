@@ -1,23 +1,15 @@
 """Cycles of a waveform, and the spans of a record that hold one level or a sweep.
 
-A record of unknown frequency is cut at its rising crossings. A crossing counts when the motion
-goes from below ``-h`` to above ``+h``, so noise makes none; ``h`` is a part of the amplitude, and
-where the motion stays within ``±h`` for long the search goes on there with that part's own
-amplitude. So levels that differ by any factor are found, each about its own mean. Where the
-frequency is known the record is cut into its periods instead, which works in any noise.
+A record of unknown frequency is cut at its rising crossings: from below ``-h`` to above ``+h``,
+``h`` being a part of the amplitude, so noise makes none. Where the motion stays within ``±h`` for
+long the search goes on with that part's own amplitude. A record of known frequency is cut into its
+periods, in any noise. The phase of each cycle's own sine then puts its beginning right.
 
-The phase of each cycle's own sine then puts its beginning right, so amplitude and frequency of a
-cycle have the noise of a sine fit, and not that of a few samples near zero.
-
-Cycle by cycle a piece grows while amplitude and frequency stay what they were on average, to
-within a tolerance that the noise may widen. A piece that is long enough and has no trend is a
-plateau, and becomes a point; the others are ramps, and are left out. Where there is more ramp
-than plateau the record is a sweep; it is cut into windows short enough that amplitude and
-frequency change little in each.
-
-A drive such as a crank may be steady for no two cycles. Where plateaus hold less than half of
-cycles that neither sweep nor ramp, these are grouped with a wider tolerance, and halved as long as
-they have a trend: points with an amplitude of their own, whose scatter is part of the covariance.
+Cycle by cycle a piece grows while amplitude and frequency stay what they were on average. One that
+is long enough and has no trend is a plateau, and becomes a point; the others are ramps. Where there
+is more ramp than plateau the record is a sweep, cut into windows of little change. A drive such as
+a crank may be steady for no two cycles: where plateaus hold less than half of the cycles that
+neither sweep nor ramp, these are grouped with a wider tolerance.
 """
 
 from __future__ import annotations
@@ -71,8 +63,8 @@ _SWEEP_CYCLES = (4, 20)  # in a window
 class Cycles:
     """Consecutive cycles of a sine; those with a hole in the sampling are left out.
 
-    `noise` is the standard deviation of `log_amplitude`, and of the phase in rad.
-    `log_frequency` belongs to the boundaries, from the middle of one cycle to that of the next.
+    `noise` is the standard deviation of `log_amplitude`, and of the phase in rad. `log_frequency`
+    is from the middle of one cycle to that of the next.
     """
 
     start: FloatArray
@@ -96,11 +88,7 @@ def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
 
 
 def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
-    """Cut a record of known frequency into its periods, from the first sample on.
-
-    Where noise hides the amplitude of a period, so many periods are taken for one cycle that it
-    does not.
-    """
+    """Cut a record of known frequency into its periods; in noise, several make one cycle."""
     cycles = _cut(time, motion, frequency_hz, 1)
     if len(cycles):
         noise = float(np.median(cycles.noise))
@@ -177,11 +165,7 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
 
 
 def scattered(samples: FloatArray, count: int) -> FloatArray:
-    """Return so many samples, evenly spread over the record and over the phases of any period.
-
-    The places are multiples of the golden section. A plain stride may fit the period of the
-    motion, and then sees a few phases only.
-    """
+    """Return so many samples, spread over the record and over the phases of any period."""
     if samples.size <= count:
         return samples
     places = np.arange(count) * _GOLDEN % 1.0
@@ -290,10 +274,7 @@ def _with_hole(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Span:
-    """Start and stop in s, and the frequency in the middle, Hz.
-
-    `earliest` and `latest` are where the spans next to it end and begin.
-    """
+    """Start and stop, s, frequency in the middle, Hz, and where the spans next to it are."""
 
     start: float
     stop: float
@@ -357,8 +338,8 @@ class _Piece:
 def find_spans(runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | None) -> list[Span]:
     """Return the spans of runs of consecutive cycles, in order of time.
 
-    Plateaus of `fewest` cycles at least, windows of sweeps, or whichever there is more of. A
-    `window` has that many cycles, or else as many as change little.
+    Plateaus of `fewest` cycles at least, windows of sweeps (of `window` cycles, or as many as
+    change little), or whichever there is more of.
     """
     pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= fewest]
     plateaus = [piece for piece in pieces if not piece.trending]

@@ -5,15 +5,11 @@ cycles they give, by weights w_i = n_i / sum n,
 
     N = sum w_i N_i,      C = sum w_i^2 (C_i - R_i) + sum w_i R_i
 
-R being what rounding and aliasing leave alike in every cycle, which no averaging lowers. A part
-that has not settled belongs to the settling periods of the one that has. At a cut the cycle that
-it goes through is lost.
+R being what rounding and aliasing leave alike in every cycle. A part that has not settled belongs
+to the settling periods of the one that has.
 
-A record that is not a sine measurement is refused. Random
-motion, an earthquake, or point-to-point motion of a drive cross zero as well, and a few of their
-cycles look alike by chance. In a sine test (steady levels, steps, sweeps, an unsteady
-crank) almost every cycle is like the one before it. Cycles count by their energy, so noise during
-rests does not.
+A record that is not a sine measurement is refused: in a sine test almost every cycle is like the
+one before it, by energy; in random motion a few are so by chance.
 """
 
 from __future__ import annotations
@@ -59,10 +55,7 @@ _SPECTRUM_OF = 2**20  # samples at most
 def record_response(
     pieces: Iterable[Record], settings: Settings, level: ArrayLike | None, run: str | None
 ) -> FrequencyResponse:
-    """Return the points of a record in pieces, with a row for each harmonic.
-
-    A level that goes on from one piece to the next is one point.
-    """
+    """Return the points of a record in pieces; a level across a cut is one point."""
     points: list[Point] = []
     refused: list[str] = []
     doubts: dict[str, None] = {}
@@ -152,8 +145,7 @@ def _route(file: str | None = None) -> str:
 def _not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:
     """Return why the motion is not a sine measurement; empty where it may be one.
 
-    `runs` are its cycles between crossings, `covered` is the share of the moving time that points
-    cover; chance makes some of any motion.
+    `covered` is the share of the moving time that points cover; chance makes some of any motion.
     """
     noise, period, amplitude, pairs = _neighbours(runs)
     unlike = period > _PERIOD_CHANGE or amplitude > _AMPLITUDE_CHANGE

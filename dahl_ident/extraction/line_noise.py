@@ -1,23 +1,15 @@
-r"""Noise of the phasors, from what does not repeat from cycle to cycle.
+"""Noise of the phasors, from what does not repeat from cycle to cycle.
 
-Over P whole cycles whatever repeats falls on the harmonics, also those above the fitted ones.
-What lies on the lines between them, at ``f = (k + m/P) f_0`` for ``0 < |m| < P``, does not
-repeat: it is noise. Cycles are not compared one by one, since under 1/f noise neighbouring
-cycles share their error; the lines see the noise at the frequency where it counts.
-
-With Z_i the two channels' content of the lines, the cross-spectral matrix at the harmonic is
+Over P whole cycles whatever repeats falls on the harmonics. What lies on the lines between them, at
+``f = (k + m/P) f_0``, is noise, seen at the frequency where it counts. With Z_i the two channels'
+content of the lines, the cross-spectral matrix at the harmonic is
 
     C = sum_i f_i Z_i Z_i^H / sum_i f_i
 
-The lines lie evenly about the harmonic, so these weights make the expectation right for every
-noise spectrum ``a + b/f``, white and 1/f alike. With P >= 4 lines within half a harmonic are
-taken; fewer cycles have too few so close, and all lines up to the next harmonics serve as a
-spectral estimate. The noise is taken as circular (its phase is uniform), so n lines of equal
-weight give 2 n degrees of freedom.
-
-The mean (k = 0) has no line at 0 next to it that is noise alone. Its noise is that of the lowest
-lines, each of which appears on both sides: white noise is assumed from there down, so a slower
-drift of the sensor's zero is not in the mean's covariance.
+The lines lie evenly about the harmonic, so the expectation is right for every noise spectrum
+``a + b/f``. With P >= 4, lines within half a harmonic are taken, else all up to the next harmonics.
+The noise is taken as circular: n lines of equal weight give 2 n degrees of freedom. The noise of
+the mean (k = 0) is that of the lowest lines, white from there down.
 """
 
 from __future__ import annotations
@@ -40,11 +32,7 @@ _BLOCKS_PER_CYCLE = 128  # slow noise loses 1 % on the line of the ninth harmoni
 
 @dataclass(frozen=True)
 class LineNoise:
-    """Noise next to one harmonic, as that of white noise with the same density there.
-
-    `lines` is (2, lines): the errors of motion and force on each line, weighted so that their
-    products sum to those of a sample's errors.
-    """
+    """Noise next to one harmonic: `lines`, (2, lines), whose products sum to a sample's errors."""
 
     lines: ComplexArray
     dof: float
@@ -58,10 +46,7 @@ class LineNoise:
 def line_noise(
     fit: SineFit, harmonics: Sequence[int], cycles: int, residual: FloatArray
 ) -> list[LineNoise]:
-    """Return the noise next to each harmonic of a fit over two or more whole cycles.
-
-    `residual` is what the fit and the transient leave of motion and force.
-    """
+    """Return the noise next to each harmonic of a fit over two or more whole cycles."""
     reach = cycles // 2 if cycles >= CYCLES_FOR_SCATTER else cycles - 1
     side = min(reach, _MOST_LINES)
     content, window = _line_content(fit, harmonics, cycles, side, residual)

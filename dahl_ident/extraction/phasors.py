@@ -1,4 +1,4 @@
-r"""The phasors of a segment with their errors, and the responses that they give.
+"""The phasors of a segment with their errors, and the responses that they give.
 
 With the phasors X of displacement and F of force and their errors e_X, e_F,
 
@@ -7,10 +7,8 @@ With the phasors X of displacement and F of force and their errors e_X, e_F,
     N_k = F_k exp(-j k phi)/A         dN_k = e_Fk exp(-j k phi)/A - N_k (dA/A + j k dphi)
     N_0 = F_0/A                       dN_0 = e_F0/A - N_0 dA/A,   real
 
-so the response shares the displacement's error with the amplitude. A velocity or an acceleration
-is integrated at the fitted frequency: its phasor at harmonic k is divided by ``j k omega`` once
-or twice. Where the force was held and harmonics of the displacement are asked for, X and F change
-places: R_k = X_k exp(-j k phi)/abs(F_1), phi being the force's phase.
+A velocity or an acceleration is divided by ``j k omega`` once or twice. Where the force was held
+and harmonics of the displacement are asked for, X and F change places.
 """
 
 from __future__ import annotations
@@ -115,9 +113,8 @@ class Settings:
 class Phasors:
     """Displacement and force of one segment with their noise.
 
-    `fit` is without the transient where that is significant; `transient_phasors` is what the
-    transient adds to the phasors of its channel, and belongs to the response. `steps` are those of
-    the two sensors, 0 where they have none; the block means are made of `samples`.
+    `fit` is without the transient where that is significant; `transient_phasors` is what it adds to
+    the phasors of its channel. `steps` are those of the two sensors, 0 where they have none.
     """
 
     fit: SineFit

@@ -35,8 +35,8 @@ _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 class Point:
     """One amplitude and frequency: responses of the fundamental and the harmonics.
 
-    `joint` is the covariance of the amplitude (or drive, in rows X_k/F_1) with real and imaginary
-    part of each response, (rows, 3, 3); `repeating` is the part of it that is alike in every cycle.
+    `joint` is the covariance of what was held with each response, (rows, 3, 3); `repeating` is the
+    part of it that is alike in every cycle.
     """
 
     frequency_hz: float
@@ -54,10 +54,7 @@ class Point:
 def measure(
     segment: Segment, settings: Settings, samples: Samples, *, sweep: bool = False
 ) -> Point:
-    """Turn a segment of known phase, and the record's samples, into a point.
-
-    In a sweep amplitude and response may change linearly, and no cycles are left out.
-    """
+    """Turn a segment of known phase, and the record's samples, into a point."""
     if settings.of_displacement and settings.integrations and 0 in settings.harmonics:
         raise ExtractionError(
             f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "

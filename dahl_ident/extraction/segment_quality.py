@@ -1,22 +1,15 @@
-"""Quality of a segment of samples: sensor steps, clipping, share of the sine, asymmetry.
-
-The describing function assumes a displacement that is one sine, seen by a sensor that is finer
-than the amplitude and wide enough for it. Each of these is measured here, for each segment.
+"""Quality of a segment of samples: sensor steps, clipping, share of the sine, asymmetry, aliases.
 
 A loop that is alike in both directions has odd harmonics alone. Even ones appear where friction,
 clearance or a spring differ between the directions, and where the displacement has even harmonics
-itself: a linear element turns X_k/X_1 into k^2 X_k/X_1 of the force at most (a mass), and a
-symmetric but nonlinear one spreads X_2 over all even orders, each about as large as X_2/X_1. The
-mean (k = 0) is not judged, because a load cell's zero and a weight shift it as well. Without
-asymmetry abs(F_k)^2 over its variance follows F(2, dof_k) for each order. Above the limit of
-F(2 m, smallest dof) the mean of m orders lies less often than one of that distribution would.
+itself: a mass turns X_k/X_1 into k^2 X_k/X_1 of the force, and a symmetric nonlinear element
+spreads X_2 over all even orders. Without asymmetry abs(F_k)^2 over its variance follows F(2,
+dof_k).
 
-Harmonics above half the sampling rate alias onto the measured ones. With r samples a cycle the
-harmonics r - k and r + k are sampled as harmonic k, alike in every cycle, so that no scatter shows
-them. A waveform with kinks, such as friction's force, has harmonics that fall as a power of their
-order, between 1/k (steps) and 1/k^3 (reversals of Dahl friction). The power is taken from the
-harmonics that stand out of the noise, and extended to the first two that alias. Where r is not a
-whole number the alias lies next to the harmonic, and drops out of it the more cycles there are.
+With r samples a cycle the harmonics r - k and r + k alias onto harmonic k, alike in every cycle.
+The harmonics of a waveform with kinks fall as a power of their order, between 1/k (steps) and 1/k^3
+(reversals of Dahl friction). The power is taken from those that stand out of the noise. Where r is
+not a whole number, the alias drops out of the harmonic the more cycles there are.
 """
 
 from __future__ import annotations
@@ -51,10 +44,7 @@ _FITTED = 5  # offset, drift, a sine and its frequency
 
 
 def sensor_step(samples: FloatArray) -> float:
-    """Return the sensor's step, 0 where the values lie on no grid.
-
-    A sine sampled at the same phases in every cycle has few values too, but its gaps differ.
-    """
+    """Return the sensor's step, 0 where the values lie on no grid."""
     values = np.sort(scattered(samples, _LOOKED_AT))
     gaps = np.diff(values)
     gaps = gaps[gaps > _SAME * (values[-1] - values[0])]
@@ -70,13 +60,11 @@ def sensor_step(samples: FloatArray) -> float:
 def quantisation_errors(
     amplitude: FloatArray, step: FloatArray, residual: FloatArray, samples_a_cycle: float
 ) -> FloatArray:
-    """Return the error that rounding to sensor steps leaves in a phasor, for each channel.
+    """Return the root mean square error that rounding leaves in a phasor, for each channel.
 
-    Root mean square of its absolute value. Noise of more than half a step dithers: rounding then
-    averages out like noise, and shows in the scatter. Without it every cycle may be rounded
-    alike, so that only the samples of one cycle, step/sqrt(12) each, average out; and rounding
-    itself adds up to (2 step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A). Values
-    that follow a sine far more closely than the step were not rounded to it.
+    Noise of more than half a step dithers. Without it every cycle may be rounded alike: only the
+    samples of one cycle, step/sqrt(12) each, average out; and rounding itself adds up to (2
+    step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A).
     """
     sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
     of_amplitude = (
@@ -87,11 +75,10 @@ def quantisation_errors(
 
 
 def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:
-    """Return the share of samples that stand still at the highest or the lowest value.
+    """Return the share of samples that stand still at an extreme, in runs with a corner.
 
-    They do so in runs that the waveform enters and leaves at a corner; one that saturates does
-    not enter so. Where the noise does not reach the sensor's step, a crest of `crest` samples
-    stands still as well.
+    Where the noise does not reach the sensor's step, a crest of `crest` samples stands still as
+    well.
     """
     highest, lowest = float(samples.max()), float(samples.min())
     span = highest - lowest
@@ -121,9 +108,7 @@ def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
 def fundamental_share(fit: SineFit, segment: Segment, within: FloatArray) -> FloatArray:
     """Return the fundamental's share of the power of each channel, offset and drift apart.
 
-    `fit` may be one of block means; the power is that of the samples themselves, and `within`
-    the part of it that the segment's own means do not show. The residual power is divided
-    by its degrees of freedom, because a sine fits any few samples well.
+    `fit` may be one of block means; `within` is the power that the segment's means do not show.
     """
     sine = 0.5 * np.abs(fit.phasors(1)) ** 2
     drift = fit.coefficients[1] ** 2 / 3.0
@@ -134,10 +119,7 @@ def fundamental_share(fit: SineFit, segment: Segment, within: FloatArray) -> Flo
 
 
 def distortion(fit: SineFit, channel: int, integrations: int = 0) -> float:
-    """Return a channel's harmonics 2 to 9 over its fundamental, root of summed squares.
-
-    What the noise adds to their power is subtracted.
-    """
+    """Return a channel's harmonics 2 to 9 over its fundamental, without what noise adds."""
     orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
     noise = float(fit.residual_variance[channel])
     sizes = np.array([abs(fit.phasors(k)[channel]) for k in orders.tolist()])
@@ -155,8 +137,7 @@ def asymmetry(
 ) -> float:
     """Return the force's even harmonics over its fundamental, 0 where they are not significant.
 
-    `force` and `displacement` are phasors of even orders over those of the fundamental, with E
-    abs(error)^2 of the former as `variance` and its degrees of freedom.
+    Both phasors are over those of the fundamental; `variance` is E abs(error)^2 of the force's.
     """
     if orders.size == 0:
         return 0.0
@@ -169,10 +150,7 @@ def asymmetry(
 
 
 def alias_error(fit: SineFit, harmonic: int, cycles: int) -> FloatArray:
-    """Return the size of the aliases on a harmonic of motion and force, shape (2,).
-
-    In a sweep no alias stays in one place for long.
-    """
+    """Return the size of the aliases on a harmonic of motion and force, (2,); 0 in a sweep."""
     per_cycle = 2.0 * np.pi / fit.segment.sample_phase
     whole = round(per_cycle)
     if fit.trending or whole - harmonic <= fit.orders:

@@ -1,17 +1,12 @@
-r"""Segments: the spans of a record as samples with their phase.
+"""Segments: the spans of a record as samples with their phase.
 
-Spans are looked for between crossings first. Where noise drowns those, or they cover little
-of the record, the periods of its strongest line are tried as well, and the longer reading wins.
-Each span then gets its frequency, and the cycles next to it that the same sine fits.
-
-Where a ramp begins or ends, the first cycles that depart are off by a percent, in amplitude or in
-phase. The cycles inside tell how far is too far: a sine that may change linearly is fitted to
-them, and what a fundamental explains of each cycle's residual, Q_i, scatters with the noise, be it
-white or 1/f. With m cycles inside
+Each span gets its frequency, and the cycles next to it that the same sine fits. Where a ramp begins
+or ends, cycles depart by a percent. The m cycles inside tell how far is too far: what a fundamental
+explains of each cycle's residual, Q_i, scatters with the noise, and with h the error of the sine
 
     s^2 = sum_i Q_i / (2 m - 4),      F = Q / (2 (1 + h) s^2)
 
-and for a cycle that belongs F follows F(2, 2 m - 4), h being the error of the fitted sine there.
+follows F(2, 2 m - 4) for a cycle that belongs.
 """
 
 from __future__ import annotations
@@ -204,8 +199,7 @@ def _steady_part(
 ) -> slice:
     """Return the part of a record without cycles at its ends that stray, or with more that fit.
 
-    `segment` is the part with the phase of a steady sine, `room` where it may grow. Where the room
-    ends there may be a partial cycle.
+    `segment` is the part with the phase of a steady sine, `room` where it may grow.
     """
     edges = _cycle_edges(segment)
     start, stop = part.start, part.stop

@@ -1,27 +1,17 @@
-r"""Sine fit: the phasors of motion and force in one segment of steady sine excitation.
+"""Sine fit: the phasors of motion and force in one segment of steady sine excitation.
 
 Both channels are fitted with the same columns by linear least squares,
 
     y(t) = offset + drift tau + sum_k c_k cos(k theta) + s_k sin(k theta),   k = 1 ... K
 
-so that what is fitted with the fundamental (odd and even harmonics, offset, drift) does not
-leak into it, and samples are taken where they are: jitter, gaps and missing samples need no
-resampling. A phasor is ``Y_k = c_k - j s_k``, so that ``y = Re(Y_k exp(j k theta))``.
-
-The phase ``theta`` is a polynomial of ``tau``, time from -1 to 1 over the segment: ``theta =
-omega (t - t_c)`` where the frequency is steady. With the middle of the segment as origin an
-error of the frequency does not turn the phasors. The frequency is either known or estimated
-jointly with them from both channels, the four-parameter fit of IEEE Std 1057. In a sweep theta
-has a higher degree, and each harmonic may change linearly over the segment.
+so that nothing fitted leaks into the fundamental, and jitter, gaps and missing samples need no
+resampling. A phasor is ``Y_k = c_k - j s_k``. The phase ``theta`` is a polynomial of ``tau``, time
+from -1 to 1 over the segment, known or estimated jointly from both channels, the four-parameter fit
+of IEEE Std 1057. In a sweep each harmonic may change linearly.
 
 A record with many samples a cycle needs no more than 256 block means of them. The mean of m samples
-spaced evenly by the phase p is, of harmonic k in the middle of the block,
-
-    D_k = sin(m k p/2) / (m sin(k p/2))
-
-times as large, exactly. The fit takes its columns smaller by the same factor, so nothing is biased;
-of white noise 0.2 % more reaches the ninth harmonic. What judges single samples (sensor step,
-clipping, share of the power) looks at the samples themselves.
+spaced evenly by the phase p is, of harmonic k in the middle of the block, D_k = sin(m k p/2) / (m
+sin(k p/2)) times as large; the fit takes its columns smaller by the same factor.
 """
 
 from __future__ import annotations
@@ -55,10 +45,7 @@ _STEP_TOLERANCE = 1e-4  # phase at the ends of the segment, rad; its square is t
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples of motion (row 0) and force (row 1) with their phase, a polynomial of tau.
-
-    Each may be the mean of a `block` of evenly spaced samples.
-    """
+    """Samples of motion (row 0) and force (row 1), or means of a `block`, and their phase."""
 
     time: FloatArray
     channels: FloatArray
@@ -233,10 +220,7 @@ class SineFit:
         return np.asarray(cos - 1j * sin)
 
     def phasors_of(self, waveform: FloatArray) -> ComplexArray:
-        """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample.
-
-        The real part of the first is the mean.
-        """
+        """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample."""
         theta, tau = self.segment.theta[: waveform.size], self.segment.tau[: waveform.size]
         right = np.zeros(self.inverse.shape[0])
         passed = self.segment.passed(self.orders)
@@ -268,10 +252,7 @@ def resolvable_orders(segment: Segment) -> int:
 
 
 def sine_fit(segment: Segment, *, trend: bool = False, most: int = _MOST_HARMONICS) -> SineFit:
-    """Fit harmonics, at most so many, offset and drift to both channels, the phase being known.
-
-    With `trend` every harmonic may also change linearly over the segment, as in a sweep.
-    """
+    """Fit harmonics, offset and drift to both channels; with `trend` harmonics change linearly."""
     orders = min(resolvable_orders(segment), most)
     trending = orders if trend else 0
     theta, tau, passed = segment.theta, segment.tau, segment.passed(orders)
@@ -294,8 +275,7 @@ def sine_fit(segment: Segment, *, trend: bool = False, most: int = _MOST_HARMONI
 def estimate_frequency(segment: Segment) -> Segment:
     """Return the segment with the frequency that fits both channels best.
 
-    Gauss-Newton on the four-parameter fit; the channels are weighted by their residuals. The
-    start has to be within about half a cycle over the whole segment, see `track_phase`.
+    Gauss-Newton from within half a cycle; the channels are weighted by their residuals.
     """
     few, moved = thinned(segment), 0.0
     for _ in range(_MAX_STEPS):
@@ -315,11 +295,7 @@ def estimate_frequency(segment: Segment) -> Segment:
 
 
 def track_phase(segment: Segment, degree: int) -> Segment:
-    """Return the segment with its phase following the motion's, cycle by cycle.
-
-    The phase of each cycle's phasor is unwrapped and added to the phase as a polynomial, so a
-    start that is wrong by many cycles over the segment is put right.
-    """
+    """Return the segment with its phase following the motion's, cycle by cycle."""
     for _ in range(_MAX_STEPS):
         bend = _phase_error(thinned(segment), degree)
         segment = replace(segment, phase=segment.phase + bend)
@@ -390,10 +366,7 @@ def columns(
     trending: int = 0,
     passed: FloatArray | None = None,
 ) -> FloatArray:
-    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then the first ones times tau.
-
-    Of each harmonic the share that has `passed` into block means.
-    """
+    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then the first ones times tau."""
     width = 2 * orders + 2
     out = np.empty((width + 2 * trending, theta.size))
     out[0] = 1.0

@@ -190,10 +190,7 @@ class FileTask:
 def extract_all(
     tasks: Sequence[FileTask], how: Mapping[str, Any], jobs: int = 1, names: Sequence[str] = ()
 ) -> FrequencyResponse:
-    """Return the points of all tasks in one table; `how` holds the other words of `extract`.
-
-    Several tasks without runs get their names as runs, or as levels.
-    """
+    """Return the points of all tasks in one table; `how` holds the other words of `extract`."""
     stated = {name: value for name, value in how.items() if value is not None}
     if how.get("controlled") == "force":
         stated.setdefault("harmonics", (1,))

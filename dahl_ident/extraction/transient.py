@@ -1,21 +1,14 @@
-r"""The transient of friction: whether a segment has settled, and the remaining bias if not.
+"""The transient of friction: whether a segment has settled, and the remaining bias if not.
 
-After a change of level the force departs from its steady loop. For Dahl friction the departure
-fades along the path s travelled, whatever the direction,
+For Dahl friction the departure from the steady loop fades along the path s travelled,
 
     D(s) = D_0 exp(-beta s/A),     beta = sigma A/f_max;     exp(-4 beta) a cycle
 
-so settling takes cycles, not seconds, and the more of them the smaller the amplitude. In the
-response D barely shows from cycle to cycle. But it has one sign, so the force's mean shows it
-plainly, and there it is estimated: least squares of the force on harmonics, offset and
-exp(-beta s/A). What D then adds to each harmonic, as that was fitted, is the remaining bias.
-
-The rate is estimated as well, as far as the decay shows it. Where it does not (so slow that the
-mean seems to drift, or faded long ago) it leans on the beta at which Dahl friction alone has the
-measured phase. The noise of D_0 is taken from the lines below the fundamental, as 1/f noise: the
-less favourable case.
-
-Where the force is controlled its mean cannot drift; there the displacement's mean shows it.
+so settling takes cycles, not seconds. D has one sign, so the force's mean shows it, or the
+displacement's where the force is controlled: least squares on harmonics, offset and exp(-beta s/A).
+What D then adds to each harmonic is the remaining bias. Where the decay does not show its rate, it
+leans on the beta at which Dahl friction has the measured phase. The noise of D_0 is taken from the
+lines below the fundamental, as 1/f noise.
 """
 
 from __future__ import annotations
@@ -48,7 +41,7 @@ MOST_CYCLES = 256  # that D_0 and the rate are estimated from
 
 @dataclass(frozen=True)
 class Transient:
-    """Departure of one channel from its steady loop: D_0 with its error, and 4 beta as `rate`.
+    """Departure D_0 of one channel from its steady loop, and 4 beta as `rate`.
 
     D_0 is taken where the path of ``cos(theta + displacement_phase)`` is `start` amplitudes.
     """
@@ -85,8 +78,7 @@ def estimate_transient(
 ) -> Transient:
     """Return the departure that a segment starts with, at its first sample, and its rate.
 
-    The fit is from where the amplitude became constant, over at most `MOST_CYCLES`; the phase of
-    the response, a dynamic stiffness, determines the rate if the decay does not.
+    The phase of the response, a dynamic stiffness, determines the rate if the decay does not.
     """
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
     few = thinned(replace(fit.segment, channels=drifting[None]))

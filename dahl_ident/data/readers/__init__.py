@@ -1,10 +1,7 @@
 """Readers, which turn the usual laboratory files into frequency responses or records.
 
-Formats are recognised by their content: text tables (CSV, TSV and the like, also packed with gzip,
-bzip2 or xz), Excel, Parquet, MATLAB, HDF5, universal files 58 and 58b, NI TDMS, LabVIEW LVM, SDF.
-Information that the file does not contain, such as a unit or which column is the force, comes from
-a column map (:mod:`dahl_ident.data.column_map`) or from keywords; missing information is an error.
-Every remaining assumption, such as amplitudes being zero to peak, is noted in the result.
+Formats are recognised by their content. What a file does not contain, such as a unit, comes from a
+column map or from keywords, or is an error; every assumption is noted in the result.
 """
 
 from __future__ import annotations
@@ -245,11 +242,7 @@ def record_pieces(
     missing: Literal["error", "drop"] = "error",
     **roles: Any,
 ) -> Iterator[Record]:
-    """Yield a record in pieces of at most so many samples, each read when its turn comes.
-
-    The options are those of :func:`read_record`. The arrays of HDF5, TDMS, Parquet and npy stay in
-    the file until their piece is read.
-    """
+    """Yield a record in pieces of at most so many samples, each read when its turn comes."""
     if missing not in ("error", "drop"):
         raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
     if roles.get("time") is not None and roles.get("sample_rate") is not None:

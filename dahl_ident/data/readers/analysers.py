@@ -1,9 +1,7 @@
-"""Files of analysers: universal files 58 and 58b, and the Standard Data Format of HP and Keysight.
+"""Universal files 58 and 58b, and the Standard Data Format of HP and Keysight.
 
-The SDF is read as the 35665A and 35670A write it: records of big-endian numbers without padding. A
-file header has the places of all others; a header of the measurement follows, and for each result a
-header with its axis and units; then the vectors, the channels and the numbers. (Standard Data
-Format Utilities User's Guide, Agilent 5963-1715)
+The SDF has records of big-endian numbers without padding. (Standard Data Format Utilities User's
+Guide, Agilent 5963-1715)
 """
 
 from __future__ import annotations
@@ -78,8 +76,7 @@ _UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # others 
 def read_uff(file: File) -> RawFile:
     """Return the frequency responses and time records of a universal file.
 
-    A negative direction of response or reference turns the sign. Units are the axis labels of
-    the data set; without them those of data set 164, which gives factors to SI.
+    Units are the axis labels of the data set, or those of data set 164.
     """
     sets = _uff_sets(file, library("pyuff", "uff"))
     units = _uff_system(file, next((s for s in sets if s.get("type") == 164), None))
@@ -218,11 +215,7 @@ def merged_axes(channels: list[RawChannel]) -> list[RawChannel]:
 
 
 def read_sdf(file: File) -> RawFile:
-    """Return the results of an analyser's file with their axes.
-
-    A frequency response is in the engineering units of its channels. Where its coherence is in the
-    file too, the standard deviation follows from it.
-    """
+    """Return the results of an analyser's file with their axes, in engineering units."""
     return _Sdf(file).source()
 
 

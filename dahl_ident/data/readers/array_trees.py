@@ -1,9 +1,7 @@
 """Named arrays in a tree, as MATLAB, HDF5 and NumPy keep them, to channels.
 
-A path names an array: ``FRdata.ForceControl[2].frequency`` in MATLAB files, where indices of
-struct and cell arrays count from 0, ``group/dataset`` in HDF5. A matrix appears as its columns
-or rows, whichever are fewer: ``data[:,0]``, ``data[:,1]``. The arrays of HDF5, and of MATLAB v7.3,
-which is HDF5 inside, stay in the file until they are used.
+A path names an array: ``FRdata.ForceControl[2].frequency`` in MATLAB files (indices count from 0),
+``group/dataset`` in HDF5. A matrix is its columns or rows, whichever are fewer: ``data[:,0]``.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Columns by name: JSON, and the time series of SDyPy (its enhancement proposal 5).
 
-JSON may hold an object of columns, ``{"time [s]": [...], "x [mm]": [...]}``, or a list of them,
-``[{"name": "x", "values": [...], "unit": "mm"}, ...]``; a list of rows, ``[{"time [s]": 0.0,
-"x [mm]": 1.0}, ...]`` or ``[["time [s]", "x [mm]"], [0.0, 1.0], ...]``; ``{"columns": [...],
-"data": [[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or a list of
-channels with ``name``, ``data``, ``unit_str`` and either ``fs`` or ``time``, as SDyPy has them.
-Units may stand in the names, in each column, or for all of them under ``"units"`` or
-``"displacement units"``. Rows without names have columns ``column 1``, ``column 2``, ...
+JSON may hold ``{"x [mm]": [...], ...}``; ``[{"name": "x", "values": [...], "unit": "mm"}, ...]``;
+rows, ``[{"x [mm]": 1.0}, ...]`` or ``[["x [mm]"], [1.0], ...]``; ``{"columns": [...], "data":
+[[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or SDyPy's channels.
+Units stand in the names, in each column, or under ``"units"`` or ``"displacement units"``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A file with its hash, its format found from the content, and limits of size and time.
 
-The unpacked or declared size of a file is limited before memory is allocated, because a damaged or
-malicious file of some kilobytes may declare exabytes. Compiled libraries trust what a file says of
-its own structure; they work in a process of its own, which damage may end, hang or fill with
-numbers. There a crash is an error like others. Systems without ``fork`` go without.
+A damaged file of some kilobytes may declare exabytes, so sizes are limited before memory is taken.
+Compiled libraries trust what a file says of itself; they work in a process of its own (where there
+is ``fork``), so that a crash is an error like others.
 """
 
 from __future__ import annotations
@@ -49,10 +48,9 @@ _UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
 
 
 class Format(NamedTuple):
-    """A format: its name for messages, extensions that it may have, and module.function to read it.
+    """A format: its name, the extensions it may have, module.function to read it.
 
-    A file of another extension may have any format. Where a library reads it, any of the library's
-    errors says that what is called `damaged` in messages is so.
+    Where a library reads it, any of its errors says that what is called `damaged` is so.
     """
 
     name: str
@@ -108,11 +106,7 @@ _PACKED: tuple[tuple[bytes, Callable[[Any], Any], str], ...] = (
 
 @dataclass(frozen=True)
 class File:
-    """A file that is open to be read, and what it is.
-
-    `path` is the place of the bytes as they are, None where they came from standard input or had
-    to be unpacked; `size` is the number of bytes on the disk.
-    """
+    """A file that is open to be read; `content` where it is not on the disk as it is."""
 
     path: Path | None
     name: str

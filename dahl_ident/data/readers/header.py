@@ -40,8 +40,7 @@ class Run:
 class Header:
     """Names and units of the columns; no names for a table without a header.
 
-    `cells` is how many columns the header line has; rows may also end in a delimiter.
-    `contradicted` is whether another line above the numbers names the columns differently.
+    `cells` is how many columns the header line has; `contradicted` is whether another line differs.
     """
 
     names: tuple[str, ...]
@@ -53,8 +52,7 @@ class Header:
 def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
     """Return the run with the most numbers, half weighed against by cells of text.
 
-    None stands for a line to look past: blank, or a comment. A line of another width belongs
-    to the run that it breaks; it is for the parser to refuse.
+    None stands for a blank line or a comment. A line of another width belongs to the run it breaks.
     """
     is_number = CELL[mark].fullmatch
     best: Run | None = None
@@ -99,10 +97,7 @@ def _numeric(row: Sequence[str], mark: str) -> list[bool | None]:
 
 
 def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None) -> Header:
-    """Return names and units from the lines directly above the numbers, the nearest last.
-
-    Rows of `width` cells may end in delimiters, so that only `filled` of them hold something.
-    """
+    """Return names and units from the lines directly above the numbers, the nearest last."""
     least = width - 1 if filled is None else min(filled, width - 1)
     lines: list[list[str]] = []
     for row in reversed(above):

@@ -1,9 +1,4 @@
-"""Files of National Instruments: TDMS, and LabVIEW's measurement files (LVM).
-
-An LVM file is text with a header for the file and one for each segment. Every line of a segment
-must have the fields of its column labels, and a segment the number of samples that its header says;
-a lost line would move all later samples in time.
-"""
+"""Files of National Instruments: TDMS, and LabVIEW's measurement files (LVM)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
 """Text tables: any delimiter, decimal comma, comments, several header lines, a row of units.
 
-The layout is found from the numbers: the delimiter and decimal mark are those under which the
-longest run of lines reads as numbers; the lines above it with as many fields are the header,
-and its last line is a row of units where each of its cells is one. Lines further up are the
-instrument's own preamble.
+Delimiter and decimal mark are those under which the longest run of lines reads as numbers; the
+lines above it with as many fields are the header.
 """
 
 from __future__ import annotations
@@ -79,11 +77,7 @@ _LAST_DIALECTS = ((":", "."), (":", ","))  # a colon also stands in times of day
 
 @dataclass(frozen=True)
 class _Layout:
-    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header.
-
-    `repeated` is the line above the numbers, by which a second header in the file is known;
-    `comments` are all lines above them where the header is in comments.
-    """
+    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header."""
 
     delimiter: str | None
     mark: str
