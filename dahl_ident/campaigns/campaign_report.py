@@ -95,22 +95,13 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     def devices() -> object:
         from dahl_ident.plots import plot_devices
 
-        table = p.devices
-        return plot_devices(
-            list(table.index), table["own"].to_numpy(), table["u"].to_numpy(),
-            table["shrunken"].to_numpy(), p.mean[0], p.outlying, label=label,
-        )  # fmt: skip
+        return plot_devices(p.devices, p.mean[0], label=label)
 
     def charts() -> object:
         from dahl_ident.plots import plot_control_charts
 
-        fits = p.fits
-        ewma = [fits[c].to_numpy() for c in ("ewma", "ewma_limit")] if p.ordered else [None, None]
-        return plot_control_charts(
-            fits["value"].to_numpy(), ewma[0], float(fits["centre"].iloc[0]),
-            float(fits["limit"].iloc[0]), ewma[1], label=measured,
-            x_label="fit, in order of time" if p.ordered else "fit, in the order of the table",
-        )  # fmt: skip
+        order = "in order of time" if p.ordered else "in the order of the table"
+        return plot_control_charts(p.fits, label=measured, x_label=f"fit, {order}")
 
     beyond = ", ".join(p.outlying) or "none"
     drift = " and EWMA chart" if p.ordered else "; no order in time is stated, so no EWMA chart"

@@ -4,25 +4,34 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
-from dahl_ident.plots.control_charts import plot_control_charts, plot_devices
-from dahl_ident.plots.control_loops import plot_margins, plot_nichols, plot_nyquist
 from dahl_ident.plots.corner import plot_corner, plot_trace
 from dahl_ident.plots.fit_diagnostics import (
     plot_bench_time,
     plot_budget,
+    plot_control_charts,
     plot_correlation,
+    plot_devices,
     plot_information,
     plot_profile,
     plot_residuals,
 )
-from dahl_ident.plots.friction import plot_loops, plot_recorded_loops, plot_universal_curve
 from dahl_ident.plots.responses import (
     Curve,
     plot_amplitude_response,
     plot_backbone,
     plot_frequency_response,
+    plot_margins,
+    plot_nichols,
+    plot_nyquist,
 )
-from dahl_ident.plots.waveforms import plot_cycles, plot_sample_residuals, plot_waveforms
+from dahl_ident.plots.waveforms import (
+    plot_cycles,
+    plot_loops,
+    plot_recorded_loops,
+    plot_sample_residuals,
+    plot_universal_curve,
+    plot_waveforms,
+)
 
 __all__ = [
     "Axes",

@@ -38,13 +38,6 @@ def plot_corner(
         Which axes are logarithmic, where their values span a factor of three at least.
     truth : mapping of str to float, optional
         Values to mark, by label.
-    ax : ndarray of Axes, shape (p, p), optional
-        New where left out.
-
-    Returns
-    -------
-    ndarray of Axes, shape (p, p)
-        The upper triangle is empty.
 
     Examples
     --------
@@ -102,13 +95,6 @@ def plot_trace(
         Steps of warm-up, shaded.
     log : sequence of bool, shape (p,), optional
         Which axes are logarithmic, where their values span a factor of three at least.
-    ax : sequence of Axes, shape (p,), optional
-        New where left out.
-
-    Returns
-    -------
-    ndarray of Axes, shape (p,)
-        One for each parameter.
 
     Examples
     --------

@@ -1,9 +1,10 @@
-"""Diagnostic plots of a fit: residuals, profiles, correlation, information, budget, bench time."""
+"""Plots of estimates: residuals, profiles, correlation, information, budget, time, devices."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.plots import style
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _LARGEST_DISC = 250.0  # area, points squared
 _MOST_JOINED = 6  # curves; with more, lines between points only confuse
@@ -48,13 +52,6 @@ def plot_residuals(
         To which curve each point belongs; one curve where left out.
     suspicious : array_like of int
         Indices to ring.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        Residuals over `x`.
 
     Examples
     --------
@@ -117,13 +114,6 @@ def plot_profile(
         The parameter with its unit.
     log : bool, default False
         Logarithmic axis, for a positive parameter.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        Deviance over the parameter.
 
     Examples
     --------
@@ -159,13 +149,6 @@ def plot_correlation(
         The parameters.
     correlation : array_like, shape (p, p)
         Between -1 and 1.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        The matrix.
 
     Examples
     --------
@@ -206,14 +189,6 @@ def plot_information(
         there is none.
     x_label : str
         Axis label with unit.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        A line for each parameter; the areas of the discs are proportional to the shares, and the
-        largest share is written.
 
     Examples
     --------
@@ -260,14 +235,6 @@ def plot_budget(
         parameters first appear, sources likewise.
     x_label : str
         Axis label.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        One bar for each parameter. Sources differ in colour and hatching; shares of 10 % and more
-        are written on them.
 
     Examples
     --------
@@ -321,13 +288,6 @@ def plot_bench_time(
         where a time is too short.
     target : mapping of str to float, optional
         Wanted uncertainties, drawn as dotted lines.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        Plans solid, grids dashed; both axes logarithmic.
 
     Examples
     --------
@@ -353,3 +313,62 @@ def plot_bench_time(
     style.readable_log_ticks(axis)
     axis.legend()
     return axis
+
+
+@style.house_style()
+def plot_devices(devices: pd.DataFrame, mean: float, *, label: str, ax: Axes | None = None) -> Axes:
+    """Draw each device's own estimate, the one shrunk towards the population, and the mean.
+
+    `devices` is that of :class:`dahl_ident.campaigns.population.PopulationParameter`; up to 40
+    devices are named.
+    """
+    axis = style.axes(ax, size=(6.4, 3.2))
+    table = devices.sort_values("own", kind="stable")
+    place = np.arange(len(table))
+    axis.axhline(mean, color=style.GREY, lw=1.0, label="population mean")
+    axis.errorbar(
+        place, table["shrunken"], 2.0 * table["u"], fmt="o", color=style.BLUE, capsize=0,
+        lw=1.0, label="shrunk towards the population, with 2 u",
+    )  # fmt: skip
+    axis.plot(place, table["own"], "x", color=style.VERMILION, label="own estimate")
+    marked = np.flatnonzero(table["outlying"])
+    if marked.size:
+        axis.plot(
+            marked, table["own"].iloc[marked], "s", mfc="none", ms=9, color=style.BLACK,
+            label="outside the population",
+        )  # fmt: skip
+    if len(table) <= 40:
+        axis.set_xticks(place, table.index, rotation=90)
+    else:
+        axis.set_xlabel(f"{len(table)} devices in the order of their own estimate")
+    axis.set_ylabel(label)
+    axis.legend(loc="upper left")
+    return axis
+
+
+@style.house_style()
+def plot_control_charts(
+    fits: pd.DataFrame, *, label: str, x_label: str = "fit", ax: Sequence[Axes] | None = None
+) -> tuple[Axes, ...]:
+    """Draw the individuals chart of fits and, where they have an order in time, the EWMA chart.
+
+    `fits` is that of :class:`dahl_ident.campaigns.population.PopulationParameter`; points outside
+    the limits are marked.
+    """
+    charts = [(label, "value", "limit")]
+    if "ewma" in fits:
+        charts.append((f"{label}, EWMA", "ewma", "ewma_limit"))
+    size = (6.4, 4.4 if "ewma" in fits else 2.6)
+    axes = style.axes_column(ax, len(charts), size=size)
+    n, centre = np.arange(1, len(fits) + 1), fits["centre"]
+    for axis, (name, column, limit) in zip(axes, charts, strict=True):
+        line, width = fits[column], fits[limit]
+        axis.axhline(centre.iloc[0], color=style.GREY, lw=1.0)
+        for bound in (centre + width, centre - width):
+            axis.plot(n, bound, "--", color=style.GREY, lw=1.0)
+        axis.plot(n, line, "-o", color=style.BLUE, lw=0.8, ms=3)
+        beyond = ((line - centre).abs() > width).to_numpy()
+        axis.plot(n[beyond], line[beyond], "s", mfc="none", ms=8, color=style.VERMILION)
+        axis.set_ylabel(name)
+    axes[-1].set_xlabel(x_label)
+    return tuple(axes)

@@ -1,8 +1,8 @@
-"""Responses over amplitude or frequency: gain above phase, and backbones."""
+"""Responses over amplitude or frequency, in the complex plane, and margins of control loops."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.plots import style
+
+Band = tuple[FloatArray, FloatArray] | None
 
 
 @dataclass(frozen=True)
@@ -32,69 +34,69 @@ class Curve:
 
     x: FloatArray
     response: ComplexArray
-    gain_band: tuple[FloatArray, FloatArray] | None = None
-    phase_band: tuple[FloatArray, FloatArray] | None = None
+    gain_band: Band = None
+    phase_band: Band = None
     label: str = "fit"
 
 
 @dataclass(frozen=True)
 class Points:
-    """Measured responses along an axis, with standard deviations where known.
-
-    Parameters
-    ----------
-    x : array_like, shape (n,)
-        Amplitude or frequency.
-    response : array_like of complex, shape (n,)
-        In the unit of the gain.
-    gain_std, phase_std : array_like, shape (n,), optional
-        In the unit of the gain and rad.
-    """
+    """Measured responses along an axis, with standard deviations (phase in rad) where known."""
 
     x: ArrayLike
     response: ArrayLike
     gain_std: ArrayLike | None = None
     phase_std: ArrayLike | None = None
 
+    def draw(self, axes: Sequence[Axes], **look: Any) -> None:
+        """Draw the points with error bars, in order of their place."""
+        order = np.argsort(np.asarray(self.x))
+        x, R = np.asarray(self.x)[order], np.asarray(self.response)[order]
+        errors = [
+            None if std is None else factor * np.asarray(std)[order]
+            for std, factor in ((self.gain_std, 1.0), (self.phase_std, 180.0 / np.pi))
+        ]
+        marks = {"capsize": 2, "elinewidth": 1, "zorder": 3, **look}
+        axes[0].errorbar(x, np.abs(R), yerr=errors[0], **marks)
+        axes[1].errorbar(x, _degrees(R), yerr=errors[1], **marks)
 
-def draw_points(axes: Sequence[Axes], points: Points, **look: Any) -> None:
-    """Draw points with error bars, in order of their place."""
-    order = np.argsort(np.asarray(points.x))
-    x, R = np.asarray(points.x)[order], np.asarray(points.response)[order]
-    errors = [
-        None if std is None else factor * np.asarray(std)[order]
-        for std, factor in ((points.gain_std, 1.0), (points.phase_std, 180.0 / np.pi))
-    ]
-    marks = {"capsize": 2, "elinewidth": 1, "zorder": 3, **look}
-    axes[0].errorbar(x, np.abs(R), yerr=errors[0], **marks)
-    axes[1].errorbar(x, _degrees(R), yerr=errors[1], **marks)
-
-
-def draw_curve(axes: Sequence[Axes], curve: Curve, *, near: Points, **look: Any) -> None:
-    """Draw a curve and its band, with its phase shifted by whole turns to match the points."""
-    phase = _degrees(curve.response)
-    turns = _turns_away(curve.x, phase, near)
-    axes[0].plot(curve.x, np.abs(curve.response), **look)
-    axes[1].plot(curve.x, phase + turns, **look)
-    band: dict[str, Any] = {"color": look.get("color"), "alpha": 0.2, "lw": 0}
-    if curve.gain_band is not None:
-        axes[0].fill_between(curve.x, *curve.gain_band, **band)
-    if curve.phase_band is not None:
-        middle = np.angle(curve.response)
-        low, high = (phase + turns + np.degrees(limit - middle) for limit in curve.phase_band)
-        axes[1].fill_between(curve.x, low, high, **band)
+    def draw_fitted(self, axes: Sequence[Axes], curve: Curve, **look: Any) -> None:
+        """Draw a curve and its band, its phase shifted by whole turns to match the points."""
+        order = np.argsort(np.asarray(self.x))
+        measured = _degrees(np.asarray(self.response)[order])
+        phase = _degrees(curve.response)
+        away = measured - np.interp(np.asarray(self.x)[order], curve.x, phase)
+        phase = phase + 360.0 * float(np.round(np.median(away) / 360.0))
+        axes[0].plot(curve.x, np.abs(curve.response), **look)
+        axes[1].plot(curve.x, phase, **look)
+        band: dict[str, Any] = {"color": look.get("color"), "alpha": 0.2, "lw": 0}
+        if curve.gain_band is not None:
+            axes[0].fill_between(curve.x, *curve.gain_band, **band)
+        if curve.phase_band is not None:
+            middle = np.angle(curve.response)
+            low, high = (phase + np.degrees(limit - middle) for limit in curve.phase_band)
+            axes[1].fill_between(curve.x, low, high, **band)
 
 
 def _degrees(response: ComplexArray) -> FloatArray:
     return np.asarray(np.degrees(np.unwrap(np.angle(response))))
 
 
-def _turns_away(x: FloatArray, phase: FloatArray, near: Points) -> float:
-    """Return by how many degrees, whole turns, the points lie above a curve."""
-    order = np.argsort(np.asarray(near.x))
-    there = _degrees(np.asarray(near.response)[order])
-    away = there - np.interp(np.asarray(near.x)[order], x, phase)
-    return 360.0 * float(np.round(np.median(away) / 360.0))
+def _decibels(gain: ArrayLike) -> FloatArray:
+    """Return 20 lg of a gain; minus infinity where it is zero."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(20.0 * np.log10(np.asarray(gain, dtype=np.float64)))
+
+
+def _label_pair(
+    top: Axes, bottom: Axes, *, x_label: str, wide: bool = True, **top_has: Any
+) -> None:
+    """Name the axes of gain above phase, over a logarithm where the places span a wide range."""
+    scale = "log" if wide else "linear"
+    top.set(xscale=scale, **of_top)
+    bottom.set(xscale=scale, xlabel=x_label)
+    style.readable_log_ticks(top)
+    style.readable_log_ticks(bottom)
 
 
 @style.house_style()
@@ -121,19 +123,10 @@ def plot_frequency_response(
         Standard deviations of each level's points, in the gain's unit and in rad.
     fitted : sequence of Curve, optional
         The model's curves, one a level; the levels are then drawn as points.
-    gain_label : str
-        Axis label with unit.
-    x_label : str
-        The same for the abscissa, which may be an amplitude as well.
+    gain_label, x_label : str
+        Axis labels with units; the abscissa may be an amplitude as well.
     marker : str, default no marker
         A matplotlib marker at the points of a joined level.
-    ax : sequence of two Axes, optional
-        For gain and for phase; new ones where left out.
-
-    Returns
-    -------
-    tuple of Axes
-        Gain above, phase in degrees below.
 
     Examples
     --------
@@ -143,23 +136,20 @@ def plot_frequency_response(
     """
     pair = top, bottom = style.axes_pair(ax)
     lines, markers = style.level_lines(len(levels)), style.level_markers(len(levels))
-    labelled = style.labelled_levels(len(levels))
+    names = style.level_names([label for label, _, _ in levels])
     with_errors = [*errors, *[(None, None)] * (len(levels) - len(errors))]
     points = [Points(x, R, *std) for (_, x, R), std in zip(levels, with_errors, strict=True)]
-    for i, (part, (label, x, _)) in enumerate(zip(points, levels, strict=True)):
-        joined = not fitted and np.unique(x).size == np.size(x)  # no two share a position
+    for i, part in enumerate(points):
+        joined = not fitted and np.unique(part.x).size == np.size(part.x)  # no two share a position
         look = lines[i] | ({"marker": marker} if marker else {}) if joined else markers[i]
-        name = label if label and i in labelled else None
-        draw_points(pair, part, label=name, **look)
+        part.draw(pair, label=names[i], **look)
     for curve, part, look in zip(fitted, points, lines, strict=False):
-        draw_curve(pair, curve, near=part, **look)
+        part.draw_fitted(pair, curve, **look)
     places = np.concatenate([np.ravel(np.asarray(x)) for _, x, _ in levels])
-    wide = places.max() > 3.0 * places.min()
-    top.set(xscale="log" if wide else "linear", yscale="log", ylabel=gain_label)
-    bottom.set(xscale="log" if wide else "linear", xlabel=x_label, ylabel="phase [degrees]")
-    style.readable_log_ticks(top)
-    style.readable_log_ticks(bottom)
-    if any(label for label, _, _ in levels):
+    wide = bool(places.max() > 3.0 * places.min())
+    bottom.set(ylabel="phase [degrees]")
+    _label_pair(top, bottom, x_label=x_label, wide=wide, yscale="log", ylabel=gain_label)
+    if any(names):
         style.legend_above(top)
     return top, bottom
 
@@ -188,13 +178,6 @@ def plot_amplitude_response(
         The fitted response.
     amplitude_label, gain_label : str
         Axis labels with units.
-    ax : sequence of two Axes, optional
-        For gain and for phase; new ones where left out.
-
-    Returns
-    -------
-    tuple of Axes
-        Gain above, phase in degrees below.
 
     Examples
     --------
@@ -205,12 +188,10 @@ def plot_amplitude_response(
     pair = top, bottom = style.axes_pair(ax)
     points = Points(amplitude, response, gain_std, phase_std)
     if curve is not None:
-        draw_curve(pair, curve, near=points, color=style.FIT, label=curve.label)
-    draw_points(pair, points, fmt="o", color=style.BLUE, label="data")
-    top.set(xscale="log", yscale="log", ylabel=gain_label)
-    bottom.set(xscale="log", xlabel=amplitude_label, ylabel="phase [degrees]")
-    style.readable_log_ticks(top)
-    style.readable_log_ticks(bottom)
+        points.draw_fitted(pair, curve, color=style.FIT, label=curve.label)
+    points.draw(pair, fmt="o", color=style.BLUE, label="data")
+    bottom.set(ylabel="phase [degrees]")
+    _label_pair(top, bottom, x_label=amplitude_label, yscale="log", ylabel=gain_label)
     style.legend_above(top)
     return top, bottom
 
@@ -223,28 +204,7 @@ def plot_backbone(
     amplitude_label: str,
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
-    """Draw two quantities over the amplitude, one above the other, with error bars.
-
-    Parameters
-    ----------
-    amplitude : ndarray, shape (n,)
-    rows : sequence of two (label, values, standard deviations)
-    amplitude_label : str
-        Axis label with unit.
-    ax : sequence of two Axes, optional
-        New ones where left out.
-
-    Returns
-    -------
-    tuple of Axes
-
-    Examples
-    --------
-    >>> A = np.array([1e-4, 1e-3])
-    >>> pair = plot_backbone(A, [("f", A, A), ("zeta", A, A)], amplitude_label="amplitude [m]")
-    >>> pair[1].get_xlabel()
-    'amplitude [m]'
-    """
+    """Draw two quantities (label, values, standard deviations) over the amplitude."""
     pair = top, bottom = style.axes_pair(ax)
     order = np.argsort(amplitude)
     for axis, (label, values, std) in zip(pair, rows, strict=True):
@@ -252,4 +212,126 @@ def plot_backbone(
         axis.set(xscale="log", ylabel=label)
     bottom.set_xlabel(amplitude_label)
     style.readable_log_ticks(bottom)
+    return top, bottom
+
+
+@style.house_style()
+def plot_nyquist(
+    levels: Sequence[tuple[str, ArrayLike]], *, label: str = "response", ax: Axes | None = None
+) -> Axes:
+    """Draw complex responses in the complex plane, to one scale, one curve a level.
+
+    Parameters
+    ----------
+    levels : sequence of (label, complex response)
+        In the order of the levels; colours run from dark to light.
+    label : str
+        What is drawn, with its unit.
+
+    Examples
+    --------
+    >>> plot_nyquist([("1 N", [1.0, 0.5 - 0.5j, 0.0])]).get_xlabel()
+    'Re response'
+    """
+    axis = style.axes(ax)
+    for R, look in _levels(levels):
+        axis.plot(R.real, R.imag, **look)
+    axis.set(xlabel=f"Re {label}", ylabel=f"Im {label}")
+    axis.set_aspect("equal", adjustable="datalim")
+    return _with_legend(axis, levels)
+
+
+@style.house_style()
+def plot_nichols(
+    levels: Sequence[tuple[str, ArrayLike]], *, gain_label: str = "gain", ax: Axes | None = None
+) -> Axes:
+    """Draw gain in dB over phase in degrees, one curve a level.
+
+    Parameters
+    ----------
+    levels : sequence of (label, complex response)
+        In the order of the levels, each over rising frequency.
+    gain_label : str
+        Name of the gain; the label adds "dB", and the reference of 0 dB if the name ends in a unit:
+        ``"receptance [m/N]"`` becomes "receptance [dB re m/N]".
+
+    Examples
+    --------
+    >>> plot_nichols([("1 N", [1.0, 0.5 - 0.5j])], gain_label="receptance [m/N]").get_ylabel()
+    'receptance [dB re m/N]'
+    """
+    axis = style.axes(ax)
+    for R, look in _levels(levels):
+        axis.plot(_degrees(R), _decibels(np.abs(R)), **look)
+    label = gain_label.replace("[", "[dB re ") if "[" in gain_label else f"{gain_label} [dB]"
+    axis.set(xlabel="phase [degrees]", ylabel=label)
+    return _with_legend(axis, levels)
+
+
+def _levels(
+    levels: Sequence[tuple[str, ArrayLike]],
+) -> Iterator[tuple[ComplexArray, dict[str, Any]]]:
+    """Yield the response of each level with its look."""
+    names = style.level_names([label for label, _ in levels])
+    for (_, R), name, look in zip(levels, names, style.level_lines(len(levels)), strict=True):
+        yield np.asarray(R, dtype=np.complex128), {**look, "label": name}
+
+
+def _with_legend(axis: Axes, levels: Sequence[tuple[str, ArrayLike]]) -> Axes:
+    if any(name for name, _ in levels):
+        style.legend_above(axis)
+    return axis
+
+
+@style.house_style()
+def plot_margins(
+    amplitude: ArrayLike,
+    gain_margin: ArrayLike,
+    phase_margin_deg: ArrayLike,
+    *,
+    gain_band: Band = None,
+    phase_band: Band = None,
+    ax: Sequence[Axes] | None = None,
+) -> tuple[Axes, Axes]:
+    """Draw the margins of a loop against the amplitude of its displacement.
+
+    Parameters
+    ----------
+    amplitude : array_like, shape (m,)
+        m.
+    gain_margin, phase_margin_deg : array_like, shape (m,)
+        A factor > 0, drawn in dB, and degrees. Where one is infinite (no gain or phase reaches -1)
+        the top of the axes is marked.
+    gain_band, phase_band : tuple of two ndarrays, shape (m,), optional
+        Lower and upper limits.
+
+    Examples
+    --------
+    >>> top, bottom = plot_margins([1e-3, 1.0], [2.0, 3.0], [30.0, 50.0])
+    >>> bottom.get_ylabel()
+    'phase margin [degrees]'
+    """
+    top, bottom = style.axes_pair(ax)
+    A = np.asarray(amplitude, dtype=np.float64)
+    decibel_band = None if gain_band is None else tuple(_decibels(g) for g in gain_band)
+    rows = (
+        (top, _decibels(gain_margin), decibel_band),
+        (bottom, np.asarray(phase_margin_deg, dtype=np.float64), phase_band),
+    )
+    for axis, values, band in rows:
+        axis.plot(A, np.where(np.isfinite(values), values, np.nan), color=style.FIT)
+        if band is not None:
+            low, high = (np.where(np.isfinite(limit), limit, np.nan) for limit in band)
+            axis.fill_between(A, low, high, color=style.FIT, alpha=0.2, lw=0)
+        infinite = np.isposinf(values)
+        if infinite.any():
+            axis.plot(
+                A[infinite], np.full(infinite.sum(), 0.97), "^", color=style.FIT, label="infinite",
+                clip_on=False, transform=axis.get_xaxis_transform(),
+            )  # fmt: skip
+            if infinite.all():
+                axis.set_yticks([])
+            style.legend_above(axis)
+    bottom.set(ylabel="phase margin [degrees]")
+    _label_pair(top, bottom, x_label="amplitude [m]", ylabel="gain margin [dB]")
     return top, bottom

@@ -110,23 +110,20 @@ def level_colours(count: int) -> list[Any]:
 
 def level_lines(count: int) -> list[dict[str, Any]]:
     """Return colour and line style of `count` levels, in the order of the levels."""
-    return [
-        {"color": colour, "linestyle": line}
-        for colour, line in zip(level_colours(count), itertools.cycle(LINE_STYLES), strict=False)
-    ]
+    looks = zip(level_colours(count), itertools.cycle(LINE_STYLES), strict=False)
+    return [{"color": colour, "linestyle": line} for colour, line in looks]
 
 
 def level_markers(count: int) -> list[dict[str, Any]]:
     """Return colour and marker of `count` levels that are drawn as points."""
-    return [
-        {"color": colour, "marker": marker, "linestyle": "none"}
-        for colour, marker in zip(level_colours(count), itertools.cycle(MARKERS), strict=False)
-    ]
+    looks = zip(level_colours(count), itertools.cycle(MARKERS), strict=False)
+    return [{"color": colour, "marker": mark, "linestyle": "none"} for colour, mark in looks]
 
 
-def labelled_levels(count: int, most: int = 8) -> set[int]:
-    """Return which of many levels are in the legend: evenly spread, including the ends."""
-    return set(np.linspace(0, count - 1, most).round().astype(int).tolist())
+def level_names(labels: Sequence[str], most: int = 8) -> list[str | None]:
+    """Return the labels of levels for the legend; of many some, evenly spread, and the ends."""
+    labelled = set(np.linspace(0, len(labels) - 1, most).round().astype(int).tolist())
+    return [label if label and i in labelled else None for i, label in enumerate(labels)]
 
 
 def legend_above(axis: Axes) -> None:

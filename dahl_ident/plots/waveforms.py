@@ -1,4 +1,4 @@
-"""Waveforms against time, cycles of an extraction, and fits of records."""
+"""Waveforms against time, cycles of an extraction, hysteresis loops, friction in its plane."""
 
 from __future__ import annotations
 
@@ -12,6 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from dahl_ident.plots import style
 
 
+def _draw_measured(axis: Axes, x: ArrayLike, samples: ArrayLike, fitted: ArrayLike | None) -> None:
+    """Draw samples, and over them what a model predicts."""
+    axis.plot(x, samples, color=style.BLUE, lw=0.8, label="measured")
+    if fitted is not None:
+        axis.plot(x, fitted, "--", color=style.VERMILION, lw=1.0, label="fit")
+        style.legend_above(axis)
+
+
 @style.house_style()
 def plot_waveforms(
     time: ArrayLike,
@@ -20,7 +28,7 @@ def plot_waveforms(
     fitted: Sequence[ArrayLike | None] = (),
     ax: Sequence[Axes] | None = None,
 ) -> NDArray[Any]:
-    """Draw channels against time, one above the other.
+    """Draw channels against time, one above the other, each on axes of its own.
 
     Parameters
     ----------
@@ -30,18 +38,6 @@ def plot_waveforms(
         Labels with units; samples have shape (n,).
     fitted : sequence of array_like or None, optional
         What a model predicts for each channel, drawn over it; None where it predicts nothing.
-    ax : sequence of Axes, one a channel, optional
-        New where left out.
-
-    Returns
-    -------
-    ndarray of Axes
-        One for each channel.
-
-    Raises
-    ------
-    ValidationError
-        If `ax` holds another number of axes than there are channels.
 
     Examples
     --------
@@ -52,13 +48,76 @@ def plot_waveforms(
     rows = style.axes_column(ax, len(channels), size=(6.4, 0.8 + 1.4 * len(channels)))
     predicted = [*fitted, *[None] * (len(channels) - len(fitted))]
     for axis, (label, samples), model in zip(rows, channels, predicted, strict=True):
-        axis.plot(time, samples, color=style.BLUE, lw=0.8, label="measured")
-        if model is not None:
-            axis.plot(time, model, "--", color=style.VERMILION, lw=1.0, label="fit")
-            style.legend_above(axis)
+        _draw_measured(axis, time, samples, model)
         axis.set_ylabel(label)
     rows[-1].set_xlabel("time [s]")
     return rows
+
+
+@style.house_style()
+def plot_recorded_loops(
+    displacement: ArrayLike,
+    force: ArrayLike,
+    *,
+    fitted: ArrayLike | None = None,
+    displacement_label: str = "displacement [m]",
+    force_label: str = "force [N]",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw recorded force against motion, with the force that a fit gives over it.
+
+    Parameters
+    ----------
+    displacement, force : array_like, shape (n,)
+        Samples; the motion may be a velocity or an acceleration as well.
+    fitted : array_like, shape (n,), optional
+        The model's force at these samples.
+    displacement_label, force_label : str
+        Axis labels with units.
+
+    Examples
+    --------
+    >>> plot_recorded_loops([0.0, 1.0], [0.0, 2.0]).get_xlabel()
+    'displacement [m]'
+    """
+    axis = style.axes(ax)
+    _draw_measured(axis, displacement, force, fitted)
+    axis.set(xlabel=displacement_label, ylabel=force_label)
+    style.few_plain_ticks(axis.xaxis, most=6)
+    return axis
+
+
+@style.house_style()
+def plot_sample_residuals(
+    x: ArrayLike,
+    residuals: ArrayLike,
+    *,
+    x_label: str = "time [s]",
+    channel: str = "force",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the residuals of a record, sample by sample, with their root mean square as title.
+
+    Parameters
+    ----------
+    x, residuals : array_like, shape (n,)
+        Time or displacement, and measured minus fitted samples.
+    x_label : str
+        Axis label with unit.
+    channel : str, default "force"
+        What was fitted.
+
+    Examples
+    --------
+    >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title("left")
+    '3 rms'
+    """
+    axis = style.axes(ax, size=(6.4, 3.0))
+    axis.plot(x, residuals, color=style.BLUE, lw=0.6)
+    axis.axhline(0.0, color="0.5", lw=0.6)
+    axis.set(xlabel=x_label, ylabel=f"measured minus fitted {channel}")
+    axis.set_title(f"{np.sqrt(np.mean(np.square(residuals))):.3g} rms")
+    return axis
 
 
 @style.house_style()
@@ -71,7 +130,7 @@ def plot_cycles(
     mean_std: float | None = None,
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
-    """Draw how one point settled: its response and mean force, cycle by cycle.
+    """Draw how one point settled: its response off the median, and mean force, cycle by cycle.
 
     Parameters
     ----------
@@ -83,13 +142,6 @@ def plot_cycles(
         Leading cycles that were left out, shaded.
     response_std, mean_std : float, optional
         Standard deviation of one cycle's value, drawn as a band around the median.
-    ax : sequence of two Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    tuple of Axes
-        Response above, in percent of its median and relative to it; mean force below.
 
     Examples
     --------
@@ -105,14 +157,14 @@ def plot_cycles(
     top.plot(cycle, away.real, "o-", color=style.BLUE, lw=0.8, label="real part")
     top.plot(cycle, away.imag, "s-", color=style.VERMILION, lw=0.8, label="imaginary part")
     bottom.plot(cycle, mean, "o-", color=style.GREEN, lw=0.8)
-    if response_std is not None:
-        half = 200.0 * response_std / np.abs(middle)
-        top.axhspan(-half, half, color=style.GREY, alpha=0.15, lw=0)
-    if mean_std is not None:
-        centre, half = np.median(mean[left_out:]), 2.0 * mean_std
-        bottom.axhspan(centre - half, centre + half, color=style.GREY, alpha=0.15, lw=0)
-    for axis in (top, bottom) if left_out else ():
-        axis.axvspan(0.5, left_out + 0.5, color=style.GREY, alpha=0.3, lw=0)
+    for axis, centre, half in (
+        (top, 0.0, response_std and 200.0 * response_std / np.abs(middle)),
+        (bottom, np.median(mean[left_out:]), mean_std and 2.0 * mean_std),
+    ):
+        if half is not None:
+            axis.axhspan(centre - half, centre + half, color=style.GREY, alpha=0.15, lw=0)
+        if left_out:
+            axis.axvspan(0.5, left_out + 0.5, color=style.GREY, alpha=0.3, lw=0)
     top.set(ylabel="response, off its median [%]")
     bottom.set(xlabel="cycle", ylabel="mean force [N]")
     style.legend_above(top)
@@ -120,40 +172,79 @@ def plot_cycles(
 
 
 @style.house_style()
-def plot_sample_residuals(
-    x: ArrayLike,
-    residuals: ArrayLike,
+def plot_loops(
+    loops: Sequence[tuple[ArrayLike, ArrayLike, str]],
     *,
-    x_label: str = "time [s]",
-    channel: str = "force",
+    measured: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    displacement_label: str = "displacement [m]",
+    force_label: str = "force [N]",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the residuals of a record, sample by sample.
+    """Draw hysteresis loops, force against displacement.
 
     Parameters
     ----------
-    x, residuals : array_like, shape (n,)
-        Time or displacement, and measured minus fitted samples.
-    x_label : str
-        Axis label with unit.
-    channel : str, default "force"
-        What was fitted.
-    ax : Axes, optional
-        New where left out.
-
-    Returns
-    -------
-    Axes
-        With the residuals' root mean square as title.
+    loops : sequence of (displacement, force, label)
+        The model's loops.
+    measured : sequence of (displacement, force), optional
+        Measured points, drawn as markers in the colour of the corresponding loop.
+    displacement_label, force_label : str
+        Axis labels with units.
 
     Examples
     --------
-    >>> plot_sample_residuals([0.0, 1.0], [3.0, -3.0]).get_title("left")
-    '3 rms'
+    >>> plot_loops([([0.0, 1.0], [0.0, 1.0], "1 m")]).get_ylabel()
+    'force [N]'
     """
-    axis = style.axes(ax, size=(6.4, 3.0))
-    axis.plot(x, residuals, color=style.BLUE, lw=0.6)
-    axis.axhline(0.0, color="0.5", lw=0.6)
-    axis.set(xlabel=x_label, ylabel=f"measured minus fitted {channel}")
-    axis.set_title(f"{np.sqrt(np.mean(np.square(residuals))):.3g} rms")
+    axis = style.axes(ax)
+    count = max(len(loops), len(measured))
+    for (displacement, force), look in zip(measured, style.level_markers(count), strict=False):
+        axis.plot(displacement, force, **look, markersize=3, alpha=0.6)
+    for (displacement, force, label), look in zip(loops, style.level_lines(count), strict=False):
+        axis.plot(displacement, force, **look, label=label)
+    axis.set(xlabel=displacement_label, ylabel=force_label)
+    style.few_plain_ticks(axis.xaxis, most=6)
+    style.legend_above(axis)
+    return axis
+
+
+@style.house_style()
+def plot_universal_curve(
+    normalised: ArrayLike,
+    *,
+    curve: ArrayLike,
+    marked_beta: Sequence[tuple[float, complex]] = (),
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw N/sigma of the data with h(beta), the curve of every linear Dahl element.
+
+    Parameters
+    ----------
+    normalised : array_like of complex, shape (n,)
+        Measured friction, divided by the fitted sigma.
+    curve : array_like of complex, shape (m,)
+        h over a range of beta.
+    marked_beta : sequence of (beta, h(beta))
+        Points of the curve to label.
+
+    Examples
+    --------
+    >>> plot_universal_curve([0.9 + 0.1j], curve=[1.0, 0.73 + 0.3j]).get_xlabel()
+    'Re N / sigma'
+    """
+    axis = style.axes(ax)
+    h, N = np.asarray(curve), np.asarray(normalised)
+    axis.plot(h.real, h.imag, color=style.FIT, label="h(beta), linear Dahl")
+    axis.plot(N.real, N.imag, "o", color=style.BLUE, label="data / sigma", zorder=3)
+    for beta, value in marked_beta:
+        axis.plot(value.real, value.imag, "|", color=style.FIT, markersize=9)
+        inwards = 0.5 + 0.1j - value  # clear of the data
+        inwards *= 18.0 / abs(inwards)
+        axis.annotate(
+            f"{beta:g}", (value.real, value.imag), (inwards.real, inwards.imag), fontsize=7,
+            textcoords="offset points", ha="center", va="center", color=style.GREY,
+        )  # fmt: skip
+    axis.set(xlabel="Re N / sigma", ylabel="Im N / sigma")
+    axis.margins(y=0.12)
+    style.legend_above(axis)
     return axis
