@@ -88,9 +88,7 @@ def _decibels(gain: ArrayLike) -> FloatArray:
         return np.asarray(20.0 * np.log10(np.asarray(gain, dtype=np.float64)))
 
 
-def _label_pair(
-    top: Axes, bottom: Axes, *, x_label: str, wide: bool = True, **top_has: Any
-) -> None:
+def _label_pair(top: Axes, bottom: Axes, *, x_label: str, wide: bool = True, **of_top: Any) -> None:
     """Name the axes of gain above phase, over a logarithm where the places span a wide range."""
     scale = "log" if wide else "linear"
     top.set(xscale=scale, **of_top)
