@@ -50,7 +50,7 @@ def executed(notebook: Path, folder: Path) -> dict[str, Any]:
     import nbformat
     from nbclient import NotebookClient
 
-    content = nbformat.read(notebook, as_version=4)  # type: ignore[no-untyped-call]  # has none
+    content = nbformat.read(notebook, as_version=4)
     where = {"metadata": {"path": str(folder)}}
     NotebookClient(content, timeout=300, record_timing=False, resources=where).execute()
     content.metadata.pop("language_info")  # the version of Python
@@ -58,7 +58,7 @@ def executed(notebook: Path, folder: Path) -> dict[str, Any]:
     for cell in content.cells:
         if cell.cell_type == "code":
             cell.outputs = [_smaller(one) for one in cell.outputs if not _compiles(one)]
-    text = nbformat.writes(content)  # type: ignore[no-untyped-call]  # has none
+    text = nbformat.writes(content)
     return dict(json.loads(text))
 
 

@@ -1,18 +1,15 @@
 """The page's server: who may use it, what it keeps, and what it does with bad input."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
 
 import pytest
 
 import dahl_ident as di
-from tests.app_server import Server, started
+from tests.app_server import started
 
 NOISY = Path(__file__).parents[1] / "datasets" / "synthetic" / "noisy.csv"
 LAW = '''
@@ -34,13 +31,13 @@ class Worn(di.Friction):
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def server(tmp_path_factory):
     with started(tmp_path_factory.mktemp("work")) as running:
         yield running
 
 
 @pytest.fixture(scope="module")
-def work(server: Server) -> str:
+def work(server):
     """A table that has been read and confirmed."""
     place = server.upload([("noisy.csv", NOISY.read_bytes())])
     assert "Read as a table of responses" in server.page(place)
@@ -49,7 +46,7 @@ def work(server: Server) -> str:
 
 
 @pytest.fixture(scope="module")
-def fitted(server: Server, work: str) -> str:
+def fitted(server, work):
     """A fit of that table, with a known mass and a calibration."""
     return server.fitted(
         work, mass="known", mass_value="1 g", force_uncertainty="0.5 %", force_k="2",
@@ -72,14 +69,12 @@ def fitted(server: Server, work: str) -> str:
     ],
 )
 @pytest.mark.versions
-def test_a_request_that_is_not_of_the_page_is_refused(
-    server: Server, method: str, headers: dict[str, str | None], status: int
-) -> None:
+def test_a_request_that_is_not_of_the_page_is_refused(server, method, headers, status):
     assert server.request(method, "/", headers=headers)[0] == status
 
 
 @pytest.mark.versions
-def test_the_token_is_needed_once_and_pages_load_nothing_from_elsewhere(server: Server) -> None:
+def test_the_token_is_needed_once_and_pages_load_nothing_from_elsewhere(server):
     assert server.request("GET", "/?token=guess", headers={"Cookie": None})[0] == 403
     status, headers, _ = server.request("GET", "/")
     assert status == 200
@@ -88,7 +83,7 @@ def test_the_token_is_needed_once_and_pages_load_nothing_from_elsewhere(server: 
 
 
 @pytest.mark.versions
-def test_the_name_of_a_file_is_not_a_path(server: Server) -> None:
+def test_the_name_of_a_file_is_not_a_path(server):
     names = [
         "../../outside.csv", "C:data level.csv", "-o.csv", ".csv", "..", "a%2fb.csv",
         "Ölprüfung.csv", "*.csv", "<b>bold.csv", "x" * 300 + ".csv", "report.toml",
@@ -105,7 +100,7 @@ def test_the_name_of_a_file_is_not_a_path(server: Server) -> None:
 
 
 @pytest.mark.versions
-def test_of_two_files_with_one_name_both_are_kept(server: Server) -> None:
+def test_of_two_files_with_one_name_both_are_kept(server):
     place = server.upload([("run.csv", b"one"), ("run.csv", b"two")])
     server.upload([("run.csv", b"three")], f"{place}/files")
     kept = sorted(p.read_bytes() for p in (server.folder / place[1:] / "data").iterdir())
@@ -121,9 +116,7 @@ def test_of_two_files_with_one_name_both_are_kept(server: Server) -> None:
         (b"frequency [Hz],amplitude [m],gain [N/m],phase [deg]\n1,1e-3,30,5\n1,2e-3,x9,6\n", "x9"),
     ],
 )
-def test_a_bad_file_is_refused_in_the_reader_s_words(
-    server: Server, content: bytes, message: str
-) -> None:
+def test_a_bad_file_is_refused_in_the_reader_s_words(server, content, message):
     page = unescape(server.page(server.upload([("a file.csv", content)])))
     assert 'role="alert"' in page
     alert = page.partition('role="alert"')[2].partition("</div>")[0]
@@ -132,7 +125,7 @@ def test_a_bad_file_is_refused_in_the_reader_s_words(
     assert 'value="model" disabled' in page
 
 
-def test_the_program_gives_what_the_page_shows(server: Server, work: str, fitted: str) -> None:
+def test_the_program_gives_what_the_page_shows(server, work, fitted):
     run = fitted
     page = unescape(server.page(run))
     assert "Trusted." in page
@@ -147,7 +140,7 @@ def test_the_program_gives_what_the_page_shows(server: Server, work: str, fitted
     assert "force_gain" in stated.params  # the calibration counts
 
 
-def test_downloads_are_complete(server: Server, fitted: str) -> None:
+def test_downloads_are_complete(server, fitted):
     run = fitted
     assert server.page(f"{run}/file/report.html").startswith("<!doctype html>")
     assert server.page(f"{run}/file/report.pdf").startswith("%PDF")
@@ -160,7 +153,7 @@ def test_downloads_are_complete(server: Server, fitted: str) -> None:
         assert server.request("GET", f"{run}/{missing}")[0] == 404
 
 
-def test_comparison_and_plan_go_on_from_a_fit(server: Server, fitted: str) -> None:
+def test_comparison_and_plan_go_on_from_a_fit(server, fitted):
     run = fitted
     server.send(f"{run}/compare")
     server.wait(run)
@@ -176,7 +169,7 @@ def test_comparison_and_plan_go_on_from_a_fit(server: Server, fitted: str) -> No
     assert server.page(f"{run}/file/plan-1/waveform.csv").startswith("time")
 
 
-def test_what_a_form_says_wrongly_fails_with_the_reason(server: Server, work: str) -> None:
+def test_what_a_form_says_wrongly_fails_with_the_reason(server, work):
     for fields, message in (
         ({"known": "); import os ("}, "import os"),
         ({"mass": "known", "mass_value": "3 parsec"}, "parsec"),
@@ -187,7 +180,7 @@ def test_what_a_form_says_wrongly_fails_with_the_reason(server: Server, work: st
         assert message in alert
 
 
-def test_a_fit_is_cancelled(server: Server, work: str) -> None:
+def test_a_fit_is_cancelled(server, work):
     run = server.send(f"{work}/model", law="dahl")
     server.send(f"{run}/cancel")
     server.wait(run)
@@ -195,9 +188,7 @@ def test_a_fit_is_cancelled(server: Server, work: str) -> None:
     assert not (server.folder / run[1:] / "report.pdf").exists()
 
 
-def test_work_is_found_again_and_laws_of_the_user_are_run_only_where_they_were_named(
-    tmp_path: Path,
-) -> None:
+def test_work_is_found_again_and_laws_of_the_user_are_run_only_where_they_were_named(tmp_path):
     laws, folder = tmp_path / "laws.py", tmp_path / "work"
     laws.write_text(LAW)
     folder.mkdir()
@@ -213,7 +204,7 @@ def test_work_is_found_again_and_laws_of_the_user_are_run_only_where_they_were_n
         assert second.send(f"{work}/model", law="dahl").endswith("run-2")
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_named(tmp_path):
     words = [sys.executable, "-m", "dahl_ident.cli", "app", str(tmp_path / "none")]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     assert ended.returncode == 1

@@ -1,19 +1,16 @@
 """The page in a real browser: from files to a signed report, as a technician goes through it."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
-from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
-from tests.app_server import Server, started
-from tests.browser import CHROMIUM, Page, chromium
+from tests.app_server import started
+from tests.browser import CHROMIUM, chromium
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
@@ -23,13 +20,13 @@ _ENDED = f"{_RUN} && {_READY} && !document.getElementById('progress')"
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def server(tmp_path_factory):
     with started(tmp_path_factory.mktemp("work")) as running:
         yield running
 
 
 @pytest.fixture
-def page(server: Server, tmp_path: Path) -> Iterator[Page]:
+def page(server, tmp_path):
     """A page that has been opened with the token; nothing may come from another machine."""
     with chromium(tmp_path / "profile") as opened:
         opened.attach()
@@ -40,7 +37,7 @@ def page(server: Server, tmp_path: Path) -> Iterator[Page]:
         assert opened.problems == []
 
 
-def _check_access(page: Page, place: str) -> None:
+def _check_access(page, place):
     """Check labels, contrast and the like, in light and dark, and at the width of a phone."""
     for scheme in ("light", "dark"):
         wanted = {"name": "prefers-color-scheme", "value": scheme}
@@ -67,12 +64,12 @@ def _check_access(page: Page, place: str) -> None:
     )
 
 
-def _click(page: Page, selector: str, until: str) -> None:
+def _click(page, selector, until):
     page.value(f"document.querySelector({json.dumps(selector)}).click()")
     page.wait(f"{until} && {_READY}")
 
 
-def _keep_picture(page: Page, name: str, folder: Path) -> None:
+def _keep_picture(page, name, folder):
     """Keep a picture of the page for the manual, in few colours; the test shows that it is one."""
     with Image.open(io.BytesIO(page.screenshot())) as shot:
         assert shot.width == 1100
@@ -81,15 +78,13 @@ def _keep_picture(page: Page, name: str, folder: Path) -> None:
         top.quantize(64).save(folder / f"app_{name}.png", optimize=True)
 
 
-def _to_model(page: Page, file: Path) -> None:
+def _to_model(page, file):
     page.choose("#files", [file])
     _click(page, "form.drop button", "location.pathname != '/'")
     _click(page, "button[name=next]", "location.pathname.endsWith('/model')")
 
 
-def test_a_table_becomes_a_report_and_every_page_is_accessible(
-    page: Page, server: Server, tmp_path: Path
-) -> None:
+def test_a_table_becomes_a_report_and_every_page_is_accessible(page, server, tmp_path):
     pictures = Path(os.environ.get("DAHL_IDENT_PICTURES", tmp_path))
     _check_access(page, "start")
     page.choose("#files", [SETS / "noisy.csv"])
@@ -114,7 +109,7 @@ def test_a_table_becomes_a_report_and_every_page_is_accessible(
     assert server.page(f"{run}/file/report.pdf").startswith("%PDF")
 
 
-def test_sweeps_become_a_report(page: Page, server: Server) -> None:
+def test_sweeps_become_a_report(page, server):
     file = "sweep_plant.csv.gz"
     _to_model(page, SETS / file)
     for name in ("mass", "damping", "stiffness"):
@@ -127,8 +122,8 @@ def test_sweeps_become_a_report(page: Page, server: Server) -> None:
     assert server.page(f"{page.value('location.pathname')}/file/report.pdf").startswith("%PDF")
 
 
-def test_a_technician_gets_to_the_report_with_the_keyboard(page: Page) -> None:
-    def go_to(selector: str) -> None:
+def test_a_technician_gets_to_the_report_with_the_keyboard(page):
+    def go_to(selector):
         for _ in range(80):
             if page.value(f"document.activeElement.matches({json.dumps(selector)})"):
                 return
@@ -153,7 +148,7 @@ def test_a_technician_gets_to_the_report_with_the_keyboard(page: Page) -> None:
     page.wait("document.querySelector('.mark').innerText == 'Cancelled'")
 
 
-def test_nothing_is_lost_by_reload_back_button_or_a_second_tab(page: Page, server: Server) -> None:
+def test_nothing_is_lost_by_reload_back_button_or_a_second_tab(page, server):
     _to_model(page, SETS / "noisy.csv")
     page.value("document.getElementById('meta_specimen').value = 'Pivot 12'")
     _click(page, "form > .buttons button", _RUN)
@@ -170,7 +165,7 @@ def test_nothing_is_lost_by_reload_back_button_or_a_second_tab(page: Page, serve
     assert page.value(f"[...document.links].some(one => one.pathname == {json.dumps(run)})")
 
 
-def test_a_bad_file_is_explained_and_goes_no_further(page: Page, tmp_path: Path) -> None:
+def test_a_bad_file_is_explained_and_goes_no_further(page, tmp_path):
     bad = tmp_path / "level 3.csv"
     bad.write_text(
         "frequency [Hz],amplitude [m],gain [N/m],phase [deg]\n1,1e-3,30,5\n1,2e-3,x9,6\n"

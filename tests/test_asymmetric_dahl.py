@@ -1,9 +1,5 @@
 """Dahl friction with two limits."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import mpmath
 import numpy as np
 import pytest
@@ -14,7 +10,7 @@ from dahl_ident.errors import ValidationError
 AT_REST = np.zeros(())
 
 
-def exactly(f_max: float, sigma: float, a: float, A: float, k: int) -> complex:
+def exactly(f_max, sigma, a, A, k):
     """Return F_k/X_1 from the loop's exponentials by quadrature with 30 digits."""
     with mpmath.workdps(30):
         f_max, sigma, a, A = (mpmath.mpf(v) for v in (f_max, sigma, a, A))
@@ -24,11 +20,11 @@ def exactly(f_max: float, sigma: float, a: float, A: float, k: int) -> complex:
         top = (up - up * E + E * (-down + down * D)) / (1 - E * D)
         bottom = -down + (down + top) * D
 
-        def rising(t: Any) -> Any:
+        def rising(t):
             force = up - (up - bottom) * mpmath.exp(-b * (1 - mpmath.cos(t)))
             return force * mpmath.expj(-k * (t + mpmath.pi))
 
-        def falling(t: Any) -> Any:
+        def falling(t):
             force = -down + (down + top) * mpmath.exp(-c * (1 - mpmath.cos(t)))
             return force * mpmath.expj(-k * t)
 
@@ -37,7 +33,7 @@ def exactly(f_max: float, sigma: float, a: float, A: float, k: int) -> complex:
         return complex(total / (2 if k == 0 else 1))
 
 
-def test_the_check_values() -> None:
+def test_the_check_values():
     law = Dahl(1.0, 2000.0, asymmetry=0.2)
     c = [1e-3 * complex(law.dynamic_stiffness(1e-3, harmonic=k)) for k in range(4)]
     assert 2.0 * c[0].real == pytest.approx(0.2361383317, abs=1e-10)
@@ -45,7 +41,7 @@ def test_the_check_values() -> None:
     assert real == pytest.approx([0.8331869096, 0.0389112359, 0.1180527595], abs=1e-10)
 
 
-def test_harmonics_against_high_precision() -> None:
+def test_harmonics_against_high_precision():
     rng = np.random.default_rng(3)
     for _ in range(4):
         a, beta = rng.uniform(-0.8, 0.8), 10.0 ** rng.uniform(-3.0, 2.5)
@@ -58,7 +54,7 @@ def test_harmonics_against_high_precision() -> None:
             assert abs(ours - exactly(2.0, 50.0, a, A, k)) < 1e-11 * size * (1.0 + 0.1 / beta)
 
 
-def test_without_asymmetry_it_is_plain_dahl() -> None:
+def test_without_asymmetry_it_is_plain_dahl():
     A = np.geomspace(1e-6, 1e3, 50)
     near = Dahl(1.0, 3.0, asymmetry=1e-12)
     for k in (1, 3, 5):
@@ -71,14 +67,14 @@ def test_without_asymmetry_it_is_plain_dahl() -> None:
     assert [p.name for p in Dahl(1.0, 3.0, asymmetry=0.0).parameters] == ["f_max", "sigma", "alpha"]
 
 
-def test_refusals() -> None:
+def test_refusals():
     assert isinstance(Dahl(asymmetry=0.1), Friction)
     with pytest.raises(ValidationError, match="asymmetry is"):
         Dahl(1.0, 1.0, asymmetry=1.5)
 
 
 @pytest.mark.parametrize("k", [0, 1, 2, 3])
-def test_derivatives_against_high_precision(k: int) -> None:
+def test_derivatives_against_high_precision(k):
     rng = np.random.default_rng(k)
     law = Model(Dahl(1.0, 3.0, asymmetry=0.2)).with_free(["f_max", "sigma", "asymmetry"])
     for beta in 10.0 ** rng.uniform(-2.0, 2.0, 2):

@@ -1,16 +1,11 @@
 """Backbones: natural frequency and damping ratio against amplitude, from file to prediction."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, ModelError, ValidationError
 
 F_MAX, SIGMA, STIFFNESS, DAMPING, MASS = 0.5, 4000.0, 9000.0, 0.8, 0.5
@@ -19,7 +14,7 @@ MODEL = di.Dahl() + di.Spring() + di.Damper() + di.Mass(MASS)
 AMPLITUDES = np.geomspace(1e-5, 3e-3, 25)
 
 
-def measured(seed: int = 0, noise: float = 1.0) -> di.FrequencyResponse:
+def measured(seed=0, noise=1.0):
     """Return natural frequencies and damping ratios worked out from the friction alone."""
     N = di.Dahl(F_MAX, SIGMA).describing_function(AMPLITUDES)
     omega = np.sqrt((STIFFNESS + N.real) / MASS)
@@ -35,7 +30,7 @@ def measured(seed: int = 0, noise: float = 1.0) -> di.FrequencyResponse:
     )
 
 
-def test_parameters_are_recovered_within_their_uncertainties() -> None:
+def test_parameters_are_recovered_within_their_uncertainties():
     runs, inside = 20, dict.fromkeys(TRUTH, 0)
     for seed in range(runs):
         fit = di.fit(measured(seed), MODEL)
@@ -46,7 +41,7 @@ def test_parameters_are_recovered_within_their_uncertainties() -> None:
     assert min(inside.values()) >= binom.ppf(1e-4, runs, 0.95), inside
 
 
-def test_prediction_is_the_backbone_again() -> None:
+def test_prediction_is_the_backbone_again():
     data = measured(noise=0.0)
     fit = di.fit(data, MODEL)
     again = fit.backbone(AMPLITUDES)
@@ -60,14 +55,14 @@ def test_prediction_is_the_backbone_again() -> None:
     )
 
 
-def test_phase_resonance_of_an_integrated_motion() -> None:
+def test_phase_resonance_of_an_integrated_motion():
     # at the predicted frequency and amplitude the fundamental of the force leads by 90 degrees
     A = 2e-4
     fit = di.fit(measured(noise=0.0), MODEL)
     row = fit.backbone(A)
     omega = float(row.omega[0])
 
-    def friction(t: float, F: FloatArray) -> FloatArray:
+    def friction(t, F):
         v = A * omega * np.cos(omega * t)
         return np.asarray(SIGMA * v * (1.0 - np.sign(v) * F / F_MAX))
 
@@ -83,7 +78,7 @@ def test_phase_resonance_of_an_integrated_motion() -> None:
     assert Z.imag == pytest.approx(2.0 * MASS * omega**2 * row.response.imag[0], rel=1e-3)
 
 
-def test_read_from_a_file_and_stored(tmp_path: Path) -> None:
+def test_read_from_a_file_and_stored(tmp_path):
     data = measured()
     place = tmp_path / "backbone.csv"
     data.to_frame().to_csv(place, index=False)
@@ -97,7 +92,7 @@ def test_read_from_a_file_and_stored(tmp_path: Path) -> None:
     assert "damping ratio" in str(read)
 
 
-def test_a_saved_backbone_keeps_every_column(tmp_path: Path) -> None:
+def test_a_saved_backbone_keeps_every_column(tmp_path):
     data = di.FrequencyResponse.backbone(
         [1e-4, 1e-3], [21.0, 20.0], [0.02, 0.03], frequency_std=0.01, damping_ratio_std=1e-3,
         drive=[0.1, 0.2], dof=7.0, amplitude_std=[1e-6, 1e-6], level=["a", "b"],
@@ -110,7 +105,7 @@ def test_a_saved_backbone_keeps_every_column(tmp_path: Path) -> None:
     assert read.quality["settled"].tolist() == [True, False]
 
 
-def test_what_cannot_be_done_is_refused() -> None:
+def test_what_cannot_be_done_is_refused():
     data = measured()
     with pytest.raises(ModelError, match="up to the mass"):
         di.fit(data, di.Dahl() + di.Spring() + di.Mass())
@@ -127,7 +122,7 @@ def test_what_cannot_be_done_is_refused() -> None:
     assert free.params["sigma"].value == pytest.approx(di.fit(data, MODEL).params["sigma"].value)
 
 
-def test_a_table_that_lacks_a_column_is_refused(tmp_path: Path) -> None:
+def test_a_table_that_lacks_a_column_is_refused(tmp_path):
     place = tmp_path / "backbone.csv"
     place.write_text("frequency [Hz],amplitude [mm],damping_ratio\n20,1,0.02\n", "utf-8")
     with pytest.raises(DataError, match="frequency_std and damping_ratio_std"):

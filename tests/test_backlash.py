@@ -1,7 +1,5 @@
 """A gap in the link to a friction element."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 
@@ -22,19 +20,18 @@ from dahl_ident import (
 )
 from dahl_ident.elements import describe_model
 from dahl_ident.errors import ModelError
-from tests.command_line import Runner
 from tests.test_generic_friction import Jenkins
 
 AT_REST = np.zeros(())
 
 
-def by_path(f_max: float, sigma: float, b: float, A: float, k: int) -> complex:
+def by_path(f_max, sigma, b, A, k):
     """Return F_k/A of linear Dahl behind a half-gap b, from the force over the path."""
     x_c = f_max / sigma
     f0 = np.tanh(sigma * (A - b) / f_max)
     first = x_c * np.log1p(f0)
 
-    def force(path: np.ndarray) -> np.ndarray:
+    def force(path):
         moved = np.where(path < first, path, path - 2.0 * b)
         inside = (path >= first) & (path <= first + 2.0 * b)
         return np.where(inside, 0.0, f_max * (-1.0 + (1.0 + f0) * np.exp(-moved / x_c)))
@@ -56,12 +53,12 @@ def by_path(f_max: float, sigma: float, b: float, A: float, k: int) -> complex:
         (Backlash(Dahl(1.0, 1.0), 0.6), 1.0, 0.5368324 + 0.1217627j, 0.0781530 + 0.0417040j),
     ],
 )
-def test_the_check_values(law: Backlash, A: float, first: complex, third: complex) -> None:
+def test_the_check_values(law, A, first, third):
     assert complex(law.dynamic_stiffness(A)) == pytest.approx(first, abs=1e-7)
     assert complex(law.dynamic_stiffness(A, harmonic=3)) == pytest.approx(third, abs=1e-7)
 
 
-def test_harmonics_against_the_force_over_the_path() -> None:
+def test_harmonics_against_the_force_over_the_path():
     rng = np.random.default_rng(7)
     for _ in range(60):
         f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
@@ -75,7 +72,7 @@ def test_harmonics_against_the_force_over_the_path() -> None:
         assert abs(law.dynamic_stiffness(A, harmonic=2)) == 0.0
 
 
-def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force() -> None:
+def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force():
     A = np.geomspace(0.01, 10.0, 20)
     tight = Backlash(Dahl(1.0, 3.0, 2.0), 1e-12).describing_function(A)
     np.testing.assert_allclose(tight, Dahl(1.0, 3.0, 2.0).describing_function(A), rtol=1e-6)
@@ -84,7 +81,7 @@ def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force() -> None:
     assert wide.force([0.0, 0.9, -0.9, 0.9]).tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
-def test_the_force_steps_through_the_gap() -> None:
+def test_the_force_steps_through_the_gap():
     law = Backlash(Jenkins(2.0, 0.5), 0.4)
     x = [0.0, 0.2, 0.5, 1.0, 0.9, 0.5, 0.2, 0.1, 0.0, 0.1, 0.4]
     # contact at 0.2; slip at 1 N; zero force at 0.5; the gap is crossed to 0.1
@@ -92,7 +89,7 @@ def test_the_force_steps_through_the_gap() -> None:
     np.testing.assert_allclose(law.force(x), expected, atol=1e-9)
 
 
-def test_derivatives_of_linear_dahl_are_exact() -> None:
+def test_derivatives_of_linear_dahl_are_exact():
     rng = np.random.default_rng(11)
     places, weights = np.array([1.0, -1.0, 2.0, -2.0]), np.array([8.0, -8.0, -1.0, 1.0]) / 12e-5
     law = Model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
@@ -113,7 +110,7 @@ def test_derivatives_of_linear_dahl_are_exact() -> None:
             )
 
 
-def test_refusals() -> None:
+def test_refusals():
     wrong: list[Element] = [Spring(1.0), PowerDamper(1.0, 0.5), Backlash(Dahl(), 0.1)]
     for element in wrong:
         with pytest.raises(ModelError, match="Backlash got"):
@@ -121,7 +118,7 @@ def test_refusals() -> None:
     assert isinstance(Backlash(Dahl()).element, Friction)
 
 
-def test_two_limits_behind_a_gap_are_those_of_the_general_loop() -> None:
+def test_two_limits_behind_a_gap_are_those_of_the_general_loop():
     """Closed forms against the quadrature that every law takes, and against differences."""
     rng = np.random.default_rng(3)
     for i in range(30):
@@ -151,7 +148,7 @@ def test_two_limits_behind_a_gap_are_those_of_the_general_loop() -> None:
 
 
 @pytest.mark.parametrize("start", [0.55, -0.55])
-def test_a_history_that_starts_in_contact_changes_with_the_gap(start: float) -> None:
+def test_a_history_that_starts_in_contact_changes_with_the_gap(start):
     """The engine's derivative, for a law without a closed form."""
     x = 2.0 * np.sin(0.05 * np.arange(300.0))
     law = Backlash(Dahl(1.0, 3.0, 1.5))
@@ -165,7 +162,7 @@ def test_a_history_that_starts_in_contact_changes_with_the_gap(start: float) -> 
 
 @pytest.mark.parametrize("asymmetry", [0.0, 0.3])
 @pytest.mark.parametrize("start", [0.0, 0.3, 0.5])
-def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None:
+def test_a_history_behind_a_gap_is_exact(asymmetry, start):
     """Against the tables that every law takes, and its derivatives against differences."""
     rng = np.random.default_rng(5)
     x = 0.3 * np.cumsum(rng.standard_normal(300)) + 2.0 * np.sin(0.05 * np.arange(300.0))
@@ -190,7 +187,7 @@ def test_a_history_behind_a_gap_is_exact(asymmetry: float, start: float) -> None
         np.testing.assert_allclose(found.by_state, (ends[0] - ends[1]) / 2e-5, atol=1e-7)
 
 
-def test_the_element_behind_a_gap_is_written_on_the_command_line(run: Runner) -> None:
+def test_the_element_behind_a_gap_is_written_on_the_command_line(run):
     for text, missing in (
         ("backlash", "f_max, sigma, gap"),
         ("backlash(gap=0.1)", "f_max, sigma"),
@@ -203,7 +200,7 @@ def test_the_element_behind_a_gap_is_written_on_the_command_line(run: Runner) ->
     assert told["plant"] == describe_model(expected)
 
 
-def test_amplitudes_within_the_gap_are_no_misfit() -> None:
+def test_amplitudes_within_the_gap_are_no_misfit():
     """Rows of noise alone, where nothing is crossed, do not hide that the others are met."""
     A = np.concatenate([np.geomspace(1e-4, 4e-4, 5), np.geomspace(6e-4, 5e-2, 20)])
     noise = np.random.default_rng(1).standard_normal((2, A.size))
@@ -216,7 +213,7 @@ def test_amplitudes_within_the_gap_are_no_misfit() -> None:
     assert found.goodness.rms_misfit < 0.02
 
 
-def test_a_plant_that_moves_within_the_gap_is_linear() -> None:
+def test_a_plant_that_moves_within_the_gap_is_linear():
     f_max, sigma, gap = 6.468504e-05, 7.829406e-03, 4.0916780e-02
     linear = di.Mass(1.3699373e-09) + di.Damper(2.9454746e-08) + di.Spring(3.6530052e-03)
     plant = di.Backlash(di.Dahl(f_max, sigma), gap=gap) + linear

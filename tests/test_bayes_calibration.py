@@ -1,15 +1,10 @@
 """Simulation-based calibration in small; ``python -m benchmarks.calibration`` is the large one."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from benchmarks.calibration import (
     RANKS,
-    Scenario,
     critical,
     extremity,
     friction,
@@ -19,7 +14,7 @@ from benchmarks.calibration import (
 )
 
 
-def test_the_band_holds_uniform_ranks_and_sees_narrow_posteriors() -> None:
+def test_the_band_holds_uniform_ranks_and_sees_narrow_posteriors():
     limit = critical(300, 2)
     random = np.random.default_rng(1)
     uniform = random.integers(RANKS, size=300).astype(float)
@@ -31,14 +26,14 @@ def test_the_band_holds_uniform_ranks_and_sees_narrow_posteriors() -> None:
 
 
 @pytest.mark.parametrize(("scenario", "tables"), [(friction(), 5), (plant(), 1)])
-def test_ranks_of_the_truth_are_uniform(scenario: Scenario, tables: int) -> None:
+def test_ranks_of_the_truth_are_uniform(scenario, tables):
     found, failed = ranks(scenario, tables, seed=2)
     assert failed == 0
     limit = critical(tables, found.shape[1])
     assert all(extremity(column) >= limit for column in found.T)
 
 
-def test_the_report_says_whether_ranks_stay_inside(tmp_path: Path) -> None:
+def test_the_report_says_whether_ranks_stay_inside(tmp_path):
     random = np.random.default_rng(1)
     results = {"friction": (random.integers(RANKS, size=(100, 2)).astype(float), 0)}
     text = report(results, tmp_path)

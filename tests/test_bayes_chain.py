@@ -1,7 +1,5 @@
 """Moves, convergence and chains, against emcee, closed forms and themselves."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -11,11 +9,9 @@ import pytest
 from scipy import stats
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.convergence import autocorrelation_time, judge, r_hat
 from dahl_ident.bayes.moves import (
     EnsembleMove,
-    Proposal,
     differential_evolution,
     independent,
     snooker,
@@ -25,7 +21,7 @@ from dahl_ident.problem import TableProblem
 from tests.bayes_cases import FRICTION, friction_table, with_covariance
 
 
-def autoregression(steps: int, walkers: int, rho: float, seed: int = 3) -> FloatArray:
+def autoregression(steps, walkers, rho, seed=3):
     """Return paths whose autocorrelation time is (1 + rho)/(1 - rho)."""
     random = np.random.default_rng(seed)
     chain = np.empty((steps, walkers, 1))
@@ -36,14 +32,14 @@ def autoregression(steps: int, walkers: int, rho: float, seed: int = 3) -> Float
     return chain
 
 
-def test_autocorrelation_time_is_that_of_emcee_and_of_the_closed_form() -> None:
+def test_autocorrelation_time_is_that_of_emcee_and_of_the_closed_form():
     chain = autoregression(3000, 16, 0.8)
     tau = autocorrelation_time(chain)
     assert tau == pytest.approx(emcee.autocorr.integrated_time(chain, quiet=True), rel=1e-10)
     assert tau[0] == pytest.approx(9.0, rel=0.05)
 
 
-def test_r_hat_sees_ensembles_apart_and_drift() -> None:
+def test_r_hat_sees_ensembles_apart_and_drift():
     chain = autoregression(2000, 16, 0.5)
     assert r_hat(chain, 4)[0] < 1.002
     apart = chain.copy()
@@ -53,7 +49,7 @@ def test_r_hat_sees_ensembles_apart_and_drift() -> None:
     assert r_hat(drifting, 4)[0] > 1.02
 
 
-def test_the_verdict_says_what_is_missing() -> None:
+def test_the_verdict_says_what_is_missing():
     verdict = judge(autoregression(200, 16, 0.9), 4, wanted=5000.0)
     assert not verdict.reached
     assert "autocorrelation times, expected 50" in verdict.lacks[0]
@@ -64,11 +60,11 @@ def test_the_verdict_says_what_is_missing() -> None:
 
 
 @pytest.mark.parametrize("proposal", [independent, differential_evolution, snooker])
-def test_every_move_alone_leaves_a_distribution_as_it_is(proposal: Proposal) -> None:
+def test_every_move_alone_leaves_a_distribution_as_it_is(proposal):
     # skewed, in two dimensions: x gamma, y normal around x^2
     target = stats.gamma(3.0)
 
-    def log_density(x: FloatArray) -> FloatArray:
+    def log_density(x):
         with np.errstate(divide="ignore", invalid="ignore"):
             first = np.where(x[:, 0] > 0.0, 2.0 * np.log(x[:, 0]) - x[:, 0], -np.inf)
         return first - 0.5 * (x[:, 1] - 0.3 * x[:, 0]) ** 2
@@ -87,7 +83,7 @@ def test_every_move_alone_leaves_a_distribution_as_it_is(proposal: Proposal) -> 
     assert stats.kstest(draws[:, 1] - 0.3 * draws[:, 0], "norm").pvalue > 1e-3
 
 
-def test_the_same_seed_gives_the_same_chain() -> None:
+def test_the_same_seed_gives_the_same_chain():
     data = friction_table()
     first = di.posterior(data, di.Dahl(), seed=4, steps=60, uncertainty="noise")
     again = di.posterior(data, di.Dahl(), seed=4, steps=60, uncertainty="noise")
@@ -99,7 +95,7 @@ def test_the_same_seed_gives_the_same_chain() -> None:
     np.testing.assert_array_equal(unseeded.get_chain(), repeated.get_chain())
 
 
-def test_a_pool_gives_the_same_posterior() -> None:
+def test_a_pool_gives_the_same_posterior():
     data = friction_table()
     with ThreadPoolExecutor(2) as pool:
         spread = di.posterior(data, di.Dahl(), seed=4, steps=40, pool=pool, uncertainty="noise")
@@ -107,14 +103,14 @@ def test_a_pool_gives_the_same_posterior() -> None:
     np.testing.assert_allclose(spread.get_chain(), alone.get_chain(), rtol=1e-9)
 
 
-def test_walkers_start_at_finite_density_and_wide() -> None:
+def test_walkers_start_at_finite_density_and_wide():
     posterior = di.posterior(friction_table(), di.Dahl(), seed=1, steps=300, uncertainty="noise")
     assert np.isfinite(posterior.get_log_prob()).all()
     chain = posterior.get_chain()
     assert chain[0].std(axis=0)[0] > 1.2 * chain[100:].std(axis=(0, 1))[0]
 
 
-def test_priors_alone_are_recovered_without_likelihood() -> None:
+def test_priors_alone_are_recovered_without_likelihood():
     f_max = stats.lognorm(0.3, scale=0.2)
     given: dict[str, Any] = {"f_max": f_max, "sigma": (5.0, 50.0)}
     posterior = di.posterior(friction_table(), di.Dahl(), priors=given, likelihood="none", seed=2)
@@ -126,7 +122,7 @@ def test_priors_alone_are_recovered_without_likelihood() -> None:
     assert stats.kstest(np.log10(draws[:, 1] / 5.0), "uniform").pvalue > 1e-4
 
 
-def test_student_t_resists_an_outlier() -> None:
+def test_student_t_resists_an_outlier():
     data = friction_table(rows=20, noise=0.01)
     response = data.response.copy()
     response[10] *= 1.8
@@ -137,7 +133,7 @@ def test_student_t_resists_an_outlier() -> None:
     assert np.median(robust) == pytest.approx(0.1, abs=0.002)
 
 
-def test_interchangeable_elements_keep_their_order() -> None:
+def test_interchangeable_elements_keep_their_order():
     amplitude = np.geomspace(1e-4, 1e-1, 25)
     truth = di.Dahl(f_max=0.1, sigma=300.0, name="a") + di.Dahl(f_max=0.5, sigma=30.0, name="b")
     random = np.random.default_rng(2)
@@ -153,7 +149,7 @@ def test_interchangeable_elements_keep_their_order() -> None:
     assert np.median(values[:, 0]) == pytest.approx(0.1, rel=0.1)
 
 
-def test_sensor_priors_of_any_kind_are_sampled() -> None:
+def test_sensor_priors_of_any_kind_are_sampled():
     sensors = di.Sensors(force_gain=stats.uniform(0.95, 0.1))
     posterior = di.posterior(
         friction_table(), di.Dahl(), sensors=sensors, seed=1, uncertainty="noise"
@@ -165,14 +161,14 @@ def test_sensor_priors_of_any_kind_are_sampled() -> None:
     assert rule.width == pytest.approx(1.0, abs=0.1)
 
 
-def test_known_noise_has_no_scale() -> None:
+def test_known_noise_has_no_scale():
     posterior = di.posterior(
         with_covariance(friction_table(), 0.02), di.Dahl(), seed=1, steps=50, uncertainty="noise"
     )
     assert posterior.names == ("f_max", "sigma")
 
 
-def test_a_fit_is_taken_over() -> None:
+def test_a_fit_is_taken_over():
     data = friction_table()
     fit = di.fit(data, di.Dahl())
     assert di.posterior(fit, seed=1, steps=50, uncertainty="noise").problem is fit.problem
@@ -180,7 +176,7 @@ def test_a_fit_is_taken_over() -> None:
         di.posterior(fit, noise="absolute", free=["alpha"], uncertainty="noise")
 
 
-def test_refusals() -> None:
+def test_refusals():
     data = friction_table()
     with pytest.raises(ModelError, match="there is no model"):
         di.posterior(data, uncertainty="noise")

@@ -1,7 +1,5 @@
 """Chains on disk: killed, resumed, damaged, foreign, shared."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import signal
@@ -10,7 +8,6 @@ import sys
 import time
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +16,6 @@ import dahl_ident as di
 from dahl_ident.data import storage
 from dahl_ident.errors import SamplingError
 from dahl_ident.problem import TableProblem
-from dahl_ident.results import Posterior
 from tests.bayes_cases import friction_table
 
 STEPS = 800
@@ -36,11 +32,11 @@ di.posterior(
 """
 
 
-def sampled(path: Path | None, **options: Any) -> Posterior:
+def sampled(path, **options):
     return di.posterior(friction_table(), di.Dahl(), resume=path, **options, uncertainty="noise")
 
 
-def refused(path: Path, message: str, **options: Any) -> None:
+def refused(path, message, **options):
     """Check that a file is refused with a message, and left as it is."""
     before = hashlib.sha256(path.read_bytes()).digest()
     with pytest.raises(SamplingError, match=message):
@@ -50,13 +46,13 @@ def refused(path: Path, message: str, **options: Any) -> None:
 
 
 @pytest.fixture
-def begun(tmp_path: Path) -> Path:
+def begun(tmp_path):
     path = tmp_path / "chain.h5"
     sampled(path, seed=9, steps=60)
     return path
 
 
-def test_resume_goes_on_to_a_total_and_changes_nothing(begun: Path) -> None:
+def test_resume_goes_on_to_a_total_and_changes_nothing(begun):
     resumed = sampled(begun, steps=130)
     whole = sampled(None, seed=9, steps=130)
     assert (resumed.steps, resumed.seed) == (130, 9)
@@ -66,14 +62,14 @@ def test_resume_goes_on_to_a_total_and_changes_nothing(begun: Path) -> None:
     assert [p.name for p in begun.parent.iterdir()] == [begun.name]
 
 
-def test_resume_until_convergence_ends_where_one_run_ends(begun: Path) -> None:
+def test_resume_until_convergence_ends_where_one_run_ends(begun):
     resumed = sampled(begun)
     whole = sampled(None, seed=9)
     assert resumed.converged
     np.testing.assert_array_equal(resumed.get_chain(), whole.get_chain())
 
 
-def test_killed_at_random_moments_it_ends_with_the_same_chain(tmp_path: Path) -> None:
+def test_killed_at_random_moments_it_ends_with_the_same_chain(tmp_path):
     path = tmp_path / "chain.h5"
     random = np.random.default_rng(11)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -94,14 +90,12 @@ def test_killed_at_random_moments_it_ends_with_the_same_chain(tmp_path: Path) ->
     np.testing.assert_array_equal(resumed.get_chain(), whole.get_chain())
 
 
-def test_an_exception_leaves_all_steps_in_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_exception_leaves_all_steps_in_the_file(tmp_path, monkeypatch):
     path = tmp_path / "chain.h5"
     calls = 0
     likelihood = TableProblem.log_likelihood
 
-    def interrupted(self: TableProblem, *args: Any) -> Any:
+    def interrupted(self, *args):
         nonlocal calls
         calls += 1
         if calls == 300:
@@ -118,7 +112,7 @@ def test_an_exception_leaves_all_steps_in_the_file(
     np.testing.assert_array_equal(resumed.get_chain(), sampled(None, seed=9, steps=200).get_chain())
 
 
-def test_foreign_runs_are_refused(begun: Path) -> None:
+def test_foreign_runs_are_refused(begun):
     refused(begun, "was begun with seed 9, but seed is 8", seed=8)
     refused(begun, "it differs in prior of f_max. Resume with", priors={"f_max": (1e-3, 1.0)})
     refused(begun, "differs in noise", noise="absolute")
@@ -131,7 +125,7 @@ def test_foreign_runs_are_refused(begun: Path) -> None:
     assert begun.read_bytes() == before
 
 
-def test_damaged_files_are_refused(begun: Path) -> None:
+def test_damaged_files_are_refused(begun):
     whole = begun.read_bytes()
     begun.write_bytes(whole[: len(whole) // 2])
     refused(begun, "cannot be read as a chain .*damaged or something else")
@@ -147,14 +141,14 @@ def test_damaged_files_are_refused(begun: Path) -> None:
     refused(begun, "cannot be read as a chain")
 
 
-def test_other_hdf5_files_are_refused(tmp_path: Path) -> None:
+def test_other_hdf5_files_are_refused(tmp_path):
     path = tmp_path / "table.h5"
     with h5py.File(path, "w") as file:
         file["amplitude"] = np.ones(3)
     refused(path, f"^{path} is an HDF5 file, but not a chain that this version can resume")
 
 
-def test_two_runs_exclude_each_other(tmp_path: Path) -> None:
+def test_two_runs_exclude_each_other(tmp_path):
     path = tmp_path / "chain.h5"
     with subprocess.Popen(
         [sys.executable, "-c", LONG_RUN.replace(str(STEPS), "1000000"), str(path)],
@@ -171,16 +165,14 @@ def test_two_runs_exclude_each_other(tmp_path: Path) -> None:
             process.kill()
 
 
-def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(tmp_path, monkeypatch):
     path = tmp_path / "chain.h5"
     lock = tmp_path / "chain.h5.lock"
     lock.touch()
     seen: list[bool] = []
     is_still = storage._is_still
 
-    def removed_once(path: Path, file: Any) -> bool:
+    def removed_once(path, file):
         if not seen:
             lock.unlink()
         seen.append(is_still(path, file))
@@ -192,7 +184,7 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(
     assert not lock.exists()
 
 
-def test_a_missing_folder_and_a_folder_are_said(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_folder_are_said(tmp_path):
     with pytest.raises(SamplingError, match="is a folder; give the path of a file in it"):
         sampled(tmp_path, steps=50)
     with pytest.raises(SamplingError, match="nowhere is not a folder; make it"):

@@ -1,20 +1,17 @@
 """Decorrelated coordinates of a plant: a shift that keeps volumes, and what it is for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
+from dahl_ident.bayes.decorrelation import decorrelation_of
 from dahl_ident.problem import TableProblem
 from tests.bayes_cases import FRICTION, X_C, friction_table, spring_table
 
 PLANT = di.Dahl() + di.Spring() + di.Damper() + di.Mass()
 
 
-def problem() -> TableProblem:
+def problem():
     amplitude = np.tile(np.geomspace(0.01, 1.0, 6) * X_C, 3)
     frequency = np.repeat([1.0, 2.0, 3.0], 6)
     truth = FRICTION + di.Spring(20.0) + di.Damper(0.3) + di.Mass(0.1)
@@ -23,19 +20,19 @@ def problem() -> TableProblem:
 
 
 @pytest.fixture(scope="module")
-def decorrelation() -> Decorrelation:
+def decorrelation():
     found = decorrelation_of(problem())
     assert found is not None
     return found
 
 
-def around(random: np.random.Generator) -> FloatArray:
+def around(random):
     """Return points with a noise scale as their last coordinate."""
     centre = np.array([np.log(0.1), np.log(30.0), 20.0, 0.3, 0.1, -4.0])
     return centre + random.normal(size=(5, 6))
 
 
-def test_bent_undoes_straight(decorrelation: Decorrelation) -> None:
+def test_bent_undoes_straight(decorrelation):
     x = around(np.random.default_rng(1))
     moved = decorrelation.decorrelated(x)
     assert np.abs(moved[:, 2:5] - x[:, 2:5]).min() > 1e-4
@@ -43,14 +40,14 @@ def test_bent_undoes_straight(decorrelation: Decorrelation) -> None:
     np.testing.assert_allclose(decorrelation.original(moved), x, rtol=0.0, atol=1e-12)
 
 
-def test_volumes_stay(decorrelation: Decorrelation) -> None:
+def test_volumes_stay(decorrelation):
     x = around(np.random.default_rng(2))[0]
     step = 1e-6 * np.eye(6)
     jacobian = (decorrelation.decorrelated(x + step) - decorrelation.decorrelated(x - step)) / 2e-6
     assert np.linalg.det(jacobian) == pytest.approx(1.0, abs=1e-7)
 
 
-def test_least_squares_for_given_friction_stays_in_place(decorrelation: Decorrelation) -> None:
+def test_least_squares_for_given_friction_stays_in_place(decorrelation):
     # what the plant's parameters have to be for another friction, phi says of both
     made = problem()
     view = made.stiffness_data
@@ -67,13 +64,13 @@ def test_least_squares_for_given_friction_stays_in_place(decorrelation: Decorrel
     np.testing.assert_allclose(moved[0, 2:], moved[1, 2:], rtol=1e-9)
 
 
-def test_friction_or_a_plant_alone_needs_none() -> None:
+def test_friction_or_a_plant_alone_needs_none():
     assert decorrelation_of(TableProblem(friction_table(), di.Dahl())) is None
     assert decorrelation_of(TableProblem(friction_table(), di.Dahl() + di.Spring(3.0))) is None
     assert decorrelation_of(TableProblem(friction_table(), FRICTION + di.Spring())) is None
 
 
-def test_a_curved_ridge_is_walked_along() -> None:
+def test_a_curved_ridge_is_walked_along():
     # microslip with a free spring: f_max is open upwards, stiffness = constant - sigma
     data = spring_table(1e-3, 20, 0.003, 0.03)
     posterior = di.posterior(

@@ -1,7 +1,5 @@
 """Posteriors from measurements made by others; what the model cannot say has to show."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -19,7 +17,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def test_the_damper_shows_its_misfit() -> None:
+def test_the_damper_shows_its_misfit():
     data = di.FrequencyResponse.concatenate(
         [di.extract(measured(name), harmonics=(1,)) for name in FILES]
     )
@@ -36,7 +34,7 @@ def test_the_damper_shows_its_misfit() -> None:
         assert np.median(posterior.values[:, i]) == pytest.approx(middle, abs=0.1 * grid.std()[i])
 
 
-def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path: Path) -> None:
+def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path):
     columns = tmp_path / "columns.toml"
     columns.write_text(BEAM)
     path = Path(MEASURED or "") / "brb" / "ForcedFrequencyResponses.mat"

@@ -1,9 +1,6 @@
 """Priors: densities, defaults, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,11 +15,11 @@ from tests.bayes_cases import friction_table
 pytestmark = pytest.mark.versions
 
 
-def problem(**options: Any) -> TableProblem:
+def problem(**options):
     return TableProblem(friction_table(), di.Dahl(), **options)
 
 
-def test_bounds_are_log_uniform() -> None:
+def test_bounds_are_log_uniform():
     prior = joint_prior(problem(), {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)})
     theta = np.log([[0.1, 30.0], [0.001, 30.0], [0.1, 301.0]])
     density = prior.log_density(theta)
@@ -31,7 +28,7 @@ def test_bounds_are_log_uniform() -> None:
     assert prior.priors[0].quantile(np.array([0.5])) == pytest.approx(np.log(0.1))
 
 
-def test_a_distribution_of_the_value_gets_its_jacobian() -> None:
+def test_a_distribution_of_the_value_gets_its_jacobian():
     given = stats.lognorm(0.5, scale=0.1)
     part = joint_prior(problem(), {"f_max": given}).priors[0]
     theta = np.array([-3.0, -2.0])
@@ -40,7 +37,7 @@ def test_a_distribution_of_the_value_gets_its_jacobian() -> None:
     assert part.width == pytest.approx(0.5 * np.diff(stats.norm.ppf([0.16, 0.84]))[0])
 
 
-def test_a_normal_prior_equals_that_of_scipy() -> None:
+def test_a_normal_prior_equals_that_of_scipy():
     sensors = di.Sensors(force_gain=stats.norm(1.0, 0.005), delay=stats.norm(0.0, 2e-5))
     prior = joint_prior(problem(sensors=sensors))
     gain, delay = prior.priors[2:]
@@ -53,14 +50,14 @@ def test_a_normal_prior_equals_that_of_scipy() -> None:
     )
 
 
-def test_draws_follow_the_prior() -> None:
+def test_draws_follow_the_prior():
     prior = joint_prior(problem(), {"f_max": stats.gamma(3.0, scale=0.03), "sigma": (1.0, 10.0)})
     draws = np.exp(prior.draw(np.random.default_rng(1), 4000))
     assert stats.kstest(draws[:, 0], stats.gamma(3.0, scale=0.03).cdf).pvalue > 0.01
     assert stats.kstest(np.log10(draws[:, 1]), "uniform").pvalue > 0.01
 
 
-def test_defaults_hold_what_the_data_show() -> None:
+def test_defaults_hold_what_the_data_show():
     data = friction_table()
     prior = joint_prior(problem())
     stiffness = np.abs(data.response)
@@ -76,7 +73,7 @@ def test_defaults_hold_what_the_data_show() -> None:
     assert text == "log-uniform from 0.01 to 1 N"
 
 
-def test_plants_and_sensors_have_defaults() -> None:
+def test_plants_and_sensors_have_defaults():
     plant = di.Dahl(alpha=1.0) + di.Spring() + di.Mass() + di.Damper()
     sensors = di.Sensors(force_gain=None, delay=None)
     made = TableProblem(friction_table(), plant, sensors=sensors, free=["alpha"])
@@ -90,7 +87,7 @@ def test_plants_and_sensors_have_defaults() -> None:
     assert limits["mass"][1] == pytest.approx(1e3 * largest / (2.0 * np.pi) ** 2)
 
 
-def test_rotation_has_the_same_defaults() -> None:
+def test_rotation_has_the_same_defaults():
     table = friction_table()
     turned = replace(table, motion="rotation")
     model = di.Dahl() + di.Spring() + di.Damper()
@@ -98,7 +95,7 @@ def test_rotation_has_the_same_defaults() -> None:
     assert [p.limits for p in there.priors] == [p.limits for p in here.priors]
 
 
-def test_a_law_gets_defaults_from_its_declaration() -> None:
+def test_a_law_gets_defaults_from_its_declaration():
     class Law(di.Friction):
         """dF/dx = k (1 - sign(v) F/g); two more parameters show what defaults they get."""
 
@@ -109,7 +106,7 @@ def test_a_law_gets_defaults_from_its_declaration() -> None:
             di.Parameter("skew", "", "skew", lower=-1.0, upper=1.0, prior=(-0.2, 0.2)),
         )
 
-        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        def slope(self, force, direction, velocity, values):
             return values[1] * (1.0 - direction * force / values[0])
 
     table = friction_table()
@@ -121,7 +118,7 @@ def test_a_law_gets_defaults_from_its_declaration() -> None:
     assert prior.priors[3].limits == (-1.0, 1.0)  # five times wider, within its own bounds
 
 
-def test_defaults_of_plants_hold_a_larger_estimate() -> None:
+def test_defaults_of_plants_hold_a_larger_estimate():
     made = TableProblem(friction_table(), di.Dahl() + di.Spring())
     prior = joint_prior(made, estimate=np.array([0.1, 30.0, -1e5]))
     assert prior.priors[2].limits == pytest.approx((-1e6, 1e6), rel=1e-9)
@@ -141,12 +138,12 @@ def test_defaults_of_plants_hold_a_larger_estimate() -> None:
         ((0.1, np.nan), r"prior of f_max\[1\] is nan"),
     ],
 )
-def test_bad_priors_are_refused(given: Any, message: str) -> None:
+def test_bad_priors_are_refused(given, message):
     with pytest.raises(ValidationError, match=message):
         joint_prior(problem(), {"f_max": given})
 
 
-def test_limits_reach_beyond_an_estimate_in_the_tail_unless_nothing_is_there() -> None:
+def test_limits_reach_beyond_an_estimate_in_the_tail_unless_nothing_is_there():
     estimate = np.array([0.1, 30.0])
     for prior, low in (
         (stats.lognorm(0.01, scale=1.0), 2.0 * np.log(0.1) + 0.01 * 6.3613),  # 6.36 deviations
@@ -157,11 +154,11 @@ def test_limits_reach_beyond_an_estimate_in_the_tail_unless_nothing_is_there() -
         assert part.limits[1] == part.bulk[1]
 
 
-def test_a_prior_without_moments_is_told_by_its_quantiles() -> None:
+def test_a_prior_without_moments_is_told_by_its_quantiles():
     prior = joint_prior(problem(), {"f_max": stats.halfcauchy(scale=0.1)})
     assert str(prior.priors[0]) == "halfcauchy, median 0.1, 95 % from 0.003929 to 2.545 N"
 
 
-def test_priors_of_unknown_names_are_refused() -> None:
+def test_priors_of_unknown_names_are_refused():
     with pytest.raises(ModelError, match="a prior for alpha, but free are f_max, sigma"):
         joint_prior(problem(), {"alpha": (0.1, 10.0)})

@@ -1,23 +1,18 @@
 """The bar that a long chain shows: how far it is, and how far it has to go."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
-
-import pytest
 
 import dahl_ident as di
 from tests.bayes_cases import friction_table
 
 
-def test_a_chain_moves_the_bar_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_chain_moves_the_bar_to_its_end(monkeypatch):
     from rich import progress
 
     seen: list[tuple[float, float | None]] = []
     update = progress.Progress.update
 
-    def remember(self: progress.Progress, task: Any, **given: Any) -> None:
+    def remember(self, task, **given):
         seen.append((given["completed"], given["total"]))
         update(self, task, **given)
 
@@ -32,9 +27,7 @@ def test_a_chain_moves_the_bar_to_its_end(monkeypatch: pytest.MonkeyPatch) -> No
     assert all(total is None or total >= done for done, total in seen)
 
 
-def test_the_bar_shows_the_time_that_is_left(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bar_shows_the_time_that_is_left(capsys, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
     monkeypatch.setenv("COLUMNS", "100")
     di.posterior(friction_table(), di.Dahl(), seed=1, steps=100, progress=True, uncertainty="noise")

@@ -1,9 +1,6 @@
 """Bouc-Wen of exponent 1 against direct integration with located events, and against Dahl."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,17 +8,16 @@ from scipy.integrate import quad, solve_ivp
 
 import dahl_ident as di
 from dahl_ident import BoucWen, Dahl
-from dahl_ident.arrays import FloatArray
 
 LAWS = [(3.0, 1.3, 0.5), (5e4, -300.0, 1900.0), (2.0, 0.7, 0.0), (1.0, 0.0, 2.0), (4.0, -0.5, -0.2)]
 
 
-def integrated(z: float, span: float, s: float, law: tuple[float, float, float]) -> float:
+def integrated(z, span, s, law):
     """Return z after a path, with the passage through zero located."""
     sigma, q, p = law
     start = 0.0
 
-    def passes(_: float, y: FloatArray) -> float:
+    def passes(_, y):
         return float(y[0])
 
     passes.terminal = True  # type: ignore[attr-defined]
@@ -42,7 +38,7 @@ def integrated(z: float, span: float, s: float, law: tuple[float, float, float])
     return z
 
 
-def stiffness(point: FloatArray, harmonic: int) -> list[complex]:
+def stiffness(point, harmonic):
     """Return N_k/sigma and its derivatives at one amplitude, q and p."""
     A, q, p = (np.asarray(v) for v in point)
     at = (np.ones(()), q, p)
@@ -50,18 +46,18 @@ def stiffness(point: FloatArray, harmonic: int) -> list[complex]:
     return [complex(v) for v in (found.value, found.by_amplitude, *found.by_parameter[1:])]
 
 
-def history(x: FloatArray, point: FloatArray) -> FloatArray:
+def history(x, point):
     """Return the force at an initial force, sigma, q and p."""
     start, *law = point.tolist()
     return BoucWen().force_history(law, x, state=start)
 
 
-def tip_force(A: float, law: tuple[float, float, float]) -> float:
+def tip_force(A, law):
     """Return the force at the upper turning point of the settled loop."""
     return float(BoucWen(*law).loop(A)[1][0])
 
 
-def test_check_values() -> None:
+def test_check_values():
     law = BoucWen(3.0, 1.3, 0.5)
     assert tip_force(2.0, (3.0, 1.3, 0.5)) == pytest.approx(2.2782955, abs=5e-8)
     first, third = (2.0 * law.dynamic_stiffness(2.0, harmonic=k) for k in (1, 3))
@@ -71,7 +67,7 @@ def test_check_values() -> None:
 
 @pytest.mark.parametrize("beta", [1e-9, 1e-3, 0.3, 3.0, 300.0, 1e5])
 @pytest.mark.parametrize("harmonic", [1, 3, 101])
-def test_equal_rates_are_linear_dahl(beta: float, harmonic: int) -> None:
+def test_equal_rates_are_linear_dahl(beta, harmonic):
     found = stiffness(np.array([beta, 1.0, 1.0]), harmonic)[0]
     expected = complex(Dahl(1.0, 1.0).dynamic_stiffness(beta, harmonic=harmonic))
     size = abs(Dahl(1.0, 1.0).describing_function(beta))
@@ -80,7 +76,7 @@ def test_equal_rates_are_linear_dahl(beta: float, harmonic: int) -> None:
 
 @pytest.mark.parametrize("law", LAWS[:4])  # the last gains energy: its loop is unstable
 @pytest.mark.parametrize("k", [1, 3])
-def test_harmonics_against_the_integrated_loop(law: tuple[float, float, float], k: int) -> None:
+def test_harmonics_against_the_integrated_loop(law, k):
     A = 1.5 / max(abs(law[1]), abs(law[2]))
     z = 0.0
     for _ in range(40):  # the loop closes by going round
@@ -91,10 +87,10 @@ def test_harmonics_against_the_integrated_loop(law: tuple[float, float, float], 
     at_zero = np.log1p(p * z / sigma) / p if p else z / sigma
     turn = 2.0 * np.arcsin(np.sqrt(at_zero / 2.0 / A))
 
-    def force(theta: float) -> float:
+    def force(theta):
         return integrated(z, A * (1.0 - np.cos(theta)), -1.0, law) if theta else z
 
-    def part(wave: Callable[[float], float], start: float, stop: float) -> float:
+    def part(wave, start, stop):
         return float(quad(lambda t: force(t) * wave(k * t), start, stop, epsrel=1e-9)[0])
 
     halves = ((0.0, turn), (turn, np.pi))
@@ -105,7 +101,7 @@ def test_harmonics_against_the_integrated_loop(law: tuple[float, float, float], 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("harmonic", [1, 3])
-def test_stiffness_derivatives(law: tuple[float, float, float], harmonic: int) -> None:
+def test_stiffness_derivatives(law, harmonic):
     _, q, p = law
     point = np.array([1.5 / max(abs(q), abs(p)), q, p])
     found = stiffness(point, harmonic)[1:]
@@ -122,7 +118,7 @@ def test_stiffness_derivatives(law: tuple[float, float, float], harmonic: int) -
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_force_for_any_history(law: tuple[float, float, float]) -> None:
+def test_force_for_any_history(law):
     rng = np.random.default_rng(3)
     x = np.cumsum(rng.standard_normal(40)) / max(abs(law[1]), abs(law[2]))
     z = start = 0.3 * law[0] / max(abs(law[1]), abs(law[2]))
@@ -143,7 +139,7 @@ def test_force_for_any_history(law: tuple[float, float, float]) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_force_derivatives(law: tuple[float, float, float]) -> None:
+def test_force_derivatives(law):
     rng = np.random.default_rng(4)
     x = np.cumsum(rng.standard_normal(300)) * 0.3 / max(abs(law[1]), abs(law[2]))
     point = np.array([0.3 * law[0] / max(abs(law[1]), abs(law[2])), *law])
@@ -162,11 +158,11 @@ def test_force_derivatives(law: tuple[float, float, float]) -> None:
 
 @pytest.mark.parametrize("n", [0.6, 2.0, 7.0])
 @pytest.mark.parametrize(("q", "p"), [(1.3, 0.5), (0.0, 2.0), (1.0, -0.4)])
-def test_an_exponent_against_the_integrated_loop(n: float, q: float, p: float) -> None:
+def test_an_exponent_against_the_integrated_loop(n, q, p):
     sigma, A = 3.0, 1.1
     law = BoucWen(sigma, q, p, exponent=n)
 
-    def slope(x: float, z: FloatArray, s: float) -> FloatArray:
+    def slope(x, z, s):
         rate = q if s * z[0] > 0.0 else -p
         return np.asarray(s * sigma * (1.0 - np.sign(rate) * np.abs(rate * z / sigma) ** n))
 
@@ -180,7 +176,7 @@ def test_an_exponent_against_the_integrated_loop(n: float, q: float, p: float) -
     assert BoucWen.from_description(parameters, None).describe() == described
 
 
-def test_the_exponent_1_is_not_a_parameter() -> None:
+def test_the_exponent_1_is_not_a_parameter():
     one, near = BoucWen(3.0, 1.3, 0.5), BoucWen(3.0, 1.3, 0.5, exponent=1.0 + 1e-9)
     assert one.labels == ("sigma", "q", "p") == BoucWen(exponent=1.0).labels
     assert near.labels == ("sigma", "q", "p", "exponent")
@@ -188,7 +184,7 @@ def test_the_exponent_1_is_not_a_parameter() -> None:
     np.testing.assert_allclose(found, one.dynamic_stiffness([0.3, 2.0]), rtol=1e-8)
 
 
-def test_an_exponent_is_estimated_and_handed_on() -> None:
+def test_an_exponent_is_estimated_and_handed_on():
     law = BoucWen(30.0, 300.0, 100.0, exponent=2.0)
     A = np.geomspace(1e-4, 3e-2, 9)
     noise = np.random.default_rng(1).normal(scale=2e-3, size=(2, 9))
@@ -204,7 +200,7 @@ def test_an_exponent_is_estimated_and_handed_on() -> None:
         fit.export("c")
 
 
-def test_a_table_with_harmonics_takes_seconds() -> None:
+def test_a_table_with_harmonics_takes_seconds():
     true = BoucWen(30.0, 200.0, 150.0) + di.Mass(0.02) + di.Damper(0.1)
     orders = np.tile([1, 3, 5], 15)
     A, f = np.repeat(np.geomspace(1e-4, 0.1, 15), 3), np.repeat(np.resize([0.5, 1.0, 2.0], 15), 3)
@@ -227,12 +223,12 @@ def test_a_table_with_harmonics_takes_seconds() -> None:
 
 
 @pytest.mark.parametrize("p", [1e12, 1e30])
-def test_a_force_that_vanishes_at_once_on_reversal(p: float) -> None:
+def test_a_force_that_vanishes_at_once_on_reversal(p):
     """Each half cycle begins without a force: by quadrature."""
     sigma, q, A = 2e4, 400.0, 0.01
 
-    def fourier(wave: Callable[[float], float]) -> float:  # x = A cos(theta) falls
-        def part(theta: float) -> float:
+    def fourier(wave):  # x = A cos(theta) falls
+        def part(theta):
             return float(sigma / q * np.expm1(-q * A * (1.0 - np.cos(theta))) * wave(theta))
 
         return 2.0 / np.pi * float(quad(part, 0.0, np.pi)[0])

@@ -1,7 +1,5 @@
 """Campaigns: one row a device whatever happens, resumed without loss, and their population."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib
@@ -15,7 +13,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import date
@@ -30,13 +28,12 @@ import pytest
 import dahl_ident as di
 from dahl_ident import population
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
-from tests.command_line import Runner
 
 SECONDS = ["seconds"]
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes are POSIX")
 
 
-def make_tables(folder: Path, devices: int, runs: int = 1, seed: int = 1) -> pd.DataFrame:
+def make_tables(folder, devices, runs=1, seed=1):
     """Write response tables of devices whose f_max grows with temperature; return the truth."""
     rng = np.random.default_rng(seed)
     amplitude = np.geomspace(1e-4, 3e-2, 9)
@@ -56,7 +53,7 @@ def make_tables(folder: Path, devices: int, runs: int = 1, seed: int = 1) -> pd.
     return frame
 
 
-def definition(folder: Path, **changes: Any) -> dict[str, Any]:
+def definition(folder, **changes):
     content: dict[str, Any] = {
         "files": {
             "pattern": f"{folder.as_posix()}/{{device}}_{{run}}.csv",
@@ -72,7 +69,7 @@ def definition(folder: Path, **changes: Any) -> dict[str, Any]:
     return content
 
 
-def as_toml(folder: Path) -> Path:
+def as_toml(folder):
     path = folder / "lab.toml"
     path.write_text(
         '[files]\npattern = "{device}_{run}.csv"\nkind = "response"\n'
@@ -81,7 +78,7 @@ def as_toml(folder: Path) -> Path:
     return path
 
 
-def test_each_device_is_a_row_and_a_failure_is_one_too(tmp_path: Path) -> None:
+def test_each_device_is_a_row_and_a_failure_is_one_too(tmp_path):
     truth = make_tables(tmp_path, 5, runs=2)
     (tmp_path / "d001_r1.csv").write_text("nothing that can be read\n")
     done = di.campaign(definition(tmp_path), jobs=1)
@@ -100,7 +97,7 @@ def test_each_device_is_a_row_and_a_failure_is_one_too(tmp_path: Path) -> None:
     assert (table["seconds"] > 0).all()
 
 
-def test_a_fit_without_an_uncertainty_is_left_out_and_named(tmp_path: Path) -> None:
+def test_a_fit_without_an_uncertainty_is_left_out_and_named(tmp_path):
     """Data without noise leave nothing to estimate an uncertainty from, but a trusted fit."""
     make_tables(tmp_path, 4)
     di.load_dataset("clean").save(tmp_path / "d001_r0.csv", overwrite=True)
@@ -119,13 +116,13 @@ def test_a_fit_without_an_uncertainty_is_left_out_and_named(tmp_path: Path) -> N
     assert "there is no population" in nobody.read_text(encoding="utf-8")
 
 
-def test_one_fit_a_run(tmp_path: Path) -> None:
+def test_one_fit_a_run(tmp_path):
     make_tables(tmp_path, 2, runs=3)
     table = di.campaign(definition(tmp_path, output__per="run"), jobs=1).table
     assert table["run"].tolist() == ["r0", "r1", "r2"] * 2
 
 
-def test_a_second_run_does_only_what_is_missing_or_changed(tmp_path: Path) -> None:
+def test_a_second_run_does_only_what_is_missing_or_changed(tmp_path):
     make_tables(tmp_path, 4)
     first = di.campaign(definition(tmp_path), jobs=1)
     before = first.table
@@ -142,7 +139,7 @@ def test_a_second_run_does_only_what_is_missing_or_changed(tmp_path: Path) -> No
     assert third.table["device"][changed].tolist() == ["d002"]
 
 
-def test_a_line_cut_off_by_a_crash_is_done_again(tmp_path: Path) -> None:
+def test_a_line_cut_off_by_a_crash_is_done_again(tmp_path):
     make_tables(tmp_path, 3)
     before = di.campaign(definition(tmp_path), jobs=1).table
     journal = tmp_path / "results" / "journal.jsonl"
@@ -152,7 +149,7 @@ def test_a_line_cut_off_by_a_crash_is_done_again(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(again.table.drop(columns=SECONDS), before.drop(columns=SECONDS))
 
 
-def test_changed_options_are_named_before_anything_runs(tmp_path: Path) -> None:
+def test_changed_options_are_named_before_anything_runs(tmp_path):
     make_tables(tmp_path, 2)
     di.campaign(definition(tmp_path), jobs=1)
     with pytest.raises(DataError, match=r'fit was \{\}, now \{"noise": "absolute"\}'):
@@ -180,7 +177,7 @@ WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_definition_is_named_before_anything_runs(tmp_path: Path, case: str) -> None:
+def test_a_wrong_definition_is_named_before_anything_runs(tmp_path, case):
     make_tables(tmp_path, 2)
     changes, message = WRONG[case]
     with pytest.raises(DataError, match=message):
@@ -188,7 +185,7 @@ def test_a_wrong_definition_is_named_before_anything_runs(tmp_path: Path, case: 
     assert not (tmp_path / "results").exists()
 
 
-def test_duplicates_and_missing_covariates_are_named(tmp_path: Path) -> None:
+def test_duplicates_and_missing_covariates_are_named(tmp_path):
     make_tables(tmp_path, 2)
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "d000_r0.csv").write_bytes((tmp_path / "d000_r0.csv").read_bytes())
@@ -217,14 +214,14 @@ def test_duplicates_and_missing_covariates_are_named(tmp_path: Path) -> None:
         ("", "has the columns none"),
     ],
 )
-def test_a_wrong_table_of_covariates_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_a_wrong_table_of_covariates_is_named(tmp_path, text, message):
     make_tables(tmp_path, 2)
     (tmp_path / "devices.csv").write_text(text)
     with pytest.raises(DataError, match=message):
         di.campaign(definition(tmp_path), dry_run=True)
 
 
-def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path: Path) -> None:
+def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path):
     for name in ("a_b-c", "a-b_c"):
         (tmp_path / f"{name}.csv").write_text("")
     (tmp_path / "devices.csv").write_text("device,day\na_b,1\na,1\n")
@@ -247,16 +244,14 @@ def test_a_covariate_given_twice_and_fits_of_one_name_are_named(tmp_path: Path) 
         ({"fit__free": ["mass"]}, "the first fits all fail: ModelError: the model has no"),
     ],
 )
-def test_options_that_no_fit_can_use_leave_no_result(
-    tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_options_that_no_fit_can_use_leave_no_result(tmp_path, changes, message):
     make_tables(tmp_path, 2)
     with pytest.raises(DataError, match=message):
         di.campaign(definition(tmp_path, **changes), jobs=1)
     assert di.campaign(definition(tmp_path), jobs=1).statuses == {"trusted": 2}
 
 
-def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path: Path) -> None:
+def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path):
     """The first of the fits fails with an error of options; the others can use them."""
     make_tables(tmp_path, 3)
     table = di.read_frequency_response(tmp_path / "d001_r0.csv")
@@ -267,9 +262,7 @@ def test_one_device_that_the_options_do_not_fit_is_a_row(tmp_path: Path) -> None
     assert rows["error"].iloc[0] == rows["error"].iloc[2] != ""
 
 
-def test_what_a_report_cannot_use_is_named_before_anything_runs(
-    tmp_path: Path, run: Runner
-) -> None:
+def test_what_a_report_cannot_use_is_named_before_anything_runs(tmp_path, run):
     make_tables(tmp_path, 2)
     path = as_toml(tmp_path)
     report = str(tmp_path / "r.html")
@@ -285,7 +278,7 @@ def test_what_a_report_cannot_use_is_named_before_anything_runs(
     assert not (tmp_path / "results").exists()
 
 
-def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> None:
+def test_waveforms_with_content_sent_along_and_any_executor(tmp_path):
     record = di.load_dataset("plant_recording")
     record.save(tmp_path / "p1.csv")
     content = {
@@ -303,11 +296,11 @@ def test_waveforms_with_content_sent_along_and_any_executor(tmp_path: Path) -> N
 class _Changed(ThreadPoolExecutor):
     """Workers whose jobs for one device are changed on the way."""
 
-    def __init__(self, device: str, **changes: Any) -> None:
+    def __init__(self, device, **changes):
         super().__init__(1)
         self.device, self.changes = device, changes
 
-    def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Any:
+    def submit(self, function, /, *arguments, **_):
         job, *others = arguments
         job = replace(job, **self.changes) if job.name == self.device else job
         return super().submit(function, job, *others)
@@ -316,11 +309,11 @@ class _Changed(ThreadPoolExecutor):
 class _Deadly(tuple[Any, ...]):
     """Files that end the process that looks at them."""
 
-    def __iter__(self) -> Any:
+    def __iter__(self):
         os._exit(9)
 
 
-def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path) -> None:
+def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path):
     make_tables(tmp_path, 3)
     with _Changed("d001", files=_Deadly()) as pool:
         table = di.campaign(definition(tmp_path), executor=pool).table
@@ -328,7 +321,7 @@ def test_a_job_that_kills_its_process_is_a_row_and_costs_no_other(tmp_path: Path
     assert "died" in table["error"].iloc[1]
 
 
-def test_a_killed_driver_and_a_killed_worker_lose_nothing(tmp_path: Path) -> None:
+def test_a_killed_driver_and_a_killed_worker_lose_nothing(tmp_path):
     make_tables(tmp_path, 12)
     path = as_toml(tmp_path)
     program = str(Path(sys.executable).with_name("dahl-ident"))
@@ -357,7 +350,7 @@ def test_a_killed_driver_and_a_killed_worker_lose_nothing(tmp_path: Path) -> Non
     assert len(keys) == len(set(keys)) == 12, "what was finished is not repeated"
 
 
-def worker_of(driver: int) -> int:
+def worker_of(driver):
     """Return a process of the driver's pool: the youngest of its descendants."""
     own = {driver}
     for stat in sorted(Path("/proc").glob("[0-9]*/stat"), key=lambda p: int(p.parent.name)):
@@ -391,7 +384,7 @@ if __name__ == "__main__":
 class Cluster:
     """A Dask scheduler with a worker, which can be killed and started again."""
 
-    def __init__(self, folder: Path, protocol: str = "tcp://", version: str = "") -> None:
+    def __init__(self, folder, protocol="tcp://", version=""):
         self._script = folder / "cluster.py"
         self._script.write_text(CLUSTER)
         self._protocol, self._version = protocol, version
@@ -400,30 +393,30 @@ class Cluster:
             self._port = str(free.getsockname()[1])
         self.address = f"{protocol}127.0.0.1:{self._port}"
 
-    def start(self) -> None:
+    def start(self):
         self._process = subprocess.Popen(
             [sys.executable, str(self._script), self._protocol, self._port, self._version],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,
         )  # fmt: skip
 
-    def kill(self) -> None:
+    def kill(self):
         """Kill the scheduler and its worker at once, as a machine that loses its power."""
         os.killpg(self._process.pid, signal.SIGKILL)
         self._process.communicate()
 
-    def __enter__(self) -> Cluster:
+    def __enter__(self):
         self.start()
         assert self._process.stdout.readline().decode().strip() == self.address
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         if self._process.poll() is None:
             self.kill()
 
 
 @pytest.fixture
-def dask_leaks() -> Iterator[None]:
+def dask_leaks():
     """Drop, with the test, the sockets that a client leaves open where its scheduler was killed."""
     yield
     with warnings.catch_warnings():
@@ -431,18 +424,18 @@ def dask_leaks() -> Iterator[None]:
         gc.collect()
 
 
-def serial(folder: Path) -> pd.DataFrame:
+def serial(folder):
     return di.campaign(definition(folder, output__folder=str(folder / "serial")), jobs=1).table
 
 
-def equal(table: pd.DataFrame, other: pd.DataFrame) -> None:
+def equal(table, other):
     pd.testing.assert_frame_equal(table.drop(columns=SECONDS), other.drop(columns=SECONDS))
 
 
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
 @pytest.mark.versions
-def test_a_dask_scheduler_gives_the_serial_table(tmp_path: Path, run: Runner) -> None:
+def test_a_dask_scheduler_gives_the_serial_table(tmp_path, run):
     make_tables(tmp_path, 3)
     with Cluster(tmp_path) as cluster:
         run("campaign", str(as_toml(tmp_path)), "--scheduler", cluster.address, "--send-files")
@@ -452,11 +445,11 @@ def test_a_dask_scheduler_gives_the_serial_table(tmp_path: Path, run: Runner) ->
 
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
-def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path: Path) -> None:
+def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path):
     make_tables(tmp_path, 3)
     with Cluster(tmp_path) as cluster:
 
-        def restart(done: int, *_: Any) -> None:
+        def restart(done, *_):
             if done == 2:
                 cluster.kill()
                 cluster.start()
@@ -468,11 +461,11 @@ def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path: Path) -> N
 
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
-def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(tmp_path: Path) -> None:
+def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(tmp_path):
     make_tables(tmp_path, 3)
     with Cluster(tmp_path) as cluster:
 
-        def lose(done: int, *_: Any) -> None:
+        def lose(done, *_):
             if done == 2:
                 cluster.kill()
 
@@ -489,7 +482,7 @@ def test_a_scheduler_that_stays_dead_ends_the_campaign_with_what_is_done(tmp_pat
 
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
-def test_workers_of_another_version_are_named_before_anything_runs(tmp_path: Path) -> None:
+def test_workers_of_another_version_are_named_before_anything_runs(tmp_path):
     make_tables(tmp_path, 2)
     with (
         Cluster(tmp_path, version="0.0.1") as cluster,
@@ -506,7 +499,7 @@ def test_workers_of_another_version_are_named_before_anything_runs(tmp_path: Pat
 @POSIX
 @pytest.mark.usefixtures("dask_leaks")
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="there is no openssl")
-def test_a_scheduler_behind_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_behind_certificates(tmp_path, monkeypatch):
     make_tables(tmp_path, 2)
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     subprocess.run(
@@ -534,13 +527,13 @@ def test_a_scheduler_behind_certificates(tmp_path: Path, monkeypatch: pytest.Mon
 class _Elsewhere(ThreadPoolExecutor):
     """Workers that do not have the files of this machine."""
 
-    def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Any:
+    def submit(self, function, /, *arguments, **_):
         job, *others = arguments
         files = tuple((f"/elsewhere{name}", content) for name, content in job.files)
         return super().submit(function, replace(job, files=files), *others)
 
 
-def test_files_that_a_worker_does_not_see_are_done_by_a_second_call(tmp_path: Path) -> None:
+def test_files_that_a_worker_does_not_see_are_done_by_a_second_call(tmp_path):
     make_tables(tmp_path, 2)
     with _Elsewhere(1) as pool:
         first = di.campaign(definition(tmp_path), executor=pool)
@@ -553,11 +546,11 @@ def test_files_that_a_worker_does_not_see_are_done_by_a_second_call(tmp_path: Pa
 class _Silent(ThreadPoolExecutor):
     """An executor from which nothing comes back."""
 
-    def submit(self, *_: Any, **__: Any) -> Any:
+    def submit(self, *_, **__):
         return Future()
 
 
-def test_an_executor_that_does_not_answer_is_not_waited_for(tmp_path: Path) -> None:
+def test_an_executor_that_does_not_answer_is_not_waited_for(tmp_path):
     make_tables(tmp_path, 2)
     with _Silent(1) as pool, pytest.raises(DataError, match="executor has not answered for 1 s; 0"):
         di.campaign(definition(tmp_path), executor=pool, timeout=0.5, patience=0.5)
@@ -573,14 +566,14 @@ def test_an_executor_that_does_not_answer_is_not_waited_for(tmp_path: Path) -> N
 class _Hanging(tuple[Any, ...]):
     """Files that take for ever to read."""
 
-    def __iter__(self) -> Any:
+    def __iter__(self):
         time.sleep(3600.0)
 
 
 class _Hungry(tuple[Any, ...]):
     """Files that need more memory than there is."""
 
-    def __iter__(self) -> Any:
+    def __iter__(self):
         return iter([np.ones(10**9)])
 
 
@@ -592,17 +585,15 @@ class _Hungry(tuple[Any, ...]):
         (_Hungry(), {"memory": 2.0}, "the limit of memory for a device does not suffice"),
     ],
 )
-def test_a_device_has_limits_of_time_and_memory(
-    tmp_path: Path, files: Any, limits: dict[str, float], says: str
-) -> None:
+def test_a_device_has_limits_of_time_and_memory(tmp_path, files, limits, says):
     make_tables(tmp_path, 1)
     with _Changed("d000", files=files) as pool:
-        table = di.campaign(definition(tmp_path), executor=pool, **limits).table  # type: ignore[arg-type]
+        table = di.campaign(definition(tmp_path), executor=pool, **limits).table
     assert table["error"].iloc[0].startswith(says)
     assert di.campaign(definition(tmp_path), jobs=1).statuses == {"trusted": 1}
 
 
-def test_fits_that_were_stopped_are_done_with_more_time(tmp_path: Path, run: Runner) -> None:
+def test_fits_that_were_stopped_are_done_with_more_time(tmp_path, run):
     make_tables(tmp_path, 2)
     path = str(as_toml(tmp_path))
     stopped = run("campaign", path, "--jobs", "1", "--timeout", "0.001")
@@ -616,7 +607,7 @@ def test_fits_that_were_stopped_are_done_with_more_time(tmp_path: Path, run: Run
 
 
 @POSIX
-def test_what_is_not_a_file_is_a_row_and_is_not_waited_for(tmp_path: Path, run: Runner) -> None:
+def test_what_is_not_a_file_is_a_row_and_is_not_waited_for(tmp_path, run):
     make_tables(tmp_path, 2)
     (tmp_path / "d001_r0.csv").unlink()
     os.mkfifo(tmp_path / "d001_r0.csv")
@@ -631,7 +622,7 @@ def test_what_is_not_a_file_is_a_row_and_is_not_waited_for(tmp_path: Path, run: 
 
 
 @POSIX
-def test_covariates_in_a_pipe_are_refused(tmp_path: Path) -> None:
+def test_covariates_in_a_pipe_are_refused(tmp_path):
     make_tables(tmp_path, 2)
     os.mkfifo(tmp_path / "table.csv")
     with pytest.raises(DataError, match="is a pipe; expected a file"):
@@ -640,9 +631,7 @@ def test_covariates_in_a_pipe_are_refused(tmp_path: Path) -> None:
         )
 
 
-def test_a_law_of_a_module_is_known_where_it_is_fitted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_law_of_a_module_is_known_where_it_is_fitted(tmp_path, monkeypatch):
     make_tables(tmp_path, 1)
     (tmp_path / "lab_laws.py").write_text(LAW)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -671,7 +660,7 @@ class LabLaw(di.Friction):
 """
 
 
-def test_cells_that_spreadsheets_run_are_inert(tmp_path: Path) -> None:
+def test_cells_that_spreadsheets_run_are_inert(tmp_path):
     make_tables(tmp_path, 1)
     (tmp_path / "d000_r0.csv").rename(tmp_path / "=1+2_r0.csv")
     (tmp_path / "devices.csv").write_text("device,@lab,t\n=1+2,+x,-3\n")
@@ -696,7 +685,7 @@ def test_cells_that_spreadsheets_run_are_inert(tmp_path: Path) -> None:
 
 
 @pytest.mark.pictures
-def test_command_line(tmp_path: Path, run: Runner) -> None:
+def test_command_line(tmp_path, run):
     make_tables(tmp_path, 4)
     path = as_toml(tmp_path)
     plan = run("campaign", str(path), "--dry-run")
@@ -712,7 +701,7 @@ def test_command_line(tmp_path: Path, run: Runner) -> None:
 # Population
 
 
-def simulated(seed: int, devices: int, runs: int, **truth: float) -> tuple[pd.DataFrame, Any]:
+def simulated(seed, devices, runs, **truth):
     rng = np.random.default_rng(seed)
     t = rng.uniform(-1.0, 1.0, devices)
     level = np.log(0.1) + truth["slope"] * t + rng.normal(0.0, truth["tau"], devices)
@@ -729,7 +718,7 @@ def simulated(seed: int, devices: int, runs: int, **truth: float) -> tuple[pd.Da
     return table, (level, np.log(0.1) + truth["slope"] * t.mean())
 
 
-def test_population_covers_mean_scatter_and_slope_and_shrinks_errors() -> None:
+def test_population_covers_mean_scatter_and_slope_and_shrinks_errors():
     truth = {"slope": 0.1, "tau": 0.05, "omega": 0.0, "u": 0.04}
     sets, hits, errors = 30, np.zeros(3), np.zeros(2)
     for seed in range(sets):
@@ -747,7 +736,7 @@ def test_population_covers_mean_scatter_and_slope_and_shrinks_errors() -> None:
     assert errors[0] < 0.85 * errors[1]
 
 
-def test_scatter_between_runs_is_distinguished_from_that_between_devices() -> None:
+def test_scatter_between_runs_is_distinguished_from_that_between_devices():
     table, _ = simulated(3, 40, 4, slope=0.0, tau=0.05, omega=0.02, u=0.005)
     found = population(table)["f_max"]
     assert found.between_devices[1] < 0.05 < found.between_devices[2]
@@ -755,7 +744,7 @@ def test_scatter_between_runs_is_distinguished_from_that_between_devices() -> No
     assert found.between_runs[2] < 0.03
 
 
-def test_outlying_devices_are_found_and_false_alarms_are_rare() -> None:
+def test_outlying_devices_are_found_and_false_alarms_are_rare():
     alarms = 0
     for seed in range(30):
         table, _ = simulated(seed, 12, 1, slope=0.0, tau=0.03, omega=0.0, u=0.01)
@@ -769,7 +758,7 @@ def test_outlying_devices_are_found_and_false_alarms_are_rare() -> None:
     assert told.endswith("outside the population: d004, d009, not in these numbers")
 
 
-def test_control_charts_alarm_at_a_drift_and_seldom_without() -> None:
+def test_control_charts_alarm_at_a_drift_and_seldom_without():
     alarms = caught = 0
     for seed in range(20):
         table, _ = simulated(seed, 60, 1, slope=0.0, tau=0.02, omega=0.0, u=0.005)
@@ -781,7 +770,7 @@ def test_control_charts_alarm_at_a_drift_and_seldom_without() -> None:
     assert caught >= 18
 
 
-def test_a_moving_range_chart_by_hand() -> None:
+def test_a_moving_range_chart_by_hand():
     table, _ = simulated(1, 3, 1, slope=0.0, tau=0.02, omega=0.0, u=0.005)
     table["f_max"] = np.exp([1.0, 1.2, 0.9])
     fits = population(table, order="at")["f_max"].fits
@@ -793,7 +782,7 @@ def test_a_moving_range_chart_by_hand() -> None:
     assert fits["ewma_limit"].iloc[0] == pytest.approx(2.86 * sigma * 0.2)
 
 
-def test_scatter_between_devices_is_no_alarm_where_devices_have_several_fits() -> None:
+def test_scatter_between_devices_is_no_alarm_where_devices_have_several_fits():
     alarms = 0
     for seed in range(4):
         table, _ = simulated(seed, 20, 5, slope=0.0, tau=0.05, omega=0.01, u=0.005)
@@ -803,14 +792,14 @@ def test_scatter_between_devices_is_no_alarm_where_devices_have_several_fits() -
     assert 37 in population(table, order="at")["f_max"].out_of_control
 
 
-def test_a_device_with_one_fit_is_not_compared_with_others_that_have_several() -> None:
+def test_a_device_with_one_fit_is_not_compared_with_others_that_have_several():
     table, _ = simulated(1, 8, 3, slope=0.0, tau=0.05, omega=0.01, u=0.005)
     fits = population(table.drop(index=[0, 1]), order="at")["f_max"].fits
     assert np.flatnonzero(fits["value"].isna()).tolist() == [0]
     assert np.isfinite(fits["ewma"][1:]).all()
 
 
-def test_outlying_devices_take_no_part_in_mean_scatter_and_limits() -> None:
+def test_outlying_devices_take_no_part_in_mean_scatter_and_limits():
     table, _ = simulated(7, 15, 1, slope=0.0, tau=0.03, omega=0.0, u=0.005)
     clean = population(table.drop(index=4), order="at")["f_max"]
     table.loc[[4], "f_max"] *= 1.4
@@ -824,7 +813,7 @@ def test_outlying_devices_take_no_part_in_mean_scatter_and_limits() -> None:
     assert 4 in whole.out_of_control
 
 
-def test_charts_show_time_only_where_an_order_is_stated() -> None:
+def test_charts_show_time_only_where_an_order_is_stated():
     table, _ = simulated(2, 10, 1, slope=0.0, tau=0.05, omega=0.0, u=0.01)
     assert "ewma" not in population(table)["f_max"].fits
     shuffled = table.sample(frac=1.0, random_state=0)
@@ -833,7 +822,7 @@ def test_charts_show_time_only_where_an_order_is_stated() -> None:
     )
 
 
-def test_wrong_tables_are_named() -> None:
+def test_wrong_tables_are_named():
     table, _ = simulated(0, 5, 1, slope=0.0, tau=0.02, omega=0.0, u=0.01)
     cases: list[tuple[pd.DataFrame, dict[str, Any], type[DahlIdentError], str]] = [
         (table.drop(columns="u_f_max"), {}, DataError, "no parameter with an uncertainty"),

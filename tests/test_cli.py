@@ -1,7 +1,5 @@
 """The command line: what it prints, what it writes, how it ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -18,7 +16,6 @@ from scipy import stats
 import dahl_ident as di
 from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment
-from tests.command_line import Runner
 
 COMMANDS = (
     "demo", "app", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "export",
@@ -27,7 +24,7 @@ COMMANDS = (
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
 
-def test_fit_recovers_the_truth_and_ends_with_0(run: Runner) -> None:
+def test_fit_recovers_the_truth_and_ends_with_0(run):
     assert run("simulate", "--f-max", "0.2", "--sigma", "50", "-o", "clean.csv").status == 0
     outcome = run("fit", "clean.csv", "--json", "--noise", "relative")
     params = json.loads(outcome.out)["params"]
@@ -36,7 +33,7 @@ def test_fit_recovers_the_truth_and_ends_with_0(run: Runner) -> None:
     assert params["sigma"]["value"] == pytest.approx(50.0, rel=1e-9)
 
 
-def test_command_line_and_python_give_the_same_numbers(run: Runner) -> None:
+def test_command_line_and_python_give_the_same_numbers(run):
     table = run("datasets", "noisy", "-o", "-").out
     whole = json.loads(run("fit", "-", "--json", stdin=table).out)
     told = whole["params"]
@@ -50,7 +47,7 @@ def test_command_line_and_python_give_the_same_numbers(run: Runner) -> None:
     assert f"(here {alpha['value']:.3f} ± {alpha['stderr']:.3f})" in fit.verdict
 
 
-def test_a_missing_file_is_one_line_and_status_1(run: Runner) -> None:
+def test_a_missing_file_is_one_line_and_status_1(run):
     outcome = run("fit", "nothing.csv")
     assert outcome.status == 1
     assert outcome.out == ""
@@ -78,9 +75,7 @@ def test_a_missing_file_is_one_line_and_status_1(run: Runner) -> None:
         (("fit", "-", "--config", "absent.toml"), "absent.toml: no TOML file of options"),
     ],
 )
-def test_bad_input_says_what_was_expected(
-    run: Runner, arguments: tuple[str, ...], message: str
-) -> None:
+def test_bad_input_says_what_was_expected(run, arguments, message):
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run(*arguments, stdin=table)
     assert outcome.status == 1
@@ -90,11 +85,11 @@ def test_bad_input_says_what_was_expected(
 
 
 @pytest.mark.parametrize("arguments", [("fit",), ("fit", "x.csv", "--nosuch"), ("nosuch",)])
-def test_wrong_use_ends_with_2(run: Runner, arguments: tuple[str, ...]) -> None:
+def test_wrong_use_ends_with_2(run, arguments):
     assert run(*arguments).status == 2
 
 
-def test_a_fit_that_runs_away_ends_with_3_and_says_why(run: Runner) -> None:
+def test_a_fit_that_runs_away_ends_with_3_and_says_why(run):
     amplitude = np.geomspace(1e-6, 1e-5, 8)
     response = np.full(8, 30.0 + 0.0j) * np.exp(1j * 1e-3 * ((-1.0) ** np.arange(8) - 0.5))
     di.FrequencyResponse(np.ones(8), response, amplitude).save("stuck.csv")
@@ -104,7 +99,7 @@ def test_a_fit_that_runs_away_ends_with_3_and_says_why(run: Runner) -> None:
     assert "f_max" in outcome.out
 
 
-def test_points_that_are_not_good_end_with_3(run: Runner) -> None:
+def test_points_that_are_not_good_end_with_3(run):
     record = run("datasets", "unsettled", "-o", "-").out
     outcome = run("extract", "-", "-o", "levels.csv", stdin=record)
     assert outcome.status == 3
@@ -113,7 +108,7 @@ def test_points_that_are_not_good_end_with_3(run: Runner) -> None:
     assert di.read_frequency_response("levels.csv").n > 0
 
 
-def test_options_come_from_a_file_and_the_command_line_wins(run: Runner) -> None:
+def test_options_come_from_a_file_and_the_command_line_wins(run):
     Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
     Path("lab.toml").write_text(
         'sigma = "40"\n[fit]\nnoise = "relative"\njson = true\n[datasets]\nname = "x"\n',
@@ -137,9 +132,7 @@ def test_options_come_from_a_file_and_the_command_line_wins(run: Runner) -> None
         ("fti = 3\n", "no command has the option fti; "),
     ],
 )
-def test_an_unknown_name_in_a_file_of_options_is_refused(
-    run: Runner, options: str, says: str
-) -> None:
+def test_an_unknown_name_in_a_file_of_options_is_refused(run, options, says):
     Path("lab.toml").write_text(options, encoding="utf-8")
     outcome = run("fit", "x.csv", "--config", "lab.toml")
     assert outcome.status == 1
@@ -147,7 +140,7 @@ def test_an_unknown_name_in_a_file_of_options_is_refused(
     assert outcome.err.count("\n") == 1
 
 
-def test_a_report_shows_how_waveforms_settled(run: Runner) -> None:
+def test_a_report_shows_how_waveforms_settled(run):
     Path("run.csv").write_text(run("datasets", "plant_recording", "-o", "-").out, encoding="utf-8")
     assert run("extract", "run.csv", "--controlled", "force", "-o", "levels.csv").status == 0
     plant = ("--mass", "free", "--damping", "free", "--stiffness", "free")
@@ -167,7 +160,7 @@ def test_a_report_shows_how_waveforms_settled(run: Runner) -> None:
     assert not Path("b.html").exists()
 
 
-def test_levels_come_from_file_names(run: Runner) -> None:
+def test_levels_come_from_file_names(run):
     amplitude = np.geomspace(1e-4, 1e-2, 6)
     stiffness = di.Dahl(0.1, 30.0).describing_function(amplitude)
     for level, A, N in zip(("0.1", "0.2", "0.3"), amplitude[::2], stiffness[::2], strict=True):
@@ -181,7 +174,7 @@ def test_levels_come_from_file_names(run: Runner) -> None:
     assert json.loads(outcome.out)["params"]["f_max"]["value"] > 0.0
 
 
-def test_simulate_prints_an_experiment_that_it_reads(run: Runner) -> None:
+def test_simulate_prints_an_experiment_that_it_reads(run):
     options = ("simulate", "--f-max", "0.1", "--sigma", "30", "--levels", "1e-3,2e-3")
     text = run(*options).out
     assert Experiment.from_toml(text).truth["sigma"] == 30.0
@@ -192,7 +185,7 @@ def test_simulate_prints_an_experiment_that_it_reads(run: Runner) -> None:
     assert tomllib.loads(text)["excitation"]["levels"] == [1e-3, 2e-3]
 
 
-def test_noise_is_a_share_of_a_table_and_has_the_unit_of_samples(run: Runner) -> None:
+def test_noise_is_a_share_of_a_table_and_has_the_unit_of_samples(run):
     plant = ("simulate", "--f-max", "2.4N", "--sigma", "5.2N/mm")
     shown = run(*plant, "--force-std", "0.5 %", "--json")
     assert json.loads(shown.out)["table"]["force_std"] == 0.005
@@ -204,7 +197,7 @@ def test_noise_is_a_share_of_a_table_and_has_the_unit_of_samples(run: Runner) ->
     assert "such as 5e-6 or 5uN" in run(*plant, "--force-std", "1 %", "--record").err
 
 
-def test_a_record_is_simulated_inspected_and_extracted(run: Runner) -> None:
+def test_a_record_is_simulated_inspected_and_extracted(run):
     made = run(
         "simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", "2e-3,8e-3",
         "--force-std", "1e-4", "--settling-periods", "20", "-o", "run.csv",
@@ -222,7 +215,7 @@ def test_a_record_is_simulated_inspected_and_extracted(run: Runner) -> None:
     assert Path("points.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_proposed_column_map_is_written_and_read(run: Runner) -> None:
+def test_a_proposed_column_map_is_written_and_read(run):
     Path("own.csv").write_text(
         "Freq (Hz),Disp [um],Gain [N/um],Phase [deg]\n"
         "2,20,0.038,9.7\n2,200,0.011,59\n2,900,0.003,75\n"
@@ -239,7 +232,7 @@ def test_a_proposed_column_map_is_written_and_read(run: Runner) -> None:
     assert "own.csv and other.csv need different column maps" in different.err
 
 
-def test_extraction_of_several_files_names_levels_and_files(run: Runner) -> None:
+def test_extraction_of_several_files_names_levels_and_files(run):
     for level in ("2e-3", "8e-3"):
         run("simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", level,
             "--force-std", "1e-4", "-o", f"run_{level}m.csv")  # fmt: skip
@@ -254,7 +247,7 @@ def test_extraction_of_several_files_names_levels_and_files(run: Runner) -> None
     assert "flat.csv: no segment of constant amplitude" in refused.err
 
 
-def test_no_good_point_is_an_error_of_its_own(run: Runner) -> None:
+def test_no_good_point_is_an_error_of_its_own(run):
     run("simulate", "--f-max", "0.1", "--sigma", "30", "--record", "--levels", "1e-4",
         "--force-std", "1e-6", "-o", "run.csv")  # fmt: skip
     table = Path("run.csv").read_text().replace("force [N]", "minus force [N]")
@@ -269,7 +262,7 @@ def test_no_good_point_is_an_error_of_its_own(run: Runner) -> None:
     assert "no point is good" in outcome.err
 
 
-def test_sample_tells_the_posterior(run: Runner) -> None:
+def test_sample_tells_the_posterior(run):
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("sample", "-", "--prior", "f_max=0.01:1", "--json", stdin=table)
     told = json.loads(outcome.out)
@@ -279,7 +272,7 @@ def test_sample_tells_the_posterior(run: Runner) -> None:
     assert abs(row["median"] - 0.1) < 4.0 * row["std"]
 
 
-def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
+def test_sample_integrates_at_once_where_asked(run):
     table = run("datasets", "noisy", "-o", "-").out
     options = ("sample", "-", "--prior", "f_max=0.01:1", "--alpha", "1")
     told = json.loads(run(*options, "--method", "grid", "--json", stdin=table).out)
@@ -298,14 +291,14 @@ def test_sample_integrates_at_once_where_asked(run: Runner) -> None:
     assert "--max-steps is given together with --method grid, which runs no" in refused.err
 
 
-def test_a_chain_that_is_too_short_ends_with_3(run: Runner) -> None:
+def test_a_chain_that_is_too_short_ends_with_3(run):
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("sample", "-", "--steps", "20", "--alpha", "1", stdin=table)
     assert outcome.status == 3
     assert outcome.out.startswith("NOT CONVERGED after 20 steps")
 
 
-def test_a_prior_that_keeps_the_data_out_ends_with_3(run: Runner) -> None:
+def test_a_prior_that_keeps_the_data_out_ends_with_3(run):
     table = run("datasets", "noisy", "-o", "-").out
     options = ("--method", "grid", "--prior", "f_max=1:2", "--uncertainty", "noise")
     outcome = run("sample", "-", *options, stdin=table)
@@ -314,7 +307,7 @@ def test_a_prior_that_keeps_the_data_out_ends_with_3(run: Runner) -> None:
     assert "MISFIT: the residuals are larger than the noise that the data state" in outcome.out
 
 
-def test_report_writes_every_format_asked_for(run: Runner) -> None:
+def test_report_writes_every_format_asked_for(run):
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("report", "-", "-o", "a.html", "-o", "a.json", stdin=table)
     assert outcome.out.split() == ["a.html", "a.json"]
@@ -323,7 +316,7 @@ def test_report_writes_every_format_asked_for(run: Runner) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
+def test_every_help_has_an_example_that_runs(run, command):
     help_text = " ".join(re.sub("[│╭╮╰╯]", " ", run(command, "--help").out).split())
     found = re.search(r"Example: (dahl-ident .*?)(?= (?:Arguments|Options|Ends) |─|$)", help_text)
     assert found, help_text
@@ -340,7 +333,7 @@ def test_every_help_has_an_example_that_runs(run: Runner, command: str) -> None:
 
 
 @pytest.mark.versions
-def test_help_lists_all_commands(run: Runner) -> None:
+def test_help_lists_all_commands(run):
     text = run("--help").out
     assert [name for name in COMMANDS if name not in text] == []
     Path("options.toml").write_text("[nosuch]\nnoise = 1\n")
@@ -350,12 +343,12 @@ def test_help_lists_all_commands(run: Runner) -> None:
 
 
 @pytest.mark.versions
-def test_no_colour_off_a_terminal(run: Runner) -> None:
+def test_no_colour_off_a_terminal(run):
     assert "\x1b[" not in run("datasets").out + run("--no-color", "datasets").out
 
 
 @pytest.mark.versions
-def test_help_loads_nothing_heavy() -> None:
+def test_help_loads_nothing_heavy():
     code = (
         "import sys\nfrom dahl_ident.cli import main\n"
         "try:\n    main(['fit', '--help'])\nexcept SystemExit:\n    pass\n"
@@ -367,9 +360,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("extracted", [False, True])
-def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(
-    tmp_path: Path, *, extracted: bool
-) -> None:
+def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(tmp_path, *, extracted):
     """Also of one with runs, truth values and verdicts, as `extract` writes them."""
     table = tmp_path / "noisy.csv"
     data = di.load_dataset("noisy")
@@ -393,7 +384,7 @@ def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(
     assert loaded & (heavy | {"scipy.interpolate"}) == set()
 
 
-def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
+def test_a_saved_fit_is_reported_with_its_posterior(run):
     table = run("datasets", "noisy", "-o", "-").out
     assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=table).status == 0
     assert run("report", "fit.json", "--posterior", "-o", "r.json").status == 0
@@ -403,7 +394,7 @@ def test_a_saved_fit_is_reported_with_its_posterior(run: Runner) -> None:
     assert told["fits"][0]["parameters"]["f_max"]["value"] == pytest.approx(0.1, rel=0.02)
 
 
-def test_a_chain_goes_on_from_its_file(run: Runner) -> None:
+def test_a_chain_goes_on_from_its_file(run):
     Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
     options = ("sample", "noisy.csv", "--alpha", "1", "--json")
     first = json.loads(run(*options, "--resume", "chain.h5", "--steps", "30").out)
@@ -414,7 +405,7 @@ def test_a_chain_goes_on_from_its_file(run: Runner) -> None:
 
 
 @pytest.mark.versions
-def test_the_status_is_coloured_on_a_terminal_unless_no_color(tmp_path: Path) -> None:
+def test_the_status_is_coloured_on_a_terminal_unless_no_color(tmp_path):
     pty = pytest.importorskip("pty", reason="terminals are POSIX")
     table = tmp_path / "noisy.csv"
     di.load_dataset("noisy").save(table)
@@ -441,7 +432,7 @@ def test_the_status_is_coloured_on_a_terminal_unless_no_color(tmp_path: Path) ->
         assert b"f_max" in out
 
 
-def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
+def test_a_progress_bar_stays_out_of_the_results(tmp_path):
     pty = pytest.importorskip("pty", reason="terminals are POSIX")
     table = tmp_path / "noisy.csv"
     di.load_dataset("noisy").save(table)
@@ -459,7 +450,7 @@ def test_a_progress_bar_stays_out_of_the_results(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_full_disk_behind_standard_output_is_one_line(unbuffered: str) -> None:
+def test_a_full_disk_behind_standard_output_is_one_line(unbuffered):
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(
@@ -470,13 +461,13 @@ def test_a_full_disk_behind_standard_output_is_one_line(unbuffered: str) -> None
     assert ended.stderr == "error: standard output: No space left on device\n"
 
 
-def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_standard_input_is_named(monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)
     with pytest.raises(DataError, match="standard input is closed; pipe the file into it"):
         di.read_frequency_response("-")
 
 
-def test_a_bootstrap_from_a_negative_seed_is_refused(run: Runner) -> None:
+def test_a_bootstrap_from_a_negative_seed_is_refused(run):
     table = run("datasets", "noisy", "-o", "-").out
     outcome = run("report", "-", "--bootstrap", "--seed", "-2", stdin=table)
     assert outcome.status == 1
@@ -493,9 +484,7 @@ def test_a_bootstrap_from_a_negative_seed_is_refused(run: Runner) -> None:
         ("template op", "options"),
     ],
 )
-def test_the_shell_completes_commands_and_values(
-    run: Runner, monkeypatch: pytest.MonkeyPatch, words: str, completed: str
-) -> None:
+def test_the_shell_completes_commands_and_values(run, monkeypatch, words, completed):
     typed = f"dahl-ident {words}"
     monkeypatch.setenv("_DAHL_IDENT_COMPLETE", "complete_bash")
     monkeypatch.setenv("COMP_WORDS", typed)
@@ -503,7 +492,7 @@ def test_the_shell_completes_commands_and_values(
     assert run().out.split() == [completed]
 
 
-def test_every_template_is_read_by_its_option(run: Runner) -> None:
+def test_every_template_is_read_by_its_option(run):
     for name in ("report", "options", "columns", "campaign"):
         assert run("template", name, "-o", f"{name}.toml").status == 0
     assert run("template", "report").out == Path("report.toml").read_text(encoding="utf-8")
@@ -526,7 +515,7 @@ def test_every_template_is_read_by_its_option(run: Runner) -> None:
     assert "to do: pivot" in listed.out, listed.err
 
 
-def test_quantities_take_their_unit(run: Runner) -> None:
+def test_quantities_take_their_unit(run):
     plant = ("--f-max", "100mN", "--sigma", "0.03N/mm", "--mass", "300g")
     drive = ("--controlled", "force", "--levels", "50:200mN:9", "--frequency", "1,2Hz")
     assert run("simulate", *plant, *drive, "-o", "plant.csv").status == 0
@@ -540,7 +529,7 @@ def test_quantities_take_their_unit(run: Runner) -> None:
     assert params["sigma"]["value"] == pytest.approx(30.0, rel=1e-6)
 
 
-def test_quiet_leaves_errors_and_what_goes_to_standard_output(run: Runner) -> None:
+def test_quiet_leaves_errors_and_what_goes_to_standard_output(run):
     table = run("datasets", "noisy", "-o", "-", "--quiet").out
     assert "frequency_hz" in table
     told = run("fit", "-", "--quiet", "--save", "f.json", "--report", "r.html", stdin=table)
@@ -551,9 +540,7 @@ def test_quiet_leaves_errors_and_what_goes_to_standard_output(run: Runner) -> No
 
 
 @pytest.mark.parametrize("command", ["datasets", "simulate"])
-def test_lists_keep_to_a_narrow_terminal(
-    run: Runner, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_lists_keep_to_a_narrow_terminal(run, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "60")
     plant = ("--f-max", "0.1", "--sigma", "30") if command == "simulate" else ()
     told = run(command, *plant).out
@@ -573,7 +560,7 @@ WRITING = {
 
 
 @pytest.mark.parametrize("command", WRITING)
-def test_what_is_there_is_replaced_on_request_only(run: Runner, command: str) -> None:
+def test_what_is_there_is_replaced_on_request_only(run, command):
     there = {"demo": "levels.csv"}.get(command) or next(
         word for word in WRITING[command] if word.startswith("there")
     )
@@ -586,7 +573,7 @@ def test_what_is_there_is_replaced_on_request_only(run: Runner, command: str) ->
     assert Path(there).read_text(encoding="utf-8") == "mine"
 
 
-def test_overwrite_replaces(run: Runner) -> None:
+def test_overwrite_replaces(run):
     Path("noisy.csv").write_text("mine", encoding="utf-8")
     assert run("datasets", "noisy", "-o", "noisy.csv", "--overwrite").status == 0
     assert di.read_frequency_response("noisy.csv").n > 10
@@ -597,7 +584,7 @@ def test_overwrite_replaces(run: Runner) -> None:
 
 
 @pytest.mark.parametrize("option", ["--save", "--report"])
-def test_an_input_is_never_written_over(run: Runner, option: str) -> None:
+def test_an_input_is_never_written_over(run, option):
     assert run("datasets", "noisy", "-o", "noisy.csv").status == 0
     before = Path("noisy.csv").read_bytes()
     outcome = run("fit", "noisy.csv", option, "./noisy.csv")
@@ -621,16 +608,14 @@ def test_an_input_is_never_written_over(run: Runner, option: str) -> None:
         (("fit", "-", "--force-gain", "norm(1,0)"), "has no finite mean or no width"),
     ],
 )
-def test_bad_options_are_refused_before_anything_is_written(
-    run: Runner, arguments: tuple[str, ...], message: str
-) -> None:
+def test_bad_options_are_refused_before_anything_is_written(run, arguments, message):
     outcome = run(*arguments, stdin=run("datasets", "noisy", "-o", "-").out)
     assert (outcome.status, outcome.out) == (1, "")
     assert message in outcome.err
     assert list(Path().iterdir()) == []
 
 
-def test_a_report_goes_to_standard_output(run: Runner) -> None:
+def test_a_report_goes_to_standard_output(run):
     table = run("datasets", "noisy", "-o", "-").out
     out = run("fit", "-", "--report", "-", stdin=table).out
     assert out.startswith("<!doctype html>")
@@ -638,7 +623,7 @@ def test_a_report_goes_to_standard_output(run: Runner) -> None:
     assert list(Path().iterdir()) == []
 
 
-def test_both_solvers_find_the_same_optimum(run: Runner) -> None:
+def test_both_solvers_find_the_same_optimum(run):
     table = run("datasets", "noisy", "-o", "-").out
     one, two = (
         json.loads(run("fit", "-", "--json", *extra, stdin=table).out)["params"]
@@ -648,7 +633,7 @@ def test_both_solvers_find_the_same_optimum(run: Runner) -> None:
         assert two[name]["value"] == pytest.approx(one[name]["value"], rel=1e-7)
 
 
-def test_sensors_are_fixed_free_or_have_a_prior(run: Runner) -> None:
+def test_sensors_are_fixed_free_or_have_a_prior(run):
     Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
     Path("lab.toml").write_text('force_gain = "norm(1, 0.05)"\ndelay = 1e-4\n', encoding="utf-8")
     params = json.loads(run("fit", "noisy.csv", "--json", "--config", "lab.toml").out)["params"]
@@ -664,7 +649,7 @@ def test_sensors_are_fixed_free_or_have_a_prior(run: Runner) -> None:
     assert "give force_gain a prior" in outcome.out
 
 
-def test_priors_come_from_a_calibration_sheet(run: Runner) -> None:
+def test_priors_come_from_a_calibration_sheet(run):
     table = run("datasets", "noisy", "-o", "-").out
     Path("lab.toml").write_text(
         "[sample]\nsteps = 30\n[sample.prior]\nf_max = ['10mN', '1N']\n"
@@ -676,7 +661,7 @@ def test_priors_come_from_a_calibration_sheet(run: Runner) -> None:
     assert told["priors"]["sigma"].startswith("lognorm, mean 30.15")
 
 
-def test_a_saved_fit_takes_no_other_model(run: Runner) -> None:
+def test_a_saved_fit_takes_no_other_model(run):
     table = run("datasets", "noisy", "-o", "-").out
     assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0
     outcome = run("report", "fit.json", "--mass", "free", "-o", "r.html")
@@ -684,13 +669,13 @@ def test_a_saved_fit_takes_no_other_model(run: Runner) -> None:
     assert "saved fits are reported unchanged" in outcome.err
 
 
-def test_a_comparison_is_printed_once(run: Runner) -> None:
+def test_a_comparison_is_printed_once(run):
     table = run("datasets", "alpha_2", "-o", "-").out
     told = run("fit", "-", "-v", "--compare", stdin=table).out
     assert len(re.findall(r"^ *model +reason ", told, re.MULTILINE)) == 1
 
 
-def test_warnings_are_in_the_short_output(run: Runner) -> None:
+def test_warnings_are_in_the_short_output(run):
     table = run("datasets", "fig_7_plant", "-o", "-").out
     plant = ("--mass", "0.3", "--damping", "free", "--stiffness", "free")
     told = run("fit", "-", *plant, "--steady", "describing function", stdin=table).out

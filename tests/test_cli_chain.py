@@ -1,7 +1,5 @@
 """The whole chain, from waveforms to a report: on the shipped recording, and on measured data."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -13,7 +11,7 @@ from dahl_ident.cli import main
 MEASURED = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent")) / "brfd"
 
 
-def run(*arguments: str) -> int:
+def run(*arguments):
     with pytest.raises(SystemExit) as ended:
         main(list(arguments))
     code = ended.value.code
@@ -21,8 +19,8 @@ def run(*arguments: str) -> int:
 
 
 def test_demo_recovers_the_plant_and_tells_machines_its_steps_on_standard_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     Path("lab.toml").write_text("json = true\noutput = 'here'\n", encoding="utf-8")
     status = run("demo", "--config", "lab.toml")
@@ -55,9 +53,7 @@ def test_demo_recovers_the_plant_and_tells_machines_its_steps_on_standard_error(
     assert '<p class="mark">Trusted</p>' in page.read_text(encoding="utf-8")
 
 
-def test_demo_says_where_no_folder_can_be(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_demo_says_where_no_folder_can_be(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("there").write_text("", encoding="utf-8")
     assert run("demo", "-o", "there") == 1
@@ -65,9 +61,7 @@ def test_demo_says_where_no_folder_can_be(
 
 
 @pytest.mark.skipif(not MEASURED.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no brfd folder")
-def test_measured_damper_from_files_to_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_measured_damper_from_files_to_report(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     tests = ("0.25Hz_0.5in", "0.25Hz_1in", "0.5Hz_0.5in", "0.5Hz_1in", "1Hz_1.5in", "2Hz_0.5in")
     files = [str(MEASURED / f"band30lb_{test}.csv") for test in tests]
@@ -93,7 +87,7 @@ def test_measured_damper_from_files_to_report(
     assert "displacement distorted 11 %" in page
 
 
-def _channels(contents: str) -> list[str]:
+def _channels(contents):
     """Return the options that name displacement and force of these files."""
     names = [line.split("  ")[1].strip() for line in contents.splitlines() if line.startswith("  ")]
     displacement = next(name for name in names if "isplacement" in name)

@@ -1,7 +1,5 @@
 """How commands end where they cannot do their work: wrong use, interrupts, pipes, full disks."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -16,7 +14,6 @@ import pytest
 import dahl_ident as di
 from dahl_ident.errors import DataError, SamplingError
 from tests.bayes_cases import friction_table
-from tests.command_line import Runner
 
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes are POSIX")
@@ -38,9 +35,7 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals and pipes ar
         (("nosuch",), ("No such command", "nosuch"), ""),
     ],
 )
-def test_wrong_use_is_two_plain_lines(
-    run: Runner, arguments: tuple[str, ...], found: tuple[str, ...], command: str
-) -> None:
+def test_wrong_use_is_two_plain_lines(run, arguments, found, command):
     outcome = run(*arguments)
     assert (outcome.status, outcome.out) == (2, "")
     message, hint = outcome.err.splitlines()
@@ -50,14 +45,14 @@ def test_wrong_use_is_two_plain_lines(
     assert outcome.err.isascii()
 
 
-def test_nothing_typed_shows_the_help(run: Runner) -> None:
+def test_nothing_typed_shows_the_help(run):
     outcome = run()
     assert outcome.status == 2
     assert "Usage: dahl-ident" in outcome.out + outcome.err
     assert "error" not in outcome.err
 
 
-def interrupted(folder: Path, *arguments: str, when: Path | None = None) -> tuple[str, str]:
+def interrupted(folder, *arguments, when=None):
     """Interrupt a command, once a file is there, and return what it printed on both streams.
 
     Its standard input stays open and empty: what reads from there has not ended by then.
@@ -86,7 +81,7 @@ def interrupted(folder: Path, *arguments: str, when: Path | None = None) -> tupl
 
 
 @POSIX
-def test_an_interrupted_chain_says_how_it_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_chain_says_how_it_goes_on(tmp_path):
     friction_table().save(tmp_path / "levels.csv")
     endless = ("sample", "levels.csv", "--ess", "1e9", "--max-steps", "1000000", "--json")
     chain = tmp_path / "chain.h5"
@@ -106,14 +101,14 @@ def test_an_interrupted_chain_says_how_it_goes_on(tmp_path: Path) -> None:
     ("report", "-", "--bootstrap", "--posterior", "-o", "new.html"),
     ("extract", "-", "--controlled", "force", "-o", "new.csv"),
 ])  # fmt: skip
-def test_an_interrupt_leaves_nothing(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+def test_an_interrupt_leaves_nothing(tmp_path, arguments):
     out, err = interrupted(tmp_path, *arguments)
     assert (out, err) == ("", "interrupted; no file is incomplete\n")
     assert not list(tmp_path.iterdir())
 
 
 @POSIX
-def test_an_interrupt_leaves_the_old_file_whole(tmp_path: Path) -> None:
+def test_an_interrupt_leaves_the_old_file_whole(tmp_path):
     target = tmp_path / "long.csv"
     target.write_text("as it was", encoding="utf-8")
     interrupted(
@@ -127,7 +122,7 @@ def test_an_interrupt_leaves_the_old_file_whole(tmp_path: Path) -> None:
 
 @POSIX
 @pytest.mark.parametrize("command", ["datasets", "--help", "simulate run.toml -o -"])
-def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path, command: str) -> None:
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path, command):
     levels = ", ".join(str(1e-5 * (i + 1)) for i in range(3000))
     (tmp_path / "run.toml").write_text(
         "[[plant]]\nkind = 'dahl'\nf_max = 0.1\nsigma = 30.0\n[excitation]\n"
@@ -155,7 +150,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path, command: str)
         ("datasets noisy -o n.csv 2>&-", 0, b""),
     ],
 )
-def test_closed_streams(tmp_path: Path, command: str, status: int, says: bytes) -> None:
+def test_closed_streams(tmp_path, command, status, says):
     ended = subprocess.run(
         ["sh", "-c", f"exec {PROGRAM} {command}"], stderr=subprocess.PIPE, cwd=tmp_path
     )
@@ -163,11 +158,11 @@ def test_closed_streams(tmp_path: Path, command: str, status: int, says: bytes) 
     assert list(tmp_path.iterdir()) == ([] if status else [tmp_path / "n.csv"])
 
 
-def test_of_two_writers_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_writers_one_fails(tmp_path, monkeypatch):
     place, other = tmp_path / "t.csv", b"of somebody else"
     written = Path.write_bytes
 
-    def slow(path: Path, content: bytes) -> int:
+    def slow(path, content):
         """Write; meanwhile another writer finishes."""
         written(place, other)
         return written(path, content)
@@ -197,7 +192,7 @@ def test_of_two_writers_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     "command", ["datasets", "--help", "inspect größe.csv", "report größe.csv -o -", "nosuchß"]
 )
-def test_an_old_encoding_breaks_nothing(tmp_path: Path, command: str) -> None:
+def test_an_old_encoding_breaks_nothing(tmp_path, command):
     friction_table().save(tmp_path / "größe.csv")
     done = subprocess.run(
         [str(PROGRAM), *command.split()], capture_output=True, cwd=tmp_path,
@@ -212,7 +207,7 @@ def test_an_old_encoding_breaks_nothing(tmp_path: Path, command: str) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names")
-def test_a_name_that_is_no_text_is_told_and_reported(run: Runner) -> None:
+def test_a_name_that_is_no_text_is_told_and_reported(run):
     name = os.fsdecode(b"l\xff.csv")
     Path(name).write_bytes(b"")
     assert run("fit", name).err == "error: l\\udcff.csv: the file is empty\n"
@@ -233,9 +228,7 @@ def test_a_name_that_is_no_text_is_told_and_reported(run: Runner) -> None:
         ("simulate", "--f-max", "1", "--sigma", "2", "-o", "{}"),
     ],
 )
-def test_a_place_that_cannot_be_is_refused_before_any_work(
-    run: Runner, arguments: tuple[str, ...]
-) -> None:
+def test_a_place_that_cannot_be_is_refused_before_any_work(run, arguments):
     Path("file.json").write_text("mine", encoding="utf-8")
     Path("folder.json").mkdir()
     Path("levels.csv").write_text("no table, so that any work would end with another error")
@@ -262,7 +255,7 @@ def test_a_place_that_cannot_be_is_refused_before_any_work(
         ("demo", "-o", "/proc/new"),
     ],
 )
-def test_a_folder_that_takes_no_files_is_one_line(run: Runner, arguments: tuple[str, ...]) -> None:
+def test_a_folder_that_takes_no_files_is_one_line(run, arguments):
     friction_table().save("levels.csv")
     outcome = run(*arguments)
     assert outcome.status == 1
@@ -271,15 +264,13 @@ def test_a_folder_that_takes_no_files_is_one_line(run: Runner, arguments: tuple[
     assert outcome.err.count("\n") == 1
 
 
-def test_a_chain_on_a_full_disk_is_one_line_and_leaves_the_old_file(
-    run: Runner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chain_on_a_full_disk_is_one_line_and_leaves_the_old_file(run, monkeypatch):
     friction_table().save("levels.csv")
     options = ("sample", "levels.csv", "--resume", "chain.h5", "--steps")
     run(*options, "60")
     before = Path("chain.h5").read_bytes()
 
-    def full(_: int) -> None:
+    def full(_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
@@ -295,7 +286,7 @@ def test_a_chain_on_a_full_disk_is_one_line_and_leaves_the_old_file(
         di.posterior(friction_table(), di.Dahl(), seed=1, steps=60, resume="new.h5")
 
 
-def test_a_negative_seed_is_refused_without_an_output_too(run: Runner) -> None:
+def test_a_negative_seed_is_refused_without_an_output_too(run):
     outcome = run("simulate", "--f-max", "0.1", "--sigma", "30", "--seed", "-1")
     assert (outcome.status, outcome.out) == (1, "")
     assert outcome.err == "error: seed is -1; expected a whole number >= 0\n"
@@ -334,9 +325,7 @@ RECORD = "time [s],displacement [m],force [N]\n0,1,1\n1,2,2\n2,1,1\n"
          "--waveforms-columns is given without --waveforms"),
     ],
 )  # fmt: skip
-def test_input_without_effect_or_of_another_kind_is_refused(
-    run: Runner, arguments: tuple[str, ...], message: str
-) -> None:
+def test_input_without_effect_or_of_another_kind_is_refused(run, arguments, message):
     Path("t.csv").write_text(TABLE.format(drive="", value=""), encoding="utf-8")
     Path("newton.csv").write_text(TABLE.format(drive="drive [N],", value="1,"), encoding="utf-8")
     labelled = TABLE.format(drive="level,", value="low,")
@@ -349,7 +338,7 @@ def test_input_without_effect_or_of_another_kind_is_refused(
     assert outcome.err.count("\n") == 1
 
 
-def test_a_chain_keeps_the_seed_it_was_begun_with(run: Runner) -> None:
+def test_a_chain_keeps_the_seed_it_was_begun_with(run):
     friction_table().save("levels.csv")
     options = ("sample", "levels.csv", "--alpha", "1", "--resume", "chain.h5")
     assert run(*options, "--steps", "60", "--seed", "5").status == 3
@@ -358,7 +347,7 @@ def test_a_chain_keeps_the_seed_it_was_begun_with(run: Runner) -> None:
 
 
 @pytest.mark.parametrize("columns", [40, 80])
-def test_no_number_is_broken_on_a_narrow_terminal(columns: int) -> None:
+def test_no_number_is_broken_on_a_narrow_terminal(columns):
     pty = pytest.importorskip("pty", reason="terminals are POSIX")
     code = (
         "from dahl_ident.cli.console import table\n"

@@ -1,7 +1,5 @@
 """Messages of the library reach the command line in the words of its options."""
 
-from __future__ import annotations
-
 import io
 import shlex
 import sys
@@ -14,7 +12,6 @@ import pytest
 from dahl_ident import read_frequency_response
 from dahl_ident.cli import console
 from dahl_ident.errors import DataError
-from tests.command_line import Runner
 
 TABLE = "drive [N],gain [m/N],phase_deg\n0.1,1e-3,-20\n0.2,2e-3,-30\n"
 WAVES = "time [s],x [mm],pull [N]\n" + "".join(f"{i},{i % 5},{i % 3}\n" for i in range(30))
@@ -45,7 +42,7 @@ DRIVEN = "frequency_hz,drive [N],gain [m/N],phase_deg\n" + "".join(
         ("sample driven.csv --alpha free --mass free --method grid", "or use --method mcmc"),
     ],
 )
-def test_messages_name_options(command: str, said: str, run: Runner) -> None:
+def test_messages_name_options(command, said, run):
     Path("table.csv").write_text(TABLE)
     Path("waves.csv").write_text(WAVES)
     Path("moved.csv").write_text(WAVES.replace("x [mm]", "moved [mm]"))
@@ -55,16 +52,16 @@ def test_messages_name_options(command: str, said: str, run: Runner) -> None:
     assert said in ended.err
 
 
-def test_python_is_told_arguments() -> None:
+def test_python_is_told_arguments():
     data = pd.read_csv(io.StringIO(TABLE))
     with pytest.raises(DataError, match=r"columns=\{'frequency': \.\.\.\}.*sweep='1:100Hz log'"):
         read_frequency_response(data)
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_a_long_task_shows_that_it_goes_on(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_task_shows_that_it_goes_on(quiet, monkeypatch):
     class Terminal(io.StringIO):
-        def isatty(self) -> bool:
+        def isatty(self):
             return True
 
     screen = Terminal()

@@ -1,7 +1,5 @@
 """``dahl-ident plan``: the same numbers as in Python, and files that can be used."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -10,13 +8,12 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from tests.command_line import Runner
 
 BENCH = ("--frequency", "5Hz", "--displacement", "0.3:30mm", "--noise", "0.02")
 RANGES = ("--ranges", "f_max=90:110mN", "--ranges", "sigma=27:33")
 
 
-def test_a_plan_from_ranges_is_that_of_python(run: Runner) -> None:
+def test_a_plan_from_ranges_is_that_of_python(run):
     outcome = run("plan", *BENCH, *RANGES, "--target", "f_max=0.01", "--alpha", "1", "--json")
     assert outcome.status == 0, outcome.err
     plan = di.plan(
@@ -31,7 +28,7 @@ def test_a_plan_from_ranges_is_that_of_python(run: Runner) -> None:
     assert told["steps"][0]["level"] == plan.steps[0].level
 
 
-def test_a_saved_fit_is_continued_and_files_are_written(run: Runner) -> None:
+def test_a_saved_fit_is_continued_and_files_are_written(run):
     table = run("datasets", "noisy", "-o", "-").out
     assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=table).status == 0
     outcome = run(
@@ -44,7 +41,7 @@ def test_a_saved_fit_is_continued_and_files_are_written(run: Runner) -> None:
     assert len(Path("levels.csv").read_text().splitlines()) == 3
 
 
-def test_motions_in_time_continue_a_fit_of_records(run: Runner) -> None:
+def test_motions_in_time_continue_a_fit_of_records(run):
     time = np.arange(800) / 100.0
     x = 5e-3 * np.sin(2.0 * time)
     noise = 2e-3 * np.random.default_rng(0).standard_normal(800)
@@ -64,7 +61,7 @@ def test_motions_in_time_continue_a_fit_of_records(run: Runner) -> None:
     )
 
 
-def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
+def test_a_target_out_of_reach_ends_with_3(run):
     outcome = run("plan", *BENCH, *RANGES, "--target", "f_max=1e-5", "--time", "20")
     assert outcome.status == 3
     assert "does NOT meet the target" in outcome.out
@@ -83,15 +80,13 @@ def test_a_target_out_of_reach_ends_with_3(run: Runner) -> None:
         (("nothing.json", "--mass", "1"), "a saved fit has its model and sensors"),
     ],
 )
-def test_bad_input_says_what_was_expected(
-    run: Runner, options: tuple[str, ...], message: str
-) -> None:
+def test_bad_input_says_what_was_expected(run, options, message):
     outcome = run("plan", *BENCH, *options)
     assert outcome.status == 1
     assert message in outcome.err
 
 
-def test_time_to_spare_is_for_repeats(run: Runner) -> None:
+def test_time_to_spare_is_for_repeats(run):
     outcome = run("plan", *BENCH, *RANGES, "--alpha", "1", "--target", "f_max=0.01", "--time", "1h")
     first = outcome.out.splitlines()[0]
     seconds = float(first.split()[3])

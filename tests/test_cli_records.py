@@ -1,7 +1,5 @@
 """Records of any motion on the command line: what is read, refused and printed."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -13,7 +11,6 @@ import pytest
 import dahl_ident as di
 from dahl_ident.cli import main
 from dahl_ident.errors import DataError
-from tests.command_line import Runner
 from tests.test_record_fit import DAHL, recorded
 
 MAP = """
@@ -30,7 +27,7 @@ unit = "kN"
 
 
 @pytest.fixture
-def odd_columns(tmp_path: Path) -> Path:
+def odd_columns(tmp_path):
     """Return a file that only a column map explains: two motions, units of its own."""
     record = recorded(DAHL, "random", 300, 1e-3)
     x, force = np.asarray(record.displacement), record.force_samples
@@ -41,18 +38,14 @@ def odd_columns(tmp_path: Path) -> Path:
     return place
 
 
-def told(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object
-) -> tuple[int, str, str]:
+def told(monkeypatch, capsys, *words):
     monkeypatch.setattr("sys.argv", ["dahl-ident", *map(str, words)])
     with pytest.raises(SystemExit) as end:
         main()
     return int(end.value.code or 0), *capsys.readouterr()
 
 
-def test_a_column_map_is_used(
-    odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_column_map_is_used(odd_columns, monkeypatch, capsys):
     words = ("fit", odd_columns, "--record")
     code, _, why = told(monkeypatch, capsys, *words)
     assert code == 1
@@ -69,9 +62,7 @@ def test_a_column_map_is_used(
     assert "offset" in out
 
 
-def test_waveforms_need_no_option(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_waveforms_need_no_option(tmp_path, monkeypatch, capsys):
     for seed in (1, 2):
         recorded(DAHL, "random", 600, 1e-3, seed).save(tmp_path / f"sweep{seed}.csv")
     pattern = tmp_path / "sweep*.csv"
@@ -86,9 +77,7 @@ def test_waveforms_need_no_option(
     assert "fitted as a record: dahl-ident fit --record" in why
 
 
-def test_a_fast_sweep_is_told_how_to_be_fitted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fast_sweep_is_told_how_to_be_fitted(tmp_path, monkeypatch, capsys):
     t = np.arange(12_000) / 1000.0
     x = 0.02 * np.exp(-t / 6.0) * np.sin(2.0 * np.pi * 5.0 * t)
     path = di.Record(t, displacement=x, force=DAHL.force(x)).save(tmp_path / "a run.csv")
@@ -101,13 +90,7 @@ def test_a_fast_sweep_is_told_how_to_be_fitted(
 
 @pytest.mark.parametrize("command", ["fit", "sample"])
 @pytest.mark.parametrize("words", [("--level", "1"), ("--noise", "relative")])
-def test_options_of_tables_are_refused(
-    command: str,
-    words: tuple[str, str],
-    odd_columns: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_options_of_tables_are_refused(command, words, odd_columns, monkeypatch, capsys):
     place = odd_columns.with_name("columns.toml")
     code, _, why = told(
         monkeypatch, capsys, command, odd_columns, "--record", "--columns", place, *words
@@ -116,9 +99,7 @@ def test_options_of_tables_are_refused(
     assert re.search(rf"{words[0]} (is )?given (together )?with .*record", why)
 
 
-def test_the_force_is_predicted_although_the_model_has_a_mass(
-    odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, monkeypatch, capsys):
     place = odd_columns.with_name("columns.toml")
     words = ("fit", odd_columns, "--record", "--columns", place, "--mass", "free")
     _, out, _ = told(monkeypatch, capsys, *words, "--predicted", "force")
@@ -129,12 +110,7 @@ def test_the_force_is_predicted_although_the_model_has_a_mass(
 
 
 @pytest.mark.parametrize("words", [("--loss", "huber"), ("--method", "scipy")])
-def test_losses_and_methods_are_taken_with_records(
-    words: tuple[str, str],
-    odd_columns: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_losses_and_methods_are_taken_with_records(words, odd_columns, monkeypatch, capsys):
     place = odd_columns.with_name("columns.toml")
     base = ("fit", odd_columns, "--record", "--columns", place, "--json")
     plain, other = (
@@ -144,9 +120,7 @@ def test_losses_and_methods_are_taken_with_records(
         assert other[name]["value"] == pytest.approx(plain[name]["value"], rel=0.01)
 
 
-def test_models_of_records_are_compared(
-    odd_columns: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_models_of_records_are_compared(odd_columns, monkeypatch, capsys):
     place = odd_columns.with_name("columns.toml")
     words = ("fit", odd_columns, "--record", "--columns", place, "--compare")
     _, out, _ = told(monkeypatch, capsys, *words)
@@ -154,7 +128,7 @@ def test_models_of_records_are_compared(
     assert "of the force left" in out
 
 
-def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:
+def test_a_waveform_of_a_plan_is_no_record(tmp_path):
     limits = {"displacement": (1e-4, 3e-2), "frequency_hz": 5.0, "time": 60.0}
     plan = di.plan(
         di.Dahl(alpha=1.0),
@@ -167,7 +141,7 @@ def test_a_waveform_of_a_plan_is_no_record(tmp_path: Path) -> None:
         di.read_record(place)
 
 
-def test_two_days_of_waveforms_are_compared(run: Runner) -> None:
+def test_two_days_of_waveforms_are_compared(run):
     """Parameters of the device change, not the first force, offset and drift of a record."""
     time = np.arange(600) / 100.0
     x = 5e-3 * np.sin(2.0 * time) * (0.2 + 0.8 * np.sin(0.6 * time) ** 2)
@@ -192,9 +166,7 @@ def test_two_days_of_waveforms_are_compared(run: Runner) -> None:
     assert "Changes from each measurement" in Path("r.html").read_text(encoding="utf-8")
 
 
-def test_waveforms_are_read_alike_by_every_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_waveforms_are_read_alike_by_every_command(tmp_path, monkeypatch, capsys):
     recorded(DAHL, "random", 600, 1e-3).save(tmp_path / "run.csv")
     file, note = tmp_path / "run.csv", "the files hold waveforms: fitted sample by sample"
     code, _, why = told(monkeypatch, capsys, "fit", file, "--predicted", "force")

@@ -1,21 +1,16 @@
 """Elements and rows as they are typed: ``--element``, ``--where``, ``--levels``, ``--runs``."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import dahl_ident as di
 from dahl_ident.elements import KINDS, describe_model
-from tests.command_line import Runner
 
 
-def table(**columns: Any) -> di.FrequencyResponse:
+def table(**columns):
     A = np.geomspace(1e-4, 1e-2, 6)
     N = di.Dahl(f_max=0.1, sigma=30.0).describing_function(A)
     return di.FrequencyResponse(
@@ -29,7 +24,7 @@ def table(**columns: Any) -> di.FrequencyResponse:
     )
 
 
-def kept(run: Runner, *options: str) -> di.FrequencyResponse:
+def kept(run, *options):
     """Return the rows that a fit used."""
     table().save("t.csv", overwrite=True)
     fit = ("fit", "t.csv", "--noise", "absolute", "--save", "f.json", "--overwrite")
@@ -50,12 +45,12 @@ def kept(run: Runner, *options: str) -> di.FrequencyResponse:
         ("phase_deg > -1", [0, 1, 2, 3, 4, 5]),
     ],
 )
-def test_where_keeps_what_meets_the_condition(run: Runner, where: str, rows: list[int]) -> None:
+def test_where_keeps_what_meets_the_condition(run, where, rows):
     amplitude = table().amplitude
     assert kept(run, "--where", where).amplitude == pytest.approx(amplitude[rows], rel=1e-12)
 
 
-def test_levels_and_runs_are_named(run: Runner) -> None:
+def test_levels_and_runs_are_named(run):
     assert kept(run, "--levels", "1, 10").n == 3
     assert kept(run, "--runs", "b").n == 3
     assert kept(run, "--where", "harmonic == 1", "--levels", "2,3", "--runs", "a").n == 1
@@ -77,14 +72,14 @@ def test_levels_and_runs_are_named(run: Runner) -> None:
         ("level > 100", "selects none of 6 rows"),
     ],
 )
-def test_conditions_that_cannot_be_met_are_refused(run: Runner, where: str, message: str) -> None:
+def test_conditions_that_cannot_be_met_are_refused(run, where, message):
     table().save("t.csv")
     outcome = run("fit", "t.csv", "--where", where)
     assert outcome.status == 1
     assert re.search(message, outcome.err)
 
 
-def test_elements_are_written_by_their_kind(run: Runner) -> None:
+def test_elements_are_written_by_their_kind(run):
     known = ("dahl(100 mN, alpha=free, name=pivot)", "mass(300g)", "spring")
     told = run("simulate", *(word for text in known for word in ("--element", text)))
     assert "no value for pivot_sigma, pivot_alpha" in told.err
@@ -95,7 +90,7 @@ def test_elements_are_written_by_their_kind(run: Runner) -> None:
 
 
 @pytest.mark.parametrize("kind", [kind for kind, one in KINDS.items() if one.parameters])
-def test_every_kind_can_be_typed(run: Runner, kind: str) -> None:
+def test_every_kind_can_be_typed(run, kind):
     assert " has no value for " in run("simulate", "--element", kind, "--levels", "1").err
 
 
@@ -114,13 +109,13 @@ def test_every_kind_can_be_typed(run: Runner, kind: str) -> None:
         ("mass(0.3", "expected a kind and its values"),
     ],
 )
-def test_elements_that_do_not_exist_are_refused(run: Runner, text: str, message: str) -> None:
+def test_elements_that_do_not_exist_are_refused(run, text, message):
     outcome = run("simulate", "--element", text)
     assert outcome.status == 1
     assert message in outcome.err
 
 
-def test_a_law_that_a_user_wrote_is_simulated_and_fitted(run: Runner) -> None:
+def test_a_law_that_a_user_wrote_is_simulated_and_fitted(run):
     class Typed(di.Friction):
         kind = "typed_jenkins"
         equation = "dF/dx = stiffness below f_max"
@@ -129,7 +124,7 @@ def test_a_law_that_a_user_wrote_is_simulated_and_fitted(run: Runner) -> None:
             di.Parameter("f_max", "N", "friction limit", lower=0.0, transform="log"),
         )
 
-        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        def slope(self, force, direction, velocity, values):
             stiffness, f_max = values
             return stiffness * (direction * force < f_max)
 
@@ -146,9 +141,7 @@ def test_a_law_that_a_user_wrote_is_simulated_and_fitted(run: Runner) -> None:
         del KINDS["typed_jenkins"]
 
 
-def test_a_fit_is_told_on_few_lines_and_wrapped(
-    run: Runner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_is_told_on_few_lines_and_wrapped(run, monkeypatch):
     assert run("datasets", "microslip", "-o", "m.csv").status == 0
     brief = run("fit", "m.csv", "--mass", "free", "--damping", "free", "--stiffness", "free")
     report = brief.out.splitlines()
@@ -164,7 +157,7 @@ def test_a_fit_is_told_on_few_lines_and_wrapped(
     assert all(line.startswith("    ") for line in verdict)
 
 
-def test_patterns_name_files(run: Runner, tmp_path: Path) -> None:
+def test_patterns_name_files(run, tmp_path):
     """Quoted patterns, which some shells pass on as they are."""
     for run_name in ("a", "b"):
         table().select(run=run_name).save(tmp_path / f"day_{run_name}.csv")

@@ -1,10 +1,6 @@
 """Records that a fit solves without a start; independent solvers made them."""
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +8,9 @@ import pytest
 import dahl_ident as di
 from dahl_ident.errors import DataWarning
 from tests import cold_records as cold
-from tests.cold_records import Case
 
 
-def assert_found(case: Case) -> None:
+def assert_found(case):
     """Check every free parameter: within three standard uncertainties, which say something."""
     fit = di.fit(case.record, case.model, throw=False)
     assert fit.success, fit.verdict
@@ -31,24 +26,24 @@ def assert_found(case: Case) -> None:
 @pytest.mark.parametrize(
     ("sigma", "seed", "samples"), [(300.0, 0, 512), (30000.0, 0, 320), (30000.0, 3, 768)]
 )
-def test_friction_faster_than_the_sampling(sigma: float, seed: int, samples: int) -> None:
+def test_friction_faster_than_the_sampling(sigma, seed, samples):
     assert_found(cold.fast(sigma, seed, samples))
 
 
 @pytest.mark.parametrize(("gap", "seed"), [(0.5, 0), (2.0, 1), (6.0, 2)])
-def test_backlash_with_measured_displacement(gap: float, seed: int) -> None:
+def test_backlash_with_measured_displacement(gap, seed):
     assert_found(cold.play(gap, seed))
 
 
 @pytest.mark.parametrize(("made", "seed"), [(cold.lugre, 0), (cold.slips, 1), (cold.iwan, 1)])
-def test_driven_plants(made: Callable[[int], Case], seed: int) -> None:
+def test_driven_plants(made, seed):
     assert_found(made(seed))
 
 
 @pytest.mark.parametrize(
     ("name", "known"), [(name, ("mass", "spring")[i % 2]) for i, name in enumerate(cold.DECAYS)]
 )
-def test_free_decays(name: str, known: str) -> None:
+def test_free_decays(name, known):
     assert_found(cold.decay(name, known, 1))
 
 
@@ -60,13 +55,13 @@ class StiffnessFirst(di.Friction):
         di.Parameter("limit", "N", "friction limit", lower=0.0, transform="log"),
     )
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         k, limit = values
         return k * (direction * force < limit)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
-def test_an_own_law_at_any_scale_whatever_the_order_of_its_parameters(scale: float) -> None:
+def test_an_own_law_at_any_scale_whatever_the_order_of_its_parameters(scale):
     t = np.arange(600) / 100.0
     x = 3e-3 * scale * (np.sin(6.0 * t) + np.sin(21.3 * t))
     force = np.zeros(t.size)
@@ -80,7 +75,7 @@ def test_an_own_law_at_any_scale_whatever_the_order_of_its_parameters(scale: flo
         assert abs(found.value - value) < 4.0 * float(found.stderr or 0.0)
 
 
-def with_gap(record: di.Record, low: int, high: int) -> di.Record:
+def with_gap(record, low, high):
     return di.Record(
         np.delete(record.time, slice(low, high)),
         displacement=np.delete(record.motion_samples, slice(low, high)),
@@ -88,7 +83,7 @@ def with_gap(record: di.Record, low: int, high: int) -> di.Record:
     )
 
 
-def test_a_gap_in_a_driven_record_makes_two_parts() -> None:
+def test_a_gap_in_a_driven_record_makes_two_parts():
     case = cold.fast(300.0, 0)
     said = r"nothing is known from 3\.49 to 4\.3 s; 2 parts are fitted, each from a first state"
     with pytest.warns(DataWarning, match=said):
@@ -96,37 +91,37 @@ def test_a_gap_in_a_driven_record_makes_two_parts() -> None:
 
 
 @pytest.mark.parametrize("seed", [414, 416])
-def test_springs_have_forces_of_their_own_after_a_gap(seed: int) -> None:
+def test_springs_have_forces_of_their_own_after_a_gap(seed):
     case = cold.slips(seed)
     with pytest.warns(DataWarning, match="2 parts are fitted"):
         assert_found(case._replace(record=with_gap(case.record, 200, 260)))
 
 
-def test_iwan_is_loaded_within_full_slip_after_a_gap() -> None:
+def test_iwan_is_loaded_within_full_slip_after_a_gap():
     """Beyond it the load has no effect, and a search from there once ended 7 u off."""
     case = cold.iwan(3)
     with pytest.warns(DataWarning, match="2 parts are fitted"):
         assert_found(case._replace(record=with_gap(case.record, 150, 200)))
 
 
-def test_first_states_are_begun_again_as_long_as_it_helps() -> None:
+def test_first_states_are_begun_again_as_long_as_it_helps():
     assert_found(cold.decay("maxwell_slip", "spring", 5))
 
 
-def test_a_free_decay_goes_on_after_a_gap() -> None:
+def test_a_free_decay_goes_on_after_a_gap():
     """The second part is much smaller than the first, the noise the same."""
     case = cold.decay("dahl", "spring", 2)
     with pytest.warns(DataWarning, match="2 parts are fitted"):
         assert_found(case._replace(record=with_gap(case.record, 120, 180)))
 
 
-def test_friction_slips_behind_a_gap_where_a_record_goes_on() -> None:
+def test_friction_slips_behind_a_gap_where_a_record_goes_on():
     case = cold.play(2.0, 412)
     with pytest.warns(DataWarning, match="2 parts are fitted"):
         assert_found(case._replace(record=with_gap(case.record, 700, 1100)))
 
 
-def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers() -> None:
+def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers():
     """In the gap the displacement turns several times: a straight way through it is wrong."""
     case = cold.play(0.5, 0)
     record = with_gap(case.record, 400, 700)
@@ -144,7 +139,7 @@ def test_a_gap_in_a_force_record_is_not_bridged_where_friction_remembers() -> No
     assert again.verdict == fit.verdict
 
 
-def test_a_gap_is_bridged_where_nothing_remembers() -> None:
+def test_a_gap_is_bridged_where_nothing_remembers():
     t = np.delete(np.arange(400) / 100.0, slice(150, 220))
     x = 1e-3 * np.sin(7.0 * t)
     force = 50.0 * x + 1e-4 * np.random.default_rng(0).standard_normal(t.size)
@@ -155,7 +150,7 @@ def test_a_gap_is_bridged_where_nothing_remembers() -> None:
     assert fit.params["stiffness"].value == pytest.approx(50.0, rel=0.01)
 
 
-def test_short_parts_are_left_out_and_uneven_times_are_no_gaps() -> None:
+def test_short_parts_are_left_out_and_uneven_times_are_no_gaps():
     x = 1e-2 * np.cumsum(np.random.default_rng(0).standard_normal(500))
     force = di.Dahl(0.1, 30.0).force(x) + 1e-3 * np.random.default_rng(1).standard_normal(500)
     t = np.arange(500) / 100.0

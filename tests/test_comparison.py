@@ -1,7 +1,5 @@
 """Other laws than the one fitted: which is chosen, by what, and what means the same in all."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +12,6 @@ from dahl_ident import (
     BoucWen,
     Dahl,
     Damper,
-    Element,
     FrequencyResponse,
     LuGre,
     Mass,
@@ -28,16 +25,15 @@ from dahl_ident import (
 from dahl_ident.diagnostics.comparison import _candidates
 from dahl_ident.diagnostics.predictive_density import predictive_density
 from dahl_ident.errors import FitError
-from tests.command_line import Runner
 from tests.friction_tables import FRICTION, table
 
 
 @pytest.mark.parametrize("law", ["linear Dahl", "two limits", "gap"])
-def test_the_law_that_made_the_data_is_chosen(law: str) -> None:
+def test_the_law_that_made_the_data_is_chosen(law):
     assert [right for _, right in choices(law, 1, seed=5, amplitudes=8)] == [True]
 
 
-def test_tiny_covariances_of_harmonics_do_not_rule() -> None:
+def test_tiny_covariances_of_harmonics_do_not_rule():
     """A third harmonic that is 5 % off, stated to 1e-5: a difference for BIC, none for tests."""
     data = table()
     third = FRICTION.dynamic_stiffness(data.amplitude, harmonic=3) * 1.05
@@ -56,7 +52,7 @@ def test_tiny_covariances_of_harmonics_do_not_rule() -> None:
     assert spring.density.gain_over(plain.density)[0] < 10.0
 
 
-def test_what_means_the_same_whatever_the_law() -> None:
+def test_what_means_the_same_whatever_the_law():
     found = compare_models(
         fit(table(noise=1e-3), Dahl()), {"gap": Backlash(Dahl(), 1e-6), "spring": Spring()}
     )
@@ -72,19 +68,19 @@ def test_what_means_the_same_whatever_the_law() -> None:
     assert "energy a cycle" in str(found)
 
 
-def test_the_command_prints_the_comparison(run: Runner) -> None:
+def test_the_command_prints_the_comparison(run):
     result = run.line("dahl-ident datasets noisy -o - | dahl-ident fit - --compare")
     assert "No model compared is better" in result.out
     assert "force limit" in result.out
 
 
-def test_lugre_is_tried_where_the_force_falls_with_the_frequency() -> None:
+def test_lugre_is_tried_where_the_force_falls_with_the_frequency():
     A = np.tile(np.geomspace(1e-3, 1.0, 14), 2)
     f = np.repeat([0.1, 1.0], 14)
     rng = np.random.default_rng(3)
     noise = 1.0 + 0.005 * rng.standard_normal((28, 2)) @ [1.0, 1.0j]
 
-    def tried(law: Element) -> list[str]:
+    def tried(law):
         N = law.dynamic_stiffness(A, 2.0 * np.pi * f)
         data = FrequencyResponse(f, N * noise, A)
         found = fit(data, Dahl(), throw=False).optimum
@@ -95,13 +91,13 @@ def test_lugre_is_tried_where_the_force_falls_with_the_frequency() -> None:
     assert "LuGre" not in tried(Dahl(1.0, 100.0) + Damper(0.5))
 
 
-def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl() -> None:
+def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl():
     A = np.geomspace(1e-3, 1.0, 12)
     rng = np.random.default_rng(4)
     noise = 1.0 + 0.01 * rng.standard_normal((12, 2)) @ [1.0, 1.0j]
     law = LuGre(1.0, 100.0, 1.8, 0.5)
 
-    def sentences(frequency: float) -> list[str]:
+    def sentences(frequency):
         N = law.dynamic_stiffness(A, 2.0 * np.pi * frequency) * noise
         given = fit(FrequencyResponse(np.full(12, frequency), N, A), Dahl(), throw=False)
         asked = LuGre(static_ratio=1.8, stribeck_speed=0.5)
@@ -113,7 +109,7 @@ def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl() -> None:
     assert not sentences(0.2)
 
 
-def test_the_model_that_was_fitted_stands_with_what_it_states() -> None:
+def test_the_model_that_was_fitted_stands_with_what_it_states():
     result = fit(table(noise=1e-3), Dahl() + Mass(0.01))
     found = compare_models(result, {"spring": Dahl() + Spring()})
     f_max = result.params["f_max"]
@@ -125,7 +121,7 @@ def test_the_model_that_was_fitted_stands_with_what_it_states() -> None:
     )
 
 
-def test_what_runs_away_is_not_determined() -> None:
+def test_what_runs_away_is_not_determined():
     """Microslip: any limit of the force would do."""
     data = table(beta=(1e-4, 1e-3), noise=0.01)
     found = compare_models(fit(data, Dahl(), throw=False), {"gap": Backlash(Dahl())})
@@ -133,7 +129,7 @@ def test_what_runs_away_is_not_determined() -> None:
     assert {row[5] for row in found.rows} == {"-"}
 
 
-def test_a_damper_is_told_from_another_loop_at_one_frequency() -> None:
+def test_a_damper_is_told_from_another_loop_at_one_frequency():
     """Without a damper among the candidates, Bouc-Wen's law took its place."""
     A = np.geomspace(3e-4, 3e-2, 12)
     truth = Dahl(0.1, 30.0, alpha=1.0) + PowerDamper(0.02, 0.5)
@@ -146,7 +142,7 @@ def test_a_damper_is_told_from_another_loop_at_one_frequency() -> None:
     assert "of the fundamental, and how much of that is noise is not known" in comparison.headline
 
 
-def test_models_whose_parameters_are_open_are_not_recommended() -> None:
+def test_models_whose_parameters_are_open_are_not_recommended():
     """In gross slip one of two elements is as stiff as one likes, however well both predict."""
     A = np.geomspace(0.5, 5.0, 12)
     exact = Dahl(0.1, 30.0, alpha=1.0).describing_function(A) * (1.0 + 0.05 * np.sin(9.0 * A))
@@ -163,7 +159,7 @@ def test_models_whose_parameters_are_open_are_not_recommended() -> None:
     assert best.name == "spring added"
 
 
-def test_two_jenkins_elements_are_maxwell_slip() -> None:
+def test_two_jenkins_elements_are_maxwell_slip():
     """Not the law of a free exponent that leaves ten times as much."""
     A = np.geomspace(0.1, 10.0, 12) / 300.0
     exact = MaxwellSlip([1e-3, 8e-3], [20.0, 10.0]).describing_function(A)
@@ -179,7 +175,7 @@ T = np.arange(1000) / 100.0
 X = 1e-3 * np.sin(3.0 * T) + 7e-3 * np.sin(0.9 * T) * np.sin(0.31 * T)
 
 
-def loop(x: np.ndarray) -> np.ndarray:
+def loop(x):
     """Bouc-Wen's equation, dF = 30 (1 - 500 |F/30| sgn(F dx) + 200 F/30) dx, in small steps."""
     fine = np.interp(np.linspace(0, x.size - 1, 40 * (x.size - 1) + 1), np.arange(x.size), x)
     z = np.zeros(fine.size)
@@ -192,7 +188,7 @@ def loop(x: np.ndarray) -> np.ndarray:
     return 30.0 * z[::40]
 
 
-def test_the_law_of_a_record_is_recognised() -> None:
+def test_the_law_of_a_record_is_recognised():
     noise = 2e-4 * np.random.default_rng(0).standard_normal(T.size)
     force = loop(X) + noise
     record = Record(T, displacement=X, force=force)
@@ -213,7 +209,7 @@ def test_the_law_of_a_record_is_recognised() -> None:
     assert "of the force" in comparison.headline
 
 
-def test_the_density_of_a_record_is_that_of_blocks_left_out() -> None:
+def test_the_density_of_a_record_is_that_of_blocks_left_out():
     """A spring, an offset and a drift: linear regression, repeated without each block."""
     rng = np.random.default_rng(2)
     force = 3.0 * X + 1e-3 * rng.standard_normal(T.size)
@@ -231,7 +227,7 @@ def test_the_density_of_a_record_is_that_of_blocks_left_out() -> None:
         assert density == pytest.approx(normal.logpdf(y[rows]), rel=1e-6)
 
 
-def test_a_power_damper_is_found_where_dahl_alone_slips_at_once() -> None:
+def test_a_power_damper_is_found_where_dahl_alone_slips_at_once():
     """Friction small against a damper of exponent 0.47, as of magneto-rheological dampers."""
     rng = np.random.default_rng(2)
     A, f = np.geomspace(5.7e-3, 12.6e-3, 20), np.tile([0.84, 1.0, 1.2, 0.9], 5)
@@ -250,7 +246,7 @@ def test_a_power_damper_is_found_where_dahl_alone_slips_at_once() -> None:
     assert "share the parameter names exponent" in str(again)
 
 
-def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere() -> None:
+def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere():
     A = np.geomspace(1e-3, 1e-1, 12)
     exact = Dahl(0.1, 30.0, alpha=30.0).describing_function(A)
     noise = 0.003 * np.random.default_rng(1).standard_normal((2, A.size)).T @ [1.0, 1.0j]
@@ -264,7 +260,7 @@ def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere() -> None:
         predictive_density(wild)
 
 
-def test_a_model_that_spoils_the_fundamental_is_not_better() -> None:
+def test_a_model_that_spoils_the_fundamental_is_not_better():
     """Fundamentals of Dahl's law, third harmonics of tiny covariance that only a gap explains."""
     data = table(noise=0.01, seed=23)
     third = Backlash(FRICTION, 2e-3).dynamic_stiffness(data.amplitude, harmonic=3)
@@ -285,7 +281,7 @@ def test_a_model_that_spoils_the_fundamental_is_not_better() -> None:
     assert comparison.best is plain
 
 
-def test_a_force_that_falls_with_the_speed_asks_for_lugre() -> None:
+def test_a_force_that_falls_with_the_speed_asks_for_lugre():
     """From no guess, next to harmonics that say nothing."""
     law, n = LuGre(0.1, 350.0, 1.94, 0.01), 10
     A = np.tile(np.repeat(0.1 / 350.0 * np.geomspace(0.1, 10.0, n), 2), 3)

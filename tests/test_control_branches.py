@@ -1,15 +1,11 @@
 """Branches of an active plant: up- and down-sweeps in the time domain land where predicted."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest
 
 from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
-from dahl_ident.arrays import FloatArray
 from dahl_ident.control_interop import response_branches
-from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.synthetic.mechanism import Mechanism
 from dahl_ident.synthetic.waveform import WaveformBuilder
@@ -21,7 +17,7 @@ ACTIVE = Dahl(0.1, 30.0) + Mass(0.3) + LAGGING + Spring(3.0)
 FREQUENCY = 0.65
 
 
-def staircase(plant: Element, drives: FloatArray, frequency_hz: float, hold: int) -> FloatArray:
+def staircase(plant, drives, frequency_hz, hold):
     """Return the displacement amplitude at the end of each step of drive, in the time domain."""
     builder = WaveformBuilder(frequency_hz)
     for drive in drives:
@@ -38,7 +34,7 @@ def staircase(plant: Element, drives: FloatArray, frequency_hz: float, hold: int
     return np.array(amplitudes)
 
 
-def test_sweeps_up_and_down_land_on_the_two_stable_branches() -> None:
+def test_sweeps_up_and_down_land_on_the_two_stable_branches():
     """At drives far apart, between which branches begin and end."""
     up = np.array([0.05, 0.065, 0.0675, 0.0725])
     seen = staircase(ACTIVE, np.concatenate([up, up[::-1][1:]]), FREQUENCY, 60)
@@ -52,7 +48,7 @@ def test_sweeps_up_and_down_land_on_the_two_stable_branches() -> None:
     assert falling[[0, 2, 3]] == pytest.approx([A[0, 0], A[2, 2], A[3, 0]], rel=1e-4)
 
 
-def test_the_describing_function_places_branches_roughly() -> None:
+def test_the_describing_function_places_branches_roughly():
     """The third harmonic, near the held mass's resonance, shifts the upper branch by a tenth."""
     exact, sine = (
         response_branches(ACTIVE, FREQUENCY, 0.0675, steady=steady).steady.amplitude
@@ -62,7 +58,7 @@ def test_the_describing_function_places_branches_roughly() -> None:
     assert sine != pytest.approx(exact, rel=0.05)
 
 
-def test_passive_plants_have_one_stable_branch() -> None:
+def test_passive_plants_have_one_stable_branch():
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     frequency, drive = np.geomspace(0.05, 5.0, 16)[:, None], np.geomspace(1e-4, 10.0, 16)
     branches = response_branches(plant, frequency, drive)
@@ -70,7 +66,7 @@ def test_passive_plants_have_one_stable_branch() -> None:
     assert branches.stable.all()
 
 
-def test_without_friction_the_rate_is_that_of_the_pole() -> None:
+def test_without_friction_the_rate_is_that_of_the_pole():
     mass, damping, stiffness = 0.3, 0.01, 3.0
     plant = Dahl(1e-9, 1e-9) + Mass(mass) + Damper(damping) + Spring(stiffness)
     f = np.sqrt(stiffness / mass) / (2.0 * np.pi)
@@ -79,7 +75,7 @@ def test_without_friction_the_rate_is_that_of_the_pole() -> None:
     assert rate == pytest.approx([pole.real], rel=1e-3)
 
 
-def test_falling_branches_are_unstable() -> None:
+def test_falling_branches_are_unstable():
     """Where A |Z| falls with A, at least one disturbance grows."""
     u = np.geomspace(0.03, 0.2, 60)
     f = np.linspace(0.5, 0.9, 15)[:, None]
@@ -93,7 +89,7 @@ def test_falling_branches_are_unstable() -> None:
     assert not branches.stable[~branches.steady.found].any()
 
 
-def test_amplitude_dies_at_the_predicted_rate_in_the_time_domain() -> None:
+def test_amplitude_dies_at_the_predicted_rate_in_the_time_domain():
     """A step of drive far above friction: the envelope nears its new level at the given rate."""
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.05) + Spring(3.0)
     f = 0.5032
@@ -117,7 +113,7 @@ def test_amplitude_dies_at_the_predicted_rate_in_the_time_domain() -> None:
     assert np.polyfit(when[:-1], np.log(left), 1)[0] == pytest.approx(rate, rel=0.1)
 
 
-def test_bad_arguments_are_named() -> None:
+def test_bad_arguments_are_named():
     with pytest.raises(ValidationError, match=r"frequency_hz is 0\.0; expected numbers > 0"):
         response_branches(ACTIVE, 0.0, 1.0)
     with pytest.raises(ModelError, match="has no friction; add one, such as Dahl"):

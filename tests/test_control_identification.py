@@ -4,17 +4,12 @@ The data come from the equation of motion, solved in time by an ODE solver with 
 state (Eqn. 2) among its states, not from describing functions.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import control
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from dahl_ident import Dahl, FrequencyResponse, LinearSystem, fit
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.control_interop import closed_loop_response, level_responses
 from dahl_ident.errors import ValidationError
 
@@ -24,15 +19,13 @@ s = control.tf("s")
 LINEAR_PART = 1 / (MASS * s**2 + DAMPING * s + STIFFNESS)
 
 
-def simulated(
-    frequency_hz: float, drive: float, gains: tuple[float, float] = (0.0, 0.0), cycles: int = 12
-) -> tuple[complex, float]:
+def simulated(frequency_hz, drive, gains=(0.0, 0.0), cycles=12):
     """Return X over the drive's phasor and abs(X), driven by force, or by a reference under PD."""
     w = 2.0 * np.pi * frequency_hz
     stiff, damp = gains
     closed = any(gains)
 
-    def slope(t: float, y: FloatArray) -> list[float]:
+    def slope(t, y):
         x, v, F = y
         if closed:
             u = stiff * (drive * np.cos(w * t) - x) - damp * (drive * w * np.sin(w * t) + v)
@@ -50,7 +43,7 @@ def simulated(
     return X / drive, abs(X)
 
 
-def table(points: list[tuple[float, float]], **options: Any) -> tuple[ComplexArray, FloatArray]:
+def table(points, **options):
     rows = [simulated(f, u, **options) for f, u in points]
     return np.array([r for r, _ in rows]), np.array([A for _, A in rows])
 
@@ -59,11 +52,11 @@ POINTS = [(f, u) for u in (0.05, 0.15, 0.4, 1.0) for f in (1.0, 2.2, 3.1)]
 
 
 @pytest.fixture(scope="module")
-def open_loop() -> tuple[ComplexArray, FloatArray]:
+def open_loop():
     return table(POINTS)
 
 
-def test_given_linear_part_force_controlled(open_loop: tuple[ComplexArray, FloatArray]) -> None:
+def test_given_linear_part_force_controlled(open_loop):
     f, u = np.array(POINTS).T
     data = FrequencyResponse(
         f, open_loop[0], drive=u, controlled="force", quantity="receptance", level=u
@@ -81,9 +74,7 @@ def test_given_linear_part_force_controlled(open_loop: tuple[ComplexArray, Float
         assert sigma == pytest.approx(SIGMA, rel=0.03)
 
 
-def test_given_linear_part_displacement_controlled(
-    open_loop: tuple[ComplexArray, FloatArray],
-) -> None:
+def test_given_linear_part_displacement_controlled(open_loop):
     f, u = np.array(POINTS).T
     data = FrequencyResponse(f, 1.0 / open_loop[0], amplitude=open_loop[1], level=u)
     result = fit(data, Dahl() + LinearSystem(LINEAR_PART, quantity="receptance"))
@@ -91,10 +82,8 @@ def test_given_linear_part_displacement_controlled(
     assert result.params["sigma"].value == pytest.approx(SIGMA, rel=0.03)
 
 
-def test_free_linear_part_is_found_with_the_friction(
-    open_loop: tuple[ComplexArray, FloatArray],
-) -> None:
-    def mode(mass: float, damping: float) -> Any:
+def test_free_linear_part_is_found_with_the_friction(open_loop):
+    def mode(mass, damping):
         return 1 / (mass * s**2 + damping * s + STIFFNESS)
 
     f, u = np.array(POINTS).T
@@ -108,7 +97,7 @@ def test_free_linear_part_is_found_with_the_friction(
     assert found == pytest.approx(truth, rel=0.05)
 
 
-def test_plant_measured_under_feedback_with_a_known_controller() -> None:
+def test_plant_measured_under_feedback_with_a_known_controller():
     stiff, damp = 12.0, 0.6
     controller = stiff + damp * s
     points = [(f, r) for r in (0.004, 0.012, 0.04, 0.12) for f in (1.0, 1.8, 2.6)]
@@ -129,7 +118,7 @@ def test_plant_measured_under_feedback_with_a_known_controller() -> None:
     assert amplitude.min() < 0.02 < amplitude.max()
 
 
-def test_covariance_turns_with_the_controller() -> None:
+def test_covariance_turns_with_the_controller():
     rng = np.random.default_rng(2)
     controller = control.tf([3.0, 50.0], [0.01, 1.0])
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-6
@@ -142,7 +131,7 @@ def test_covariance_turns_with_the_controller() -> None:
     assert data.response[0] == pytest.approx(0.5 / C)
 
 
-def test_bad_closed_loop_data_are_named() -> None:
+def test_bad_closed_loop_data_are_named():
     with pytest.raises(ValidationError, match=r"reference is 0\.0; expected numbers > 0"):
         closed_loop_response([1.0], 0.0, [1.0], LINEAR_PART)
     notch = (s**2 + 4.0) / (s + 1) ** 2

@@ -1,7 +1,5 @@
 """Fig. 7, equivalent plants and margins against python-control and the closed forms."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control
@@ -18,7 +16,7 @@ from dahl_ident.control_interop import (
     loop_margins,
 )
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.units import QUANTITIES, Quantity
+from dahl_ident.units import QUANTITIES
 
 FIG_7 = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
 F = np.geomspace(0.01, 10.0, 300)
@@ -27,12 +25,12 @@ s = control.tf("s")
 
 
 @pytest.fixture(autouse=True)
-def _close_figures() -> Any:
+def _close_figures():
     yield
     plt.close("all")
 
 
-def test_fig_7_in_one_call() -> None:
+def test_fig_7_in_one_call():
     fig_7 = level_responses(FIG_7, F, U0, steady="describing function")
     truth = response(FIG_7, F, U0[:, None], steady="describing function").receptance
     np.testing.assert_allclose(fig_7.response, truth, rtol=1e-13)
@@ -45,7 +43,7 @@ def test_fig_7_in_one_call() -> None:
     assert static == pytest.approx([1.0 / 30.3, 1.0 / 0.3], rel=0.02)
 
 
-def test_one_drive_that_slides_is_the_linear_plant_of_python_control() -> None:
+def test_one_drive_that_slides_is_the_linear_plant_of_python_control():
     """Far below and far above friction the FRD is that of a plain transfer function."""
     low, high = level_responses(FIG_7, F, [1e-9, 1e7]).to_control().values()
     for frd, stiffness in ((low, 30.3), (high, 0.3)):
@@ -55,7 +53,7 @@ def test_one_drive_that_slides_is_the_linear_plant_of_python_control() -> None:
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_held_amplitude_gives_the_describing_function(quantity: Quantity) -> None:
+def test_held_amplitude_gives_the_describing_function(quantity):
     A = np.array([1e-4, 1e-2])
     w = 2.0 * np.pi * F
     Z = 0.3 - 0.3 * w**2 + 0.24j * w + Dahl(0.1, 30.0).describing_function(A)[:, None]
@@ -67,7 +65,7 @@ def test_held_amplitude_gives_the_describing_function(quantity: Quantity) -> Non
     np.testing.assert_allclose(ours.response, expected, rtol=1e-12)
 
 
-def test_points_without_an_amplitude_are_left_out() -> None:
+def test_points_without_an_amplitude_are_left_out():
     undamped = Dahl(1.0, 1.0) + Mass(1.0) + Spring(1.0)
     f = np.array([0.5, 1.0, 2.0]) / (2.0 * np.pi)
     result = level_responses(undamped, f, [3.0])
@@ -75,7 +73,7 @@ def test_points_without_an_amplitude_are_left_out() -> None:
     assert result.to_control()[3.0].omega.tolist() == pytest.approx([0.5, 2.0])
 
 
-def test_pictures_of_levels() -> None:
+def test_pictures_of_levels():
     data = level_responses(FIG_7, F, U0, steady="describing function")
     _, pair = plt.subplots(2, 1)
     top, bottom = data.plot(ax=pair)
@@ -106,14 +104,14 @@ def test_pictures_of_levels() -> None:
         ((1.0, 1.0), {"quantity": "gain"}, "quantity is 'gain'; expected one of receptance"),
     ],
 )
-def test_bad_levels_are_named(arguments: Any, options: Any, text: str) -> None:
+def test_bad_levels_are_named(arguments, options, text):
     with pytest.raises(ValidationError, match=text):
         level_responses(FIG_7, *arguments, **options)
 
 
 @pytest.mark.parametrize("amplitude", [1e-5, 3e-3, 0.5])
 @pytest.mark.parametrize("frequency", [0.1, 2.0])
-def test_equivalent_plant_is_exact_where_it_should_be(amplitude: float, frequency: float) -> None:
+def test_equivalent_plant_is_exact_where_it_should_be(amplitude, frequency):
     ours = equivalent_plant(FIG_7, amplitude, frequency)
     omega = 2.0 * np.pi * frequency
     assert complex(ours(1j * omega)) == pytest.approx(
@@ -131,7 +129,7 @@ def test_equivalent_plant_is_exact_where_it_should_be(amplitude: float, frequenc
     assert den == pytest.approx(expected, rel=1e-12)
 
 
-def test_equivalent_plant_around_python_control_systems() -> None:
+def test_equivalent_plant_around_python_control_systems():
     two_modes = 1 / (s**2 + 0.2 * s + 1) + 0.5 / (s**2 + 0.02 * s + 100)
     friction = Dahl(0.1, 30.0)
     for linear, power in (
@@ -146,7 +144,7 @@ def test_equivalent_plant_around_python_control_systems() -> None:
         total = Z - 0.1 * w**2 + friction.describing_function(1e-3)
         assert complex(ours(1j * w)) == pytest.approx(1.0 / complex(total), rel=1e-9)
 
-    def mode(mass: float, stiffness: float) -> Any:
+    def mode(mass, stiffness):
         return control.tf([1.0], [mass, 0.0, stiffness])
 
     named = LinearSystem(
@@ -166,7 +164,7 @@ LAGGING_PID = 100 + 150 / s + 20 * s / (0.02 * s + 1) ** 2
 FINE = np.geomspace(0.02, 200.0, 6000)
 
 
-def test_margins_are_those_of_python_control() -> None:
+def test_margins_are_those_of_python_control():
     A = np.geomspace(1e-5, 1.0, 5)
     ours = loop_margins(SERVO, LAGGING_PID, A, frequency_hz=FINE)
     omega = 2.0 * np.pi * FINE
@@ -182,7 +180,7 @@ def test_margins_are_those_of_python_control() -> None:
         assert ours.modulus_margin[i] == pytest.approx(np.min(moduli), rel=1e-4)
 
 
-def test_margins_at_the_equivalent_plants_crossover() -> None:
+def test_margins_at_the_equivalent_plants_crossover():
     """The TransferFunction has the same phase margin if its damper is exact at the crossover."""
     A = 0.1
     ours = loop_margins(SERVO, LAGGING_PID, [A], frequency_hz=FINE)
@@ -194,7 +192,7 @@ def test_margins_at_the_equivalent_plants_crossover() -> None:
     assert ours.phase_margin_deg[0] == pytest.approx(phase, abs=1e-2)
 
 
-def test_margins_vanish_on_a_limit_cycle() -> None:
+def test_margins_vanish_on_a_limit_cycle():
     friction, pid = Dahl(1.0, 1e4), 100 + 300 / s + 20 * s / (0.02 * s + 1) ** 2
     (cycle,) = limit_cycles(control.feedback(1 / s**2, pid), friction)
     margins = loop_margins(friction + Mass(1.0), pid, cycle.amplitude, frequency_hz=FINE)
@@ -202,7 +200,7 @@ def test_margins_vanish_on_a_limit_cycle() -> None:
     assert margins.phase_margin_deg[0] == pytest.approx(0.0, abs=0.05)
 
 
-def test_a_loop_without_crossings_has_infinite_margins() -> None:
+def test_a_loop_without_crossings_has_infinite_margins():
     margins = loop_margins(Dahl(1.0, 1.0) + Spring(9.0), control.tf([0.1], [1.0]), 1.0,
                            frequency_hz=FINE)  # fmt: skip
     assert margins.gain_margin.tolist() == [np.inf]
@@ -210,7 +208,7 @@ def test_a_loop_without_crossings_has_infinite_margins() -> None:
     assert margins.modulus_margin[0] > 1.0
 
 
-def test_draws_give_a_band_that_moves_with_the_posterior() -> None:
+def test_draws_give_a_band_that_moves_with_the_posterior():
     rng = np.random.default_rng(5)
     free = Dahl() + Mass(1.0) + Damper(0.5)
     A, f = np.geomspace(1e-5, 1.0, 5), np.geomspace(0.1, 100.0, 800)
@@ -249,11 +247,11 @@ def test_draws_give_a_band_that_moves_with_the_posterior() -> None:
         ({}, ValidationError, "draws is empty"),
     ],
 )
-def test_bad_draws_are_named(draws: Any, error: type[Exception], text: str) -> None:
+def test_bad_draws_are_named(draws, error, text):
     with pytest.raises(error, match=text):
         loop_margins(Dahl() + Mass(1.0), LAGGING_PID, 1.0, frequency_hz=FINE, draws=draws)
 
 
-def test_frequencies_must_rise() -> None:
+def test_frequencies_must_rise():
     with pytest.raises(ValidationError, match="one dimension each, frequencies rising"):
         loop_margins(SERVO, LAGGING_PID, 1.0, frequency_hz=[2.0, 1.0])

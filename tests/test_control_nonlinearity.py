@@ -1,7 +1,5 @@
 """FrictionNonlinearity inside python-control: signs, memory, intersections."""
 
-from __future__ import annotations
-
 import control
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 
 from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
 from dahl_ident.control_interop import FrictionNonlinearity
-from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.synthetic import SteppedSine
 from dahl_ident.synthetic.mechanism import Mechanism
@@ -20,14 +17,14 @@ TWO = Dahl(0.1, 30.0, name="a") + Dahl(0.03, 90.0, 1.5, name="b")
 
 
 @pytest.mark.parametrize("friction", [Dahl(0.1, 30.0), Dahl(2.0, 5.0, 0.5), TWO])
-def test_python_control_gets_the_exact_describing_function(friction: Element) -> None:
+def test_python_control_gets_the_exact_describing_function(friction):
     A = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 15)])
     theirs = control.describing_function(FrictionNonlinearity(friction), A)
     np.testing.assert_allclose(theirs, friction.dynamic_stiffness(A), rtol=1e-13)
 
 
 @pytest.mark.parametrize("friction", [Dahl(0.1, 30.0), Dahl(0.1, 30.0, 2.0), TWO])
-def test_python_controls_own_quadrature_has_the_same_sign_and_value(friction: Element) -> None:
+def test_python_controls_own_quadrature_has_the_same_sign_and_value(friction):
     A = 0.03  # beta = 9: the memory of the first cycle is gone after one more
     numerical = control.describing_function(
         FrictionNonlinearity(friction), [A], num_points=2000, try_method=False
@@ -36,7 +33,7 @@ def test_python_controls_own_quadrature_has_the_same_sign_and_value(friction: El
     assert numerical[0].imag > 0.0
 
 
-def test_friction_leads_where_a_relay_lags() -> None:
+def test_friction_leads_where_a_relay_lags():
     relay = control.relay_hysteresis_nonlinearity(0.1, 0.001)
     for nonlinearity, sign in ((relay, -1.0), (FrictionNonlinearity(Dahl(0.1, 30.0)), 1.0)):
         exact, numerical = (
@@ -48,7 +45,7 @@ def test_friction_leads_where_a_relay_lags() -> None:
 
 
 @pytest.mark.parametrize("friction", [Dahl(0.1, 30.0), Dahl(0.1, 30.0, 0.5), TWO])
-def test_call_by_call_gives_the_force_of_the_whole_history(friction: Element) -> None:
+def test_call_by_call_gives_the_force_of_the_whole_history(friction):
     x = np.cumsum(np.random.default_rng(1).normal(0.0, 2e-3, 200))
     nonlinearity = FrictionNonlinearity(friction)
     one_by_one = [nonlinearity(v) for v in x]
@@ -60,7 +57,7 @@ def test_call_by_call_gives_the_force_of_the_whole_history(friction: Element) ->
     assert control.describing_function(nonlinearity, [1e-3]).shape == (1,)
 
 
-def test_describing_function_response_and_its_plot_find_the_cycles() -> None:
+def test_describing_function_response_and_its_plot_find_the_cycles():
     s = control.tf("s")
     H = 1 / (0.3 * s**2 - 0.3 * s + 0.3)
     friction = Dahl(0.1, 30.0)
@@ -79,7 +76,7 @@ def test_describing_function_response_and_its_plot_find_the_cycles() -> None:
     plt.close("all")
 
 
-def test_a_sine_through_the_time_domain_has_python_controls_phase() -> None:
+def test_a_sine_through_the_time_domain_has_python_controls_phase():
     """F(A sin wt) = A |N| sin(wt + arg N): the fundamental of a simulated force."""
     friction, A = Dahl(0.1, 30.0), 0.004
     motion = SteppedSine((A,), (1.0,), controlled="displacement", settling_periods=4, num_periods=2)
@@ -94,12 +91,12 @@ def test_a_sine_through_the_time_domain_has_python_controls_phase() -> None:
 
 
 @pytest.mark.parametrize("amplitude", [-1.0, np.nan, np.inf])
-def test_bad_amplitudes_are_refused(amplitude: float) -> None:
+def test_bad_amplitudes_are_refused(amplitude):
     with pytest.raises(ValidationError, match=r"A is .*; expected"):
         FrictionNonlinearity(Dahl(1.0, 1.0)).describing_function(amplitude)
 
 
-def test_what_is_no_friction_is_refused() -> None:
+def test_what_is_no_friction_is_refused():
     with pytest.raises(
         ModelError, match=r"friction holds Mass\(mass=0\.3\); expected friction alone"
     ):

@@ -1,7 +1,5 @@
 """The public Dahl element: derived quantities, derivatives, limits, and what it refuses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +15,7 @@ DECADES = np.geomspace(1e-12, 1e12, 49)
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_derived_quantities_agree_with_each_other(alpha: float) -> None:
+def test_derived_quantities_agree_with_each_other(alpha):
     friction = Dahl(0.5, 30.0, alpha)
     A = np.geomspace(1e-4, 10.0, 31)
     N = friction.describing_function(A)
@@ -38,7 +36,7 @@ def test_derived_quantities_agree_with_each_other(alpha: float) -> None:
 
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("beta", [0.05, 1.0, 30.0])
-def test_dissipated_energy_is_the_area_of_the_loop(alpha: float, beta: float) -> None:
+def test_dissipated_energy_is_the_area_of_the_loop(alpha, beta):
     friction = Dahl(0.5, 30.0, alpha)
     A = beta * friction.characteristic_displacement
     x, force = friction.loop(A, points=40001)
@@ -50,7 +48,7 @@ def test_dissipated_energy_is_the_area_of_the_loop(alpha: float, beta: float) ->
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_at_rest_friction_is_a_spring(alpha: float) -> None:
+def test_at_rest_friction_is_a_spring(alpha):
     friction = Dahl(0.5, 30.0, alpha)
     assert friction.describing_function(0.0) == 30.0
     assert friction.equivalent_damping(0.0, 1.0) == 0.0
@@ -60,7 +58,7 @@ def test_at_rest_friction_is_a_spring(alpha: float) -> None:
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_gradient_at_rest_is_the_limit(alpha: float) -> None:
+def test_gradient_at_rest_is_the_limit(alpha):
     friction = Dahl(0.5, 30.0, alpha)
     at_rest, near = friction.gradient(0.0), friction.gradient(1e-9)
     assert at_rest["sigma"] == 1.0
@@ -74,7 +72,7 @@ def test_gradient_at_rest_is_the_limit(alpha: float) -> None:
 @pytest.mark.parametrize("alpha", [1.0, 2.0])
 @pytest.mark.parametrize("f_max", [1e-30, 1.0, 1e30])
 @pytest.mark.parametrize("sigma", [1e-30, 1.0, 1e30])
-def test_extreme_units_give_the_same_curve(alpha: float, f_max: float, sigma: float) -> None:
+def test_extreme_units_give_the_same_curve(alpha, f_max, sigma):
     """Any warning fails the test, as everywhere here."""
     friction, unit = Dahl(f_max, sigma, alpha), Dahl(1.0, 1.0, alpha)
     x_c = friction.characteristic_displacement
@@ -113,9 +111,7 @@ every_call = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
 
 @every_call
 @pytest.mark.parametrize("alpha", [1.0, 2.0])
-def test_scalars_stay_scalars_and_shapes_stay(
-    call: Callable[[Dahl, Any], Any], alpha: float
-) -> None:
+def test_scalars_stay_scalars_and_shapes_stay(call, alpha):
     friction = Dahl(0.5, 30.0, alpha)
     one = call(friction, 0.01)
     assert isinstance(one, float | complex)
@@ -127,7 +123,7 @@ def test_scalars_stay_scalars_and_shapes_stay(
     assert call(friction, []).shape == (0,)
 
 
-def test_arguments_are_not_changed() -> None:
+def test_arguments_are_not_changed():
     A = np.array([0.01, 0.02])
     kept = A.copy()
     for call in CALLS.values():
@@ -139,9 +135,7 @@ def test_arguments_are_not_changed() -> None:
 @pytest.mark.parametrize("alpha", [1.0, 1e-9, 0.5, 2.0, 1e2])
 @pytest.mark.parametrize("f_max", [1e-90, 1.0, 1e90])
 @pytest.mark.parametrize("sigma", [1e-90, 1.0, 1e90])
-def test_every_call_is_finite_to_the_edges_of_what_is_accepted(
-    f_max: float, sigma: float, alpha: float
-) -> None:
+def test_every_call_is_finite_to_the_edges_of_what_is_accepted(f_max, sigma, alpha):
     friction = Dahl(f_max, sigma, alpha)
     A = np.array([0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1.0, 1e30, 1e90])
     N = friction.describing_function(A)
@@ -175,9 +169,7 @@ def test_every_call_is_finite_to_the_edges_of_what_is_accepted(
         ([[1.0], [1.0, 2.0]], r"^amplitude: expected an array of real numbers"),
     ],
 )
-def test_bad_amplitudes_are_named(
-    call: Callable[[Dahl, Any], Any], amplitude: Any, text: str
-) -> None:
+def test_bad_amplitudes_are_named(call, amplitude, text):
     with pytest.raises(ValidationError, match=text):
         call(Dahl(0.5, 30.0), amplitude)
 
@@ -197,7 +189,7 @@ def test_bad_amplitudes_are_named(
         (1e-200, r" is 1e-200; expected numbers of at least 1e-90; check the unit"),
     ],
 )
-def test_bad_parameters_are_named(parameter: str, value: Any, text: str) -> None:
+def test_bad_parameters_are_named(parameter, value, text):
     given_values: dict[str, Any] = {"f_max": 1.0, "sigma": 1.0, parameter: value}
     with pytest.raises(ValidationError, match=f"^pivot_{parameter}{text}"):
         Dahl(**given_values, name="pivot")
@@ -211,12 +203,12 @@ def test_bad_parameters_are_named(parameter: str, value: Any, text: str) -> None
         ([[0.0, 1.0]], r"^displacement has shape \(1, 2\); expected one history, shape \(n,\)"),
     ],
 )
-def test_bad_histories_are_named(displacement: Any, text: str) -> None:
+def test_bad_histories_are_named(displacement, text):
     with pytest.raises(ValidationError, match=text):
         Dahl(1.0, 1.0).force(displacement)
 
 
-def test_other_bad_arguments_are_named() -> None:
+def test_other_bad_arguments_are_named():
     friction = Dahl(1.0, 1.0)
     with pytest.raises(ValidationError, match=r"initial_force is 1\.5; .* -1 and 1"):
         friction.force([0.0, 1.0], initial_force=1.5)

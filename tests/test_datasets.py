@@ -1,7 +1,5 @@
 """The shipped data sets: values, checksums, sizes, and what each can determine."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess
@@ -12,8 +10,6 @@ import numpy as np
 import pytest
 
 from dahl_ident import FrequencyResponse, response
-from dahl_ident.arrays import ComplexArray
-from dahl_ident.elements import Model
 from dahl_ident.errors import DataError
 from dahl_ident.synthetic import Experiment, load_dataset, shipped
 from dahl_ident.synthetic.regenerate import main, make, readme
@@ -29,14 +25,14 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def loaded_table(name: str) -> FrequencyResponse:
+def loaded_table(name):
     data = load_dataset(name)
     assert isinstance(data, FrequencyResponse)
     return data
 
 
 @pytest.mark.parametrize("name", DATA_SETS)
-def test_experiment_and_seed_give_the_shipped_values(name: str) -> None:
+def test_experiment_and_seed_give_the_shipped_values(name):
     data, made = load_dataset(name), make(DATA_SETS[name])
     assert type(data) is type(made)
     for column in COLUMNS:
@@ -49,7 +45,7 @@ def test_experiment_and_seed_give_the_shipped_values(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DATA_SETS)
-def test_files_are_the_ones_described(name: str) -> None:
+def test_files_are_the_ones_described(name):
     sidecar = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
     content = (FOLDER / sidecar["file"]).read_bytes()
     assert hashlib.sha256(content).hexdigest() == sidecar["sha256"]
@@ -62,23 +58,23 @@ def test_files_are_the_ones_described(name: str) -> None:
     assert sidecar["caution"] == one.caution
 
 
-def test_nothing_else_lies_there_and_all_is_small() -> None:
+def test_nothing_else_lies_there_and_all_is_small():
     files = {file.name for file in FOLDER.iterdir()}
     expected = {one.file for one in DATA_SETS.values()} | {f"{name}.json" for name in DATA_SETS}
     assert files == expected | {"README.md"}
     assert sum(file.stat().st_size for file in FOLDER.iterdir()) < 5e6
 
 
-def test_the_readme_is_the_catalogues() -> None:
+def test_the_readme_is_the_catalogues():
     assert (FOLDER / "README.md").read_text(encoding="utf-8") == readme()
 
 
-def test_names_in_the_documentation_are_all_names() -> None:
+def test_names_in_the_documentation_are_all_names():
     documented = load_dataset.__doc__ or ""
     assert all(f'"{name}"' in documented for name in DATA_SETS)
 
 
-def test_regenerating_writes_the_same_files(tmp_path: Path) -> None:
+def test_regenerating_writes_the_same_files(tmp_path):
     assert main(["noisy", "unsettled", "--directory", str(tmp_path)]) == 0
     written = sorted(file.name for file in tmp_path.iterdir())
     assert written == [
@@ -89,7 +85,7 @@ def test_regenerating_writes_the_same_files(tmp_path: Path) -> None:
     assert [(tmp_path / name).read_bytes() for name in written] == again
 
 
-def test_the_command_refuses_an_unknown_name(tmp_path: Path) -> None:
+def test_the_command_refuses_an_unknown_name(tmp_path):
     command = [sys.executable, "-m", "dahl_ident.synthetic.regenerate", "nosiy"]
     run = subprocess.run(
         [*command, "--directory", str(tmp_path)], capture_output=True, text=True, check=False
@@ -99,14 +95,12 @@ def test_the_command_refuses_an_unknown_name(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unknown_name_lists_those_there_are() -> None:
+def test_an_unknown_name_lists_those_there_are():
     with pytest.raises(DataError, match=r"no data set 'nosiy'; there are alpha_2, clean, delayed"):
         load_dataset("nosiy")
 
 
-def test_a_changed_or_missing_file_is_not_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_changed_or_missing_file_is_not_loaded(tmp_path, monkeypatch):
     for name in ("noisy.json", "noisy.csv"):
         (tmp_path / name).write_bytes((FOLDER / name).read_bytes())
     monkeypatch.setattr(shipped, "_PLACES", (tmp_path / "nowhere", tmp_path, FOLDER))
@@ -120,9 +114,7 @@ def test_a_changed_or_missing_file_is_not_loaded(
         load_dataset("noisy")
 
 
-def test_sets_that_are_nowhere_are_missed_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sets_that_are_nowhere_are_missed_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "_PLACES", (tmp_path / "a", tmp_path / "b"))
     with pytest.raises(DataError, match="the synthetic data sets are in none of"):
         load_dataset("noisy")
@@ -131,7 +123,7 @@ def test_sets_that_are_nowhere_are_missed_by_name(
 # --- what a set can determine: Fisher information of its own covariance, at the truth
 
 
-def predicted(data: FrequencyResponse, plant: Model, sensors: dict[str, float]) -> ComplexArray:
+def predicted(data, plant, sensors):
     """Return the fundamental that the sensors would show."""
     gain, delay = sensors.get("force_gain", 1.0), sensors.get("delay", 0.0)
     if data.quantity == "receptance":

@@ -1,7 +1,5 @@
 """Models as plain data and back."""
 
-from __future__ import annotations
-
 import json
 
 import control
@@ -24,18 +22,18 @@ from dahl_ident.errors import ModelError
 OMEGA = np.array([1.0, 20.0, 300.0])
 
 
-def round_trip(model: Model) -> Model:
+def round_trip(model):
     return model_from_description(json.loads(json.dumps(describe_model(model))))
 
 
-def test_every_parameter_survives() -> None:
+def test_every_parameter_survives():
     model = Dahl(0.1, alpha=None, name="pivot") + Mass(0.3) + Damper() + Spring(2.0)
     model = model.with_free(["stiffness"])
     assert round_trip(model).parameters == model.parameters
     assert repr(round_trip(model)) == repr(model)
 
 
-def test_bounds_survive() -> None:
+def test_bounds_survive():
     bounded = Parameter("sigma", "N/m", "contact stiffness", 3.0, True, 1.0, 9.0, "log")
     model = Model(Dahl()).with_parameters({"sigma": bounded})
     assert round_trip(model).parameters == model.parameters
@@ -51,13 +49,13 @@ def test_bounds_survive() -> None:
     ],
     ids=["transfer function", "state space", "discrete", "FRD"],
 )
-def test_linear_systems_survive(system: object) -> None:
+def test_linear_systems_survive(system):
     model = Model(LinearSystem(system, quantity="receptance", name="plate"))
     Z = model.dynamic_stiffness(1.0, OMEGA)
     np.testing.assert_allclose(round_trip(model).dynamic_stiffness(1.0, OMEGA), Z, rtol=1e-13)
 
 
-def test_a_function_is_refused() -> None:
+def test_a_function_is_refused():
     system = LinearSystem(
         lambda k: control.tf([1.0], [k]), quantity="receptance", parameters={"k": None}
     )
@@ -76,6 +74,6 @@ def test_a_function_is_refused() -> None:
         ({"kind": "linear_system", "quantity": "receptance"}, "the linear_system element has no A"),
     ],
 )
-def test_bad_descriptions_name_what_is_wrong(entry: dict[str, object], message: str) -> None:
+def test_bad_descriptions_name_what_is_wrong(entry, message):
     with pytest.raises(ModelError, match=message):
         model_from_description([entry])

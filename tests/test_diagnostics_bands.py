@@ -1,7 +1,5 @@
 """Bands of predictions and derived quantities, against simulation, differences and closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,6 @@ from dahl_ident import (
     load_dataset,
 )
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.results import FitResult
 from dahl_ident.steady_state import Steady
 from tests.friction_tables import F_MAX, X_C, amplitudes, plant_table, table
 from tests.test_extraction_measured import crank, needs_data
@@ -30,7 +27,7 @@ GRID = np.geomspace(0.05, 20.0, 15) * X_C
 
 
 @pytest.fixture(scope="module")
-def result() -> FitResult:
+def result():
     """Data of a given exponent whose residuals ask for nothing but noise of one size."""
     for seed in range(1, 20):
         found = fit(table(seed=seed), Dahl(alpha=1.0))
@@ -40,7 +37,7 @@ def result() -> FitResult:
 
 
 class TestBands:
-    def test_are_those_of_parameters_drawn_from_the_covariance(self, result: FitResult) -> None:
+    def test_are_those_of_parameters_drawn_from_the_covariance(self, result):
         """The first-order band is the spread of the prediction, each part for itself."""
         rng = np.random.default_rng(0)
         optimum = result.optimum
@@ -58,7 +55,7 @@ class TestBands:
         np.testing.assert_allclose(band.log_gain_std, np.log(np.abs(N)).std(axis=0), rtol=0.05)
         np.testing.assert_allclose(band.phase_std, np.angle(N).std(axis=0), rtol=0.05)
 
-    def test_limits_take_the_threshold_of_t(self, result: FitResult) -> None:
+    def test_limits_take_the_threshold_of_t(self, result):
         band = result.predict(1.0, amplitude=GRID, noise=False)
         t = special.stdtrit(result.nfree, 0.975)
         low, high = band.real(0.95)
@@ -70,7 +67,7 @@ class TestBands:
         low, high = band.phase(0.95)
         np.testing.assert_allclose(high - low, 2.0 * t * band.phase_std)
 
-    def test_cover_the_true_curve(self) -> None:
+    def test_cover_the_true_curve(self):
         truth = Dahl(0.1, 30.0).describing_function(GRID)
         inside = []
         for seed in range(60):
@@ -81,7 +78,7 @@ class TestBands:
         assert cover.min() > 0.87 - 2.0 * np.sqrt(0.87 * 0.13 / 60)
         assert 0.89 < cover.mean() < 0.99
 
-    def test_plant_at_drives(self) -> None:
+    def test_plant_at_drives(self):
         model = Dahl(alpha=1.0) + Mass() + Damper() + Spring()
         result = fit(plant_table(), model, method="ipopt", constraints=lambda p: [p["mass"] >= 0.1])
         assert result.errors is None  # noise alone
@@ -99,13 +96,13 @@ class TestBands:
         expected = np.sqrt(np.einsum("in,ij,jn->n", d.imag, result.optimum.covariance, d.imag))
         np.testing.assert_allclose(band.phase_std, expected, rtol=1e-5)
 
-    def test_another_quantity(self, result: FitResult) -> None:
+    def test_another_quantity(self, result):
         stiffness = result.predict(1.0, amplitude=GRID)
         receptance = result.predict(1.0, amplitude=GRID, quantity="receptance")
         np.testing.assert_allclose(receptance.response, 1.0 / stiffness.response, rtol=1e-12)
         np.testing.assert_allclose(receptance.log_gain_std, stiffness.log_gain_std, rtol=1e-9)
 
-    def test_friction_of_a_plant(self) -> None:
+    def test_friction_of_a_plant(self):
         sine: Steady = "describing function"
         model = Dahl() + Mass() + Damper() + Spring()
         result = fit(plant_table(steady=sine), model, steady=sine)
@@ -115,16 +112,14 @@ class TestBands:
         noise = np.sqrt(result.optimum.covariance[0, 0])
         assert 0.9 * noise < band.log_gain_std[-1] < 4.0 * noise  # a model error counts
 
-    def test_what_is_determined_has_a_band_where_parameters_have_none(
-        self, result: FitResult
-    ) -> None:
+    def test_what_is_determined_has_a_band_where_parameters_have_none(self, result):
         known = result.predict(1.0, amplitude=GRID)
         lost = fit(result.data, Dahl(), sensors=Sensors(force_gain=None), throw=False)
         band = lost.predict(1.0, amplitude=GRID)
         np.testing.assert_allclose(band.log_gain_std, known.log_gain_std, rtol=0.05)
         assert np.isinf(lost.describing_function(GRID).log_gain_std).all()
 
-    def test_refusals(self, result: FitResult) -> None:
+    def test_refusals(self, result):
         with pytest.raises(ValidationError, match="give either amplitude"):
             result.predict(1.0)
         with pytest.raises(ValidationError, match="give either amplitude"):
@@ -140,7 +135,7 @@ class TestMeasured:
     """Each test of a damper is predicted by a fit to the others."""
 
     @needs_data
-    def test_bands_hold_what_was_left_out(self) -> None:
+    def test_bands_hold_what_was_left_out(self):
         data = FrequencyResponse.concatenate(
             [extract(crank(f".A.{i}"), harmonics=[1]) for i in range(1, 11)]
         )
@@ -165,7 +160,7 @@ class TestMeasured:
 
 
 class TestHarmonics:
-    def test_what_is_missed_of_them_moves_the_estimate_by_no_more_than_it_states(self) -> None:
+    def test_what_is_missed_of_them_moves_the_estimate_by_no_more_than_it_states(self):
         """A driven plant read as one whose displacement was controlled: its harmonics are wrong."""
         record = load_dataset("plant_recording")
         assert isinstance(record, Record)
@@ -179,7 +174,7 @@ class TestHarmonics:
             assert value == pytest.approx(alone.params[name].value, abs=1.7 * error)
             assert error < 0.1 * truth
 
-    def test_a_gross_error_of_one_leaves_the_bands_of_the_fundamental_alone(self) -> None:
+    def test_a_gross_error_of_one_leaves_the_bands_of_the_fundamental_alone(self):
         rng = np.random.default_rng(3)
         A = np.geomspace(3e-4, 3e-2, 12)
         own = [np.asarray(v) for v in (0.1, 30.0, 1.0)]
@@ -203,7 +198,7 @@ class TestHarmonics:
 
 
 class TestDerived:
-    def test_x_c_by_its_formula(self, result: FitResult) -> None:
+    def test_x_c_by_its_formula(self, result):
         (x_c,) = result.derived()
         f, s = result.params["f_max"].value, result.params["sigma"].value
         C = result.covar
@@ -212,7 +207,7 @@ class TestDerived:
         assert x_c.value == pytest.approx(f / s)
         assert x_c.stderr == pytest.approx(expected, rel=1e-9)
 
-    def test_energy_stiffness_and_damping_in_closed_form(self, result: FitResult) -> None:
+    def test_energy_stiffness_and_damping_in_closed_form(self, result):
         A, omega = 5e-3, 2.0 * np.pi * 3.0
         f, s = result.params["f_max"].value, result.params["sigma"].value
         found = {q.name: q for q in result.derived([A], frequency_hz=3.0)}
@@ -232,17 +227,17 @@ class TestDerived:
         assert found["energy lost in a cycle"].stderr == pytest.approx(expected, rel=1e-5)
 
     @staticmethod
-    def energy(f_max: float, sigma: float, A: float) -> float:
+    def energy(f_max, sigma, A):
         beta = sigma * A / f_max
         return 4.0 * f_max * A * (1.0 - float(np.tanh(beta)) / beta)
 
-    def test_names_of_elements_and_units_of_rotation(self) -> None:
+    def test_names_of_elements_and_units_of_rotation(self):
         data = table(model=Dahl(F_MAX, 30.0) + Dahl(F_MAX, 3.0, name="other"))
         found = fit(data, Dahl(name="early") + Dahl(name="late")).derived([1e-3])
         assert [q.name for q in found[:2]] == ["early_x_c", "late_x_c"]
         assert str(found[2]).startswith("energy lost in a cycle at amplitude 0.001 = ")
 
-    def test_no_x_c_where_it_is_infinite(self) -> None:
+    def test_no_x_c_where_it_is_infinite(self):
         results = (fit(table(beta=(1e-4, 1e-3), seed=s), Dahl(), throw=False) for s in range(10))
         (first, *_) = (r for r in results if not r.success)
         assert first.derived() == ()

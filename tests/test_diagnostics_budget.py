@@ -1,7 +1,5 @@
 """Where the uncertainty of a parameter comes from: variances, budget, coverage factor."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -10,20 +8,20 @@ import pytest
 from scipy import optimize, stats
 
 from dahl_ident import BoucWen, Dahl, Damper, FrequencyResponse, Sensors, Spring, fit, load_dataset
-from dahl_ident.diagnostics import ErrorModel, budget, error_model
+from dahl_ident.diagnostics import budget, error_model
 from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
-def modelled(data: FrequencyResponse, model: Dahl | None = None) -> ErrorModel:
+def modelled(data, model=None):
     found = error_model(fit(data, Dahl() if model is None else model).optimum)
     assert found is not None
     return found
 
 
-def three_days(scatter: float, seed: int) -> FrequencyResponse:
+def three_days(scatter, seed):
     """Return twelve levels on each of three days whose gain differs."""
     rng = np.random.default_rng(seed)
     A = np.tile(np.geomspace(0.1, 10.0, 12) * X_C, 3)
@@ -32,7 +30,7 @@ def three_days(scatter: float, seed: int) -> FrequencyResponse:
     return FrequencyResponse(np.ones(36), N, A, run=np.repeat(["mon", "tue", "wed"], 12))
 
 
-def gross_errors(data: FrequencyResponse, seed: int, stated: bool) -> FrequencyResponse:
+def gross_errors(data, seed, stated):
     """Return a table with a tenth of its rows off by ten times the noise or more."""
     rng, factors = np.random.default_rng(seed), np.ones(data.n, dtype=np.complex128)
     factors[rng.choice(data.n, data.n // 10, replace=False)] = 1.0 + rng.uniform(0.1, 0.4)
@@ -42,24 +40,24 @@ def gross_errors(data: FrequencyResponse, seed: int, stated: bool) -> FrequencyR
 
 class TestVariances:
     @staticmethod
-    def model(y: np.ndarray, J: np.ndarray, day: np.ndarray) -> MixedModel:
+    def model(y, J, day):
         group = np.zeros(len(y), dtype=np.intp)
         return MixedModel(y, J, [day], group, np.zeros(1), 1, np.array([np.inf]))
 
     @staticmethod
-    def days(rows: int = 30, seed: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def days(rows=30, seed=2):
         rng = np.random.default_rng(seed)
         day = np.repeat(np.eye(rows // 5), 5, axis=0)
         J = np.column_stack([np.ones(rows), np.linspace(-1.0, 1.0, rows)])
         y = 2.0 * day @ rng.standard_normal(rows // 5) + rng.standard_normal(rows)
         return y, J, day
 
-    def test_the_restricted_likelihood_is_highest(self) -> None:
+    def test_the_restricted_likelihood_is_highest(self):
         """Against a general minimiser on the density of contrasts that J cannot change."""
         y, J, day = self.days()
         contrasts = np.linalg.svd(J, full_matrices=True)[0][:, 2:]
 
-        def minus_log_density(log_s: np.ndarray) -> float:
+        def minus_log_density(log_s):
             V = np.exp(log_s[0]) * np.eye(30) + np.exp(log_s[1]) * day @ day.T
             law = stats.multivariate_normal(np.zeros(28), contrasts.T @ V @ contrasts)
             return -float(law.logpdf(contrasts.T @ y))
@@ -68,7 +66,7 @@ class TestVariances:
         found = self.model(y, J, day).reml(np.ones(1))
         np.testing.assert_allclose(found.variances, np.exp(best.x), rtol=0.02)
 
-    def test_the_gradient_and_the_information_are_those_of_the_likelihood(self) -> None:
+    def test_the_gradient_and_the_information_are_those_of_the_likelihood(self):
         """Two groups of noise, one source; expected information from the dense covariance."""
         y, J, day = self.days()
         group, known = np.repeat([0, 1], 15), np.array([0.3, 0.0])
@@ -90,7 +88,7 @@ class TestVariances:
                 assert state.information[k, j] == pytest.approx(known_of, rel=1e-9)
         np.testing.assert_allclose(state.weighted, P @ y, rtol=1e-9)
 
-    def test_variances_many_decades_apart_keep_their_own_errors(self) -> None:
+    def test_variances_many_decades_apart_keep_their_own_errors(self):
         """Two days apart by much more than the noise: one degree of freedom, 2 s^4 its variance."""
         rng = np.random.default_rng(3)
         day = np.repeat(np.eye(2), 20, axis=0)
@@ -99,14 +97,14 @@ class TestVariances:
         assert found.variances[1] == pytest.approx(2.0, rel=0.01)
         assert found.variances_covariance[1, 1] == pytest.approx(2.0 * 2.0**2, rel=0.02)
 
-    def test_a_source_that_is_not_there_has_no_variance(self) -> None:
+    def test_a_source_that_is_not_there_has_no_variance(self):
         y, J, day = self.days()
         found = self.model(y - day @ (day.T @ y) / 5.0, J, day).reml(np.ones(1))
         assert found.variances[1] == 0.0
 
 
 class TestBudget:
-    def test_shares_add_up_and_name_their_type(self) -> None:
+    def test_shares_add_up_and_name_their_type(self):
         for row in (found := budget(fit(table(n=12), Dahl()).optimum)).parameters:
             assert sum(r.share for r in row.rows) == pytest.approx(1.0)
             assert row.u**2 == pytest.approx(sum(r.u**2 for r in row.rows))
@@ -116,11 +114,11 @@ class TestBudget:
         assert kinds["exponent"] == "B"
         assert found.exact[0] == "force calibration"
 
-    def test_an_exponent_that_was_given_is_no_source(self) -> None:
+    def test_an_exponent_that_was_given_is_no_source(self):
         found = budget(fit(table(n=12), Dahl(alpha=1.0)).optimum)
         assert "exponent" not in {r.source for r in found["f_max"].rows}
 
-    def test_an_exponent_that_was_not_given_widens_what_depends_on_it(self) -> None:
+    def test_an_exponent_that_was_not_given_widens_what_depends_on_it(self):
         """In microslip f_max follows from alpha sigma^2/f_max: its logarithm is alpha's.
 
         These data tell a little of the exponent, so that less than its whole range is left.
@@ -130,7 +128,7 @@ class TestBudget:
         exponent = next(r for r in found.rows if r.source == "exponent")
         assert exponent.u / found.value == pytest.approx(np.log(4.0) / np.sqrt(12.0), rel=0.2)
 
-    def test_three_days_take_student_with_two_degrees_of_freedom(self) -> None:
+    def test_three_days_take_student_with_two_degrees_of_freedom(self):
         scatter = []
         for seed in range(8):
             found = budget(fit(three_days(0.05, 100 + seed), Dahl()).optimum)["sigma"]
@@ -139,7 +137,7 @@ class TestBudget:
             assert found.k > 3.0
         assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.4)
 
-    def test_passes_over_the_levels_are_days_where_they_differ(self) -> None:
+    def test_passes_over_the_levels_are_days_where_they_differ(self):
         """Whoever does not state days gets their uncertainty; most repeats stay repeats."""
         passes = "each of 3 passes over the levels a run of its own"
         data = three_days(0.03, 8)
@@ -152,9 +150,7 @@ class TestBudget:
 
     @pytest.mark.parametrize("factors", [(1.0, 1.05), (0.95, 1.0, 1.08)])
     @pytest.mark.parametrize("scatters", ["f_max", "sigma", "gain"])
-    def test_runs_that_differ_by_far_more_than_the_noise(
-        self, scatters: str, factors: tuple[float, ...]
-    ) -> None:
+    def test_runs_that_differ_by_far_more_than_the_noise(self, scatters, factors):
         """What the deviations of runs do to second order is 0.1 %, ten times the noise."""
         rng = np.random.default_rng(5)
         A = np.geomspace(0.5, 40.0, 8) * X_C
@@ -180,7 +176,7 @@ class TestBudget:
         wrong = fit(data, Dahl(alpha=0.9))
         assert wrong.status == "not described"
 
-    def test_amplitudes_that_the_response_was_divided_by(self) -> None:
+    def test_amplitudes_that_the_response_was_divided_by(self):
         """An error of 5 % there is one of the stiffness in microslip, and none in slip."""
         A = np.geomspace(0.05, 20.0, 24) * X_C
         off, stated = [], []
@@ -195,7 +191,7 @@ class TestBudget:
         np.testing.assert_allclose(u, scatter, rtol=0.3)  # 11 % is one standard deviation
         assert u[0] < 0.002  # the limit is known from slip
 
-    def test_a_model_error_that_chance_suggests_widens_by_its_size_alone(self) -> None:
+    def test_a_model_error_that_chance_suggests_widens_by_its_size_alone(self):
         """Fifteen rows of noise: k is that of few degrees of freedom in any table, never of one."""
         A = np.geomspace(0.1, 10.0, 15) * X_C
         widest = 0.0
@@ -205,7 +201,7 @@ class TestBudget:
             widest = max(widest, *(p.k for p in found.parameters))
         assert 2.3 < widest < stats.t(2.5).ppf(0.97725)
 
-    def test_a_stated_calibration_is_a_type_b_source(self) -> None:
+    def test_a_stated_calibration_is_a_type_b_source(self):
         sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
         found = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)
         row = next(r for r in found["f_max"].rows if r.source == "force calibration")
@@ -213,7 +209,7 @@ class TestBudget:
         assert row.u / found["f_max"].value == pytest.approx(0.02, rel=0.05)
         assert "force calibration" not in found.exact
 
-    def test_forms(self) -> None:
+    def test_forms(self):
         found = budget(fit(table(n=12), Dahl()).optimum)
         assert "combined" in str(found)
         assert json.loads(json.dumps(found.to_dict()))["parameters"]["f_max"]["u"] > 0.0
@@ -229,7 +225,7 @@ class TestBudget:
         assert ratio.std_dev == pytest.approx(of_ratio**0.5)
         assert ratio.std_dev != pytest.approx(np.linalg.norm(slope * u), rel=1e-3)  # correlated
 
-    def test_numbers_of_the_gum_tree_calculator(self) -> None:
+    def test_numbers_of_the_gum_tree_calculator(self):
         gtc = pytest.importorskip("GTC", reason="the GUM Tree Calculator is not installed")
         found = budget(fit(table(n=12), Dahl()).optimum)
         mine, theirs = found.numbers(), found.numbers("GTC")
@@ -237,14 +233,14 @@ class TestBudget:
         assert gtc.uncertainty(ratio) == pytest.approx((mine["f_max"] / mine["sigma"]).std_dev)
         assert gtc.dof(theirs["f_max"]) == pytest.approx(min(p.dof for p in found.parameters))
 
-    def test_only_sources_that_were_estimated_have_degrees_of_freedom(self) -> None:
+    def test_only_sources_that_were_estimated_have_degrees_of_freedom(self):
         sensors = Sensors(force_gain=stats.norm(1.0, 0.02))
         rows = budget(fit(table(n=12), Dahl(alpha=1.0), sensors=sensors).optimum)["f_max"].rows
         by_source = {row.source: row for row in rows}
         assert by_source["force calibration"].dof == np.inf
         assert 5.0 < by_source["noise"].dof < 22.01  # 24 numbers, 2 parameters, other sources
 
-    def test_at_infinity_what_is_determined_has_a_budget(self) -> None:
+    def test_at_infinity_what_is_determined_has_a_budget(self):
         result = fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
         assert not result.success
         (only,) = result.budget().parameters
@@ -253,7 +249,7 @@ class TestBudget:
         (alone,) = (c for c in result.combinations if c.expression == only.name)
         assert only.u == pytest.approx(alone.stderr, rel=0.05)  # these data have noise alone
 
-    def test_the_exponent_is_no_part_of_what_it_cannot_change(self) -> None:
+    def test_the_exponent_is_no_part_of_what_it_cannot_change(self):
         """In microslip f_max takes the exponent's range, and alpha sigma^2/f_max does not."""
         found = budget(fit(table(beta=(0.01, 0.1), n=60, noise=3e-3), Dahl()).optimum)
         assert found["f_max"].u > 0.3 * found["f_max"].value
@@ -261,13 +257,11 @@ class TestBudget:
         assert kept.value == pytest.approx(30.0**2 / 0.1, abs=kept.U)
         assert kept.u < 0.1 * kept.value
 
-    def test_no_budget_where_no_number_is_left(self) -> None:
+    def test_no_budget_where_no_number_is_left(self):
         with pytest.raises(FitError, match="no uncertainty budget"):
             budget(fit(table(n=1), Dahl(), throw=False).optimum)
 
-    def test_a_budget_or_a_refusal_where_the_iteration_may_leave_every_steady_response(
-        self,
-    ) -> None:
+    def test_a_budget_or_a_refusal_where_the_iteration_may_leave_every_steady_response(self):
         """Drives near the force limit, where the linearised model steps below it."""
         phase = np.exp(-1j * np.radians([5.0, 20.0, 40.0]))
         for sizes in ([0.03, 0.035, 0.1], [0.03, 0.035, 0.12], [0.03, 0.033, 0.08],
@@ -285,7 +279,7 @@ class TestBudget:
 
 
 class TestEstimate:
-    def test_a_wrong_exponent_is_found_under_its_range(self) -> None:
+    def test_a_wrong_exponent_is_found_under_its_range(self):
         data = table(model=Dahl(0.1, 30.0, alpha=1.3), n=12, noise=0.01)
         found = modelled(data)
         for name, truth in (("f_max", 0.1), ("sigma", 30.0), ("alpha", 1.3)):
@@ -293,13 +287,13 @@ class TestEstimate:
         plain = fit(data, Dahl(alpha=1.0)).optimum
         assert abs(plain.values[0] - 0.1) > 5.0 * plain.stderr["f_max"]
 
-    def test_large_tables_give_what_small_ones_give(self) -> None:
+    def test_large_tables_give_what_small_ones_give(self):
         data = table(n=240, noise=0.01)
         whole = modelled(data)
         few = modelled(data.select(rows=np.arange(240) % 2 == 0))
         assert whole.stderr["sigma"] * 2.0**0.5 == pytest.approx(few.stderr["sigma"], rel=0.25)
 
-    def test_a_point_that_stands_apart_has_an_error_of_its_own(self) -> None:
+    def test_a_point_that_stands_apart_has_an_error_of_its_own(self):
         """A gross error widens the estimate and does not move it from least squares."""
         data = table(n=12, noise=0.01, seed=4)
         off = data.response.copy()
@@ -315,7 +309,7 @@ class TestEstimate:
             assert apart < 2.0 * found.stderr[name]
 
     @pytest.mark.parametrize("level_too", [False, True])
-    def test_levels_whose_gain_is_wrong(self, level_too: bool) -> None:
+    def test_levels_whose_gain_is_wrong(self, level_too):
         """An amplifier's range at each of ten levels of three frequencies, not given as runs."""
         size, inside = 0.05, []
         for seed in range(12):
@@ -334,7 +328,7 @@ class TestEstimate:
             ]
         assert sum(inside) >= 21  # of 24
 
-    def test_the_misfit_makes_chi_square_its_degrees_of_freedom(self) -> None:
+    def test_the_misfit_makes_chi_square_its_degrees_of_freedom(self):
         """Against a general minimiser and root finder on residuals made here."""
         A = np.geomspace(0.1, 10.0, 12) * X_C
         N = FRICTION.describing_function(A) * (1.0 + 0.05 * np.sin(np.arange(12)))
@@ -343,11 +337,11 @@ class TestEstimate:
         data = FrequencyResponse(np.ones(12), N, A, covariance=covariance)
         found = modelled(data, Dahl(alpha=1.0))
 
-        def left(theta: np.ndarray, s: float) -> np.ndarray:
+        def left(theta, s):
             missed = N - Dahl(*np.exp(theta)).describing_function(A)
             return np.asarray((missed / np.hypot(size, s * np.abs(N))).view(np.float64))
 
-        def excess(s: float) -> float:
+        def excess(s):
             return 2.0 * optimize.least_squares(left, found.theta, args=(s,)).cost - 22.0
 
         misfit = optimize.brentq(excess, 1e-3, 0.5, xtol=1e-12)
@@ -355,7 +349,7 @@ class TestEstimate:
         assert found.estimate.misfit == pytest.approx(misfit, rel=1e-4)
         np.testing.assert_allclose(found.theta, best.x, atol=1e-5)
 
-    def test_no_misfit_where_the_model_describes_the_data(self) -> None:
+    def test_no_misfit_where_the_model_describes_the_data(self):
         data = load_dataset("noisy")
         assert isinstance(data, FrequencyResponse)
         assert fit(data, Dahl()).goodness.chi_square is not None
@@ -366,7 +360,7 @@ class TestEstimate:
 
     @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
     @pytest.mark.parametrize("stated", [False, True])
-    def test_a_robust_loss_counts_every_source(self, loss: str, stated: bool) -> None:
+    def test_a_robust_loss_counts_every_source(self, loss, stated):
         """As least squares does without the gross errors: exponent, days, noise."""
         for seed in (3, 5):
             data = three_days(0.05, seed)
@@ -382,14 +376,14 @@ class TestEstimate:
                 assert (other.stderr or 0.0) > 3.0 * robust.stderr_noise[name]
                 assert other.value == pytest.approx(one.value, abs=one.stderr)
 
-    def test_a_robust_loss_changes_little_without_gross_errors(self) -> None:
+    def test_a_robust_loss_changes_little_without_gross_errors(self):
         plain, robust = (fit(table(seed=4), Dahl(), loss=loss) for loss in ("linear", "huber"))
         for name in ("f_max", "sigma"):
             one, other = plain.params[name], robust.params[name]
             assert other.stderr == pytest.approx(one.stderr, rel=0.15)
             assert other.value == pytest.approx(one.value, abs=0.5 * (one.stderr or 0.0))
 
-    def test_harmonics_of_tiny_covariance_do_not_pull(self) -> None:
+    def test_harmonics_of_tiny_covariance_do_not_pull(self):
         """Third harmonics 20 % off, their stated error a hundredth of the fundamental's."""
         A = np.geomspace(0.3, 10.0, 12) * X_C
         first = FRICTION.describing_function(A) * relative_noise(12, 0.005, 1)
@@ -407,7 +401,7 @@ class TestEstimate:
             assert p.value == pytest.approx(truth, abs=2.0 * p.stderr)
             assert p.value == pytest.approx(alone.params[name].value, abs=1.5 * p.stderr)
 
-    def test_the_estimate_holds_still_where_a_test_is_left_out(self) -> None:
+    def test_the_estimate_holds_still_where_a_test_is_left_out(self):
         """Bouc-Wen loops fitted by Dahl: as leaving out tests one by one says, within a factor."""
         A = np.geomspace(0.2, 10.0, 10) * X_C
         N = BoucWen(30.0, 300.0, 150.0).describing_function(A) * relative_noise(10, 0.002, 3)
@@ -424,7 +418,7 @@ class TestEstimate:
         assert (u > 0.5 * jackknife).all()
 
     @pytest.mark.parametrize("seed", [0, 1])
-    def test_no_source_explains_the_noise_of_a_dense_sweep(self, seed: int) -> None:
+    def test_no_source_explains_the_noise_of_a_dense_sweep(self, seed):
         """1,200 numbers of 1 % noise: their variance is known to 4 %."""
         found = modelled(table(beta=(0.01, 1.0), n=600, noise=0.01, seed=seed))
         assert found.rms("noise") ** 2 == pytest.approx(1e-4, rel=4 * 0.041)
@@ -435,18 +429,18 @@ class TestEstimate:
 
 class TestLevels:
     @staticmethod
-    def repeated(A: np.ndarray) -> int:
+    def repeated(A):
         """Return how many levels were measured more than once."""
         data = FrequencyResponse(np.ones(A.size), np.full(A.size, 1.0 + 1.0j), A)
         return int((np.bincount(repeated_levels(data)) > 1).sum())
 
     @pytest.mark.parametrize("scatter", [0.0, 1e-4, 3e-3])
-    def test_amplitudes_that_agree_within_their_scatter_are_one(self, scatter: float) -> None:
+    def test_amplitudes_that_agree_within_their_scatter_are_one(self, scatter):
         rng = np.random.default_rng(3)
         levels = np.repeat(np.geomspace(1e-4, 1e-2, 8), 4)
         assert self.repeated(levels * np.exp(scatter * rng.standard_normal(32))) == 8
 
-    def test_a_dense_sweep_has_none(self) -> None:
+    def test_a_dense_sweep_has_none(self):
         rng = np.random.default_rng(4)
         assert not any(self.repeated(np.geomspace(1e-4, 1e-2, n)) for n in (12, 300, 3000))
         spread = [np.exp(rng.uniform(0.0, 4.6, n)) for n in 50 * [12, 30, 100, 300]]
@@ -454,7 +448,7 @@ class TestLevels:
         assert stats.binomtest(alarms, len(spread), 0.01, alternative="greater").pvalue > 0.01
 
 
-def test_the_estimate_does_not_depend_on_the_unit_of_force() -> None:
+def test_the_estimate_does_not_depend_on_the_unit_of_force():
     """Harmonics of tiny covariances that the model misses: the search is far from the estimate."""
     rng, A = np.random.default_rng(1), np.geomspace(0.1, 10.0, 12) * X_C
     f, law = np.tile([0.5, 2.0], 6), BoucWen(30.0, 300.0, 300.0, exponent=2.0) + Damper(0.3)

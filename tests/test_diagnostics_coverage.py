@@ -1,7 +1,5 @@
 """The small version of the coverage validation: the same code, fewer data sets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,7 @@ from benchmarks.coverage import (
 
 
 @pytest.mark.parametrize("index", range(6))
-def test_intervals_cover_and_verdicts_are_right(index: int) -> None:
+def test_intervals_cover_and_verdicts_are_right(index):
     count, bootstrapped, replicates = SMALL
     if index in (2, 5):  # long profiles of a hidden spring; five parameters of a plant
         count, bootstrapped = count // 8, 0
@@ -25,7 +23,7 @@ def test_intervals_cover_and_verdicts_are_right(index: int) -> None:
     assert not [text for row in table for text in row.failures]
 
 
-def test_scenarios_are_what_they_are_for() -> None:
+def test_scenarios_are_what_they_are_for():
     bounds = [cramer_rao(s) for s in scenarios()]
     assert all((b < 0.25).all() for i, b in enumerate(bounds) if i not in (1, 2))
     np.testing.assert_allclose(bounds[1], [9.1, 0.002], rtol=0.2)
@@ -33,7 +31,7 @@ def test_scenarios_are_what_they_are_for() -> None:
     assert sum(bool(closed_by_exact_data(s).all()) for s in scenarios()) == 4
 
 
-def row(coverage: float, right: float, rmse: float) -> Row:
+def row(coverage, right, rmse):
     level = np.array([0.6827, 0.9545])
     methods = {"wald": level, "profile": np.array([coverage, 0.9545]), "bootstrap": level}
     tolerance = dict.fromkeys(methods, np.full(2, 0.02))
@@ -42,7 +40,7 @@ def row(coverage: float, right: float, rmse: float) -> Row:
     )
 
 
-def test_what_does_not_hold_is_said() -> None:
+def test_what_does_not_hold_is_said():
     assert row(0.68, 1.0, 1.0).failures == []
     bad = row(0.6, 0.98, 1.2)
     assert bad.failures == [

@@ -1,9 +1,6 @@
 """Tests of tests: they stay silent over noise, and speak of what was put into the data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,12 +30,12 @@ from tests.friction_tables import (
 )
 
 
-def judge(data: FrequencyResponse, **options: Any) -> Goodness:
+def judge(data, **options):
     found: Goodness = fit(data, Dahl(alpha=1.0), throw=False, **options).goodness
     return found
 
 
-def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
+def swept_table(fall, noise=0.01, seed=1):
     """Return friction whose stiffness falls by a share from 0.25 to 2 Hz."""
     f = np.repeat([0.25, 0.5, 1.0, 2.0], 8)
     A = np.tile(np.geomspace(0.1, 10.0, 8) * X_C, 4)
@@ -49,7 +46,7 @@ def swept_table(fall: float, noise: float = 0.01, seed: int = 1) -> FrequencyRes
 
 
 class TestSilence:
-    def test_p_values_are_uniform_and_alarms_are_rare(self) -> None:
+    def test_p_values_are_uniform_and_alarms_are_rare(self):
         found = [judge(table(seed=seed, n=8 + 22 * (seed % 2))) for seed in range(60)]
         # of 60: at 1, 5 and 2 % more than these come once in 3,000, 1,000 and 1,000 times
         assert sum(not g.acceptable for g in found) <= 4
@@ -63,7 +60,7 @@ class TestSilence:
         assert np.mean(np.array(runs) < 0.05) < 0.09
         assert sum(bool(g.suspicious) for g in found) <= 5
 
-    def test_known_noise(self) -> None:
+    def test_known_noise(self):
         data = table(seed=2)
         C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
         found = judge(replace(data, covariance=C))
@@ -72,7 +69,7 @@ class TestSilence:
         assert found.acceptable
 
     @pytest.mark.parametrize("dof", [4.0, 12.0])
-    def test_noise_known_with_few_degrees_of_freedom(self, dof: float) -> None:
+    def test_noise_known_with_few_degrees_of_freedom(self, dof):
         """Covariances as rough as a few cycles give: chi-square keeps its distribution."""
         rng = np.random.default_rng(5)
         values = []
@@ -86,14 +83,14 @@ class TestSilence:
         assert np.mean(np.array(values) < 0.05) < 0.17  # of 60: more come once in 3,000 times
         assert np.mean(values) == pytest.approx(0.5, abs=0.12)
 
-    def test_a_driven_plant(self) -> None:
+    def test_a_driven_plant(self):
         result = fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
         assert result.goodness.acceptable
         assert {t.covariate for t in result.goodness.trends} == {"amplitude", "frequency", "drive"}
 
 
 class TestDepartures:
-    def test_a_trend_with_frequency_has_its_size(self) -> None:
+    def test_a_trend_with_frequency_has_its_size(self):
         found = judge(swept_table(0.28))
         (trend,) = (t for t in found.trends if t.covariate == "frequency")
         assert trend.p_value < 1e-6
@@ -102,7 +99,7 @@ class TestDepartures:
         assert "which no rate-independent model can describe" in found.headline
         assert "friction's stiffness falls by" in found.headline
 
-    def test_ten_scattered_points_show_a_fall_of_stiffness_by_30_percent(self) -> None:
+    def test_ten_scattered_points_show_a_fall_of_stiffness_by_30_percent(self):
         """As the points of a damper do: most such tables are not to be trusted."""
         f = np.array([0.25] * 3 + [0.5] * 3 + [1.0] * 3 + [2.0])
         A = np.array([1.0, 2.0, 3.0] * 3 + [1.0]) * 3.0 * X_C
@@ -116,7 +113,7 @@ class TestDepartures:
         known = ("over frequency", "depart smoothly")  # the latter where the trend is too vague
         assert all(any(each in text for each in known) for text in alarmed)
 
-    def test_the_size_does_not_depend_on_the_claimed_noise(self) -> None:
+    def test_the_size_does_not_depend_on_the_claimed_noise(self):
         data = swept_table(0.28)
         C = (1e-3 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
         for claimed in (
@@ -127,7 +124,7 @@ class TestDepartures:
             assert np.expm1(trend.stiffness.value) == pytest.approx(-0.28, abs=0.08)
             assert trend.p_value < 1e-9
 
-    def test_another_exponent(self) -> None:
+    def test_another_exponent(self):
         found = judge(table(model=Dahl(0.1, 30.0, alpha=1.5)))
         assert found.exponent.wanted == pytest.approx(1.5, rel=0.15)
         assert "these data are not linear Dahl" in found.headline
@@ -135,18 +132,18 @@ class TestDepartures:
         assert free.acceptable
         assert free.exponent is None
 
-    def test_the_exponent_s_score_is_close_to_its_estimate(self) -> None:
+    def test_the_exponent_s_score_is_close_to_its_estimate(self):
         data = table(model=Dahl(0.1, 30.0, alpha=1.05))
         found, estimate = judge(data), fit(data, Dahl(alpha=None)).params["alpha"]
         assert found.exponent.wanted == pytest.approx(estimate.value, abs=0.005)
         assert found.exponent.stderr == pytest.approx(estimate.stderr, rel=0.2)
 
-    def test_a_missing_spring(self) -> None:
+    def test_a_missing_spring(self):
         found = judge(table(model=FRICTION + Spring(1.0)))
         assert not found.acceptable
         assert "these data are not linear Dahl: over amplitude " in found.headline
 
-    def test_noise_larger_than_the_covariance_says(self) -> None:
+    def test_noise_larger_than_the_covariance_says(self):
         data = table(noise=0.03)
         C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
         known = replace(data, covariance=C)
@@ -159,7 +156,7 @@ class TestDepartures:
         assert ", but the scatter is 2.6 times what the data's covariance states" in unused.headline
         assert "scatter" not in judge(replace(data, covariance=9.0 * C), noise="relative").headline
 
-    def test_a_third_harmonic_of_another_size(self) -> None:
+    def test_a_third_harmonic_of_another_size(self):
         A = np.repeat(np.geomspace(0.5, 20.0, 12), 2) * X_C
         k = np.tile([1, 3], 12)
         F = np.where(
@@ -173,7 +170,7 @@ class TestDepartures:
             assert found.third_harmonic.ratio == pytest.approx(factor, abs=0.02)
             assert found.acceptable == (factor == 1.0)
 
-    def test_misfit_is_its_root_mean_square(self) -> None:
+    def test_misfit_is_its_root_mean_square(self):
         result = fit(table(), Dahl())
         expected = np.sqrt(
             np.mean(np.abs(result.data.response - result.best_fit) ** 2 / result.data.gain**2)
@@ -182,7 +179,7 @@ class TestDepartures:
 
 
 class TestOutliers:
-    def test_are_listed_with_their_place(self) -> None:
+    def test_are_listed_with_their_place(self):
         data = table()
         R = data.response.copy()
         R[7] *= 1.1
@@ -196,7 +193,7 @@ class TestOutliers:
         assert first.deviation > 5.0
         assert "1 Hz, 1.01 mm, level run 7 lies" in str(first)
 
-    def test_robust_fits_list_them_too(self) -> None:
+    def test_robust_fits_list_them_too(self):
         data = table()
         R = data.response.copy()
         R[7] *= 1.1
@@ -205,22 +202,22 @@ class TestOutliers:
         assert "Suspicious rows: 1 Hz, 1.01 mm; check them" in found.headline
         assert judge(data, loss="huber").suspicious == ()
 
-    def test_none_where_too_few_points(self) -> None:
+    def test_none_where_too_few_points(self):
         assert judge(table(n=3)).suspicious == ()
 
 
 class TestPhysics:
-    def test_a_negative_spring_is_told(self) -> None:
+    def test_a_negative_spring_is_told(self):
         result = fit(table(model=FRICTION + Spring(-1.0)), Dahl() + Spring())
         (text,) = (w for w in result.goodness.warnings if "stiffness" in w)
         assert text.startswith("stiffness is negative, -")
         assert "zero is within" not in text
 
-    def test_a_negative_mass_that_was_given_has_no_error(self) -> None:
+    def test_a_negative_mass_that_was_given_has_no_error(self):
         result = fit(table(), Dahl() + Mass(-1e-6))
         assert result.goodness.warnings == ("mass is negative, as given: -1e-06 kg",)
 
-    def test_a_friction_force_beyond_slip(self) -> None:
+    def test_a_friction_force_beyond_slip(self):
         data = table(beta=(10.0, 100.0))
         R = data.response.copy()
         R[-1] *= 1.2
@@ -228,7 +225,7 @@ class TestPhysics:
         assert "At 1 Hz, 333 mm friction's fundamental is 0.1" in found.verdict
         assert "beyond_slip" not in {one.code for one in fit(data, Dahl(), throw=False).findings}
 
-    def test_units_that_were_mistaken(self) -> None:
+    def test_units_that_were_mistaken(self):
         """Micrometres taken for metres; peak-to-peak amplitudes next to nominal levels."""
         data = table()
         mistaken = replace(data, response=1e-6 * data.response, amplitude=1e6 * amplitudes(data))
@@ -241,14 +238,14 @@ class TestPhysics:
         assert "2 times its nominal level: peak-to-peak" in text
         assert not judge(replace(data, level=amplitudes(data))).warnings
 
-    def test_a_parameter_at_its_bound(self) -> None:
+    def test_a_parameter_at_its_bound(self):
         model = Dahl() + Spring()
         (own,) = (p for p in model.parameters if p.name == "f_max")
         bounded = model.with_parameters({"f_max": replace(own, upper=0.09)})
         result = fit(table(model=FRICTION + Spring(1.0)), bounded)
         assert any("At its bound: f_max = 0.09" in w for w in result.goodness.warnings)
 
-    def test_a_nearly_linear_plant_moves_in_a_sine(self) -> None:
+    def test_a_nearly_linear_plant_moves_in_a_sine(self):
         plant = FRICTION + Mass(0.3) + Damper(20.0) + Spring(300.0)
         f = np.tile(np.geomspace(0.1, 20.0, 12), 3)
         u = np.repeat([0.05, 0.1, 0.3], 12)
@@ -258,7 +255,7 @@ class TestPhysics:
 
 
 class TestComparison:
-    def test_finds_what_the_data_were_made_of(self) -> None:
+    def test_finds_what_the_data_were_made_of(self):
         makers = {
             "as fitted": FRICTION,
             "exponent free": Dahl(0.1, 30.0, alpha=1.5),
@@ -268,7 +265,7 @@ class TestComparison:
         for name, maker in makers.items():
             assert compare_models(fit(table(model=maker), Dahl())).best.name == name
 
-    def test_a_parameter_at_infinity_does_not_count(self) -> None:
+    def test_a_parameter_at_infinity_does_not_count(self):
         """Without loss sigma and the noise are all there is: k = 2, as for a spring alone."""
         tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(20))
         results = (fit(data, Dahl(), throw=False) for data in tables)
@@ -280,7 +277,7 @@ class TestComparison:
             -2.0 * spring.log_likelihood + 2.0 * np.log(60.0), abs=1e-4
         )
 
-    def test_criteria_are_those_of_the_fits(self) -> None:
+    def test_criteria_are_those_of_the_fits(self):
         result = fit(table(), Dahl())
         found = compare_models(result)
         assert (found.models[0].aic, found.models[0].bic) == pytest.approx((result.aic, result.bic))
@@ -290,7 +287,7 @@ class TestComparison:
         assert found.headline == "No model compared is better than the one fitted."
         assert list(found.to_frame()["model"]) == [m.name for m in found.models]
 
-    def test_an_element_that_vanishes_leaves_the_other_its_numbers(self) -> None:
+    def test_an_element_that_vanishes_leaves_the_other_its_numbers(self):
         for seed in range(12, 20):
             data = table(seed=seed)
             one = fit(data, Dahl())
@@ -306,7 +303,7 @@ class TestComparison:
         pytest.fail("no data set makes an element vanish")
 
     @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
-    def test_a_robust_loss_is_that_of_every_model(self, loss: str) -> None:
+    def test_a_robust_loss_is_that_of_every_model(self, loss):
         """Two rows of thrice the response would make a free exponent look clearly better."""
         clean = table()
         response = clean.response.copy()
@@ -320,7 +317,7 @@ class TestComparison:
         same = compare_models(result, {"the same": Dahl()}).models[1]
         assert same.aic == pytest.approx(result.aic, abs=1e-6)
 
-    def test_own_models_and_those_that_fail(self) -> None:
+    def test_own_models_and_those_that_fail(self):
         data = table(n=3)
         found = compare_models(
             fit(data, Dahl()), {"too much": Dahl() + Spring() + Mass() + Damper() + Dahl(name="b")}
@@ -330,11 +327,11 @@ class TestComparison:
         with pytest.raises(ValidationError, match="models is a list; expected a mapping of names"):
             compare_models(fit(data, Dahl()), [Dahl()])  # type: ignore[arg-type]
 
-    def test_an_exponent_that_is_free_is_also_tried_at_one(self) -> None:
+    def test_an_exponent_that_is_free_is_also_tried_at_one(self):
         names = [m.name for m in compare_models(fit(table(), Dahl(alpha=None))).models]
         assert "exponent 1" in names
         assert "exponent free" not in names
 
 
-def test_plant_of_the_helpers_is_that_of_the_paper() -> None:
+def test_plant_of_the_helpers_is_that_of_the_paper():
     assert [p.value for p in PLANT.parameters] == [0.1, 30.0, 1.0, 0.3, 0.24, 0.3]

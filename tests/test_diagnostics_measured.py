@@ -1,7 +1,5 @@
 """Two measured joints that no Dahl model describes: what the verdicts say of them."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path
@@ -13,7 +11,6 @@ from benchmarks.measured import BEAM
 from dahl_ident import (
     Dahl,
     Damper,
-    FitResult,
     FrequencyResponse,
     Iwan,
     Mass,
@@ -35,7 +32,7 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def tests() -> list[FrequencyResponse]:
+def tests():
     """Ten steady levels of the banded rotary friction damper at 30 lbf, harmonics 1 and 3."""
     files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
     records = [read_record(f, displacement="displacement", force="friction force") for f in files]
@@ -43,14 +40,14 @@ def tests() -> list[FrequencyResponse]:
 
 
 @pytest.fixture(scope="module")
-def damper(tests: list[FrequencyResponse]) -> FrequencyResponse:
+def damper(tests):
     """Their fundamentals."""
     data = FrequencyResponse.concatenate(tests)
     return data.select(rows=data.harmonic == 1)
 
 
 @pytest.fixture(scope="module")
-def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
+def beam(tmp_path_factory):
     """The Brake-Reuss beam near its first mode."""
     columns = tmp_path_factory.mktemp("lab") / "columns.toml"
     columns.write_text(BEAM)
@@ -58,7 +55,7 @@ def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
 
 
 class TestDamper:
-    def test_numbers_of_the_hand_fit(self, damper: FrequencyResponse) -> None:
+    def test_numbers_of_the_hand_fit(self, damper):
         found = fit(damper, Dahl(), noise="relative")
         assert found.optimum.values[0] == pytest.approx(9.7e3, rel=0.02)
         assert found.optimum.values[1] == pytest.approx(2.5e6, rel=0.05)
@@ -68,7 +65,7 @@ class TestDamper:
         assert slow.goodness.rms_misfit == pytest.approx(0.035, abs=0.002)
 
     @pytest.mark.parametrize("kept", ["covariance and verdicts", "covariance", "neither"])
-    def test_the_verdict_is_rate_dependence(self, damper: FrequencyResponse, kept: str) -> None:
+    def test_the_verdict_is_rate_dependence(self, damper, kept):
         """However bare the table, the fall of stiffness with frequency is said with its size."""
         data = damper
         if kept == "covariance":
@@ -84,7 +81,7 @@ class TestDamper:
         (trend,) = (t for t in linear.trends if t.covariate == "frequency")
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
 
-    def test_runs_deviate_within_the_bounds_of_parameters(self) -> None:
+    def test_runs_deviate_within_the_bounds_of_parameters(self):
         """A power damper that does not improve the fit, its exponent at zero."""
         files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
         every = [
@@ -97,7 +94,7 @@ class TestDamper:
         found = fit(FrequencyResponse.concatenate(every), Dahl() + PowerDamper(), throw=False)
         assert str(found.status) == "not determined"
 
-    def test_other_models_are_compared_as_well(self, damper: FrequencyResponse) -> None:
+    def test_other_models_are_compared_as_well(self, damper):
         found = fit(damper.select(rows=np.arange(damper.n) % 3 == 0), Dahl())
         report = found.fit_report()
         assert "Other models, for comparison" in report
@@ -110,12 +107,12 @@ class TestStill:
     """Estimates do not move by more than they state when a test is left out, or rows are added."""
 
     @staticmethod
-    def of(tests: list[FrequencyResponse], harmonics: int) -> FitResult:
+    def of(tests, harmonics):
         data = FrequencyResponse.concatenate(tests)
         return fit(data.select(rows=data.harmonic <= harmonics), Dahl())
 
     @pytest.mark.parametrize("harmonics", [1, 3])
-    def test_when_a_test_is_left_out(self, tests: list[FrequencyResponse], harmonics: int) -> None:
+    def test_when_a_test_is_left_out(self, tests, harmonics):
         whole = self.of(tests, harmonics)
         others = [self.of([*tests[:i], *tests[i + 1 :]], harmonics) for i in range(len(tests))]
         for name in ("f_max", "sigma"):
@@ -125,15 +122,13 @@ class TestStill:
             jackknife = float(np.sqrt((len(tests) - 1) * np.var(estimates)))
             assert 0.5 * jackknife < u < 3.0 * jackknife
 
-    def test_when_harmonics_are_added(self, tests: list[FrequencyResponse]) -> None:
+    def test_when_harmonics_are_added(self, tests):
         fundamentals, both = self.of(tests, 1), self.of(tests, 3)
         for name in ("f_max", "sigma"):
             u = fundamentals.params[name].stderr
             assert both.params[name].value == pytest.approx(fundamentals.params[name].value, abs=u)
 
-    def test_laws_are_compared_where_harmonics_are_rows(
-        self, tests: list[FrequencyResponse]
-    ) -> None:
+    def test_laws_are_compared_where_harmonics_are_rows(self, tests):
         compared = compare_models(self.of(tests[::3], 3))
         assert not compared.failed
         assert {"gap", "Bouc-Wen", "mass added"} <= {model.name for model in compared.models}
@@ -143,7 +138,7 @@ class TestBeam:
     """One mode and one joint: microslip, and more in the joint than a Dahl element."""
 
     @staticmethod
-    def fitted(beam: FrequencyResponse, controlled: str) -> FitResult:
+    def fitted(beam, controlled):
         data = beam.select(level=[label for label in beam.levels if controlled in label])
         if controlled == "Force":  # exact motions, row by row
             data = data.select(rows=np.arange(data.n) % 24 == 0)
@@ -161,7 +156,7 @@ class TestBeam:
             "Response",
         ],
     )
-    def test_only_the_loss_is_determined(self, beam: FrequencyResponse, controlled: str) -> None:
+    def test_only_the_loss_is_determined(self, beam, controlled):
         found = self.fitted(beam, controlled)
         assert not found.trusted
         assert {"f_max", "sigma"} <= set(found.identifiability.named(Verdict.NOT_IDENTIFIED))
@@ -174,13 +169,13 @@ class TestBeam:
         assert "The model does not describe these data" in found.verdict
         assert "stiffness rises with amplitude, by 0." in found.verdict
 
-    def test_controlled_response_has_its_optimum_at_infinity(self, beam: FrequencyResponse) -> None:
+    def test_controlled_response_has_its_optimum_at_infinity(self, beam):
         found = self.fitted(beam, "Response")
         assert found.optimum.values[0] == np.inf
         assert "f_max grows without bound at constant sigma^2/f_max" in found.verdict
         assert "sigma + stiffness" in found.identifiability.determined
 
-    def test_iwan_with_the_mode(self, beam: FrequencyResponse) -> None:
+    def test_iwan_with_the_mode(self, beam):
         """The mode stiffens while its loss rises, which no sum of Jenkins elements does."""
         levels = [label for label in beam.levels if label.startswith("Response")]
         data = beam.select(level=levels)

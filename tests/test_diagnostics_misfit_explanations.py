@@ -1,7 +1,5 @@
 """What misled a fit: wrong signs and single rows are named, and only where they are the cause."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 
@@ -10,8 +8,7 @@ import pytest
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
 from dahl_ident.diagnostics import VerdictStatus
-from dahl_ident.diagnostics.misfit_explanations import TURNS, Turn, neighbourhood
-from dahl_ident.elements import Element
+from dahl_ident.diagnostics.misfit_explanations import TURNS, neighbourhood
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, table
 
@@ -20,26 +17,26 @@ CONJUGATED, NEGATED, BOTH = TURNS
 BY: Final = "describing function"  # which predicts in a moment, and makes the plant's table
 
 
-def scaled(data: FrequencyResponse, rows: list[int], factors: list[float]) -> FrequencyResponse:
+def scaled(data, rows, factors):
     R = data.response.copy()
     R[rows] *= factors
     return replace(data, response=R)
 
 
-def noisy() -> FrequencyResponse:
+def noisy():
     data = load_dataset("noisy")
     assert isinstance(data, FrequencyResponse)
     return data
 
 
-def test_a_sign_is_named_where_there_is_no_finite_optimum() -> None:
+def test_a_sign_is_named_where_there_is_no_finite_optimum():
     data = CONJUGATED(noisy())
     with pytest.raises(FitError, match=r"^With the response conjugated .* No finite optimum"):
         fit(data, Dahl())
 
 
 class TestRows:
-    def test_lead_the_verdict_where_they_alone_are_the_cause(self) -> None:
+    def test_lead_the_verdict_where_they_alone_are_the_cause(self):
         data = load_dataset("outliers")
         assert isinstance(data, FrequencyResponse)
         found = fit(data, Dahl())
@@ -55,15 +52,13 @@ class TestRows:
         assert found.ndata == 60  # none is dropped
         assert fit(data, Dahl(), loss="huber").trusted
 
-    def test_a_single_row(self) -> None:
+    def test_a_single_row(self):
         first = fit(scaled(table(), [7], [2.0]), Dahl()).statements[0]
         assert "Only the row at 1 Hz, 1.01 mm contradicts the model" in first
         assert "without it the residuals are consistent with noise" in first
 
     @pytest.mark.parametrize(("fall", "explains"), [(2.0, False), (4.5, True)])
-    def test_explain_only_where_the_misfit_falls_to_a_third(
-        self, fall: float, explains: bool
-    ) -> None:
+    def test_explain_only_where_the_misfit_falls_to_a_third(self, fall, explains):
         # n rows with errors s in gain and phase have a mean square misfit of 2 s^2, to which one
         # that misses by d adds d^2/n; measured by its own size it is off by d/(1 - d)
         n, s = 60, 0.01
@@ -76,14 +71,14 @@ class TestRows:
         assert found.goodness.rms_misfit == pytest.approx(fall * alone, rel=0.25)
         assert ("Only the row at 1 Hz, 3.75 mm contradicts" in found.verdict) == explains
 
-    def test_do_not_lead_where_a_departure_is_left_without_them(self) -> None:
+    def test_do_not_lead_where_a_departure_is_left_without_them(self):
         data = scaled(table(model=Dahl(0.1, 30.0, alpha=1.5)), [7, 19], [3.0, 0.3])
         found = fit(data, Dahl(alpha=1.0))
         assert {point.row for point in found.goodness.suspicious} >= {7, 19}
         assert found.goodness.cause == ""
         assert "The stated uncertainties include a misfit of" in found.statements[0]
 
-    def test_do_not_lead_where_they_lie_side_by_side(self) -> None:
+    def test_do_not_lead_where_they_lie_side_by_side(self):
         """As where a stop is hit: the model may fail there, and a robust loss would hide it."""
         found = fit(scaled(table(), [27, 28, 29], [1.3, 1.5, 1.8]), Dahl())
         assert found.goodness.cause == ""
@@ -96,7 +91,7 @@ class TestRows:
         assert last.status is VerdictStatus.APPROXIMATE
         assert "it is the first or the last: check" in last.verdict
 
-    def test_rows_at_random_seldom_lie_side_by_side(self) -> None:
+    def test_rows_at_random_seldom_lie_side_by_side(self):
         optimum, rng = fit(table(), Dahl()).optimum, np.random.default_rng(1)
         for k in (2, 3):
             rows = [rng.choice(30, k, replace=False).tolist() for _ in range(400)]
@@ -113,9 +108,7 @@ class TestSign:
             (CONJUGATED, plant_table(steady=BY), MODEL),
         ],
     )
-    def test_is_named_with_its_misfit(
-        self, turn: Turn, data: FrequencyResponse, model: Element
-    ) -> None:
+    def test_is_named_with_its_misfit(self, turn, data, model):
         right = fit(data, model, steady=BY).goodness
         wrong = fit(turn(data), model, throw=False, steady=BY)
         assert f"With the response {turn.name} the misfit falls from " in wrong.statements[0]
@@ -125,7 +118,7 @@ class TestSign:
         assert not wrong.trusted
         assert right.sign == ""
 
-    def test_the_data_s_covariances_turn_with_it(self) -> None:
+    def test_the_data_s_covariances_turn_with_it(self):
         """Turned by hand, from draws of amplitude, real and imaginary part."""
         draws = np.random.default_rng(1).multivariate_normal(
             np.zeros(3), [[1.0, 0.3, 0.2], [0.3, 2.0, 0.5], [0.2, 0.5, 1.0]], 50
@@ -146,14 +139,14 @@ class TestSign:
             np.testing.assert_allclose(turned.covariance[0], after[1:, 1:], rtol=1e-12)
             np.testing.assert_allclose(turned.amplitude_covariance[0], after[0, 1:], rtol=1e-12)
 
-    def test_is_not_blamed_for_another_departure(self) -> None:
+    def test_is_not_blamed_for_another_departure(self):
         stiff = table(model=FRICTION + Spring(20.0))
         lossless = table(beta=(1e-6, 1e-5))
         for data in (table(model=Dahl(0.1, 30.0, alpha=2.0)), stiff, lossless):
             assert fit(data, Dahl(), throw=False).goodness.sign == ""
 
 
-def test_the_error_of_an_exponent_asked_for_follows_the_scatter() -> None:
+def test_the_error_of_an_exponent_asked_for_follows_the_scatter():
     """A covariance that claims a third of the noise narrows the error no more."""
     data = table(model=Dahl(0.1, 30.0, alpha=1.2), noise=0.03)
     C = (0.03 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
@@ -167,7 +160,7 @@ def test_the_error_of_an_exponent_asked_for_follows_the_scatter() -> None:
 
 
 class TestNoCause:
-    def test_a_missing_mass_is_no_wrong_sign(self) -> None:
+    def test_a_missing_mass_is_no_wrong_sign(self):
         """Far above resonance the response has the sign of the mass, and its loss that of all."""
         A = np.geomspace(0.1, 10.0, 30) * X_C
         Z = (FRICTION + Mass(1.0)).dynamic_stiffness(A, 4.0 * np.pi) * relative_noise(30, 0.01, 1)
@@ -175,14 +168,14 @@ class TestNoCause:
         assert found.objections
         assert found.cause == ""
 
-    def test_a_missing_mass_is_no_single_bad_row(self) -> None:
+    def test_a_missing_mass_is_no_single_bad_row(self):
         A, f = np.tile(np.geomspace(0.1, 10.0, 5) * X_C, 2), np.repeat([1.0, 4.0], 5)
         Z = (FRICTION + Mass(0.01)).dynamic_stiffness(A, 2.0 * np.pi * f)
         found = fit(FrequencyResponse(f, Z * relative_noise(10, 0.01, 0), A), Dahl())
         assert found.goodness.suspicious
         assert found.goodness.cause == ""
 
-    def test_the_last_row_may_be_where_the_model_ends(self) -> None:
+    def test_the_last_row_may_be_where_the_model_ends(self):
         found = fit(scaled(table(), [29], [1.5]), Dahl())
         assert [point.row for point in found.goodness.suspicious] == [29]
         assert found.goodness.cause == ""

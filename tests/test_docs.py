@@ -1,7 +1,5 @@
 """The manual and README: examples print what they say; the reference has every public name."""
 
-from __future__ import annotations
-
 import doctest
 import importlib.util
 import inspect
@@ -9,7 +7,6 @@ import json
 import re
 from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -20,7 +17,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 REFERENCE = "".join(page.read_text("utf-8") for page in (DOCS / "reference").glob("*.md"))
 
 
-def _explained(name: str) -> bool:
+def _explained(name):
     pattern = rf"auto(?:class|function|exception):: dahl_ident\.(?:\w+\.)?{name}$"
     return bool(re.search(pattern, REFERENCE, re.MULTILINE))
 
@@ -28,20 +25,20 @@ def _explained(name: str) -> bool:
 NAMES = [name for name in di.__all__ if not inspect.ismodule(getattr(di, name))]
 
 
-def test_every_public_name_is_in_the_reference() -> None:
+def test_every_public_name_is_in_the_reference():
     assert [name for name in NAMES if not _explained(name)] == []
 
 
-def _has_example(value: object) -> bool:
+def _has_example(value):
     parts = [value, *vars(value).values()] if isinstance(value, type) else [value]
     return any(doctest.DocTestParser().get_examples(part.__doc__ or "") for part in parts)
 
 
-def test_every_public_docstring_has_an_example() -> None:
+def test_every_public_docstring_has_an_example():
     assert [name for name in NAMES if not _has_example(getattr(di, name))] == []
 
 
-def test_every_class_and_function_of_the_reference_has_an_example() -> None:
+def test_every_class_and_function_of_the_reference_has_an_example():
     names = re.findall(r"auto(?:class|function):: dahl_ident\.(\S+)$", REFERENCE, re.MULTILINE)
     assert len(names) > 60
     assert [name for name in names if not _has_example(attrgetter(name)(di))] == []
@@ -49,25 +46,25 @@ def test_every_class_and_function_of_the_reference_has_an_example() -> None:
 
 @pytest.mark.manual
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
-def test_examples_print_what_the_page_says(page: Path, tmp_path: Path) -> None:
+def test_examples_print_what_the_page_says(page, tmp_path):
     assert renewed(page, tmp_path) == page.read_text("utf-8")
 
 
 @pytest.mark.manual
 @pytest.mark.parametrize("notebook", notebooks(), ids=lambda notebook: notebook.stem)
-def test_a_notebook_prints_what_is_stored(notebook: Path, tmp_path: Path) -> None:
+def test_a_notebook_prints_what_is_stored(notebook, tmp_path):
     stored = json.loads(notebook.read_text("utf-8"))
     assert printed(executed(notebook, tmp_path)) == printed(stored)
 
 
-def test_files_that_the_manual_names_exist() -> None:
+def test_files_that_the_manual_names_exist():
     root = DOCS.parent
     for page in DOCS.rglob("*.md"):
         for pattern in re.findall(r"`((?:tests|notebooks)/[\w*./]+)`", page.read_text("utf-8")):
             assert list(root.glob(pattern)), f"{page.name} names {pattern}"
 
 
-def _offline() -> ModuleType:
+def _offline():
     spec = importlib.util.spec_from_file_location("offline", DOCS / "extensions" / "offline.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -86,12 +83,12 @@ def _offline() -> ModuleType:
         ('<script src="_static/a.js?v=//1"></script> <img src="data:image/png;base64,//">', []),
     ],
 )  # fmt: skip
-def test_what_a_page_of_the_manual_fetches_is_found(page: str, fetches: list[str]) -> None:
+def test_what_a_page_of_the_manual_fetches_is_found(page, fetches):
     pytest.importorskip("latex2mathml")
     assert _offline().fetched(page) == fetches
 
 
-def test_the_search_quotes_the_sections_of_an_article_alone() -> None:
+def test_the_search_quotes_the_sections_of_an_article_alone():
     pytest.importorskip("latex2mathml")
     page = (
         "<nav>All</nav><article><section id='a'><h1>A &lt; B<a class='headerlink'>#</a></h1>"
@@ -101,7 +98,7 @@ def test_the_search_quotes_the_sections_of_an_article_alone() -> None:
     assert _offline().article(page) == text
 
 
-def test_formulas_of_the_manual_are_mathml() -> None:
+def test_formulas_of_the_manual_are_mathml():
     pytest.importorskip("latex2mathml")
     offline = _offline()
     blocks = [
@@ -113,7 +110,7 @@ def test_formulas_of_the_manual_are_mathml() -> None:
         assert "\\" not in re.sub("<[^>]*>", "", offline.mathml(text, "block")), text
 
 
-def test_the_messages_of_troubleshooting_are_those_of_the_package() -> None:
+def test_the_messages_of_troubleshooting_are_those_of_the_package():
     source = "".join(p.read_text("utf-8") for p in Path(di.__file__).parent.rglob("*.py"))
     flat = re.sub(r"\"\s*f?\"", "", source)  # texts over several lines
     page = (DOCS / "how_to" / "troubleshooting.md").read_text("utf-8")
@@ -122,7 +119,7 @@ def test_the_messages_of_troubleshooting_are_those_of_the_package() -> None:
     assert [text for text in messages if text not in flat] == []
 
 
-def test_every_field_of_the_metadata_is_explained() -> None:
+def test_every_field_of_the_metadata_is_explained():
     page = (DOCS / "how_to" / "reports.md").read_text("utf-8")
     template = Path(di.__file__).parent / "cli" / "templates" / "report.toml"
     fields = re.findall(r"^(?:\[\[)?([a-z_]+)(?:\]\])?(?: =|$)", template.read_text("utf-8"), re.M)

@@ -1,14 +1,11 @@
 """Masses and dampers that fits of tables find and no device has: said in the verdict."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import dahl_ident as di
-from dahl_ident.elements import Element
 
 
-def table(device: Element, seed: int = 0, noise: float = 0.005) -> di.FrequencyResponse:
+def table(device, seed=0, noise=0.005):
     """Return the response of a device at twelve amplitudes and three frequencies, with noise."""
     rng = np.random.default_rng(seed)
     A, f = (v.ravel() for v in np.meshgrid(np.geomspace(1e-3, 2e-2, 12), [0.5, 1.0, 2.0]))
@@ -20,7 +17,7 @@ def table(device: Element, seed: int = 0, noise: float = 0.005) -> di.FrequencyR
     return di.FrequencyResponse(f, Z * scatter, A)
 
 
-def test_a_negative_damper_is_said_with_what_to_do() -> None:
+def test_a_negative_damper_is_said_with_what_to_do():
     device = di.Dahl(0.1, 30.0) + di.Damper(-0.1)
     fit = di.fit(table(device), di.Dahl() + di.Damper(), throw=False)
     assert not fit.trusted
@@ -33,7 +30,7 @@ def test_a_negative_damper_is_said_with_what_to_do() -> None:
     assert "negative" not in sound.verdict
 
 
-def test_a_mass_that_rests_on_less_than_the_misfit_is_not_determined() -> None:
+def test_a_mass_that_rests_on_less_than_the_misfit_is_not_determined():
     law = di.Dahl(0.05, 20.0, name="a") + di.Dahl(0.05, 6.0, name="b") + di.Mass(3e-3)
     fit = di.fit(table(law, noise=0.02), di.Dahl() + di.Mass(), throw=False)
     assert fit.status.value == "not described"  # two laws, and one was fitted

@@ -1,15 +1,10 @@
 """Iwan's law driven by a force, against an integration with its exact memory."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from tests.motions import Driven, differences, slopes
 from tests.test_forced_motion import RATE, multisine
 
@@ -22,10 +17,10 @@ LAW = di.Iwan(*VALUES)
 class Memory:
     """The turning points that the law remembers, and the force on from the last one."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.turns: list[tuple[float, float]] = []
 
-    def force(self, x: float) -> float:
+    def force(self, x):
         at = [np.asarray(v) for v in VALUES]
         if not self.turns:
             return float(np.sign(x) * LAW.backbone(at, np.asarray(abs(x))))
@@ -33,27 +28,27 @@ class Memory:
         path = abs(x - place)
         return float(force + np.sign(x - place) * 2.0 * LAW.backbone(at, np.asarray(0.5 * path)))
 
-    def limit(self) -> float:
+    def limit(self):
         """Return the displacement at which the present path ends."""
         if not self.turns:
             return np.inf
         return self.turns[-2][0] if len(self.turns) > 1 else -self.turns[0][0]
 
 
-def exact(samples: int, drive: Callable[[float], float]) -> FloatArray:
+def exact(samples, drive):
     """Return displacements by DOP853, stopped at every turn and where a loop closes."""
     times, memory = np.arange(samples) / RATE, Memory()
     out, filled, now, y = np.empty(samples), 0, 0.0, np.zeros(2)
     s = 1.0 if drive(0.0) > 0.0 else -1.0
     while filled < samples:
 
-        def rates(t: float, y: FloatArray) -> list[float]:
+        def rates(t, y):
             return [y[1], (drive(t) - C * y[1] - K * y[0] - memory.force(float(y[0]))) / M]
 
-        def turn(_: float, y: FloatArray) -> float:
+        def turn(_, y):
             return float(y[1])
 
-        def close(_: float, y: FloatArray, s: float = s) -> float:
+        def close(_, y, s=s):
             return float(s * (y[0] - memory.limit())) if memory.turns else -1.0
 
         for event, way in ((turn, -s), (close, 1.0)):
@@ -76,13 +71,13 @@ def exact(samples: int, drive: Callable[[float], float]) -> FloatArray:
     return out
 
 
-def motion(wave: FloatArray) -> FloatArray:
+def motion(wave):
     driven = Driven(LAW + LINEAR, wave, RATE)
     return driven.motion(np.zeros(driven.order)).output
 
 
 @pytest.mark.parametrize("values", [[2.0, 5.0, -0.9, 0.1], VALUES, [1.0, 1.0, 1.5, 0.3]])
-def test_elements_are_a_polygon_in_the_backbone_curve(values: list[float]) -> None:
+def test_elements_are_a_polygon_in_the_backbone_curve(values):
     law = di.Iwan(*values)
     stiffnesses, places = law.sliders(values)
     slips = di.MaxwellSlip(places, stiffnesses)
@@ -98,7 +93,7 @@ def test_elements_are_a_polygon_in_the_backbone_curve(values: list[float]) -> No
     assert 0.9 * most < error.max() < 1.1 * most
 
 
-def test_harmonics_have_the_error_that_is_stated() -> None:
+def test_harmonics_have_the_error_that_is_stated():
     for chi in (-0.9, -0.5, 0.0):
         for ratio in (0.1, 1.0):
             law = di.Iwan(1.0, 1.0, chi, ratio)
@@ -109,7 +104,7 @@ def test_harmonics_have_the_error_that_is_stated() -> None:
             assert np.abs(other.imag / exact_one.imag - 1.0).max() < 0.02
 
 
-def test_motion_converges_to_that_of_the_exact_law(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_motion_converges_to_that_of_the_exact_law(monkeypatch):
     samples = 128
     wave, drive = multisine(samples)
     truth = exact(samples, drive)
@@ -122,7 +117,7 @@ def test_motion_converges_to_that_of_the_exact_law(monkeypatch: pytest.MonkeyPat
     assert errors[1] < errors[0] / 12.0
 
 
-def test_slopes_are_derivatives() -> None:
+def test_slopes_are_derivatives():
     plant = Driven(di.Iwan() + di.Mass() + di.Damper() + di.Spring(), multisine(64)[0], RATE)
     starts, values = np.array([1e-4, 0.01, 0.4]), np.array([*VALUES, M, C, K])
     _, found = slopes(plant, starts, values)
@@ -131,7 +126,7 @@ def test_slopes_are_derivatives() -> None:
         assert error < 2e-6, i
 
 
-def test_a_short_record_from_rest_is_fitted() -> None:
+def test_a_short_record_from_rest_is_fitted():
     """Its three shape parameters lie in a long curved valley."""
     rng, t = np.random.default_rng(0), np.arange(384) / 100.0
     lines = 2.0 * np.pi * np.arange(1, 9) / t[-1]

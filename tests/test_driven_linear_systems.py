@@ -1,14 +1,11 @@
 """Linear systems in records: scipy's integrator, exact responses, slopes, recovery, refusals."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from tests.motions import Driven, differences, slopes
@@ -31,7 +28,7 @@ PLACE = 1e-4  # of both masses at the first sample, at rest
 MODELS: list[Element] = [FRICTION + LUMPED + ABSORBER, ARM + FRICTION]
 
 
-def integrated() -> FloatArray:
+def integrated():
     """Return the first mass's motion by DOP853, stopped wherever it turns."""
     _, drive = multisine(SAMPLES)
     times = np.arange(SAMPLES) / RATE
@@ -40,12 +37,12 @@ def integrated() -> FloatArray:
     s = 1.0 if drive(0.0) - K * PLACE > 0.0 else -1.0
     while place < SAMPLES:
 
-        def rates(t: float, y: FloatArray, s: float = s) -> list[float]:
+        def rates(t, y, s=s):
             link = C2 * (y[1] - y[3]) + K2 * (y[0] - y[2])
             push = drive(t) - C * y[1] - K * y[0] - link - y[4]
             return [y[1], push / M, y[3], link / M2, SIGMA * (1.0 - s * y[4] / F_MAX) * y[1]]
 
-        def turn(_: float, y: FloatArray) -> float:
+        def turn(_, y):
             return float(y[1])
 
         turn.terminal, turn.direction = True, -s  # type: ignore[attr-defined]
@@ -62,18 +59,18 @@ def integrated() -> FloatArray:
     return out
 
 
-def driven(model: Element, repeats: int = 1) -> Driven:
+def driven(model, repeats=1):
     return Driven(model, np.tile(multisine(SAMPLES)[0], repeats), RATE)
 
 
-def at_rest(element: Element) -> FloatArray:
+def at_rest(element):
     """Return the states that do not change where the displacement stays at `PLACE`."""
     units = np.vstack([np.zeros(element.n_states), np.eye(element.n_states)])
     rates = np.array([element.mechanics([], PLACE, 0.0, 1.0, list(z)).rates for z in units])
     return np.asarray(np.linalg.solve((rates[1:] - rates[0]).T, -rates[0]))
 
 
-def first_state(model: Element) -> FloatArray:
+def first_state(model):
     """Return both masses at `PLACE` at rest, without friction."""
     found = [PLACE, 0.0]
     for element in Model(model).elements:
@@ -85,7 +82,7 @@ def first_state(model: Element) -> FloatArray:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_motion_against_scipy(model: Element) -> None:
+def test_motion_against_scipy(model):
     first = first_state(model)
     found = driven(model).motion(first).states
     reference = integrated()
@@ -93,7 +90,7 @@ def test_motion_against_scipy(model: Element) -> None:
     assert error.max() < 1e-8
 
 
-def test_slopes_are_derivatives() -> None:
+def test_slopes_are_derivatives():
     plant = driven(di.Dahl() + di.Mass() + di.Damper() + di.Spring(K) + ABSORBER)
     starts, values = np.array([PLACE, 0.01, 3.0, 2e-4, -1e-4]), np.array([F_MAX, SIGMA, M, C])
     _, found = slopes(plant, starts, values)
@@ -102,7 +99,7 @@ def test_slopes_are_derivatives() -> None:
         assert error < 1e-6, i
 
 
-def whole_motion(t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def whole_motion(t):
     """Return displacement, velocity, acceleration and the settled force of the absorber."""
     lines = np.array([[31.0, 3e-4, 0.3], [190.0, 1e-4, 1.1], [260.0, 5e-5, -2.0]])
     X = lines[:, 1] * np.exp(1j * lines[:, 2])
@@ -113,7 +110,7 @@ def whole_motion(t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     return x, v, a, force
 
 
-def test_force_from_displacement_is_the_frequency_response() -> None:
+def test_force_from_displacement_is_the_frequency_response():
     t = np.arange(600) / RATE
     x, v, a, expected = whole_motion(t)
     element = ABSORBER.sampled(1.0 / RATE)
@@ -127,7 +124,7 @@ def test_force_from_displacement_is_the_frequency_response() -> None:
         ABSORBER.force(x, velocity=v, acceleration=a)
 
 
-def test_lumped_elements_as_a_system_are_those_elements() -> None:
+def test_lumped_elements_as_a_system_are_those_elements():
     t = np.arange(50) / RATE
     x, v, a, _ = whole_motion(t)
     for quantity in ("receptance", "mobility", "accelerance"):
@@ -143,7 +140,7 @@ def test_lumped_elements_as_a_system_are_those_elements() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_recovered_from_a_driven_multisine(model: Element) -> None:
+def test_recovered_from_a_driven_multisine(model):
     x = driven(model, 4).motion(first_state(model)).output
     x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
     wave = np.tile(multisine(SAMPLES)[0], 4)
@@ -157,7 +154,7 @@ def test_recovered_from_a_driven_multisine(model: Element) -> None:
     assert np.std(fit.simulate(record) - x) < 0.3 * x.std()
 
 
-def test_recovered_from_a_measured_displacement() -> None:
+def test_recovered_from_a_measured_displacement():
     t = np.arange(2000) / RATE
     x, _, _, force = whole_motion(t)
     force = force + di.Dahl(F_MAX, SIGMA).force(x)
@@ -177,21 +174,21 @@ FRD = control.frd(WHOLE, np.geomspace(1.0, 1e3, 20))
         (WHOLE * 100.0 / (S + 100.0), "receptance", r"grows as s\^3; an equation of motion"),
     ],
 )
-def test_systems_without_an_equation_of_motion(system: object, quantity: str, text: str) -> None:
+def test_systems_without_an_equation_of_motion(system, quantity, text):
     t = np.arange(64) / RATE
     record = di.Record(t, displacement=np.sin(t), force=np.ones(64))
-    element = di.LinearSystem(system, quantity=quantity)  # type: ignore[arg-type]
+    element = di.LinearSystem(system, quantity=quantity)
     with pytest.raises(ModelError, match=text) as refusal:
         di.fit(record, di.Dahl() + di.Mass() + element)
     assert "LinearSystem" in str(refusal.value)
 
 
-def hung(damping: float, stiffness: float) -> control.TransferFunction:
+def hung(damping, stiffness):
     link = damping * S + stiffness
     return M2 * S**2 * link / (M2 * S**2 + link)
 
 
-def test_free_parameters_are_found_from_their_starts() -> None:
+def test_free_parameters_are_found_from_their_starts():
     x = driven(MODELS[0], 2).motion(first_state(MODELS[0])).output
     x = x + 1e-3 * x.std() * np.random.default_rng(0).standard_normal(x.size)
     wave = np.tile(multisine(SAMPLES)[0], 2)
@@ -219,7 +216,7 @@ def test_free_parameters_are_found_from_their_starts() -> None:
         assert error < 1e-4 * np.abs(exact[:, i]).max(), problem.names[i]
 
 
-def test_free_parameters_and_a_moving_base_are_refused() -> None:
+def test_free_parameters_and_a_moving_base_are_refused():
     record = di.Record(np.arange(64) / RATE, displacement=np.sin(np.arange(64)), force=np.ones(64))
     free = di.LinearSystem(
         lambda k: control.tf([1.0], [k]), quantity="receptance", parameters={"k": None}
@@ -232,7 +229,7 @@ def test_free_parameters_and_a_moving_base_are_refused() -> None:
         di.fit(record, di.Dahl() + di.Mass() + ABSORBER, excitation="base")
 
 
-def test_stiffness_that_is_not_stable_has_no_force_over_time() -> None:
+def test_stiffness_that_is_not_stable_has_no_force_over_time():
     beyond = di.LinearSystem((S - 30.0) / (M * S**2 + C * S + K), quantity="receptance")
     t = np.arange(300) / RATE
     x, v, a, _ = whole_motion(t)

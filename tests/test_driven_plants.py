@@ -3,8 +3,6 @@
 ``python -m benchmarks.driven_plants`` does the same for ten plants, with more tables and rows.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ from benchmarks.driven_plants import PLANTS, scored, simulated, table
 
 
 @pytest.mark.parametrize("number", [0, 2])
-def test_a_sweep_of_another_integrator_is_trusted(number: int) -> None:
+def test_a_sweep_of_another_integrator_is_trusted(number):
     plant = PLANTS[number]
     frequency, drive, receptance, closure = simulated(plant, 4, 6)
     assert closure < 1e-6
@@ -26,7 +24,7 @@ def test_a_sweep_of_another_integrator_is_trusted(number: int) -> None:
 
 
 @pytest.mark.parametrize("upwards", [True, False])
-def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards: bool) -> None:
+def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards):
     """A gap stiffens the plant: swept upwards the large motion lasts, downwards the small one."""
     known = di.Mass(0.3) + di.Spring(3.0)
     law = di.Backlash(di.Dahl(2.0, 60.0, alpha=1.0), gap=0.02)
@@ -57,7 +55,7 @@ def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards: bool) -> None
     assert "The response jumps: at 0.06 N from " in fit.verdict
 
 
-def test_a_plant_that_feeds_energy_in_is_fitted_by_the_describing_function() -> None:
+def test_a_plant_that_feeds_energy_in_is_fitted_by_the_describing_function():
     rng = np.random.default_rng(3)
     f, u = np.tile(np.geomspace(0.4, 2.6, 8), 2), np.repeat([0.05, 0.3], 8)
     omega = 2.0 * np.pi * f
@@ -75,7 +73,7 @@ def test_a_plant_that_feeds_energy_in_is_fitted_by_the_describing_function() -> 
     assert any(finding.code == "no_steady_motion" for finding in fit.findings)
 
 
-def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms() -> None:
+def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms():
     plant = di.Dahl(0.1, 30.0, 1.0) + di.Mass(0.3) + di.Damper(1.0) + di.Spring(8.0)
     f = np.tile(np.geomspace(0.4, 2.0, 5), 2)
     u = np.repeat([0.15, 0.4], 5)
@@ -95,7 +93,7 @@ def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms(
     assert "dahl-ident fit --record 'run 7.csv' --mass free" in fit.verdict
 
 
-def test_points_without_a_stable_motion_are_named() -> None:
+def test_points_without_a_stable_motion_are_named():
     law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
     plant = law + di.Mass(0.3) + di.Damper(0.3) + di.Spring(8.0)
     steady = di.response(plant, [0.4, 0.58, 2.6], [0.05, 0.05, 0.6])
@@ -104,7 +102,7 @@ def test_points_without_a_stable_motion_are_named() -> None:
     assert steady.message.startswith("2 of 3 points: no stable motion of the drive's period")
 
 
-def test_a_response_follows_its_sweep_to_the_jump() -> None:
+def test_a_response_follows_its_sweep_to_the_jump():
     law = di.Backlash(di.Dahl(2.0, 60.0, 1.0), gap=0.02)
     plant = law + di.Mass(0.3) + di.Spring(3.0) + di.Damper(0.12)
     frequency = np.linspace(0.8, 1.5, 9)
@@ -117,7 +115,7 @@ def test_a_response_follows_its_sweep_to_the_jump() -> None:
         np.testing.assert_allclose(one.amplitude, last(amplitude, axis=1)[order], rtol=1e-6)
 
 
-def test_rows_without_a_stable_motion_are_named_and_do_not_stop_the_search() -> None:
+def test_rows_without_a_stable_motion_are_named_and_do_not_stop_the_search():
     law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
     known = di.Mass(0.3) + di.Spring(8.0)
     f, u = np.tile(np.linspace(0.4, 2.6, 8), 2), np.repeat([0.05, 0.6], 8)

@@ -1,9 +1,6 @@
 """What every element promises, one contract over all of them and over sums."""
 
-from __future__ import annotations
-
 import importlib
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -20,11 +17,11 @@ from dahl_ident.errors import ModelError, ValidationError
 control: Any = importlib.import_module("control")
 
 
-def mode(mass: float, damping: float, stiffness: float) -> Any:
+def mode(mass, damping, stiffness):
     return control.tf([1.0], [mass, damping, stiffness])
 
 
-def base() -> LinearSystem:
+def base():
     """Return a linear system whose arguments declare their units."""
     return LinearSystem(
         mode,
@@ -61,7 +58,7 @@ OMEGA = np.array([0.7, 3.0, 11.0, 40.0])
 every_element = pytest.mark.parametrize("element", EVERY.values(), ids=EVERY.keys())
 
 
-def all_free(element: Element) -> Model:
+def all_free(element):
     """Return the element with every parameter free, so that every derivative is computed."""
     return Model(element).with_free([p.name for p in element.parameters])
 
@@ -70,7 +67,7 @@ def all_free(element: Element) -> Model:
 
 
 @every_element
-def test_scalars_give_scalars_and_arrays_broadcast(element: Element) -> None:
+def test_scalars_give_scalars_and_arrays_broadcast(element):
     one = element.dynamic_stiffness(0.03, 3.0)
     assert isinstance(one, complex)
     grid = element.dynamic_stiffness(AMPLITUDE, OMEGA)
@@ -81,7 +78,7 @@ def test_scalars_give_scalars_and_arrays_broadcast(element: Element) -> None:
 
 @every_element
 @pytest.mark.parametrize("harmonic", [1, 2, 3])
-def test_batches_of_parameters_are_each_alone(element: Element, harmonic: int) -> None:
+def test_batches_of_parameters_are_each_alone(element, harmonic):
     model = all_free(element)
     rng = np.random.default_rng(5)
     vectors = np.array([float(v) for v in model.known_values()]) * rng.uniform(
@@ -104,7 +101,7 @@ def test_batches_of_parameters_are_each_alone(element: Element, harmonic: int) -
 
 
 @every_element
-def test_rows_of_several_harmonics_are_each_that_of_one(element: Element) -> None:
+def test_rows_of_several_harmonics_are_each_that_of_one(element):
     model = all_free(element)
     values = list(model.known_values())
     A, omega, orders = AMPLITUDE.ravel(), OMEGA[:3], np.array([3, 1, 2])
@@ -126,12 +123,12 @@ ORDER: dict[type[Element], int] = {Mass: 2, Damper: 1, Spring: 0}
 
 
 @lru_cache
-def friction_exactly(p: tuple[mpf, ...], A: mpf, harmonic: int) -> Any:
+def friction_exactly(p, A, harmonic):
     """Return F_k/X_1 by quadrature over half of the closed loop of Eqn. 2."""
     f_max, sigma, alpha = p
     beta = sigma * A / f_max
 
-    def margin(start: mpf, path: mpf) -> mpf:
+    def margin(start, path):
         if alpha == 1:
             return start * mpmath.exp(-path)
         left = start ** (1 - alpha) - (1 - alpha) * path
@@ -148,14 +145,14 @@ def friction_exactly(p: tuple[mpf, ...], A: mpf, harmonic: int) -> Any:
         path = 2 ** (1 - alpha) / (1 - alpha)
         stops = sorted([*stops, mpmath.acos(1 - path / beta)])
 
-    def integrand(theta: mpf) -> Any:
+    def integrand(theta):
         force = margin(1 + f0, beta * (1 - mpmath.cos(theta))) - 1
         return force * mpmath.expj(-harmonic * theta)
 
     return f_max / A * 2 / mpmath.pi * mpmath.quad(integrand, stops)
 
 
-def exactly(element: Element, p: Sequence[mpf], A: mpf, omega: mpf, harmonic: int) -> Any:
+def exactly(element, p, A, omega, harmonic):
     """Return F_k/X_1 of any element or sum, in mpmath."""
     total, first = mpmath.mpc(0), 0
     s = 1j * omega
@@ -176,7 +173,7 @@ def exactly(element: Element, p: Sequence[mpf], A: mpf, omega: mpf, harmonic: in
 
 @every_element
 @pytest.mark.parametrize("harmonic", [1, 3])
-def test_values_and_all_derivatives_against_30_digits(element: Element, harmonic: int) -> None:
+def test_values_and_all_derivatives_against_30_digits(element, harmonic):
     model = all_free(element)
     values = model.known_values()
     A, w = float(AMPLITUDE[1, 0]), float(OMEGA[1])
@@ -185,11 +182,11 @@ def test_values_and_all_derivatives_against_30_digits(element: Element, harmonic
         p = [mpf(float(v)) for v in values]
         step = mpf(10) ** -9
 
-        def at(change: mpf, index: int | None = None) -> Any:
+        def at(change, index=None):
             q = [v + change if i == index else v for i, v in enumerate(p)]
             return exactly(element, q, mpf(A) + (change if index is None else 0), mpf(w), harmonic)
 
-        def slope(size: float, index: int | None = None) -> complex:
+        def slope(size, index=None):
             change = step * mpf(size)
             return complex((at(change, index) - at(-change, index)) / (2 * change))
 
@@ -205,7 +202,7 @@ def test_values_and_all_derivatives_against_30_digits(element: Element, harmonic
 
 
 @every_element
-def test_linear_elements_answer_no_harmonic(element: Element) -> None:
+def test_linear_elements_answer_no_harmonic(element):
     friction = [e for e in Model(element).elements if isinstance(e, Dahl)]
     third = element.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3)
     expected = sum(
@@ -225,9 +222,7 @@ DIMENSION = {"N": (1, 0), "N/m": (1, -1), "kg": (1, -1), "N s/m": (1, -1), "": (
 
 @every_element
 @pytest.mark.parametrize(("force", "displacement"), [(1e3, 1.0), (1.0, 1e-6), (4.448, 0.0254)])
-def test_other_units_scale_parameters_as_their_units_say(
-    element: Element, force: float, displacement: float
-) -> None:
+def test_other_units_scale_parameters_as_their_units_say(element, force, displacement):
     if isinstance(element, LinearSystem) and not element.parameters:
         return  # a fixed system has no parameter to scale
     model = Model(element)
@@ -252,7 +247,7 @@ def test_other_units_scale_parameters_as_their_units_say(
 
 
 @every_element
-def test_no_element_gives_energy(element: Element) -> None:
+def test_no_element_gives_energy(element):
     A = np.geomspace(1e-9, 1e6, 61)[:, None]
     Z = element.dynamic_stiffness(A, OMEGA)
     assert np.all(Z.imag >= -1e-14 * np.abs(Z))
@@ -261,9 +256,7 @@ def test_no_element_gives_energy(element: Element) -> None:
 
 @pytest.mark.parametrize("element", WITH_FORCE.values(), ids=WITH_FORCE.keys())
 @pytest.mark.parametrize("A", [0.03, 0.5])
-def test_force_over_time_has_the_harmonics_of_the_describing_function(
-    element: Element, A: float
-) -> None:
+def test_force_over_time_has_the_harmonics_of_the_describing_function(element, A):
     omega, samples, cycles = 3.0, 2**14, 12
     theta = 2.0 * np.pi * np.arange(samples * cycles) / samples
     force = element.force(
@@ -282,7 +275,7 @@ def test_force_over_time_has_the_harmonics_of_the_describing_function(
 # bookkeeping
 
 
-def test_a_sum_is_the_sum_of_its_parts() -> None:
+def test_a_sum_is_the_sum_of_its_parts():
     parts = [Dahl(0.5, 30.0), Mass(0.3), base()]
     total = all_free(parts[0] + parts[1] + parts[2])
     ours = total.stiffness_gradient(total.known_values(), AMPLITUDE, OMEGA)
@@ -297,7 +290,7 @@ def test_a_sum_is_the_sum_of_its_parts() -> None:
 
 
 @every_element
-def test_amplitudes_and_frequencies_are_checked(element: Element) -> None:
+def test_amplitudes_and_frequencies_are_checked(element):
     cases: list[tuple[Any, str]] = [
         ([0.1, -1.0], r"amplitude\[1\] is -1\.0"),
         (np.nan, r"amplitude is nan"),
@@ -328,12 +321,12 @@ def test_amplitudes_and_frequencies_are_checked(element: Element) -> None:
         (LinearSystem(mode, quantity="receptance", parameters={"mass": None}), "mass"),
     ],
 )
-def test_a_missing_value_is_named(element: Element, missing: str) -> None:
+def test_a_missing_value_is_named(element, missing):
     with pytest.raises(ModelError, match=f"has no value for {missing};"):
         element.dynamic_stiffness(1.0, 1.0)
 
 
-def test_histories_that_an_element_needs_are_asked_for() -> None:
+def test_histories_that_an_element_needs_are_asked_for():
     x: FloatArray = np.array([0.0, 1.0])
     with pytest.raises(ValidationError, match=r"Mass\(mass=0\.3\) needs acceleration"):
         Mass(0.3).force(x)
@@ -346,7 +339,7 @@ def test_histories_that_an_element_needs_are_asked_for() -> None:
             element.force(x, velocity=[0.0, 1.0, 2.0])
 
 
-def test_names_clash_or_are_refused() -> None:
+def test_names_clash_or_are_refused():
     with pytest.raises(ModelError, match=r"share the parameter names f_max, sigma, alpha"):
         Dahl(1.0, 1.0) + Dahl(2.0, 2.0)
     with pytest.raises(ValidationError, match=r"name is 'two words'"):

@@ -4,10 +4,6 @@ Raw or table -> extract -> fit -> posterior. Flawed data must be caught by name:
 silently wrong.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-
 import numpy as np
 import pytest
 
@@ -20,25 +16,25 @@ PLANT = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
 INSIDE = 0.9973
 
 
-def table(name: str) -> FrequencyResponse:
+def table(name):
     data = di.load_dataset(name)
     assert isinstance(data, FrequencyResponse)
     return data
 
 
-def points(name: str, **options: object) -> FrequencyResponse:
+def points(name, **options):
     """Return the fundamentals that the extraction finds in a shipped recording."""
     record = di.load_dataset(name)
     assert isinstance(record, di.Record)
-    return extract(record, **options).select(harmonic=1)  # type: ignore[arg-type]  # passed on
+    return extract(record, **options).select(harmonic=1)  # passed on
 
 
-def truth(name: str) -> Mapping[str, float]:
+def truth(name):
     provenance = di.load_dataset(name).provenance
     return dict(provenance["truth"])
 
 
-def assert_recovered(fit: di.FitResult, true: Mapping[str, float], *names: str) -> None:
+def assert_recovered(fit, true, *names):
     """Check that the profile intervals of `names` hold the truth."""
     intervals = fit.conf_interval("profile").at(INSIDE)
     for name in names:
@@ -46,7 +42,7 @@ def assert_recovered(fit: di.FitResult, true: Mapping[str, float], *names: str) 
         assert low <= true[name] <= high, f"{name}: {true[name]} outside {low} to {high}"
 
 
-def assert_posterior_holds(fit: di.FitResult, true: Mapping[str, float], *names: str) -> None:
+def assert_posterior_holds(fit, true, *names):
     """Check that the posterior's central 99.73 % holds the truth."""
     posterior = di.posterior(fit, method="grid", tolerance=1e-2)
     for name in names:
@@ -55,7 +51,7 @@ def assert_posterior_holds(fit: di.FitResult, true: Mapping[str, float], *names:
 
 
 @pytest.mark.parametrize("name", ["noisy", "alpha_2"])
-def test_tables_that_determine_everything(name: str) -> None:
+def test_tables_that_determine_everything(name):
     free = ["alpha"] if name == "alpha_2" else []
     fit = di.fit(table(name), di.Dahl(), free=free)
     assert fit.trusted, fit.verdict
@@ -63,14 +59,14 @@ def test_tables_that_determine_everything(name: str) -> None:
     assert_posterior_holds(fit, truth(name), *fit.var_names)
 
 
-def test_clean() -> None:
+def test_clean():
     fit = di.fit(table("clean"), di.Dahl())
     assert fit.trusted, fit.verdict
     for name, value in truth("clean").items():
         assert fit.params[name].value == pytest.approx(value, rel=1e-9)
 
 
-def test_microslip_says_that_f_max_is_only_bounded_below() -> None:
+def test_microslip_says_that_f_max_is_only_bounded_below():
     fit = di.fit(table("microslip"), di.Dahl())
     assert not fit.trusted
     assert "Only sigma is determined; not f_max" in fit.verdict
@@ -79,7 +75,7 @@ def test_microslip_says_that_f_max_is_only_bounded_below() -> None:
     assert_posterior_holds(fit, truth("microslip"), "f_max", "sigma")
 
 
-def test_gross_slip_says_that_sigma_is_only_bounded_below() -> None:
+def test_gross_slip_says_that_sigma_is_only_bounded_below():
     fit = di.fit(table("gross_slip"), di.Dahl())
     assert not fit.trusted
     assert "Only f_max is determined; not sigma" in fit.verdict
@@ -87,7 +83,7 @@ def test_gross_slip_says_that_sigma_is_only_bounded_below() -> None:
     assert_posterior_holds(fit, truth("gross_slip"), "f_max", "sigma")
 
 
-def test_an_exponent_of_2_is_not_taken_for_linear_dahl() -> None:
+def test_an_exponent_of_2_is_not_taken_for_linear_dahl():
     fit = di.fit(table("alpha_2"), di.Dahl(alpha=1.0))
     assert not fit.trusted
     assert "these data are not linear Dahl" in fit.verdict
@@ -97,13 +93,13 @@ def test_an_exponent_of_2_is_not_taken_for_linear_dahl() -> None:
     assert abs(estimated.value - 2.0) < 3.0 * estimated.stderr
 
 
-def test_plant_of_figure_7() -> None:
+def test_plant_of_figure_7():
     fit = di.fit(table("fig_7_plant"), PLANT)
     assert fit.trusted, fit.verdict
     assert_recovered(fit, truth("fig_7_plant"), *fit.var_names)
 
 
-def test_levels_without_time_to_settle_are_caught() -> None:
+def test_levels_without_time_to_settle_are_caught():
     data = points("unsettled")
     assert "not settled" in " ".join(data.quality["verdict"])
     fit = di.fit(data, di.Dahl())
@@ -112,7 +108,7 @@ def test_levels_without_time_to_settle_are_caught() -> None:
     assert "not settled" in fit.verdict
 
 
-def test_coarse_sensor_steps_are_caught_and_the_other_points_recover_the_truth() -> None:
+def test_coarse_sensor_steps_are_caught_and_the_other_points_recover_the_truth():
     data = points("quantised")
     flagged = data.quality["verdict"] != "good"
     assert any("sensor steps" in verdict for verdict in data.quality["verdict"][flagged])
@@ -123,7 +119,7 @@ def test_coarse_sensor_steps_are_caught_and_the_other_points_recover_the_truth()
     assert_recovered(fit, truth("quantised"), "f_max", "sigma")
 
 
-def test_outliers_are_named_and_the_other_rows_recover_the_truth() -> None:
+def test_outliers_are_named_and_the_other_rows_recover_the_truth():
     data = table("outliers")
     rows = list(data.provenance["outlier_rows"])
     fit = di.fit(data, di.Dahl())
@@ -139,7 +135,7 @@ def test_outliers_are_named_and_the_other_rows_recover_the_truth() -> None:
         assert abs(estimate.value - truth("outliers")[name]) < 3.0 * estimate.stderr
 
 
-def test_a_delayed_and_mis_scaled_sensor_is_caught() -> None:
+def test_a_delayed_and_mis_scaled_sensor_is_caught():
     data, true = table("delayed"), truth("delayed")
     fit = di.fit(data, di.Dahl())
     assert not fit.trusted
@@ -152,27 +148,27 @@ def test_a_delayed_and_mis_scaled_sensor_is_caught() -> None:
     assert not unknown.trusted
 
 
-def test_friction_alone_that_a_drive_moves_without_bound_is_refused_with_what_to_add() -> None:
+def test_friction_alone_that_a_drive_moves_without_bound_is_refused_with_what_to_add():
     for throw in (False, True):
         with pytest.raises(FitError, match=r"predict 0\.05 Hz, 1 mN.*add the mass, damper"):
             di.fit(table("fig_7_plant"), di.Dahl(), throw=throw)
 
 
-def test_degrees_of_freedom_without_bound_are_stated_alike_in_budget_and_intervals() -> None:
+def test_degrees_of_freedom_without_bound_are_stated_alike_in_budget_and_intervals():
     two = table("noisy").select(rows=np.isin(np.arange(30), [5, 15]))  # noise as it is stated
     fit = di.fit(two, di.Dahl(alpha=1.0))
     assert fit.budget()["f_max"].dof == np.inf
     assert "normal distribution" in fit.conf_interval().note
 
 
-def test_limits_in_the_verdict_are_those_at_the_parameters() -> None:
+def test_limits_in_the_verdict_are_those_at_the_parameters():
     fit = di.fit(table("microslip"), di.Dahl(), throw=False)
     limit = f"at least {fit.conf_interval()['f_max'][1].lower:.3g} N"
     assert fit.conf_interval("profile")["f_max"][1].lower > fit.conf_interval()["f_max"][1].lower
     assert f"f_max: {limit} (95.45 %), not determined" in fit.verdict
 
 
-def test_combinations_that_are_determined_have_the_uncertainty_of_their_budget() -> None:
+def test_combinations_that_are_determined_have_the_uncertainty_of_their_budget():
     A = np.geomspace(1e-6, 1e-5, 12)
     exact = di.Dahl(0.1, 30.0).describing_function(A) + 100.0
     rng = np.random.default_rng(5)

@@ -1,13 +1,9 @@
 """The engine against what is not the engine: DOP853 with events, quadrature, closed forms."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,11 +33,11 @@ F_MAX = Parameter("f_max", "N", "limit", lower=0.0, transform="log")
 STIFFNESS = Parameter("k", "N/m", "stiffness", lower=0.0, transform="log")
 
 
-def seeded(*numbers: int) -> np.random.Generator:
+def seeded(*numbers):
     return np.random.default_rng([7, *numbers])
 
 
-def loop_of(element: di.Element, amplitude: float, values: Any, **options: Any) -> Any:
+def loop_of(element, amplitude, values, **options):
     system = translate(law_equations(element))
     return settled(
         system, np.array([amplitude]), np.array([1.0]), np.array([values], dtype=float), **options
@@ -54,9 +50,7 @@ def loop_of(element: di.Element, amplitude: float, values: Any, **options: Any) 
     [("settled loop", 1e-9), ("force history", 1e-9), ("settled motion of a plant", 1e-8),
      ("driven motion", 1e-8)],
 )  # fmt: skip
-def test_random_motions_are_those_of_an_independent_integrator(
-    kind: str, limit: float, law: str
-) -> None:
+def test_random_motions_are_those_of_an_independent_integrator(kind, limit, law):
     if law == "Iwan" and kind != "force history":
         pytest.skip("thirty events in each half cycle take the oracle half a minute")
     rng = seeded(list(cases.KINDS).index(kind), list(cases.LAWS).index(law))
@@ -66,7 +60,7 @@ def test_random_motions_are_those_of_an_independent_integrator(
 
 
 @pytest.mark.parametrize("law", list(cases.WAYS))
-def test_loops_of_any_amplitude_are_those_in_closed_form(law: str) -> None:
+def test_loops_of_any_amplitude_are_those_in_closed_form(law):
     rng = seeded(4, list(cases.LAWS).index(law))
     for _ in range(3):
         case = cases.any_amplitude(law, rng)
@@ -74,7 +68,7 @@ def test_loops_of_any_amplitude_are_those_in_closed_form(law: str) -> None:
 
 
 @pytest.mark.parametrize("beta", [1e-8, 0.3, 1e8])
-def test_dahl_loops_are_the_closed_forms(beta: float) -> None:
+def test_dahl_loops_are_the_closed_forms(beta):
     law = di.Dahl(2.0, 500.0)
     A = beta * 2.0 / 500.0
     result = loop_of(di.Dahl(), A, cases.all_values(cases.Drawn(0, di.Dahl(), [2.0, 500.0], 1, 1)),
@@ -92,9 +86,7 @@ def test_dahl_loops_are_the_closed_forms(beta: float) -> None:
 
 
 @pytest.mark.parametrize(("alpha", "beta"), [(0.7, 3.0), (1.5, 0.01), (1.5, 1e8)])
-def test_asymmetric_loops_of_any_exponent_are_sums_over_their_branches(
-    alpha: float, beta: float
-) -> None:
+def test_asymmetric_loops_of_any_exponent_are_sums_over_their_branches(alpha, beta):
     asymmetry = 0.3
     limits = 1.0 + asymmetry, 1.0 - asymmetry
     # tips by iteration, in units of f_max and x_c
@@ -109,7 +101,7 @@ def test_asymmetric_loops_of_any_exponent_are_sums_over_their_branches(
         if abs(high - last) < 1e-16:
             break
 
-    def force(theta: float) -> float:
+    def force(theta):
         if theta <= np.pi:
             path = 2.0 * beta * np.sin(0.5 * theta) ** 2 / limits[1]
             return -limits[1] * (1.0 - dahl_branch(1.0 + high / limits[1], path, alpha))
@@ -139,7 +131,7 @@ class Bilinear(di.Friction):
     kind = "bilinear_of_tests"
     parameters = (STIFFNESS, F_MAX)
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         k, f_max = values
         y = direction * force / f_max
         return k * ((y < 0.5) + 0.2 * (y >= 0.5)) * (y < 1.0)
@@ -151,7 +143,7 @@ class Pinched(di.Friction):
     kind = "pinched_of_tests"
     parameters = (STIFFNESS, F_MAX)
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         k, f_max = values
         y = direction * force / f_max
         return k * (1.0 - 0.9 * (np.fabs(y - 0.3) < 0.0025)) * (y < 1.0)
@@ -160,7 +152,7 @@ class Pinched(di.Friction):
 class PinchedBySquares(Pinched):
     """The same dip by a function that touches zero within a step."""
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         k, f_max = values
         y = direction * force / f_max
         return k * (1.0 - 0.9 * ((np.fabs(y) - 0.3) ** 2 < 0.0025**2) * (y > 0.0)) * (y < 1.0)
@@ -172,7 +164,7 @@ class Preloaded(di.Friction):
     kind = "preloaded_of_tests"
     parameters = (STIFFNESS, F_MAX)
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         k, f_max = values
         return k * (1.0 - direction * force / f_max) * (0.75 - 0.25 * np.tanh(2.0 * (force - 10.0)))
 
@@ -184,14 +176,14 @@ class Drifting(di.Friction):
     rate_independent = False
     parameters = (STIFFNESS, F_MAX, Parameter("bias", "", "of the limit", upper=0.9, lower=-0.9))
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         k, f_max, bias = values
         level = f_max * (1.0 + bias * direction) * (1.0 + 0.3 * np.exp(-(velocity**2)))
         return k * (1.0 - direction * force / level)
 
 
-def by_oracle(hand: Any, amplitude: float, result: Any, odd: bool, size: float) -> Any:
-    def displacement(t: float) -> tuple[float, float]:
+def by_oracle(hand, amplitude, result, odd, size):
+    def displacement(t):
         return amplitude * np.cos(t), -amplitude * np.sin(t)
 
     oracle = Oracle([hand], displacement, True, sizes=np.full(hand.n, size))
@@ -199,13 +191,13 @@ def by_oracle(hand: Any, amplitude: float, result: Any, odd: bool, size: float) 
     return c
 
 
-def harmonics_of(law: di.Friction, amplitude: float) -> Any:
+def harmonics_of(law, amplitude):
     """Return c_k of the law's settled loop at 1 rad/s, as users get them."""
     found = [law.dynamic_stiffness(amplitude, 1.0, harmonic=k) for k in HARMONICS]
     return amplitude * np.array(found)
 
 
-def test_bilinear_slopes_by_comparisons() -> None:
+def test_bilinear_slopes_by_comparisons():
     """The tip at A = 0.006 by hand: 1.2 F = 0.64. A table of half cycles gave 5.6 % less."""
     result = loop_of(Bilinear(), 0.006, [100.0, 1.0])
     assert abs(result.starts[0, 2] - 0.64 / 1.2) < 1e-9
@@ -219,7 +211,7 @@ def test_bilinear_slopes_by_comparisons() -> None:
 
 
 @pytest.mark.parametrize("law", [Pinched, PinchedBySquares])
-def test_pinched_slopes(law: type[di.Friction]) -> None:
+def test_pinched_slopes(law):
     for A in (0.002, 0.006, 0.03):
         result = loop_of(law(), A, [100.0, 1.0], harmonics=HARMONICS)
         hand = PiecewiseByHand(1.0, [0.2975, 0.3025, 1.0], [100.0, 10.0, 100.0, 0.0])
@@ -228,9 +220,9 @@ def test_pinched_slopes(law: type[di.Friction]) -> None:
             assert np.max(np.abs(found - c)) < 1e-8 * np.max(np.abs(c))
 
 
-def test_even_harmonics_of_a_rate_dependent_law() -> None:
+def test_even_harmonics_of_a_rate_dependent_law():
     class ByHand(DahlByHand):
-        def _slope(self, v: float, s: float, F: float) -> float:
+        def _slope(self, v, s, F):
             level = self.f_max * (1.0 + self.asymmetry * s) * (1.0 + 0.3 * np.exp(-(v**2)))
             return float(self.sigma * (1.0 - s * F / level))
 
@@ -243,9 +235,9 @@ def test_even_harmonics_of_a_rate_dependent_law() -> None:
         assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
 
 
-def test_even_harmonics_where_directions_differ_at_large_forces_alone() -> None:
+def test_even_harmonics_where_directions_differ_at_large_forces_alone():
     class ByHand(DahlByHand):
-        def _slope(self, v: float, s: float, F: float) -> float:
+        def _slope(self, v, s, F):
             softer = 0.75 - 0.25 * np.tanh(2.0 * (F - 10.0))
             return float(self.sigma * (1.0 - s * F / 30.0) * softer)
 
@@ -257,7 +249,7 @@ def test_even_harmonics_where_directions_differ_at_large_forces_alone() -> None:
         assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
 
 
-def test_derivatives_of_settled_motions_are_differences_of_oracles() -> None:
+def test_derivatives_of_settled_motions_are_differences_of_oracles():
     """A plant with a gap: harmonics by drive and every parameter, through moving kinks."""
     values = np.array([1.0, 300.0, 1.0, 0.002, 0.1, 0.5, 200.0])
     element = di.Backlash(di.Dahl(alpha=1.0)) + di.Mass() + di.Damper() + di.Spring()
@@ -268,7 +260,7 @@ def test_derivatives_of_settled_motions_are_differences_of_oracles() -> None:
                      chosen=range(values.size), harmonics=harmonics)  # fmt: skip
     assert result.found[0]
 
-    def oracle(p: np.ndarray[Any, Any], U: float) -> Any:
+    def oracle(p, U):
         hand = DahlByHand(p[0], p[1], p[2], gap=p[3])
         plant = Oracle([hand], lambda t: (U * np.cos(omega * t), 0.0), False, p[4], p[5], p[6],
                        np.array([1e-2, 0.4, 1.0, 1e-2]))  # fmt: skip
@@ -285,7 +277,7 @@ def test_derivatives_of_settled_motions_are_differences_of_oracles() -> None:
     assert np.max(np.abs(result.by_amplitude[0] * drive - difference)) < 1e-6 * size
 
 
-def test_derivatives_along_a_history_jump_at_kinks() -> None:
+def test_derivatives_along_a_history_jump_at_kinks():
     rng = seeded(50)
     knots = np.linspace(0.0, 1.0, 12)
     spline = CubicSpline(knots, 0.01 * rng.standard_normal(12))
@@ -299,7 +291,7 @@ def test_derivatives_along_a_history_jump_at_kinks() -> None:
                    derivatives=True)  # fmt: skip
     times = np.union1d(samples, spline.derivative().roots(extrapolate=False))
 
-    def force(p: FloatArray) -> FloatArray:
+    def force(p):
         history = dahl_history(DahlByHand(p[0], p[1], gap=p[3]), spline(times))
         return history[np.searchsorted(times, samples)]
 
@@ -312,13 +304,13 @@ def test_derivatives_along_a_history_jump_at_kinks() -> None:
         assert np.max(np.abs(computed - difference)) < 1e-6 * size
 
 
-def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
+def test_derivatives_of_driven_motions_are_differences_of_oracles():
     """Several Jenkins elements, by parameters and by the first state."""
     n, interval = 40, 0.01
     times: FloatArray = interval * np.arange(n, dtype=float)
     omega = 2.0 * np.pi * np.array([3.0, 5.0, 8.0]) / (n * interval)
 
-    def drive(t: float) -> tuple[float, float]:
+    def drive(t):
         return float(np.sum(1.2 * np.cos(omega * t + np.array([0.3, 1.1, 2.0])))), 0.0
 
     sampled = np.array([drive(t)[0] for t in times])
@@ -330,7 +322,7 @@ def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
     motion = march(system, times, coefficients, times, first, values, chosen=range(7),
                    derivatives=True)  # fmt: skip
 
-    def oracle(p: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> Any:
+    def oracle(p, y):
         hand = JenkinsByHand(p[:2], p[2:4])
         free = Oracle([hand], drive, False, p[4], p[5], p[6], np.array([0.1, 1.0, 1.0, 1.0]))
         return integrated(free, y, 0.0, times[-1], times)[1]
@@ -346,13 +338,13 @@ def test_derivatives_of_driven_motions_are_differences_of_oracles() -> None:
     assert np.max(np.abs(motion.by_first[:, 1] - difference)) < 1e-6
 
 
-def test_friction_faster_than_the_sampling() -> None:
+def test_friction_faster_than_the_sampling():
     """f_max 0.5, m 1, c 1, k 400 at 100 Hz: sigma 30,000 slips within a thousandth of a sample."""
     n, interval = 128, 0.01
     lines = 2.0 * np.pi * np.arange(1, 20) / (n * interval)
     phase = seeded(60).uniform(0.0, 2.0 * np.pi, lines.size)
 
-    def drive(t: float) -> tuple[float, float]:
+    def drive(t):
         return float(np.sum(0.4 * np.cos(lines * t + phase))), 0.0
 
     times: FloatArray = interval * np.arange(n, dtype=float)
@@ -369,7 +361,7 @@ def test_friction_faster_than_the_sampling() -> None:
 
 
 @pytest.mark.parametrize("share", [1e-3, 0.3, 0.99, 1.01, 3.0])
-def test_plants_near_stick_and_in_resonance(share: float) -> None:
+def test_plants_near_stick_and_in_resonance(share):
     """The paper's plant, its drive from a thousandth of the friction limit on."""
     values = cases.all_values(cases.Drawn(0, di.Dahl(), [0.1, 30.0], 1, 1), 0.3, 0.24, 0.3)
     system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
@@ -388,7 +380,7 @@ def test_plants_near_stick_and_in_resonance(share: float) -> None:
         assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * size
 
 
-def test_where_no_motion_settles_none_is_found() -> None:
+def test_where_no_motion_settles_none_is_found():
     """Undamped, without friction, in resonance; and a plant that grows without bounds."""
     system = translate(plant_equations(di.Mass() + di.Damper() + di.Spring()))
     result = settled(system, np.ones(2), np.array([10.0, 10.0]),
@@ -401,7 +393,7 @@ def test_where_no_motion_settles_none_is_found() -> None:
         march(system, knots, np.ones((1, 10)), knots, np.zeros(2), np.array([1.0, -200.0, 1.0]))
 
 
-def test_units_do_not_matter() -> None:
+def test_units_do_not_matter():
     """Forces of 1e-15 and 1e15 N, periods of a picosecond and of a year."""
     system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
     values = cases.all_values(cases.Drawn(0, di.Dahl(), [1.0, 3.0], 1, 1), 1.0, 0.1, 1.0)
@@ -417,7 +409,7 @@ def test_units_do_not_matter() -> None:
         assert np.max(np.abs(difference)) < 1e-9 * np.max(np.abs(unit.coefficients))
 
 
-def test_floquet_maps_are_those_of_an_independent_integrator() -> None:
+def test_floquet_maps_are_those_of_an_independent_integrator():
     values = cases.all_values(cases.Drawn(0, di.Dahl(), [0.1, 30.0], 1, 1), 0.3, 0.24, 0.3)
     system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
     omega = 3.0
@@ -436,13 +428,13 @@ def test_floquet_maps_are_those_of_an_independent_integrator() -> None:
     assert np.max(np.abs(difference)) < 1e-6
 
 
-def test_a_sweep_of_an_integral_by_quadrature() -> None:
+def test_a_sweep_of_an_integral_by_quadrature():
     """A history without memory: the mean of |v| v^3 by quad, uneven kinks included."""
     system = translate(law_equations(di.PowerDamper()))
     result = settled(system, np.array([1.0]), np.array([2.0]), np.array([[1.0, 0.4, 1.0]]),
                      harmonics=(3,))  # fmt: skip
 
-    def part(t: float) -> float:
+    def part(t):
         v = -2.0 * np.sin(t)
         return float(v * (v * v + 1e-12) ** -0.3 * np.sin(3.0 * t))
 
@@ -451,7 +443,7 @@ def test_a_sweep_of_an_integral_by_quadrature() -> None:
 
 
 @pytest.mark.parametrize("home", ["unwritable", "missing"])
-def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, home: str) -> None:
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, home):
     place = tmp_path / "file"
     place.write_text("")
     code = (
@@ -468,7 +460,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, home: str) -
     assert done.returncode == 0, done.stderr
 
 
-def test_importing_the_package_does_not_import_numba() -> None:
+def test_importing_the_package_does_not_import_numba():
     code = "import dahl_ident, sys; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

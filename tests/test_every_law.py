@@ -1,7 +1,5 @@
 """One contract over every element class of the package, and over a law that a test defines."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -40,14 +38,14 @@ EVERY = [law for laws in LAWS.values() for law in laws]
 every_law = pytest.mark.parametrize("law", EVERY, ids=[repr(law) for law in EVERY])
 
 
-def test_every_class_is_in_the_contract() -> None:
+def test_every_class_is_in_the_contract():
     package = {kind for kind, cls in KINDS.items() if cls.__module__.startswith("dahl_ident")}
     assert package - LINEAR == set(LAWS) - {"jenkins"}
     assert all(KINDS[kind].equation for kind in package)
 
 
 @every_law
-def test_the_force_over_time_has_the_harmonics(law: Element) -> None:
+def test_the_force_over_time_has_the_harmonics(law):
     n, A, omega = 4096, 1.0, 2.0
     theta = 2.0 * np.pi * np.arange(12 * n) / n
     x, v = A * np.cos(theta), -A * omega * np.sin(theta)
@@ -59,7 +57,7 @@ def test_the_force_over_time_has_the_harmonics(law: Element) -> None:
 
 
 @every_law
-def test_derivatives_are_differences(law: Element) -> None:
+def test_derivatives_are_differences(law):
     model = Model(law).with_free([p.name for p in law.parameters])
     values, A, w = model.known_values(), np.array([0.7, 2.0]), np.array(2.0)
     for k in (0, 1, 2, 3):
@@ -85,7 +83,7 @@ UNKNOWN = [
 
 
 @pytest.mark.parametrize("law", [*EVERY, *UNKNOWN], ids=repr)
-def test_description_comes_back(law: Element) -> None:
+def test_description_comes_back(law):
     (again,) = model_from_description(json.loads(json.dumps(describe_model(law)))).elements
     assert again.parameters == law.parameters
     assert repr(again) == repr(law)
@@ -93,7 +91,7 @@ def test_description_comes_back(law: Element) -> None:
 
 
 @every_law
-def test_it_is_simulated_under_a_prescribed_displacement(law: Element) -> None:
+def test_it_is_simulated_under_a_prescribed_displacement(law):
     steps = SteppedSine((0.2, 1.0), (1.0,), num_periods=2, settling_periods=1)
     record = simulate(Experiment(law, steps), seed=1)
     assert isinstance(record, Record)

@@ -4,17 +4,15 @@ Each law is written out once more, as a rate or along its path, and integrated b
 method in fixed steps, from near the steady motion until cycles no longer change.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import control
 import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Parameter
 
 MASS, DAMPING, STIFFNESS = 0.3, 1.0, 8.0
@@ -33,7 +31,7 @@ class Exponential(di.Friction):
 
     parameters = di.Dahl.parameters[:2]
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         f_max, sigma = values
         return sigma * (1.0 - direction * force / f_max)
 
@@ -43,7 +41,7 @@ class Jenkins(di.Friction):
 
     parameters = di.Dahl.parameters[:2]
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         f_max, sigma = values
         return sigma * (direction * force < f_max)
 
@@ -54,15 +52,15 @@ class Sliders(NamedTuple):
     stiffness: FloatArray
     slip: FloatArray
 
-    def at_rest(self, n: int) -> FloatArray:
+    def at_rest(self, n):
         """Return the springs' extensions of n plants."""
         return np.zeros((self.slip.size, n))
 
-    def after(self, z: FloatArray, moved: FloatArray) -> FloatArray:
+    def after(self, z, moved):
         """Return the extensions after a displacement."""
         return np.clip(z + moved, -self.slip[:, None], self.slip[:, None])
 
-    def force(self, z: FloatArray) -> FloatArray:
+    def force(self, z):
         """Return the springs' force."""
         return np.asarray(self.stiffness @ z)
 
@@ -72,11 +70,11 @@ class Play(NamedTuple):
 
     half: float
 
-    def at_rest(self, n: int) -> FloatArray:
+    def at_rest(self, n):
         """Return force and place of n plants."""
         return np.zeros((2, n))
 
-    def after(self, z: FloatArray, moved: FloatArray) -> FloatArray:
+    def after(self, z, moved):
         """Return both after a displacement: unloading, then the gap, then loading."""
         force, place = z
         s, left = np.sign(moved), np.abs(moved)
@@ -87,20 +85,20 @@ class Play(NamedTuple):
         crossed = np.where(left < back, 0.0, crossed)
         return np.array([loaded(force, s, left - first - crossed), place + s * crossed])
 
-    def force(self, z: FloatArray) -> FloatArray:
+    def force(self, z):
         """Return the friction force."""
         return np.asarray(z[0])
 
 
-def loaded(force: FloatArray, side: FloatArray, path: FloatArray) -> FloatArray:
+def loaded(force, side, path):
     """Return linear Dahl friction after a path in one direction."""
     return np.asarray(side * F_MAX - (side * F_MAX - force) * np.exp(-path * SIGMA / F_MAX))
 
 
-def dahl(exponent: float = 1.0, asymmetry: float = 0.0) -> Law:
+def dahl(exponent=1.0, asymmetry=0.0):
     """Dahl's law."""
 
-    def rate(force: FloatArray, v: FloatArray) -> FloatArray:
+    def rate(force, v):
         side = np.sign(v)
         margin = 1.0 - side * force / (F_MAX * (1.0 + side * asymmetry))
         return np.asarray(SIGMA * np.sign(margin) * np.abs(margin) ** exponent * v)
@@ -108,19 +106,19 @@ def dahl(exponent: float = 1.0, asymmetry: float = 0.0) -> Law:
     return rate
 
 
-def bouc_wen(force: FloatArray, v: FloatArray) -> FloatArray:
+def bouc_wen(force, v):
     """Exponent 1, with other rates for loading and unloading."""
     loading = force * v > 0.0
     return v * (SIGMA + np.where(loading, -300.0, 100.0) * np.abs(force))
 
 
-def lugre(force: FloatArray, v: FloatArray) -> FloatArray:
+def lugre(force, v):
     """A limit that falls with the speed."""
     limit = F_MAX * (1.0 + 0.5 * np.exp(-((v / 0.05) ** 2)))
     return SIGMA * (v - np.abs(v) * force / limit)
 
 
-def iwan(chi: float, ratio: float, count: int = 150) -> Sliders:
+def iwan(chi, ratio, count=150):
     """Segalman's density in cells, and the stiffness that slips last."""
     g = chi + 1.0
     largest = F_MAX / SIGMA * (1.0 + ratio) / (ratio + g / (g + 1.0))
@@ -142,12 +140,12 @@ class Case(NamedTuple):
     free: tuple[str, ...] = ("damping", "stiffness")
 
 
-def oscillator(mass: float, damping: float, stiffness: float) -> Any:
+def oscillator(mass, damping, stiffness):
     """The receptance of the plant without friction."""
     return control.tf([1.0], [mass, damping, stiffness])
 
 
-def positive(start: float) -> Parameter:
+def positive(start):
     """A free argument of a linear system."""
     return Parameter("", "", "", start, free=True, lower=0.0, transform="log")
 
@@ -190,7 +188,7 @@ CASES = {
 }  # fmt: skip
 
 
-def settled(law: Law | Sliders | Play, f: FloatArray, u: FloatArray) -> ComplexArray:
+def settled(law, f, u):
     """Return the fundamentals of the displacement under u cos(2 pi f t)."""
     dt = 1.0 / f / STEPS
     x, v = np.zeros((2, f.size))
@@ -198,9 +196,7 @@ def settled(law: Law | Sliders | Play, f: FloatArray, u: FloatArray) -> ComplexA
     z = np.zeros((1, f.size)) if path is None else path.at_rest(f.size)
     last = np.full(f.size, np.inf, dtype=np.complex128)
 
-    def rates(
-        x: FloatArray, v: FloatArray, z: FloatArray, push: FloatArray, moved: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def rates(x, v, z, push, moved):
         if isinstance(law, (Sliders, Play)):
             force, change = law.force(law.after(z, moved)), np.zeros(z.shape)
         else:
@@ -230,7 +226,7 @@ def settled(law: Law | Sliders | Play, f: FloatArray, u: FloatArray) -> ComplexA
     raise AssertionError("the motion has not settled")
 
 
-def table(case: Case, levels: int, frequencies: int) -> di.FrequencyResponse:
+def table(case, levels, frequencies):
     """Return a sweep at some drives, from half the friction force to six times that."""
     drives = F_MAX * np.geomspace(0.5, 6.0, levels)
     u, f = (
@@ -247,7 +243,7 @@ def table(case: Case, levels: int, frequencies: int) -> di.FrequencyResponse:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_law_in_a_driven_plant_is_found(name: str) -> None:
+def test_a_law_in_a_driven_plant_is_found(name):
     case = CASES[name]
     size = (3, 3) if name == "Iwan" else (3, 4)  # the slowest: thirty sliders
     model = case.law

@@ -1,10 +1,5 @@
 """Parameters that could be exchanged without a difference are not called identified."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -22,12 +17,12 @@ class PullPush(di.Friction):
         for name, unit in (("pull", "N"), ("push", "N"), ("sigma", "N/m"))
     )
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         pull, push, sigma = values
         return sigma * (1.0 - direction * force / (pull * (direction > 0) + push * (direction < 0)))
 
 
-def data(harmonics: tuple[int, ...], pull: float, push: float) -> di.FrequencyResponse:
+def data(harmonics, pull, push):
     rng = np.random.default_rng(5)
     A = np.tile(np.geomspace(1e-3, 3e-2, ROWS), len(harmonics))
     k = np.repeat(harmonics, ROWS)
@@ -42,7 +37,7 @@ def data(harmonics: tuple[int, ...], pull: float, push: float) -> di.FrequencyRe
     )  # fmt: skip
 
 
-def test_the_fundamental_leaves_the_order_open_and_the_verdict_says_so() -> None:
+def test_the_fundamental_leaves_the_order_open_and_the_verdict_says_so():
     fit = di.fit(data((1,), 0.06, 0.14), PullPush(), throw=False)
     found = fit.identifiability
     assert found.named(Verdict.NOT_IDENTIFIED) == ["pull", "push"]
@@ -53,13 +48,13 @@ def test_the_fundamental_leaves_the_order_open_and_the_verdict_says_so() -> None
     assert not found.direction
 
 
-def test_even_harmonics_decide_it() -> None:
+def test_even_harmonics_decide_it():
     fit = di.fit(data((1, 2), 0.06, 0.14), PullPush(), throw=False)
     assert "exchangeable" not in fit.verdict
     assert fit.identifiability.complete
     assert fit.optimum.values[:2] == pytest.approx([0.06, 0.14], rel=0.05)
 
 
-def test_parameters_of_other_kinds_are_not_exchanged() -> None:
+def test_parameters_of_other_kinds_are_not_exchanged():
     fit = di.fit(di.load_dataset("noisy"), di.Dahl())
     assert "exchangeable" not in fit.verdict

@@ -1,12 +1,9 @@
 """Exports, each read back by a program of its own: compilers, simulators, other libraries."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,17 +15,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
-from tests.command_line import Runner
 
 pytestmark = pytest.mark.versions
 
 DAHL = di.Dahl(0.1, 30.0, alpha=1.0)
 
 
-def fitted(truth: Element, model: Element | None = None) -> di.FitResult:
+def fitted(truth, model=None):
     """Return a fit to a noisy table of a device; without a model, of its size alone."""
     amplitude = np.geomspace(3e-4, 3e-2, 12)
     exact = Model(truth).dynamic_stiffness(amplitude, 1.0)
@@ -38,7 +33,7 @@ def fitted(truth: Element, model: Element | None = None) -> di.FitResult:
     return di.fit(data, truth + di.Damper(name="added") if model is None else model, throw=False)
 
 
-def motion(seed: int = 1, samples: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:
+def motion(seed=1, samples=4000):
     """Return time, displacement and velocity that turn back at many places, and rest at some."""
     rng = np.random.default_rng(seed)
     t = np.arange(samples) / 500.0
@@ -51,7 +46,7 @@ def motion(seed: int = 1, samples: int = 4000) -> tuple[FloatArray, FloatArray, 
     return t, x, v
 
 
-def force_of(fit: di.FitResult, x: FloatArray, v: FloatArray) -> FloatArray:
+def force_of(fit, x, v):
     """Return the force of a fit's model, but for the mass."""
     parts = [e for e in fit.model.elements if e.kind != "mass"]
     return np.asarray(np.sum([e.force(x, velocity=v) for e in parts], axis=0))
@@ -72,7 +67,7 @@ LAWS: dict[str, Element] = {
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc")
 @pytest.mark.parametrize("name", [*LAWS, "lugre"])
-def test_the_c_function_gives_the_force(tmp_path: Path, name: str) -> None:
+def test_the_c_function_gives_the_force(tmp_path, name):
     law = LAWS.get(name) or di.LuGre(0.1, 30.0, 1.5, 5e-3, micro_damping=0.02, viscous=0.1)
     fit = fitted(law)
     fit.export("c", tmp_path / "friction.h")
@@ -94,13 +89,13 @@ def test_the_c_function_gives_the_force(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(force, expected, atol=3e-9 * np.abs(expected).max())
 
 
-def plant(fit: di.FitResult, mass: float, drive: Callable[[float], float], end: float) -> Any:
+def plant(fit, mass, drive, end):
     """Return time and displacement of a mass with the friction of a fit, by integration."""
     law, damper = fit.model.elements[0], fit.model.elements[1]
     values = [float(p.value or 0.0) for p in law.parameters]
     assert isinstance(law, di.Friction)
 
-    def rate(t: float, y: FloatArray) -> list[float]:
+    def rate(t, y):
         slope = law.slope(y[2], np.sign(y[1]), y[1], values)
         force = law.output(y[2], slope, y[1], values)
         damping = float(damper.parameters[0].value or 0.0)
@@ -110,13 +105,13 @@ def plant(fit: di.FitResult, mass: float, drive: Callable[[float], float], end: 
 
 
 @pytest.mark.parametrize("law", [DAHL, di.LuGre(0.1, 30.0, 1.5, 5e-3, 0.02, 0.1)])
-def test_mujoco_moves_as_the_model(law: Element) -> None:
+def test_mujoco_moves_as_the_model(law):
     mujoco = import_module("mujoco")
     fit = fitted(law + di.Damper(0.2) + di.Mass(0.3), law + di.Damper() + di.Mass(0.3))
     model = mujoco.MjModel.from_xml_string(fit.export("mujoco"))
     state = mujoco.MjData(model)
 
-    def drive(t: float) -> float:
+    def drive(t):
         return 0.25 * float(np.sin(2 * np.pi * 0.7 * t) + 0.5 * np.sin(2 * np.pi * 1.9 * t))
 
     exact = plant(fit, 0.3, drive, 3.0)
@@ -130,7 +125,7 @@ def test_mujoco_moves_as_the_model(law: Element) -> None:
     assert np.abs(moved - expected).max() < 2e-3 * np.abs(expected).max()
 
 
-def test_mujoco_takes_a_friction_limit_alone() -> None:
+def test_mujoco_takes_a_friction_limit_alone():
     mujoco = import_module("mujoco")
     fit = fitted(di.Dahl(0.1, 30.0, alpha=0.5) + di.Mass(0.3), di.Dahl(alpha=0.5) + di.Mass(0.3))
     model = mujoco.MjModel.from_xml_string(fit.export("mujoco-frictionloss"))
@@ -138,7 +133,7 @@ def test_mujoco_takes_a_friction_limit_alone() -> None:
     assert model.dof_armature[0] == 0.3
 
 
-def test_urdf_is_a_limit_and_a_damping() -> None:
+def test_urdf_is_a_limit_and_a_damping():
     fit = fitted(DAHL + di.Damper(0.2), di.Dahl(alpha=1.0) + di.Damper())
     text = str(fit.export("urdf"))
     read = ElementTree.fromstring(f"<joint>{text}</joint>").find("dynamics")
@@ -148,7 +143,7 @@ def test_urdf_is_a_limit_and_a_damping() -> None:
 
 
 @pytest.mark.parametrize("name", ["dahl", "soft", "asymmetric", "saturating", "several", "lugre"])
-def test_modelica_has_the_equations(name: str) -> None:
+def test_modelica_has_the_equations(name):
     """A small reader of the text integrates its equations."""
     law = LAWS.get(name) or di.LuGre(0.1, 30.0, 1.5, 5e-3, micro_damping=0.02, viscous=0.1)
     fit = fitted(law)
@@ -160,7 +155,7 @@ def test_modelica_has_the_equations(name: str) -> None:
     states = sorted(name for name in right if name != "f")
     waves = ((8e-3, 0.3), (3e-3, 1.1))
 
-    def at(t: float, z: FloatArray) -> dict[str, Any]:
+    def at(t, z):
         moved = {
             "s_rel": sum(a * (1 - np.cos(2 * np.pi * f * t)) for a, f in waves),
             "v_rel": sum(2 * np.pi * f * a * np.sin(2 * np.pi * f * t) for a, f in waves),
@@ -179,7 +174,7 @@ def test_modelica_has_the_equations(name: str) -> None:
     assert np.abs(np.array(force) - expected).max() < 5e-3 * np.abs(expected).max()
 
 
-def test_matlab_ufloat_and_latex_have_the_budget() -> None:
+def test_matlab_ufloat_and_latex_have_the_budget():
     fit = fitted(DAHL + di.Spring(2.0), di.Dahl(alpha=1.0) + di.Spring())
     budget = fit.budget()
     names = list(budget)
@@ -200,7 +195,7 @@ def test_matlab_ufloat_and_latex_have_the_budget() -> None:
     assert "<table" in fit.summary().to_html()
 
 
-def test_gtc_has_the_budget_source_by_source() -> None:
+def test_gtc_has_the_budget_source_by_source():
     pytest.importorskip("GTC")
     fit = fitted(DAHL + di.Spring(2.0), di.Dahl(alpha=1.0) + di.Spring())
     budget = fit.budget()
@@ -217,7 +212,7 @@ def test_gtc_has_the_budget_source_by_source() -> None:
     assert gtc.get_correlation(first, others[0]) == pytest.approx(r, rel=1e-9)
 
 
-def test_draws_follow_the_fit_and_the_posterior(tmp_path: Path) -> None:
+def test_draws_follow_the_fit_and_the_posterior(tmp_path):
     fit = fitted(DAHL, di.Dahl(alpha=1.0))
     fit.export("draws", tmp_path / "draws.parquet", size=20_000, seed=1)
     table = pd.read_parquet(tmp_path / "draws.parquet")
@@ -239,7 +234,7 @@ def test_draws_follow_the_fit_and_the_posterior(tmp_path: Path) -> None:
         posterior.export("c")
 
 
-def test_what_a_format_cannot_carry_is_refused_by_name(tmp_path: Path) -> None:
+def test_what_a_format_cannot_carry_is_refused_by_name(tmp_path):
     gap = fitted(di.Backlash(DAHL, 1e-4), di.Backlash(di.Dahl(alpha=1.0), 1e-4))
     for form in ("mujoco", "mujoco-frictionloss", "urdf", "modelica", "c"):
         with pytest.raises(
@@ -272,7 +267,7 @@ def test_what_a_format_cannot_carry_is_refused_by_name(tmp_path: Path) -> None:
         lost.export("c")
 
 
-def test_a_fit_of_records_is_exported_without_its_nuisances() -> None:
+def test_a_fit_of_records_is_exported_without_its_nuisances():
     _, x, v = motion(samples=1500)
     force = DAHL.force(x) + 0.2 * v + np.random.default_rng(0).normal(0.0, 1e-3, x.size)
     record = di.Record(np.arange(x.size) / 500.0, displacement=x, force=force)
@@ -282,7 +277,7 @@ def test_a_fit_of_records_is_exported_without_its_nuisances() -> None:
     assert "friction_dahl" in str(fit.export("c"))
 
 
-def test_the_command_line(tmp_path: Path, run: Runner) -> None:
+def test_the_command_line(tmp_path, run):
     fit = fitted(DAHL, di.Dahl(alpha=1.0))
     fit.save("fit.json")
     assert run("export", "fit.json", "--to", "latex").out == fit.export("latex")
@@ -297,7 +292,7 @@ def test_the_command_line(tmp_path: Path, run: Runner) -> None:
         fit.export("c", "joint.xml")
 
 
-def test_rotation_is_a_hinge_and_torques() -> None:
+def test_rotation_is_a_hinge_and_torques():
     angle = np.geomspace(3e-4, 3e-2, 12)
     N = DAHL.describing_function(angle) * np.exp(np.random.default_rng(1).normal(0, 2e-3, 12))
     data = di.FrequencyResponse(np.ones(12), N, angle, motion="rotation")

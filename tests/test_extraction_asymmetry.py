@@ -1,12 +1,9 @@
 """Mean force and even harmonics, against forces whose coefficients are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
 from dahl_ident.extraction import extract
@@ -20,12 +17,12 @@ TIME = np.arange(round(CYCLES * RATE)) / RATE
 THETA = 2.0 * np.pi * TIME + PHASE
 
 
-def friction(x: FloatArray) -> FloatArray:
+def friction(x):
     """Return the steady force: that of the third time round."""
     return np.asarray(FRICTION.force(np.tile(x, 3))[-x.size :])
 
 
-def noisy(seed: int, x: FloatArray, force: FloatArray, noise: float = 0.02) -> Record:
+def noisy(seed, x, force, noise=0.02):
     rng = np.random.default_rng(seed)
     return Record(
         TIME,
@@ -34,7 +31,7 @@ def noisy(seed: int, x: FloatArray, force: FloatArray, noise: float = 0.02) -> R
     )
 
 
-def test_mean_and_second_harmonic_cover_the_truth_as_often_as_stated() -> None:
+def test_mean_and_second_harmonic_cover_the_truth_as_often_as_stated():
     x = A * np.cos(THETA)
     force = friction(x) + OFFSET + SQUARE * x**2
     truth = {0: OFFSET / A + 0.5 * SQUARE * A, 2: 0.5 * SQUARE * A}
@@ -59,7 +56,7 @@ def test_mean_and_second_harmonic_cover_the_truth_as_often_as_stated() -> None:
         assert 0.8 < squares[k] / runs < 1.6, (k, squares[k])  # a mean of F(1 or 2, 4 to 16)
 
 
-def test_a_symmetric_force_is_hardly_ever_called_asymmetric() -> None:
+def test_a_symmetric_force_is_hardly_ever_called_asymmetric():
     x = A * np.cos(THETA)
     force = friction(x) + OFFSET  # the zero of a load cell is not an asymmetry
     for seed in range(100):
@@ -68,14 +65,14 @@ def test_a_symmetric_force_is_hardly_ever_called_asymmetric() -> None:
         assert data.quality["asymmetry"][0] == 0.0
 
 
-def test_even_harmonics_of_the_displacement_are_no_asymmetry_of_the_force() -> None:
+def test_even_harmonics_of_the_displacement_are_no_asymmetry_of_the_force():
     x = A * (np.cos(THETA) + 0.05 * np.cos(2.0 * THETA + 1.0))
     velocity = -2.0 * np.pi * A * (np.sin(THETA) + 0.1 * np.sin(2.0 * THETA + 1.0))
     data = extract(noisy(0, x, friction(x) + 20.0 * velocity, 1e-3), frequency=1.0)
     assert data.harmonic.tolist() == [1, 3, 5, 7, 9]
 
 
-def test_asymmetry_is_said_and_its_size_is_right() -> None:
+def test_asymmetry_is_said_and_its_size_is_right():
     x = A * np.cos(THETA)
     record = noisy(0, x, friction(x) + OFFSET + SQUARE * x**2, 0.01)
     with pytest.warns(UserWarning, match=r"asymmetric in 1 of 1 points: even harmonics are up to"):
@@ -85,7 +82,7 @@ def test_asymmetry_is_said_and_its_size_is_right() -> None:
     assert data.quality["asymmetry"][0] == pytest.approx(0.5 * SQUARE * A**2 / fundamental, rel=0.1)
 
 
-def test_the_mean_is_that_of_the_steady_loop() -> None:
+def test_the_mean_is_that_of_the_steady_loop():
     """A departure that fades is not a mean force, and its size adds to the mean's uncertainty."""
     time = np.arange(20 * 200) / 200.0
     x = A * np.cos(2.0 * np.pi * time)
@@ -102,7 +99,7 @@ def test_the_mean_is_that_of_the_steady_loop() -> None:
     assert abs(error) < 0.2 * abs(plain_mean - 0.2)
 
 
-def test_the_mean_has_the_degrees_of_freedom_of_four_lines() -> None:
+def test_the_mean_has_the_degrees_of_freedom_of_four_lines():
     """Lines below the mean repeat those above it: four complex numbers are eight."""
     data = extract(noisy(1, A * np.cos(THETA), friction(A * np.cos(THETA))), harmonics=[0, 1])
     assert data.dof[0] == pytest.approx(8.0, rel=0.05)

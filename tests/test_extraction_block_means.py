@@ -1,11 +1,8 @@
 """Block means of a densely sampled record: no bias, no loss, and single samples still judged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ExtractionError
@@ -15,7 +12,7 @@ RATE, FREQUENCY, CYCLES = 10_000.0, 5.0, 12
 FRICTION = Dahl(f_max=0.1, sigma=30.0)
 
 
-def dense(noise: float = 0.0, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def dense(noise=0.0, seed=0):
     """Return time, displacement and force at 2000 samples a cycle."""
     t = np.arange(int(CYCLES * RATE / FREQUENCY)) / RATE
     draws = noise * np.random.default_rng(seed).standard_normal((2, t.size))
@@ -23,7 +20,7 @@ def dense(noise: float = 0.0, seed: int = 0) -> tuple[FloatArray, FloatArray, Fl
     return t, x + 1e-3 * draws[0], FRICTION.force(x) + draws[1]
 
 
-def test_points_are_those_of_least_squares_on_the_samples() -> None:
+def test_points_are_those_of_least_squares_on_the_samples():
     t, x, force = dense(1e-3)
     data = extract(Record(t, displacement=x, force=force), frequency=FREQUENCY, settling_periods=2)
     kept = t >= 2.0 / FREQUENCY
@@ -41,7 +38,7 @@ def test_points_are_those_of_least_squares_on_the_samples() -> None:
 
 
 @pytest.mark.parametrize("harmonic", [1, 9])
-def test_stated_errors_hold(harmonic: int) -> None:
+def test_stated_errors_hold(harmonic):
     """The scatter of 60 records over the stated variance, by chi-square bounds of 1 in 1000."""
     errors, stated = [], []
     exact = complex(*FRICTION.fourier_coefficients(4e-3, harmonic)) / 4e-3
@@ -57,7 +54,7 @@ def test_stated_errors_hold(harmonic: int) -> None:
     assert 0.63 < ratio < 1.52  # chi-square of 120 over 120, with 2 % for the stated variance
 
 
-def test_single_samples_are_judged() -> None:
+def test_single_samples_are_judged():
     t, x, force = dense(1e-5)
     rounded = Record(t, displacement=np.round(x / 5e-4) * 5e-4, force=force)
     assert extract(rounded).quality["displacement_steps"][0] == pytest.approx(8.0, rel=0.02)
@@ -70,7 +67,7 @@ def test_single_samples_are_judged() -> None:
         extract(Record(t, displacement=x, force=buried))
 
 
-def test_a_look_at_some_samples_says_whether_noise_dithers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_look_at_some_samples_says_whether_noise_dithers(monkeypatch):
     t, x, force = dense(1e-4)
     noise, step = np.random.default_rng(3).standard_normal(t.size), 2e-4
     errors = []

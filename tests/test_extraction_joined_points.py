@@ -1,9 +1,6 @@
 """Points of two parts of a level, against the weights and covariances written out by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ MEANS = (
 )  # fmt: skip
 
 
-def point(size: float, cycles: int, start: float, **changes: Any) -> Point:
+def point(size, cycles, start, **changes):
     """Return a point at 2 Hz whose own variances are `size`, and a quarter of it repeats."""
     joint = size * np.array([np.diag([1.0, 2.0, 2.0]), np.diag([1.0, 6.0, 6.0])])
     quality = {
@@ -40,7 +37,7 @@ def point(size: float, cycles: int, start: float, **changes: Any) -> Point:
 A, B = point(1.0, 6, 0.0), point(2.0, 2, 4.0)
 
 
-def test_both_parts_count_by_their_cycles() -> None:
+def test_both_parts_count_by_their_cycles():
     (both,) = joined([A], [B])
     np.testing.assert_allclose(both.response, 0.75 * A.response + 0.25 * B.response)
     assert both.amplitude == pytest.approx(0.75 * A.amplitude + 0.25 * B.amplitude)
@@ -57,13 +54,13 @@ def test_both_parts_count_by_their_cycles() -> None:
     np.testing.assert_allclose(quality["force_steps"], 1.25)
 
 
-def test_what_speaks_against_either_part_is_told_once() -> None:
+def test_what_speaks_against_either_part_is_told_once():
     a = point(1.0, 6, 0.0, verdict=["force clipped", "good"])
     b = point(2.0, 2, 4.0, verdict=["force clipped; not settled", "good"])
     assert joined([a], [b])[0].quality["verdict"] == ["force clipped; not settled", "good"]
 
 
-def test_a_part_that_has_not_settled_is_settling_of_the_other() -> None:
+def test_a_part_that_has_not_settled_is_settling_of_the_other():
     a = point(1.0, 6, 0.0, settled=np.array([True, False]))
     (both,) = joined([a], [B])
     np.testing.assert_array_equal(both.joint, B.joint)
@@ -80,6 +77,6 @@ def test_a_part_that_has_not_settled_is_settling_of_the_other() -> None:
         replace(B, sweep=True),
     ],
 )
-def test_other_levels_stay_apart(other: Point) -> None:
+def test_other_levels_stay_apart(other):
     assert joined([A], [other]) == [A, other]
     assert len(joined([A], [point(2.0, 2, 5.4)])) == 1

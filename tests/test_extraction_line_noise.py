@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -9,12 +5,12 @@ from scipy import stats
 from benchmarks.extraction_validation import one_over_f, steady, white
 from dahl_ident.arrays import FloatArray
 from dahl_ident.extraction.line_noise import line_noise
-from dahl_ident.extraction.sine_fit import SineFit, sine_fit, steady_segment
+from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
 
 PER_CYCLE = 50
 
 
-def noise_fit(channels: FloatArray, cycles: int, time: FloatArray | None = None) -> SineFit:
+def noise_fit(channels, cycles, time=None):
     n = channels.shape[1]
     t = np.arange(n) / PER_CYCLE if time is None else time
     return sine_fit(steady_segment(t, channels, 2.0 * np.pi))
@@ -22,7 +18,7 @@ def noise_fit(channels: FloatArray, cycles: int, time: FloatArray | None = None)
 
 @pytest.mark.parametrize("cycles", [2, 3, 5, 20])
 @pytest.mark.parametrize("harmonic", [1, 3])
-def test_white_noise_has_its_variance_next_to_every_harmonic(cycles: int, harmonic: int) -> None:
+def test_white_noise_has_its_variance_next_to_every_harmonic(cycles, harmonic):
     rng = np.random.default_rng(cycles)
     powers, dof = [], 0.0
     for _ in range(150):
@@ -36,9 +32,7 @@ def test_white_noise_has_its_variance_next_to_every_harmonic(cycles: int, harmon
 
 @pytest.mark.parametrize("noise", [white, one_over_f])
 @pytest.mark.parametrize("cycles", [3, 12])
-def test_stated_error_is_that_of_the_phasor(
-    noise: Callable[[np.random.Generator, int], FloatArray], cycles: int
-) -> None:
+def test_stated_error_is_that_of_the_phasor(noise, cycles):
     rng = np.random.default_rng(7)
     records, inside, ratio = 300, 0, 0.0
     for _ in range(records):
@@ -52,7 +46,7 @@ def test_stated_error_is_that_of_the_phasor(
     assert stats.binomtest(inside, records, 0.95).pvalue > 0.01
 
 
-def test_what_repeats_is_no_noise() -> None:
+def test_what_repeats_is_no_noise():
     cycles, beta = 8, 30.0
     time: FloatArray = np.arange(cycles * 200) / np.float64(200.0)
     fit = noise_fit(np.stack(steady(beta, 2.0 * np.pi * time + 0.7)), cycles, time)
@@ -61,7 +55,7 @@ def test_what_repeats_is_no_noise() -> None:
         assert np.sqrt(noise.matrix[1, 1].real) < 1e-5
 
 
-def test_shared_noise_is_seen_with_its_phase() -> None:
+def test_shared_noise_is_seen_with_its_phase():
     rng = np.random.default_rng(4)
     cycles = 40
     shared = rng.standard_normal(cycles * PER_CYCLE + 1)
@@ -74,7 +68,7 @@ def test_shared_noise_is_seen_with_its_phase() -> None:
     np.testing.assert_allclose(matrix, matrix.conj().T)
 
 
-def test_gaps_leave_the_noise_right_and_take_degrees_of_freedom() -> None:
+def test_gaps_leave_the_noise_right_and_take_degrees_of_freedom():
     rng = np.random.default_rng(9)
     cycles = 20
     time = np.arange(cycles * PER_CYCLE) / PER_CYCLE
@@ -90,7 +84,7 @@ def test_gaps_leave_the_noise_right_and_take_degrees_of_freedom() -> None:
 
 
 @pytest.mark.parametrize(("cycles", "dof"), [(2, 3.2), (3, 6.26), (4, 6.92), (100, 40.0)])
-def test_degrees_of_freedom(cycles: int, dof: float) -> None:
+def test_degrees_of_freedom(cycles, dof):
     rng = np.random.default_rng(0)
     fit = noise_fit(rng.standard_normal((2, cycles * PER_CYCLE)), cycles)
     assert line_noise(fit, [1], cycles, fit.residual)[0].dof == pytest.approx(dof, rel=0.01)

@@ -1,17 +1,13 @@
 """Measured hysteresis loops of a rotary friction damper; three steady cycles in each file."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data import Record
 from dahl_ident.extraction import extract
 from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
 
@@ -28,28 +24,28 @@ needs_data = pytest.mark.skipif(
 )
 
 
-def measured(name: str) -> Record:
+def measured(name):
     columns = np.loadtxt(
         MEASURED / f"band30lb_{name}.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2)
     )
     return Record(columns[:, 0], displacement=INCH * columns[:, 1], force=KIP * columns[:, 2])
 
 
-def crank(name: str) -> Record:
+def crank(name):
     content = loadmat(MEASURED.parent / "mr_damper" / f"ensaio{name}.mat")
     x, _, force = content["x_F"].T
     time = np.arange(x.size) * content["Ts"].item()
     return Record(time, displacement=1e-3 * x, force=force)
 
 
-def level(samples: FloatArray, per_cycle: int) -> FloatArray:
+def level(samples, per_cycle):
     """Return samples without the straight line through the means of their cycles."""
     means = [c.mean() for c in np.split(samples, np.arange(per_cycle, samples.size, per_cycle))]
     slope = np.polyfit(np.arange(len(means) - 1), means[:-1], 1)[0] / per_cycle
     return np.asarray(samples - slope * np.arange(samples.size))
 
 
-def cycle_by_cycle(record: Record, data: FrequencyResponse, row: int) -> tuple[Any, Any]:
+def cycle_by_cycle(record, data, row):
     """Return amplitude and F_k/X_1, k = 0 ... 3, of each cycle, by a least-squares fit for each."""
     start, stop = (data.quality[name][row] for name in ("start_time", "end_time"))
     used = (record.time > start - 1e-9) & (record.time < stop + 1e-9)
@@ -69,14 +65,14 @@ def cycle_by_cycle(record: Record, data: FrequencyResponse, row: int) -> tuple[A
     return np.array(amplitude), np.array(response)
 
 
-def loop_area(x: FloatArray, force: FloatArray) -> float:
+def loop_area(x, force):
     """Return the area inside closed loops, by the shoelace formula."""
     return float(0.5 * np.sum(force * (np.roll(x, -1) - np.roll(x, 1))))
 
 
 @needs_data
 @pytest.mark.parametrize("name", FILES)
-def test_every_file_gives_its_amplitude_and_loop_area(name: str) -> None:
+def test_every_file_gives_its_amplitude_and_loop_area(name):
     record = measured(name)
     every = extract(record, harmonics=range(10))
     assert every.harmonic.tolist() == list(range(10))
@@ -113,7 +109,7 @@ def test_every_file_gives_its_amplitude_and_loop_area(name: str) -> None:
 
 
 @needs_data
-def test_covariance_is_said_to_be_spectral_and_is_small() -> None:
+def test_covariance_is_said_to_be_spectral_and_is_small():
     data = extract(measured("0.25Hz_1in"), harmonics=[1, 3, 5])
     assert set(data.quality["covariance_from"]) == {"spectrum"}
     std = np.sqrt(0.5 * np.trace(data.covariance[0]))
@@ -122,7 +118,7 @@ def test_covariance_is_said_to_be_spectral_and_is_small() -> None:
 
 
 @needs_data
-def test_asymmetry_beyond_noise_adds_rows_and_is_said() -> None:
+def test_asymmetry_beyond_noise_adds_rows_and_is_said():
     with pytest.warns(UserWarning, match=r"the force is asymmetric in 1 of 1 points: even har"):
         data = extract(measured("1Hz_1in"))
     assert data.harmonic.tolist() == list(range(10))
@@ -133,9 +129,7 @@ def test_asymmetry_beyond_noise_adds_rows_and_is_said() -> None:
 @pytest.mark.parametrize(
     ("names", "points"), [(("2.1", "8.1"), 5), (("1.1", "10.1"), 3), ((".A.1", ".A.2", ".A.6"), 4)]
 )
-def test_an_unsteady_crank_gives_points_with_the_scatter_of_its_cycles(
-    names: tuple[str, ...], points: int
-) -> None:
+def test_an_unsteady_crank_gives_points_with_the_scatter_of_its_cycles(names, points):
     """The first two files have no plateau within 2 %; all agree with a fit of every cycle.
 
     Other harmonics state in addition what the displacement's own harmonics add.
@@ -165,7 +159,7 @@ def test_an_unsteady_crank_gives_points_with_the_scatter_of_its_cycles(
 
 
 @needs_data
-def test_every_file_of_the_crank_gives_points_that_cover_most_of_its_motion() -> None:
+def test_every_file_of_the_crank_gives_points_that_cover_most_of_its_motion():
     names = [
         *(f"{i}.1" for i in range(1, 11)),
         *(f".A.{i}" for i in range(1, 11)),

@@ -1,16 +1,13 @@
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.extraction_validation import Noise, accuracy, one_over_f, steady, white
+from benchmarks.extraction_validation import accuracy, one_over_f, steady, white
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.elements import Dahl, Damper, Mass
@@ -30,13 +27,11 @@ class Waves:
     displacement: FloatArray
     force: FloatArray
 
-    def record(self) -> Record:
+    def record(self):
         return Record(self.time, displacement=self.displacement, force=self.force)
 
 
-def waves(
-    beta: float = 2.0, cycles: float = 20.0, noise: float = 1e-4, frequency: float = 1.0
-) -> Waves:
+def waves(beta=2.0, cycles=20.0, noise=1e-4, frequency=1.0):
     rng = np.random.default_rng(6)
     time = np.arange(round(cycles * RATE / frequency), dtype=np.float64) / RATE
     x, force = steady(beta, 0.4 + 2.0 * np.pi * frequency * time)
@@ -47,7 +42,7 @@ def waves(
     )
 
 
-def assert_near_truth(data: FrequencyResponse, sigmas: float = 4.0) -> None:
+def assert_near_truth(data, sigmas=4.0):
     """Check every row against the exact response at its amplitude."""
     for row in range(data.n):
         a, b = FRICTION.fourier_coefficients(data.amplitude[row], int(data.harmonic[row]))
@@ -57,7 +52,7 @@ def assert_near_truth(data: FrequencyResponse, sigmas: float = 4.0) -> None:
 
 @pytest.mark.parametrize("noise", [white, one_over_f])
 @pytest.mark.parametrize("beta", [0.3, 3.0, 30.0])
-def test_unbiased_and_as_accurate_as_stated(noise: object, beta: float) -> None:
+def test_unbiased_and_as_accurate_as_stated(noise, beta):
     kind = white if noise is white else one_over_f
     result = accuracy(beta, kind, 40, seed=20, cycles=8)
     assert result.bias < 3.5
@@ -66,7 +61,7 @@ def test_unbiased_and_as_accurate_as_stated(noise: object, beta: float) -> None:
         assert result.efficiency < 1.05 + 2.0 / (2.0 * np.sqrt(40))
 
 
-def test_rows_for_harmonics_amplitude_and_drive() -> None:
+def test_rows_for_harmonics_amplitude_and_drive():
     data = extract(waves().record())
     assert data.harmonic.tolist() == [1, 3, 5, 7, 9]
     assert data.quantity == "dynamic_stiffness"
@@ -83,9 +78,7 @@ def test_rows_for_harmonics_amplitude_and_drive() -> None:
     displacement_scale=st.floats(1e-9, 1e3),
 )
 @settings(max_examples=15)
-def test_units_and_the_clock_do_not_matter(
-    shift: float, force_scale: float, displacement_scale: float
-) -> None:
+def test_units_and_the_clock_do_not_matter(shift, force_scale, displacement_scale):
     w = waves(cycles=6, noise=1e-3)
     once = extract(w.record(), harmonics=(1, 3))
     again = extract(
@@ -102,7 +95,7 @@ def test_units_and_the_clock_do_not_matter(
 
 
 @pytest.mark.parametrize("channel", ["velocity", "acceleration"])
-def test_velocity_and_acceleration_are_integrated(channel: str) -> None:
+def test_velocity_and_acceleration_are_integrated(channel):
     w = waves(noise=0.0)
     omega = 2.0 * np.pi
     theta = 0.4 + omega * w.time
@@ -118,7 +111,7 @@ def test_velocity_and_acceleration_are_integrated(channel: str) -> None:
     assert_near_truth(data)
 
 
-def test_shared_error_of_amplitude_and_response() -> None:
+def test_shared_error_of_amplitude_and_response():
     rng = np.random.default_rng(12)
     w = waves(noise=0.0, cycles=10)
     amplitudes, responses, stated, stds = [], [], [], []
@@ -139,7 +132,7 @@ def test_shared_error_of_amplitude_and_response() -> None:
     assert np.abs(found[1] - np.mean(stated, axis=0)[1]).max() < 0.5 * np.abs(found[1]).max()
 
 
-def test_an_ideal_spring_without_noise_is_extracted_exactly() -> None:
+def test_an_ideal_spring_without_noise_is_extracted_exactly():
     time = np.arange(4000) / RATE
     x = np.sin(2.0 * np.pi * 1.1 * time)
     data = extract(Record(time, displacement=x, force=3.0 * x))
@@ -147,7 +140,7 @@ def test_an_ideal_spring_without_noise_is_extracted_exactly() -> None:
     np.testing.assert_allclose(data.response[1:], 0.0, atol=1e-9)
 
 
-def test_jitter_gaps_and_missing_samples_are_taken_as_they_are() -> None:
+def test_jitter_gaps_and_missing_samples_are_taken_as_they_are():
     rng = np.random.default_rng(4)
     n = 4000
     time = np.arange(n) / RATE + rng.uniform(-0.002, 0.002, n)
@@ -160,7 +153,7 @@ def test_jitter_gaps_and_missing_samples_are_taken_as_they_are() -> None:
     assert_near_truth(data)
 
 
-def test_known_frequency_reads_a_sine_buried_in_noise() -> None:
+def test_known_frequency_reads_a_sine_buried_in_noise():
     w = waves(cycles=200)
     rng = np.random.default_rng(5)
     x = w.displacement + 3.0 * rng.standard_normal(w.time.size)
@@ -175,9 +168,7 @@ def test_known_frequency_reads_a_sine_buried_in_noise() -> None:
 @pytest.mark.parametrize(
     ("given", "cycles", "noise"), [(1.01, 20, 1e-4), (0.99, 40, 0.1), (1.002, 60, 1e-3)]
 )
-def test_a_given_frequency_that_is_wrong_is_refused_with_the_true_one(
-    given: float, cycles: int, noise: float
-) -> None:
+def test_a_given_frequency_that_is_wrong_is_refused_with_the_true_one(given, cycles, noise):
     record = waves(cycles=cycles, noise=noise).record()
     with pytest.raises(ExtractionError, match=rf"not the given {given:g} Hz: its phase") as caught:
         extract(record, frequency=given)
@@ -186,7 +177,7 @@ def test_a_given_frequency_that_is_wrong_is_refused_with_the_true_one(
     assert_near_truth(extract(record, frequency=float(advised[1]), harmonics=(1,)))
 
 
-def test_drift_is_given_in_radians_over_the_cycles() -> None:
+def test_drift_is_given_in_radians_over_the_cycles():
     """At 1.01 Hz a sine of 1 Hz falls back by 2 pi/1.01 a hundredth of a cycle each cycle."""
     with pytest.raises(ExtractionError, match=r"has (0\.99|1\.00)\d* Hz") as caught:
         extract(waves(cycles=50).record(), frequency=1.01)
@@ -196,7 +187,7 @@ def test_drift_is_given_in_radians_over_the_cycles() -> None:
 
 
 @pytest.mark.parametrize("noise", [white, one_over_f])
-def test_a_given_frequency_that_is_right_is_never_refused(noise: Noise) -> None:
+def test_a_given_frequency_that_is_right_is_never_refused(noise):
     rng = np.random.default_rng(8)
     for _ in range(60):
         cycles = int(rng.integers(4, 40))
@@ -207,7 +198,7 @@ def test_a_given_frequency_that_is_right_is_never_refused(noise: Noise) -> None:
         assert extract(record, frequency=1.0, harmonics=(1,), min_share=0.0).n >= 1
 
 
-def test_noise_that_hides_the_crossings_leaves_the_strongest_line() -> None:
+def test_noise_that_hides_the_crossings_leaves_the_strongest_line():
     w = waves(cycles=60)
     rng = np.random.default_rng(5)
     x = w.displacement + 0.5 * rng.standard_normal(w.time.size)
@@ -217,7 +208,7 @@ def test_noise_that_hides_the_crossings_leaves_the_strongest_line() -> None:
     assert_near_truth(data)
 
 
-def test_stepped_levels_and_a_sweep_give_a_series_of_points() -> None:
+def test_stepped_levels_and_a_sweep_give_a_series_of_points():
     time = np.arange(60_000) / 1000.0
     frequency = 1.0 + 0.1 * time
     theta = 2.0 * np.pi * (time + 0.05 * time**2)
@@ -232,7 +223,7 @@ def test_stepped_levels_and_a_sweep_give_a_series_of_points() -> None:
     assert_near_truth(data, sigmas=5.0)
 
 
-def test_an_amplitude_sweep_that_is_too_fast_says_so() -> None:
+def test_an_amplitude_sweep_that_is_too_fast_says_so():
     time = np.arange(16 * 20_000) / 16_000.0
     x = 3.0 * np.exp(-time / 10.0) * np.sin(2.0 * np.pi * 5.0 * time)
     force = FRICTION.force(x)
@@ -251,7 +242,7 @@ def test_an_amplitude_sweep_that_is_too_fast_says_so() -> None:
     np.testing.assert_allclose(np.array(stated, float), 100 * bias / data.gain, rtol=0.06)
 
 
-def test_num_periods_and_settling_periods() -> None:
+def test_num_periods_and_settling_periods():
     record = waves(cycles=20).record()
     data = extract(record, num_periods=12, settling_periods=4, harmonics=(1,))
     assert data.quality["num_periods"].tolist() == [12]
@@ -265,7 +256,7 @@ def test_num_periods_and_settling_periods() -> None:
         extract(record, num_periods=5, settling_periods=4)
 
 
-def test_distortion_is_measured_and_said() -> None:
+def test_distortion_is_measured_and_said():
     w = waves()
     bent = w.displacement + 0.1 * np.sin(2.0 * (0.4 + 2.0 * np.pi * w.time))
     data = extract(Record(w.time, displacement=bent, force=w.force), harmonics=(1,))
@@ -276,7 +267,7 @@ def test_distortion_is_measured_and_said() -> None:
 
 
 @pytest.mark.parametrize("third", [0.0, 0.1])
-def test_noise_is_not_taken_for_a_distortion_of_the_force(third: float) -> None:
+def test_noise_is_not_taken_for_a_distortion_of_the_force(third):
     w, rng = waves(cycles=60.0), np.random.default_rng(2)
     phase = 2.0 * np.pi * w.time
     force = np.sin(phase) + third * np.sin(3.0 * phase) + 0.3 * rng.standard_normal(phase.size)
@@ -286,7 +277,7 @@ def test_noise_is_not_taken_for_a_distortion_of_the_force(third: float) -> None:
     assert data.quality["force_distortion"][0] == pytest.approx(third, abs=0.02)
 
 
-def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance() -> None:
+def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance():
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24)
     steps = SteppedSine((0.08, 0.4), controlled="force", settling_periods=30, num_periods=20)
     noisy = Acquisition(200.0, Channel(noise_std=2e-6), Channel(noise_std=2e-5))
@@ -308,7 +299,7 @@ def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance()
         extract(by_velocity, controlled="force", harmonics=(0, 1))
 
 
-def test_distortion_of_an_acceleration_is_that_of_the_displacement() -> None:
+def test_distortion_of_an_acceleration_is_that_of_the_displacement():
     w = waves()
     omega = 2.0 * np.pi
     acceleration = -(omega**2) * (w.displacement + 4.0 * 0.1 * np.sin(2.0 * omega * w.time))
@@ -316,7 +307,7 @@ def test_distortion_of_an_acceleration_is_that_of_the_displacement() -> None:
     assert data.quality["displacement_distortion"][0] == pytest.approx(0.05, rel=1e-2)
 
 
-def test_a_turned_sign_creates_energy() -> None:
+def test_a_turned_sign_creates_energy():
     w = waves(noise=1e-3)
     turned = extract(Record(w.time, displacement=w.displacement, force=-w.force))
     assert set(turned.quality["verdict"]) == {"creates energy: a sign is reversed"}
@@ -330,7 +321,7 @@ def test_a_turned_sign_creates_energy() -> None:
     assert verdicts.count("good") >= 39
 
 
-def test_quantisation_is_reported_in_steps_of_the_sensor() -> None:
+def test_quantisation_is_reported_in_steps_of_the_sensor():
     w = waves()
     x = np.round(w.displacement / 0.3) * 0.3
     force = np.round(w.force / 0.01) * 0.01
@@ -341,7 +332,7 @@ def test_quantisation_is_reported_in_steps_of_the_sensor() -> None:
     assert np.isinf(extract(w.record(), harmonics=(1,)).quality["force_steps"][0])
 
 
-def test_clipping_is_reported() -> None:
+def test_clipping_is_reported():
     w = waves(noise=1e-3)
     clipped = Record(
         w.time, displacement=np.clip(w.displacement, -1.9, 9.0), force=np.clip(w.force, -9.0, 0.6)
@@ -354,13 +345,13 @@ def test_clipping_is_reported() -> None:
     assert clean["displacement_clipped"][0] == clean["force_clipped"][0] == 0.0
 
 
-def test_a_force_that_saturates_is_not_clipped() -> None:
+def test_a_force_that_saturates_is_not_clipped():
     w = waves(beta=50.0, noise=0.0)
     quality = extract(w.record(), harmonics=(1,)).quality
     assert quality["force_clipped"][0] == 0.0
 
 
-def test_labels_and_origin_are_kept() -> None:
+def test_labels_and_origin_are_kept():
     w = waves()
     record = Record(
         w.time,
@@ -380,31 +371,31 @@ def test_labels_and_origin_are_kept() -> None:
     assert_near_truth(data)
 
 
-def test_table_of_points_and_verdicts() -> None:
+def test_table_of_points_and_verdicts():
     frame = extract(waves().record(), harmonics=(1, 3)).to_frame()
     assert {"settled", "verdict", "more_periods", "displacement_distortion"} <= set(frame.columns)
     assert len(frame) == 2
 
 
-def two_tones(n: int = 4000) -> Record:
+def two_tones(n=4000):
     time = np.arange(n) / RATE
     x = np.sin(2.0 * np.pi * time) + np.sin(2.0 * np.pi * 2.6 * time)
     return Record(time, displacement=x, force=x)
 
 
 @pytest.mark.parametrize(("seed", "n"), [(10, 16626), (16, 3314), (28, 10796)])
-def test_noise_is_no_sine_however_often_two_cycles_of_it_look_alike(seed: int, n: int) -> None:
+def test_noise_is_no_sine_however_often_two_cycles_of_it_look_alike(seed, n):
     motion, force = np.random.default_rng(seed).standard_normal((2, n))
     with pytest.raises(ExtractionError, match=r"^not a sine test: "):
         extract(Record(np.arange(n) / 1000.0, displacement=motion, force=force))
 
 
-def test_two_tones_are_refused_with_their_share() -> None:
+def test_two_tones_are_refused_with_their_share():
     with pytest.raises(ExtractionError, match=r"fundamental has \d+(\.\d)? % of the power"):
         extract(two_tones(), frequency=1.0)
 
 
-def test_a_force_that_is_noise_is_refused() -> None:
+def test_a_force_that_is_noise_is_refused():
     w = waves()
     rng = np.random.default_rng(0)
     record = Record(w.time, displacement=w.displacement, force=rng.standard_normal(w.time.size))
@@ -412,14 +403,14 @@ def test_a_force_that_is_noise_is_refused() -> None:
         extract(record)
 
 
-def test_less_motion_than_the_sensors_step_is_refused() -> None:
+def test_less_motion_than_the_sensors_step_is_refused():
     time = np.arange(4000) / RATE
     x = np.round(0.51 * np.sin(2.0 * np.pi * time)) * 1e-6
     with pytest.raises(ExtractionError, match=r"displacement .* sensor steps \(of 1e-06\)"):
         extract(Record(time, displacement=x, force=np.sin(2.0 * np.pi * time)))
 
 
-def test_a_dead_force_is_refused() -> None:
+def test_a_dead_force_is_refused():
     w = waves()
     with pytest.raises(ExtractionError, match=r"force around .*: amplitude 0 is 0 sensor steps"):
         extract(Record(w.time, displacement=w.displacement, force=np.zeros(w.time.size)))
@@ -434,15 +425,13 @@ def test_a_dead_force_is_refused() -> None:
         (np.sin(0.1 * np.arange(400)), "sweep", "no segment of constant"),
     ],
 )
-def test_records_without_cycles_are_refused(
-    motion: FloatArray, mode: Literal["auto", "sweep"], message: str
-) -> None:
+def test_records_without_cycles_are_refused(motion, mode, message):
     record = Record(np.arange(400) / RATE, displacement=motion, force=motion)
     with pytest.raises(ExtractionError, match=message):
         extract(record, mode=mode)
 
 
-def test_one_bad_stretch_is_left_out_with_a_warning() -> None:
+def test_one_bad_stretch_is_left_out_with_a_warning():
     good = waves(cycles=15)
     rng = np.random.default_rng(1)
     x = np.concatenate([good.displacement, np.zeros(300), 0.5 * good.displacement])
@@ -466,9 +455,9 @@ def test_one_bad_stretch_is_left_out_with_a_warning() -> None:
 )
 @settings(max_examples=150)
 def test_any_record_gives_points_or_a_named_error(
-    seed: int, samples: int, steps: str, motion: str, force: str, frequency: float | None,
-    mode: Literal["auto", "steps", "sweep"], min_share: float,
-) -> None:  # fmt: skip
+    seed, samples, steps, motion, force, frequency,
+    mode, min_share
+):  # fmt: skip
     rng = np.random.default_rng(seed)
     step = {
         "even": np.ones(samples),
@@ -520,19 +509,19 @@ def test_any_record_gives_points_or_a_named_error(
         ({"min_share": 1.0}, "min_share is 1.0; expected a share from 0 to below 1"),
     ],
 )
-def test_arguments_are_checked(options: dict[str, object], message: str) -> None:
+def test_arguments_are_checked(options, message):
     with pytest.raises(ValidationError, match=message):
-        extract(waves(cycles=4).record(), **options)  # type: ignore[arg-type]
+        extract(waves(cycles=4).record(), **options)
 
 
-def test_a_drive_without_a_factor_is_no_force() -> None:
+def test_a_drive_without_a_factor_is_no_force():
     w = waves(cycles=4)
     record = Record(w.time, displacement=w.displacement, drive=w.force)
     with pytest.raises(ValidationError, match="drive_factor"):
         extract(record)
 
 
-def test_harmonics_by_default_are_those_that_the_control_leaves_to_friction() -> None:
+def test_harmonics_by_default_are_those_that_the_control_leaves_to_friction():
     record = waves().record()
     held = extract(record)
     assert sorted(set(held.harmonic.tolist())) == [1, 3, 5, 7, 9]
@@ -540,14 +529,14 @@ def test_harmonics_by_default_are_those_that_the_control_leaves_to_friction() ->
     assert set(driven.harmonic.tolist()) == {1}
 
 
-def test_a_mean_that_moves_beyond_its_error_is_not_settled() -> None:
+def test_a_mean_that_moves_beyond_its_error_is_not_settled():
     # the drift d of n samples with errors s has the standard deviation s sqrt(12/n)
     n, s = 1000, 0.05
     error = s * np.sqrt(12.0 / n)
     time = np.arange(n) / 50.0
     wave = np.sin(2.0 * np.pi * time - 0.5)
 
-    def settled(drift: float, seed: int) -> bool:
+    def settled(drift, seed):
         noise = s * np.random.default_rng(seed).standard_normal(n)
         moved = wave + drift * (np.arange(n) / n - 0.5) + noise
         record = Record(time, displacement=1e-3 * moved, force=np.sin(2.0 * np.pi * time))
@@ -558,7 +547,7 @@ def test_a_mean_that_moves_beyond_its_error_is_not_settled() -> None:
 
 
 @pytest.mark.parametrize("distortion", [0.01, 0.05])
-def test_harmonics_state_what_those_of_the_displacement_add(distortion: float) -> None:
+def test_harmonics_state_what_those_of_the_displacement_add(distortion):
     """Against the harmonics of a sine: errors of the size that is stated, over phases and sizes."""
     law, t = Dahl(f_max=0.1, sigma=30.0), np.arange(12_000) / 1000.0
     ratios = []

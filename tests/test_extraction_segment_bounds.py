@@ -1,21 +1,19 @@
 """Ends of segments: cycles that depart go, by amplitude or phase; those of a level stay."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 import dahl_ident as di
-from benchmarks.extraction_validation import Noise, one_over_f, white
+from benchmarks.extraction_validation import one_over_f, white
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data import Record
 from dahl_ident.extraction import extract
 
 RATE = 100.0
 HELD = (5.0, 25.0)  # s, at 1 Hz
 
 
-def spring(phasor: FloatArray, phase: FloatArray, noise: FloatArray) -> FrequencyResponse:
+def spring(phasor, phase, noise):
     """Extract a displacement of about 1 Hz, and a spring's force."""
     time = np.arange(phasor.size) / RATE
     x = phasor * np.cos(2.0 * np.pi * time + phase)
@@ -23,14 +21,14 @@ def spring(phasor: FloatArray, phase: FloatArray, noise: FloatArray) -> Frequenc
     return extract(record, harmonics=(1,))
 
 
-def beyond_held() -> FloatArray:
+def beyond_held():
     """Return the seconds from where the level was held, 0 in it."""
     time: FloatArray = np.arange(int(30.0 * RATE)) / np.float64(RATE)
     return np.maximum(HELD[0] - time, 0.0) + np.maximum(time - HELD[1], 0.0)
 
 
 @pytest.mark.parametrize("phase_of_departure", [0.0, np.pi / 2.0, -2.0])
-def test_cycles_that_depart_in_amplitude_or_phase_are_left_out(phase_of_departure: float) -> None:
+def test_cycles_that_depart_in_amplitude_or_phase_are_left_out(phase_of_departure):
     """By one percent in the first cycle, four in the second: less than a cycle of it stays."""
     departure = 1.0 + 0.01 * beyond_held() ** 2 * np.exp(1j * phase_of_departure)
     rng = np.random.default_rng(1)
@@ -42,7 +40,7 @@ def test_cycles_that_depart_in_amplitude_or_phase_are_left_out(phase_of_departur
 
 
 @pytest.mark.parametrize("noise", [white, one_over_f])
-def test_a_level_in_noise_loses_nothing(noise: Noise) -> None:
+def test_a_level_in_noise_loses_nothing(noise):
     rng = np.random.default_rng(2)
     n = int(20.0 * RATE)
     short = 0
@@ -54,7 +52,7 @@ def test_a_level_in_noise_loses_nothing(noise: Noise) -> None:
     assert short <= 2
 
 
-def test_a_level_that_drifts_slowly_is_kept_whole() -> None:
+def test_a_level_that_drifts_slowly_is_kept_whole():
     rng = np.random.default_rng(3)
     n = int(20.0 * RATE)
     drifting = 1.0 + 0.01 * np.linspace(-0.5, 0.5, n)
@@ -62,7 +60,7 @@ def test_a_level_that_drifts_slowly_is_kept_whole() -> None:
     assert data.quality["num_periods"].tolist() == [20]
 
 
-def test_levels_of_a_plant_end_where_they_were_held() -> None:
+def test_levels_of_a_plant_end_where_they_were_held():
     """Each is held for 30 periods; a ramp's first cycle and a half may hide in the noise."""
     record = di.load_dataset("plant_recording")
     assert isinstance(record, Record)
@@ -80,7 +78,7 @@ def test_levels_of_a_plant_end_where_they_were_held() -> None:
 
 
 @pytest.mark.parametrize("size", [0.001, 0.003, 0.01])
-def test_a_slow_drift_is_no_ramp(size: float) -> None:
+def test_a_slow_drift_is_no_ramp(size):
     time = np.arange(int(100.0 * RATE)) / RATE
     drifting = 1.0 + size * np.exp(-time / 20.0)
     noise = 1e-4 * np.random.default_rng(2).standard_normal((2, time.size))
@@ -89,7 +87,7 @@ def test_a_slow_drift_is_no_ramp(size: float) -> None:
 
 
 @pytest.mark.parametrize("size", [0.25, 0.5])
-def test_a_phase_that_settles_is_no_wrong_frequency(size: float) -> None:
+def test_a_phase_that_settles_is_no_wrong_frequency(size):
     time = np.arange(int(100.0 * RATE)) / RATE
     x = np.cos(2.0 * np.pi * time + size * np.exp(-time / 30.0))
     noise = 1e-4 * np.random.default_rng(3).standard_normal((2, time.size))

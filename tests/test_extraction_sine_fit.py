@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.extraction.sine_fit import (
     HARMONICS,
     estimate_frequency,
@@ -17,19 +14,19 @@ MOTION = {1: 2.0 - 1.0j, 3: 0.1 + 0.2j, 4: -0.05j}
 FORCE = {1: 1.0 + 3.0j, 2: 0.3 + 0.0j, 3: -0.7j, 5: 0.2 + 0.1j, 7: 0.1 + 0.0j, 9: 0.05j}
 
 
-def waveform(theta: FloatArray, phasors: dict[int, complex]) -> FloatArray:
+def waveform(theta, phasors):
     parts = [(Y * np.exp(1j * k * theta)).real for k, Y in phasors.items()]
     return np.asarray(np.sum(parts, axis=0))
 
 
-def two_channels(time: FloatArray, omega: float, noise: float = 0.0) -> FloatArray:
+def two_channels(time, omega, noise=0.0):
     rng = np.random.default_rng(5)
     both = np.stack([waveform(omega * time, MOTION), waveform(omega * time, FORCE)])
     drift = np.array([[3.0], [-2.0]]) + np.array([[0.3], [0.5]]) * time
     return both + drift + noise * rng.standard_normal(both.shape)
 
 
-def uneven(n: int, seed: int = 0) -> FloatArray:
+def uneven(n, seed=0):
     """Jittered samples with one of five missing and a gap."""
     rng = np.random.default_rng(seed)
     time = np.arange(n) / 100.0 + rng.uniform(-0.004, 0.004, n)
@@ -37,12 +34,12 @@ def uneven(n: int, seed: int = 0) -> FloatArray:
     return time[kept]
 
 
-def phasors_at_zero(time: FloatArray, channels: FloatArray, omega: float, k: int) -> ComplexArray:
+def phasors_at_zero(time, channels, omega, k):
     segment = steady_segment(time, channels, omega)
     return np.asarray(sine_fit(segment).phasors(k) * np.exp(-1j * k * omega * segment.centre))
 
 
-def test_fit_is_exact_on_uneven_samples_with_harmonics_offset_and_drift() -> None:
+def test_fit_is_exact_on_uneven_samples_with_harmonics_offset_and_drift():
     time, omega = uneven(900), 2.0 * np.pi * 1.3
     channels = two_channels(time, omega)
     for k in range(1, HARMONICS + 1):
@@ -52,7 +49,7 @@ def test_fit_is_exact_on_uneven_samples_with_harmonics_offset_and_drift() -> Non
         )
 
 
-def test_frequency_minimises_the_weighted_squares_of_both_channels() -> None:
+def test_frequency_minimises_the_weighted_squares_of_both_channels():
     time, omega = uneven(700), 2.0 * np.pi * 1.3
     rng = np.random.default_rng(3)
     clean = np.stack([waveform(omega * time, {1: 1.0}), waveform(omega * time, {1: 2.0j})])
@@ -60,7 +57,7 @@ def test_frequency_minimises_the_weighted_squares_of_both_channels() -> None:
     found = estimate_frequency(track_phase(steady_segment(time, channels, 1.001 * omega), 1))
     weights = 1.0 / np.std(sine_fit(found).residual, axis=1)
 
-    def residual(relative: FloatArray) -> FloatArray:
+    def residual(relative):
         k = np.arange(1, 4)[:, None] * omega * relative[0]
         basis = np.vstack([np.ones_like(time), time, np.cos(k * time), np.sin(k * time)])
         fitted = np.linalg.lstsq(basis.T, channels.T, rcond=None)[0]
@@ -71,7 +68,7 @@ def test_frequency_minimises_the_weighted_squares_of_both_channels() -> None:
     assert found.omega / omega == pytest.approx(best, abs=allowed)
 
 
-def test_track_phase_follows_a_sweep() -> None:
+def test_track_phase_follows_a_sweep():
     time = np.arange(4000) / 200.0
     phase = 2.0 * np.pi * (1.0 * time + 0.02 * time**2)
     x = np.cos(phase)

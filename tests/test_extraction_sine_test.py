@@ -1,13 +1,10 @@
 """Motion that is not a sine test is refused, and the route for any motion named; sines are not."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
 import pytest
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Dahl
 from dahl_ident.errors import ExtractionError, arguments_as_options
@@ -17,13 +14,13 @@ FRICTION = Dahl(f_max=20.0, sigma=2e4)
 RATE = 200.0
 
 
-def record(x: FloatArray, rate: float = RATE, start: float = 0.0) -> Record:
+def record(x, rate=RATE, start=0.0):
     time = start + np.arange(x.size) / rate
     noise = np.random.default_rng(0).standard_normal(x.size)
     return Record(time, displacement=x, force=FRICTION.force(x) + 0.1 * noise)
 
 
-def random_motion(seed: int, low: float, high: float) -> FloatArray:
+def random_motion(seed, low, high):
     n = 12_000
     spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(n))
     frequency = np.fft.rfftfreq(n, 1.0 / RATE)
@@ -32,7 +29,7 @@ def random_motion(seed: int, low: float, high: float) -> FloatArray:
     return np.asarray(1e-3 * x / x.std())
 
 
-def strokes(seed: int) -> FloatArray:
+def strokes(seed):
     """Return point-to-point motion: trapezoids of velocity, of strokes that differ, with rests."""
     rng = np.random.default_rng(seed)
     velocity = [np.zeros(50)]
@@ -47,7 +44,7 @@ def strokes(seed: int) -> FloatArray:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("kind", ["wide", "narrow", "strokes", "there and back"])
-def test_any_other_motion_is_refused_and_the_route_named(kind: str, seed: int) -> None:
+def test_any_other_motion_is_refused_and_the_route_named(kind, seed):
     x = {
         "wide": lambda: random_motion(seed, 1.0, 5.0),
         "narrow": lambda: random_motion(seed, 2.0, 3.0),
@@ -60,7 +57,7 @@ def test_any_other_motion_is_refused_and_the_route_named(kind: str, seed: int) -
     assert "min_share" not in str(refused.value)
 
 
-def test_a_swept_force_that_friction_cannot_follow_is_named_with_the_command() -> None:
+def test_a_swept_force_that_friction_cannot_follow_is_named_with_the_command():
     t = np.arange(4000) / 100.0
     force = 0.3 * np.sin(2.0 * np.pi * 4.0 * (np.exp(0.075 * t) - 1.0))  # 0.3 to 6 Hz
     x, v, friction = np.zeros(t.size), 0.0, 0.0
@@ -82,7 +79,7 @@ def test_a_swept_force_that_friction_cannot_follow_is_named_with_the_command() -
         extract(swept, controlled="force")
 
 
-def test_levels_far_apart_sweeps_and_a_sine_in_noise_are_sine_tests() -> None:
+def test_levels_far_apart_sweeps_and_a_sine_in_noise_are_sine_tests():
     t = np.arange(12_000) / RATE
     rng = np.random.default_rng(1)
     levels = np.repeat(1e-3 * 0.5 ** np.arange(6), 2000) * np.sin(2.0 * np.pi * t)
@@ -95,7 +92,7 @@ def test_levels_far_apart_sweeps_and_a_sine_in_noise_are_sine_tests() -> None:
         extract(Record(t, displacement=hidden, force=rng.standard_normal(t.size)))
 
 
-def test_times_in_messages_count_from_the_start_of_the_record() -> None:
+def test_times_in_messages_count_from_the_start_of_the_record():
     t = np.arange(4000) / RATE
     rest = 1e-6 * np.sin(2.0 * np.pi * 31.0 * t[:1000])
     x = np.concatenate([np.sin(2.0 * np.pi * t), rest, 0.5 * np.sin(2.0 * np.pi * t)])

@@ -1,10 +1,6 @@
 """Lists, patterns and mappings of records, several processes, and files read in pieces."""
 
-from __future__ import annotations
-
 import importlib
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import h5py  # type: ignore[import-untyped]
@@ -23,7 +19,7 @@ LEVELS = {"low": 1e-3, "mid": 2e-3, "high": 4e-3}
 FRICTION = Dahl(f_max=0.1, sigma=30.0)
 
 
-def record(amplitude: float, n: int = 2000, seed: int = 0) -> Record:
+def record(amplitude, n=2000, seed=0):
     t = np.arange(n) / RATE
     x = amplitude * np.sin(2.0 * np.pi * FREQUENCY * t)
     noise = np.random.default_rng(seed).standard_normal((2, n))
@@ -31,13 +27,13 @@ def record(amplitude: float, n: int = 2000, seed: int = 0) -> Record:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     for name, amplitude in LEVELS.items():
         record(amplitude).save(tmp_path / f"{name}.csv")
     return tmp_path
 
 
-def test_lists_patterns_and_mappings_give_the_same_points_with_their_names(folder: Path) -> None:
+def test_lists_patterns_and_mappings_give_the_same_points_with_their_names(folder):
     files = [folder / f"{name}.csv" for name in sorted(LEVELS)]
     from_list = extract(files)
     from_pattern = extract(str(folder / "*.csv"))
@@ -56,14 +52,14 @@ def test_lists_patterns_and_mappings_give_the_same_points_with_their_names(folde
     assert extract([record(1e-3), record(1e-3)]).runs == ["record 1", "record 2"]
 
 
-def test_processes_give_what_one_gives(folder: Path) -> None:
+def test_processes_give_what_one_gives(folder):
     one = extract(str(folder / "*.csv"))
     two = extract(str(folder / "*.csv"), jobs=2)
     np.testing.assert_array_equal(one.response, two.response)
     assert two.runs == one.runs
 
 
-def test_rows_are_the_same_for_all_records() -> None:
+def test_rows_are_the_same_for_all_records():
     """One asymmetric record brings the even harmonics into the table, for all of them."""
     skew = record(4e-3)
     force = skew.force_samples + 4e3 * skew.motion_samples**2
@@ -74,7 +70,7 @@ def test_rows_are_the_same_for_all_records() -> None:
         assert data.select(run=run).harmonic.tolist() == list(range(10))
 
 
-def test_what_is_no_record_and_what_is_not_there(folder: Path) -> None:
+def test_what_is_no_record_and_what_is_not_there(folder):
     with pytest.raises(DataError, match=r"nothing\*\.csv: no file matches this pattern"):
         extract(str(folder / "nothing*.csv"))
     with pytest.raises(DataError, match=r"low\.csv: the file is named twice"):
@@ -92,7 +88,7 @@ def test_what_is_no_record_and_what_is_not_there(folder: Path) -> None:
         extract(record(1e-3), jobs=0)
 
 
-def saved(tmp_path: Path, with_time: bool) -> Path:
+def saved(tmp_path, with_time):
     whole = record(2e-3, n=9000)
     path = tmp_path / "long.h5"
     with h5py.File(path, "w") as file:
@@ -103,9 +99,7 @@ def saved(tmp_path: Path, with_time: bool) -> Path:
 
 
 @pytest.mark.parametrize("with_time", [True, False])
-def test_a_long_file_comes_in_pieces_that_make_up_the_whole(
-    tmp_path: Path, with_time: bool
-) -> None:
+def test_a_long_file_comes_in_pieces_that_make_up_the_whole(tmp_path, with_time):
     path = saved(tmp_path, with_time)
     reading = {} if with_time else {"sample_rate": RATE}
     whole = read_record(path, **reading)  # type: ignore[arg-type]
@@ -116,7 +110,7 @@ def test_a_long_file_comes_in_pieces_that_make_up_the_whole(
         np.testing.assert_allclose(joined, getattr(whole, name), rtol=0, atol=1e-12)
 
 
-def stored(path: Path, whole: Record) -> None:
+def stored(path, whole):
     """Save three channels in a format by the name's ending."""
     columns = {
         "time": whole.time, "displacement": whole.motion_samples, "force": whole.force_samples,
@@ -150,9 +144,7 @@ NAMED = {k: f"data.{k} [{u}]" for k, u in (("time", "s"), ("displacement", "m"),
 
 
 @pytest.mark.parametrize("ending", ["h5", "npy", "parquet", "tdms"])
-def test_a_level_across_the_cuts_is_one_point(
-    tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_level_across_the_cuts_is_one_point(tmp_path, ending, monkeypatch):
     """Two levels in four pieces: the first is cut once, the second twice."""
     one, two = record(2e-3, n=9000), record(4e-3, n=15000)
     whole = Record(
@@ -167,7 +159,7 @@ def test_a_level_across_the_cuts_is_one_point(
     monkeypatch.setattr(sources, "_PIECE", 6000)
     seen: list[int] = []
 
-    def counted(*args: Any, **words: Any) -> Iterator[Record]:
+    def counted(*args, **words):
         for piece in record_pieces(*args, **words):
             seen.append(piece.n)
             yield piece
@@ -190,7 +182,7 @@ def test_a_level_across_the_cuts_is_one_point(
     assert set(data.quality["verdict"]) == {"good"}
 
 
-def test_errors_of_joined_parts_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_of_joined_parts_hold(tmp_path, monkeypatch):
     """Scatter of 20 records over the stated variance; chi-square bounds of 1 in 1000."""
     exact = FRICTION.describing_function(2e-3)
     errors, stated, dof = [], [], []
@@ -207,9 +199,7 @@ def test_errors_of_joined_parts_hold(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert np.mean(dof) > 60.0  # three parts of about 40 each, were they alike
 
 
-def test_pieces_without_points_are_named_and_do_not_stop_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pieces_without_points_are_named_and_do_not_stop_the_others(tmp_path, monkeypatch):
     one = record(2e-3, n=3000)
     rest = np.zeros(3000)
     rng = np.random.default_rng(0)
@@ -227,7 +217,7 @@ def test_pieces_without_points_are_named_and_do_not_stop_the_others(
 
 
 @pytest.mark.parametrize("ending", ["h5", "parquet", "tdms", "csv"])
-def test_what_inspect_proposes_is_what_extract_accepts(tmp_path: Path, ending: str) -> None:
+def test_what_inspect_proposes_is_what_extract_accepts(tmp_path, ending):
     path, proposal = tmp_path / f"run.{ending}", tmp_path / "columns.toml"
     if ending == "csv":
         record(2e-3).save(path)
@@ -240,7 +230,7 @@ def test_what_inspect_proposes_is_what_extract_accepts(tmp_path: Path, ending: s
     )
 
 
-def test_a_tdms_file_that_was_appended_to_another_is_named(tmp_path: Path) -> None:
+def test_a_tdms_file_that_was_appended_to_another_is_named(tmp_path):
     nptdms: Any = importlib.import_module("nptdms")
     whole = record(2e-3)
     path = tmp_path / "run.tdms"

@@ -4,8 +4,6 @@ The samples in a cycle are not a whole number, so nothing aliases, and the state
 the theory's value: of n samples with noise sigma a phasor has E abs(e)^2 = 4 sigma^2/n.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +33,7 @@ class Simulated:
     size: FloatArray
 
 
-def simulated(displacement_noise: float, force_noise: float) -> Simulated:
+def simulated(displacement_noise, force_noise):
     rng = np.random.default_rng(5)
     time = np.arange(N) / PER_CYCLE
     x, force = steady(BETA, 0.4 + 2.0 * np.pi * time)
@@ -63,24 +61,22 @@ def simulated(displacement_noise: float, force_noise: float) -> Simulated:
     return Simulated(np.array(errors), np.array(covariances), np.array(dof), theory, np.abs(exact))
 
 
-def _parts(k: int) -> tuple[complex, complex]:
+def _parts(k):
     a, b = FRICTION.fourier_coefficients(BETA, k)
     return complex(a), 1j * complex(b)
 
 
 @pytest.fixture(scope="module")
-def noisy_force() -> Simulated:
+def noisy_force():
     return simulated(0.0002, 0.02)
 
 
 @pytest.fixture(scope="module")
-def noisy_displacement() -> Simulated:
+def noisy_displacement():
     return simulated(0.02, 0.0002)
 
 
-def test_stated_covariance_is_that_of_theory(
-    noisy_force: Simulated, noisy_displacement: Simulated
-) -> None:
+def test_stated_covariance_is_that_of_theory(noisy_force, noisy_displacement):
     """Its mean over the runs, within four standard deviations, and one per cent for the drift.
 
     Across the response a harmonic k has k^2 times the error of the displacement's phase.
@@ -93,9 +89,7 @@ def test_stated_covariance_is_that_of_theory(
                 assert stated / case.theory[row, axis] == pytest.approx(1.0, abs=bound)
 
 
-def test_errors_scatter_as_theory_has_it(
-    noisy_force: Simulated, noisy_displacement: Simulated
-) -> None:
+def test_errors_scatter_as_theory_has_it(noisy_force, noisy_displacement):
     """So the theory itself is right: chi-square bounds, each missed once in ten thousand."""
     low, high = (float(stats.chi2.ppf(q, RUNS)) / RUNS for q in (5e-5, 1.0 - 5e-5))
     for case in (noisy_force, noisy_displacement):
@@ -106,9 +100,7 @@ def test_errors_scatter_as_theory_has_it(
             assert low < along < high
 
 
-def test_stated_variance_scatters_as_its_degrees_of_freedom_say(
-    noisy_force: Simulated, noisy_displacement: Simulated
-) -> None:
+def test_stated_variance_scatters_as_its_degrees_of_freedom_say(noisy_force, noisy_displacement):
     """The variance of chi-square over dof is 2/dof; of 240 runs it is known to about 11 %."""
     scatter = []
     for case in (noisy_force, noisy_displacement):
@@ -117,9 +109,7 @@ def test_stated_variance_scatters_as_its_degrees_of_freedom_say(
     assert 0.67 < np.mean(scatter) < 1.4
 
 
-def test_a_region_of_95_per_cent_holds_the_truth_so_often(
-    noisy_force: Simulated, noisy_displacement: Simulated
-) -> None:
+def test_a_region_of_95_per_cent_holds_the_truth_so_often(noisy_force, noisy_displacement):
     for case in (noisy_force, noisy_displacement):
         e = np.stack([case.error[:, 0].real, case.error[:, 0].imag], axis=1)
         statistic = 0.5 * np.einsum("ij,ijk,ik->i", e, np.linalg.inv(case.covariance[:, 0]), e)
@@ -128,7 +118,7 @@ def test_a_region_of_95_per_cent_holds_the_truth_so_often(
 
 
 @pytest.mark.parametrize("beta", [0.1, 0.5])
-def test_the_transients_error_is_that_of_slow_noise(beta: float) -> None:
+def test_the_transients_error_is_that_of_slow_noise(beta):
     """Error of a departure over the stated one, in 1/f noise."""
     rng = np.random.default_rng(8)
     theta: FloatArray = 0.4 + 2.0 * np.pi / PER_CYCLE * np.arange(N, dtype=np.float64)

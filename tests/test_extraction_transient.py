@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from benchmarks.extraction_validation import (
     FRICTION,
-    Noise,
     descending,
     one_over_f,
     settling,
@@ -13,17 +10,15 @@ from benchmarks.extraction_validation import (
     white,
 )
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data import Record
 from dahl_ident.extraction import extract
-from dahl_ident.extraction.sine_fit import SineFit, sine_fit, steady_segment
-from dahl_ident.extraction.transient import Transient, estimate_transient
+from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
+from dahl_ident.extraction.transient import estimate_transient
 
 PER_CYCLE = 200
 
 
-def departing(
-    beta: float, cycles: int, start_force: float, noise: float = 0.0
-) -> tuple[SineFit, complex]:
+def departing(beta, cycles, start_force, noise=0.0):
     """Fit a segment that starts with some force, and return the exact response too."""
     theta: FloatArray = 1.1 + 2.0 * np.pi / PER_CYCLE * np.arange(cycles * PER_CYCLE, dtype=float)
     turns = np.pi * np.arange(1.0, np.ceil(theta[-1] / np.pi))
@@ -40,7 +35,7 @@ def departing(
     )
 
 
-def estimated(fit: SineFit) -> tuple[Transient, complex]:
+def estimated(fit):
     X, force = fit.phasors(1)
     transient = estimate_transient(fit, 1, float(np.angle(X)), complex(force / X))
     return transient, complex(transient.phasors(fit)[1] / X)
@@ -48,7 +43,7 @@ def estimated(fit: SineFit) -> tuple[Transient, complex]:
 
 @pytest.mark.parametrize("cycles", [3, 10, 40])
 @pytest.mark.parametrize("beta", [0.02, 0.1, 0.3, 1.0])
-def test_departure_and_rate_are_found_in_the_mean_of_the_force(beta: float, cycles: int) -> None:
+def test_departure_and_rate_are_found_in_the_mean_of_the_force(beta, cycles):
     fit, _ = departing(beta, cycles, 0.9, noise=1e-5)
     loop_force = steady(beta, np.array([1.1, 1.2]))[1][0]
     transient, _ = estimated(fit)
@@ -59,7 +54,7 @@ def test_departure_and_rate_are_found_in_the_mean_of_the_force(beta: float, cycl
 
 @pytest.mark.parametrize("cycles", [3, 10, 40])
 @pytest.mark.parametrize("beta", [0.02, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0])
-def test_bias_of_the_response_is_predicted(beta: float, cycles: int) -> None:
+def test_bias_of_the_response_is_predicted(beta, cycles):
     fit, exact = departing(beta, cycles, 0.9, noise=1e-6)
     X, force = fit.phasors(1)
     bias = force / X - exact
@@ -68,7 +63,7 @@ def test_bias_of_the_response_is_predicted(beta: float, cycles: int) -> None:
     assert abs(predicted - bias) < 0.25 * abs(bias)
 
 
-def test_a_settled_stretch_has_no_departure() -> None:
+def test_a_settled_stretch_has_no_departure():
     rng = np.random.default_rng(3)
     found = 0
     for beta in (0.05, 0.3, 3.0, 30.0):
@@ -81,7 +76,7 @@ def test_a_settled_stretch_has_no_departure() -> None:
     assert found <= 4
 
 
-def test_a_drifting_sensor_is_no_memory_where_friction_forgets_fast() -> None:
+def test_a_drifting_sensor_is_no_memory_where_friction_forgets_fast():
     n = 20 * PER_CYCLE
     time = np.arange(n, dtype=np.float64) / PER_CYCLE
     x, force = steady(3.0, 2.0 * np.pi * time)
@@ -94,7 +89,7 @@ def test_a_drifting_sensor_is_no_memory_where_friction_forgets_fast() -> None:
 
 @pytest.mark.parametrize("noise", [white, one_over_f])
 @pytest.mark.parametrize("fixed", [True, False])
-def test_verdicts_on_descending_levels_with_too_few_cycles(noise: Noise, fixed: bool) -> None:
+def test_verdicts_on_descending_levels_with_too_few_cycles(noise, fixed):
     result = settling(8, seed=11, noise=noise, fixed=fixed)
     assert result.found > 0.95
     assert result.biased > 0
@@ -102,11 +97,11 @@ def test_verdicts_on_descending_levels_with_too_few_cycles(noise: Noise, fixed: 
     assert result.flagged <= 0.05
 
 
-def test_more_periods_is_what_was_missing() -> None:
+def test_more_periods_is_what_was_missing():
     levels = np.array([1.0, 0.05])
     rng = np.random.default_rng(8)
 
-    def extracted(cycles: int, left_out: int) -> FrequencyResponse:
+    def extracted(cycles, left_out):
         t, x, force = descending(levels, cycles, 100)
         noisy = force + 1e-5 * rng.standard_normal(t.size)
         record = Record(t, displacement=x, force=noisy)
@@ -121,7 +116,7 @@ def test_more_periods_is_what_was_missing() -> None:
     assert not extracted(8 + more // 2, 1 + more // 2).quality["settled"][1]
 
 
-def test_settling_periods_are_left_out_by_themselves() -> None:
+def test_settling_periods_are_left_out_by_themselves():
     t, x, force = descending(np.array([1.0, 0.3, 0.03]), 60, 100)
     rng = np.random.default_rng(2)
     noisy = force + 1e-4 * rng.standard_normal(t.size)

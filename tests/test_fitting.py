@@ -1,7 +1,5 @@
 """Least squares against lmfit, curve_fit and general optimisers; coverage by simulation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -31,33 +29,33 @@ LOSSES: dict[str, Callable[[FloatArray], FloatArray]] = {
 COVARIANCE = np.abs(TRUE)[:, None, None] ** 2 * np.array([[2e-3, 1e-3], [1e-3, 4e-3]])
 
 
-def table(response: ComplexArray = MEASURED, **columns: object) -> FrequencyResponse:
-    return FrequencyResponse(np.ones(n), response, A, **columns)  # type: ignore[arg-type]
+def table(response=MEASURED, **columns):
+    return FrequencyResponse(np.ones(n), response, A, **columns)
 
 
-def model(f_max: float, sigma: float) -> ComplexArray:
+def model(f_max, sigma):
     return Dahl(f_max, sigma).describing_function(A)
 
 
 @pytest.mark.parametrize("noise", ["measured", "relative", "absolute"])
 @pytest.mark.versions
-def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
+def test_lmfit_finds_the_same_optimum_and_covariance(noise):
     problem = TableProblem(table(covariance=COVARIANCE), Dahl(), noise=noise)
     found = solve(problem)
     whitening = np.linalg.inv(np.linalg.cholesky(COVARIANCE))
 
-    def rows(values: ComplexArray) -> FloatArray:
+    def rows(values):
         """Return whitened real and imaginary parts of values in the last axis."""
         parts = np.ascontiguousarray(values).view(np.float64).reshape(*values.shape, 2)
         if noise == "measured":
             parts = np.einsum("nij,...nj->...ni", whitening, parts)
         return np.asarray(parts.reshape(*values.shape[:-1], 2 * n))
 
-    def residual(p: lmfit.Parameters) -> FloatArray:
+    def residual(p):
         N = model(p["f_max"].value, p["sigma"].value)
         return rows(np.log(MEASURED / N) if noise == "relative" else MEASURED - N)
 
-    def slopes(p: lmfit.Parameters) -> FloatArray:
+    def slopes(p):
         pivot = Dahl(p["f_max"].value, p["sigma"].value)
         by = np.array([pivot.gradient(A)[name] for name in ("f_max", "sigma")])
         return rows(-by / pivot.describing_function(A) if noise == "relative" else -by).T
@@ -89,7 +87,7 @@ def test_lmfit_finds_the_same_optimum_and_covariance(noise: str) -> None:
 
 
 @pytest.mark.versions
-def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
+def test_a_driven_plant_is_recovered_from_every_quantity():
     true = np.array([0.1, 30.0, 0.3, 0.24, 0.3])
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
     drive = np.repeat(np.geomspace(1e-3, 1.0, 5), 12)
@@ -117,7 +115,7 @@ def test_a_driven_plant_is_recovered_from_every_quantity() -> None:
 
 @pytest.mark.parametrize("exponent", [-30, 30])
 @pytest.mark.versions
-def test_units_do_not_matter(exponent: int) -> None:
+def test_units_do_not_matter(exponent):
     here = solve(TableProblem(table(), Dahl()))
     a = 10.0**exponent
     there = solve(TableProblem(FrequencyResponse(np.ones(n), MEASURED / a**2, A * a), Dahl()))
@@ -125,7 +123,7 @@ def test_units_do_not_matter(exponent: int) -> None:
     np.testing.assert_allclose(there.covariance, here.covariance, rtol=1e-6)
 
 
-def test_a_parameter_at_its_bound_is_named() -> None:
+def test_a_parameter_at_its_bound_is_named():
     capped = Model(Dahl()).with_parameters(
         {"f_max": Model(Dahl()).parameters[0].__class__(
             "f_max", "N", "friction limit", lower=0.0, upper=0.08, transform="log"
@@ -141,7 +139,7 @@ def test_a_parameter_at_its_bound_is_named() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
+def test_robust_losses_stay_with_the_bulk(loss):
     spoiled = MEASURED.copy()
     spoiled[[3, 12]] *= [8.0, 0.2j]
     clean, robust = (
@@ -159,7 +157,7 @@ def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
     # the cost is at its minimum for the scale found
     problem = TableProblem(table(spoiled), Dahl())
 
-    def cost(theta: FloatArray) -> float:
+    def cost(theta):
         y = problem.residuals(theta).view(np.complex128)
         return 0.5 * float(LOSSES[loss](np.abs(y / robust.scale) ** 2).sum())
 
@@ -171,9 +169,7 @@ def test_robust_losses_stay_with_the_bulk(loss: str) -> None:
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("factor", [1e9, 1e12])
 @pytest.mark.parametrize("row", [7, -1])
-def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(
-    loss: str, factor: float, row: int
-) -> None:
+def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(loss, factor, row):
     """Its pull is bounded, also where its cost is so large that the others' is rounding."""
     near, far = MEASURED.copy(), MEASURED.copy()
     near[row] *= 1e5
@@ -188,7 +184,7 @@ def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
+def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss):
     rng, z, scales = np.random.default_rng(1), [], []
     for _ in range(80):
         error = rng.normal(size=n) + 1j * rng.normal(size=n)
@@ -200,7 +196,7 @@ def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss: str) -> None:
 
 
 @pytest.mark.versions
-def test_a_prior_joins_data_of_known_scale() -> None:
+def test_a_prior_joins_data_of_known_scale():
     data = table(covariance=COVARIANCE)
     exact = solve(TableProblem(data, Dahl()))
     prior = stats.norm(1.0, 0.03)
@@ -212,7 +208,7 @@ def test_a_prior_joins_data_of_known_scale() -> None:
     assert found.dof == 2 * n + 1 - 3
 
 
-def test_a_prior_joins_data_of_unknown_scale() -> None:
+def test_a_prior_joins_data_of_unknown_scale():
     prior = stats.norm(1.0, 0.03)
     exact = solve(TableProblem(table(), Dahl()))
     found = solve(TableProblem(table(), Dahl(), sensors=Sensors(force_gain=prior)))
@@ -220,7 +216,7 @@ def test_a_prior_joins_data_of_unknown_scale() -> None:
     np.testing.assert_allclose(found.covariance[:2, :2], exact.covariance + 0.03**2, rtol=1e-3)
 
 
-def test_what_cannot_be_told_apart_is_singular() -> None:
+def test_what_cannot_be_told_apart_is_singular():
     found = solve(TableProblem(table(), Dahl(), sensors=Sensors(force_gain=None)))
     assert found.status is Status.SINGULAR
     assert not found.success
@@ -232,7 +228,7 @@ def test_what_cannot_be_told_apart_is_singular() -> None:
     )
 
 
-def test_stated_intervals_cover_with_relative_noise_of_ten_percent() -> None:
+def test_stated_intervals_cover_with_relative_noise_of_ten_percent():
     rng, tables = np.random.default_rng(21), 2000
     points = np.geomspace(1e-3, 1e-2, 8)
     N = Dahl(0.1, 30.0).describing_function(points)
@@ -248,7 +244,7 @@ def test_stated_intervals_cover_with_relative_noise_of_ten_percent() -> None:
         assert np.all(np.abs(covered - level) < 4.0 * np.sqrt(level * (1.0 - level) / tables))
 
 
-def test_a_start_is_completed_and_checked() -> None:
+def test_a_start_is_completed_and_checked():
     problem = TableProblem(table(), Dahl())
     with pytest.raises(ModelError, match="start names mass; the free parameters are f_max, sigma"):
         solve(problem, start={"mass": 1.0})
@@ -257,7 +253,7 @@ def test_a_start_is_completed_and_checked() -> None:
     )
 
 
-def test_too_little_data_are_refused() -> None:
+def test_too_little_data_are_refused():
     data = FrequencyResponse([1.0], [1.0 + 1.0j], [1.0])
     with pytest.raises(FitError, match="1 rows give 2 numbers, fewer than the 3 free parameters"):
         solve(TableProblem(data, Dahl() + Spring()))
@@ -265,7 +261,7 @@ def test_too_little_data_are_refused() -> None:
         solve(TableProblem(data, Dahl()), loss="cauchy")
 
 
-def test_as_many_numbers_as_parameters_leave_no_scale() -> None:
+def test_as_many_numbers_as_parameters_leave_no_scale():
     data = FrequencyResponse([1.0], [20.0 + 10.0j], [1e-2])
     found = solve(TableProblem(data, Dahl()))
     assert found.dof == 0
@@ -277,7 +273,7 @@ def test_as_many_numbers_as_parameters_leave_no_scale() -> None:
 @pytest.mark.parametrize("noise", ["relative", "absolute"])
 @pytest.mark.parametrize("loss", ["linear", *LOSSES])
 @pytest.mark.parametrize("copies", [1, 2])
-def test_data_without_noise_are_met_to_rounding(noise: str, loss: str, copies: int) -> None:
+def test_data_without_noise_are_met_to_rounding(noise, loss, copies):
     """Rounding errors are not noise: they repeat, and standard errors cannot be smaller."""
     amplitude = np.tile(np.geomspace(1e-3, 1e-1, 30), copies)
     N = Dahl(0.1, 30.0).describing_function(amplitude)
@@ -292,7 +288,7 @@ def test_data_without_noise_are_met_to_rounding(noise: str, loss: str, copies: i
     assert "the limit of rounding" in found.fit_report()
 
 
-def test_an_outlier_among_exact_data_is_no_rounding() -> None:
+def test_an_outlier_among_exact_data_is_no_rounding():
     amplitude = np.geomspace(1e-3, 1e-1, 30)
     N = Dahl(0.1, 30.0).describing_function(amplitude)
     N[4] *= 2.0
@@ -306,7 +302,7 @@ def test_an_outlier_among_exact_data_is_no_rounding() -> None:
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("noise", ["relative", "absolute"])
 @pytest.mark.parametrize("factor", [1e-9, 1e-3, 0.1, 10.0, 1e3])
-def test_one_wrong_row_does_not_even_rule_the_start(loss: str, noise: str, factor: float) -> None:
+def test_one_wrong_row_does_not_even_rule_the_start(loss, noise, factor):
     rng = np.random.default_rng(0)
     error = 0.02 * (rng.normal(size=n) + 1j * rng.normal(size=n))
     N = Dahl(0.1, 30.0).describing_function(A) * np.exp(error)
@@ -329,7 +325,7 @@ ODD_RESPONSES: dict[str, ComplexArray] = {
 
 @pytest.mark.parametrize("model", [Dahl(), Dahl() + Spring()], ids=repr)
 @pytest.mark.parametrize("name", ODD_RESPONSES)
-def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name: str, model: Any) -> None:
+def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name, model):
     data = FrequencyResponse(np.ones(n), ODD_RESPONSES[name], A)
     found = fit(data, model, noise="absolute", throw=False)
     assert not found.trusted
@@ -337,13 +333,13 @@ def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name: str, model:
     assert not np.isnan(found.optimum.values).any()
 
 
-def test_columns_alike_to_rounding_end_no_search() -> None:
+def test_columns_alike_to_rounding_end_no_search():
     """A Hessian of two columns whose cosine exceeds 1 by the first damping: exactly singular."""
     hessian = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.solve(hessian + 1e-9 * np.eye(2), np.ones(2))
 
-    def evaluate(theta: FloatArray, which: object) -> Quadratic:
+    def evaluate(theta, which):
         gradient = np.repeat(theta.sum(axis=1, keepdims=True), 2, axis=1)
         cost = 0.5 * theta.sum(axis=1) ** 2
         return Quadratic(cost, gradient, np.broadcast_to(hessian, (len(theta), 2, 2)).copy())

@@ -1,23 +1,18 @@
 """A law that is written in ten lines is estimated like any other: no guess, every method."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import optimize
 
 import dahl_ident as di
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
 from dahl_ident.errors import DataError, ValidationError
-from dahl_ident.fitting import Optimum, Status, solve, solve_many
+from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.problem import ProblemBatch, TableProblem
 
 
-def positive(name: str, unit: str) -> di.Parameter:
+def positive(name, unit):
     return di.Parameter(name, unit, name, lower=0.0, transform="log")
 
 
@@ -27,7 +22,7 @@ class ByForce(di.Friction):
     parameters = (positive("stiff", "N/m"), positive("f_max", "N"))
     scale_parameters = ("stiff", "f_max")
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         stiff, f_max = values
         return stiff * (direction * force < f_max)
 
@@ -38,7 +33,7 @@ class BySlip(di.Friction):
     parameters = (positive("stiff", "N/m"), positive("delta", "m"))
     scale_parameters = ("stiff",)
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         stiff, delta = values
         return stiff * (direction * force < stiff * delta)
 
@@ -49,12 +44,12 @@ class OneWay(di.Friction):
     parameters = (positive("stiff", "N/m"), positive("f_max", "N"))
     scale_parameters = ("stiff", "f_max")
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         stiff, f_max = values
         return stiff * (1.0 - direction * force / (f_max * (1.5 + 0.5 * direction)))
 
 
-def jenkins(amplitude: FloatArray, stiff: float, delta: float) -> ComplexArray:
+def jenkins(amplitude, stiff, delta):
     """Return N of the elastoplastic element, in closed form."""
     m = np.minimum(delta / amplitude, 1.0)
     t = np.arccos(1.0 - 2.0 * m)
@@ -68,7 +63,7 @@ TRUTH = {"stiff": STIFF, "delta": DELTA, "f_max": STIFF * DELTA}
 TRUTH |= {"mass": MASS, "damping": DAMPING, "stiffness": SPRING}
 
 
-def noisy(values: FloatArray | ComplexArray, level: float = 0.005, seed: int = 1) -> ComplexArray:
+def noisy(values, level=0.005, seed=1):
     rng = np.random.default_rng(seed)
     return np.asarray(
         values
@@ -76,12 +71,12 @@ def noisy(values: FloatArray | ComplexArray, level: float = 0.005, seed: int = 1
     )
 
 
-def alone() -> di.FrequencyResponse:
+def alone():
     A = np.geomspace(3e-4, 1e-1, 30)
     return di.FrequencyResponse(np.ones(30), noisy(jenkins(A, STIFF, DELTA)), A)
 
 
-def plant(controlled: str) -> di.FrequencyResponse:
+def plant(controlled):
     A = np.tile(np.geomspace(1e-3, 3e-2, 5), 4)
     f = np.repeat(np.geomspace(0.3, 3.0, 4), 5)
     omega = 2.0 * np.pi * f
@@ -93,7 +88,7 @@ def plant(controlled: str) -> di.FrequencyResponse:
     )
 
 
-def assert_truth(found: Optimum) -> None:
+def assert_truth(found):
     assert found.status is Status.CONVERGED
     expected = np.array([TRUTH[name] for name in found.names])
     spread = np.sqrt(np.diagonal(found.values_covariance))
@@ -105,9 +100,7 @@ def assert_truth(found: Optimum) -> None:
     ("law", "data"),
     [(ByForce, "alone"), (BySlip, "alone"), (BySlip, "displacement"), (ByForce, "force")],
 )
-def test_a_law_of_ten_lines_is_found_without_a_guess_by_every_method(
-    law: type[di.Friction], data: str
-) -> None:
+def test_a_law_of_ten_lines_is_found_without_a_guess_by_every_method(law, data):
     table = alone() if data == "alone" else plant(data)
     model: Element = law() if data == "alone" else law() + di.Mass() + di.Damper() + di.Spring()
     problem = TableProblem(table, model, steady="describing function")  # which made the data
@@ -122,7 +115,7 @@ def test_a_law_of_ten_lines_is_found_without_a_guess_by_every_method(
         np.testing.assert_allclose(other.values, by_lm.values, rtol=1e-4)
 
 
-def test_random_problems_over_twelve_decades_are_recovered() -> None:
+def test_random_problems_over_twelve_decades_are_recovered():
     rng = np.random.default_rng(5)
     for index in range(12):
         stiff, delta = 10.0 ** rng.uniform(-6.0, 6.0, 2)
@@ -138,7 +131,7 @@ def test_random_problems_over_twelve_decades_are_recovered() -> None:
 
 
 @pytest.mark.parametrize("law", [ByForce, BySlip])
-def test_a_law_that_never_slips_says_which_parameter_runs_away(law: type[di.Friction]) -> None:
+def test_a_law_that_never_slips_says_which_parameter_runs_away(law):
     A = np.geomspace(1e-7, 1e-5, 20)
     data = di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, DELTA)), A)
     found = solve(TableProblem(data, law(), noise="absolute"))
@@ -151,7 +144,7 @@ def test_a_law_that_never_slips_says_which_parameter_runs_away(law: type[di.Fric
     assert kept.value == pytest.approx(STIFF, abs=5.0 * kept.stderr)
 
 
-def test_a_law_that_always_slips_determines_its_force() -> None:
+def test_a_law_that_always_slips_determines_its_force():
     A = np.geomspace(1e5, 1e7, 20) * DELTA
     Z = 1j * np.exp(0.01j) * 4.0 / np.pi * STIFF * DELTA / A  # a stiffness a little below zero
     for law, expression in ((ByForce, "f_max"), (BySlip, "stiff delta")):
@@ -164,7 +157,7 @@ def test_a_law_that_always_slips_determines_its_force() -> None:
         assert kept.value == pytest.approx(STIFF * DELTA, rel=0.01)
 
 
-def test_like_elements_of_any_law_are_ordered_by_their_knees() -> None:
+def test_like_elements_of_any_law_are_ordered_by_their_knees():
     A = np.geomspace(1e-4, 1e-1, 24)
     Z = jenkins(A, 20.0, 1e-2) + jenkins(A, 30.0, 8e-4)
     data = di.FrequencyResponse(np.ones(24), noisy(Z, 1e-3), A)
@@ -173,7 +166,7 @@ def test_like_elements_of_any_law_are_ordered_by_their_knees() -> None:
     np.testing.assert_allclose(found.values, [30.0, 8e-4, 20.0, 1e-2], rtol=0.03)
 
 
-def test_a_batch_of_a_law_equals_its_tables_one_by_one() -> None:
+def test_a_batch_of_a_law_equals_its_tables_one_by_one():
     A = np.geomspace(3e-4, 1e-1, 20)
     tables = [
         di.FrequencyResponse(np.ones(20), noisy(jenkins(A, STIFF, d), seed=i), A)
@@ -186,11 +179,11 @@ def test_a_batch_of_a_law_equals_its_tables_one_by_one() -> None:
         )
 
 
-def test_method_names_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_method_names_what_runs(monkeypatch):
     calls = []
     original = optimize.least_squares
 
-    def counted(*arguments: Any, **options: Any) -> Any:
+    def counted(*arguments, **options):
         calls.append(options["x_scale"])
         return original(*arguments, **options)
 
@@ -207,7 +200,7 @@ def test_method_names_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         solve(TableProblem(data, di.Dahl()), method="newton")
 
 
-def test_even_harmonics_take_part_where_a_law_has_them() -> None:
+def test_even_harmonics_take_part_where_a_law_has_them():
     law = OneWay(30.0, 0.1)
     A = np.geomspace(1e-3, 1e-1, 12)
     Z = [law.dynamic_stiffness(a, harmonic=k) for a in A for k in (1, 2)]

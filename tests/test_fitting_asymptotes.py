@@ -1,15 +1,10 @@
 """Optima at infinity: named, with what is determined, and never a huge number."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring
-from dahl_ident.arrays import ComplexArray
-from dahl_ident.elements import Element
-from dahl_ident.fitting import Optimum, Status, solve, solve_many
+from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.problem import ProblemBatch, TableProblem
 from tests.random_problems import friction_and_spring
 
@@ -19,11 +14,11 @@ RNG = np.random.default_rng(8)
 ERROR = RNG.normal(size=n) + 1j * RNG.normal(size=n)
 
 
-def fitted(Z: ArrayLike, model: Element, *, noise: str = "absolute") -> Optimum:
+def fitted(Z, model, *, noise="absolute"):
     return solve(TableProblem(FrequencyResponse(np.ones(n), Z, A), model, noise=noise))
 
 
-def test_microslip_with_a_spring_determines_two_combinations() -> None:
+def test_microslip_with_a_spring_determines_two_combinations():
     kappa, K = 2e5, 7.0
     Z = K + 4j / (3.0 * np.pi) * kappa * A + 0.01 * ERROR
     found = fitted(Z, Dahl() + Spring())
@@ -51,7 +46,7 @@ def test_microslip_with_a_spring_determines_two_combinations() -> None:
     assert "No finite optimum: the fit improves as f_max grows" in found.message
 
 
-def test_alpha_joins_the_combination() -> None:
+def test_alpha_joins_the_combination():
     Z = 7.0 + 4j / (3.0 * np.pi) * 2e5 * A + 0.01 * ERROR
     found = fitted(Z, Dahl(alpha=None) + Spring())
     assert found.status is Status.MICROSLIP
@@ -61,7 +56,7 @@ def test_alpha_joins_the_combination() -> None:
     ]
 
 
-def test_alpha_tends_to_zero_where_the_knee_is_sharp() -> None:
+def test_alpha_tends_to_zero_where_the_knee_is_sharp():
     slips = np.geomspace(3.0, 100.0, n) * 1e-5 / 7.0
     Z = Dahl(1e-5, 7.0, 1e-9).describing_function(slips) * (1.0 - 0.01j / 3.0)
     found = solve(TableProblem(FrequencyResponse(np.ones(n), Z, slips), Dahl(alpha=None)))
@@ -71,7 +66,7 @@ def test_alpha_tends_to_zero_where_the_knee_is_sharp() -> None:
     assert found.combinations[0].value == pytest.approx(1e-5, rel=1e-2)
 
 
-def test_alpha_and_f_max_grow_together_where_nothing_slips_fully() -> None:
+def test_alpha_and_f_max_grow_together_where_nothing_slips_fully():
     phi, sigma = 1e-5, 7.0
     places = np.geomspace(0.3, 3.0, n) * phi / sigma
     exponential = Dahl(phi * 1e3, sigma, 1e3).describing_function(places)
@@ -83,7 +78,7 @@ def test_alpha_and_f_max_grow_together_where_nothing_slips_fully() -> None:
     assert found.combinations[0].value == pytest.approx(phi, rel=0.1)
 
 
-def test_stiffness_without_loss_determines_sigma() -> None:
+def test_stiffness_without_loss_determines_sigma():
     found = fitted(7.0 - 0.01j + 0.001 * ERROR, Dahl())
     assert found.status is Status.NO_LOSS
     assert found.values[0] == np.inf
@@ -93,7 +88,7 @@ def test_stiffness_without_loss_determines_sigma() -> None:
     assert found.stderr["f_max"] == np.inf
 
 
-def test_slip_alone_determines_f_max() -> None:
+def test_slip_alone_determines_f_max():
     found = fitted(1j * 4.0 / np.pi * 3e-5 / A - 0.01 * (1.0 + 0.1 * ERROR), Dahl())
     assert found.status is Status.GROSS_SLIP
     assert found.values[1] == np.inf
@@ -101,7 +96,7 @@ def test_slip_alone_determines_f_max() -> None:
     assert [c.expression for c in found.combinations] == ["f_max"]
 
 
-def test_no_friction_leaves_the_other_elements() -> None:
+def test_no_friction_leaves_the_other_elements():
     found = fitted(7.0 - 0.2j + 0.01 * ERROR, Dahl() + Spring())
     assert found.status is Status.NO_FRICTION
     assert found.values[:2].tolist() == [0.0, 0.0]
@@ -118,9 +113,7 @@ def test_no_friction_leaves_the_other_elements() -> None:
         (Dahl(f_max=1.0) + Spring(1.0), 1.0 - 0.1 + 0.01 * ERROR, Status.NO_FRICTION, 0.0),
     ],
 )
-def test_one_free_friction_parameter_can_run_away(
-    model: Element, Z: ArrayLike, status: Status, value: float
-) -> None:
+def test_one_free_friction_parameter_can_run_away(model, Z, status, value):
     found = fitted(Z, model)
     assert found.status is status
     assert found.values.tolist() == [value]
@@ -133,7 +126,7 @@ def test_one_free_friction_parameter_can_run_away(
         (1j * 4.0 / np.pi * 3e-5 / A - 1e-6 / A, Status.GROSS_SLIP),  # a negative stiffness
     ],
 )
-def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -> None:
+def test_limits_hold_for_driven_plants(friction, status):
     f = np.geomspace(0.05, 5.0, n)[np.random.default_rng(0).permutation(n)]
     omega = 2.0 * np.pi * f
     Z = friction + 7.0 - 0.3 * omega**2 + 0.24j * omega
@@ -147,7 +140,7 @@ def test_limits_hold_for_driven_plants(friction: ComplexArray, status: Status) -
     assert np.isfinite(list(found.stderr.values())[2:4]).all()
 
 
-def test_an_unknown_displacement_gain_is_no_limit() -> None:
+def test_an_unknown_displacement_gain_is_no_limit():
     N = Dahl(0.1, 30.0).describing_function(np.geomspace(1e-4, 1e-1, n)) * np.exp(0.01 * ERROR)
     data = FrequencyResponse(np.ones(n), N, np.geomspace(1e-4, 1e-1, n))
     found = solve(TableProblem(data, Dahl(), sensors=Sensors(displacement_gain=None)))
@@ -157,7 +150,7 @@ def test_an_unknown_displacement_gain_is_no_limit() -> None:
     assert np.isinf(found.stderr["sigma"])
 
 
-def test_limits_agree_with_dense_scans() -> None:
+def test_limits_agree_with_dense_scans():
     """A finite optimum is as low as a dense scan's, and one at infinity is named as such."""
     named = set()
     for problem, least_cost, at_edge in friction_and_spring(seed=4, count=60):
@@ -168,7 +161,7 @@ def test_limits_agree_with_dense_scans() -> None:
     assert named >= {Status.CONVERGED, Status.MICROSLIP, Status.GROSS_SLIP, Status.NO_FRICTION}
 
 
-def test_a_given_f_max_far_beyond_the_data_leaves_sigma_to_be_found_with_a_spring() -> None:
+def test_a_given_f_max_far_beyond_the_data_leaves_sigma_to_be_found_with_a_spring():
     """Only sigma^2/f_max and sigma + stiffness show: a bent valley, as with f_max free."""
     f, amplitude = np.tile(np.geomspace(0.5, 2.0, 15), 3), np.repeat([1e-6, 3e-6, 1e-5], 15)
     truth = np.array([1e6, 2.0, 1.0, -9.9e5])

@@ -1,22 +1,19 @@
 """Many tables at once give what one at a time gives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
 
 from benchmarks.harness import peak_bytes
 from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring
-from dahl_ident.elements import Element
 from dahl_ident.errors import ValidationError
-from dahl_ident.fitting import Optimum, OptimumBatch, Status, solve, solve_many
+from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.problem import ProblemBatch, TableProblem
 
 n = 20
 
 
-def tables(level: float, beta: float, spring: float, count: int = 25) -> list[FrequencyResponse]:
+def tables(level, beta, spring, count=25):
     """Return tables over one decade of amplitude; half of them have amplitudes of their own."""
     rng = np.random.default_rng(4)
     made = []
@@ -30,7 +27,7 @@ def tables(level: float, beta: float, spring: float, count: int = 25) -> list[Fr
     return made
 
 
-def assert_same(batch: OptimumBatch, singles: list[Optimum]) -> None:
+def assert_same(batch, singles):
     for index, one in enumerate(singles):
         assert batch.cost[index] == pytest.approx(one.cost, rel=1e-5)
         if batch.status[index] is not one.status:  # an optimum that hardly differs from its limit
@@ -60,23 +57,21 @@ def assert_same(batch: OptimumBatch, singles: list[Optimum]) -> None:
         (Dahl() + Spring(), 0.02, 1e2, 10.0, {Status.CONVERGED, Status.GROSS_SLIP}),
     ],
 )
-def test_many_tables_end_as_one_by_one(
-    model: Element, level: float, beta: float, spring: float, statuses: set[Status]
-) -> None:
+def test_many_tables_end_as_one_by_one(model, level, beta, spring, statuses):
     made = tables(level, beta, spring)
     found = solve_many(ProblemBatch(made, model))
     assert set(found.status) >= statuses
     assert_same(found, [solve(TableProblem(table, model)) for table in made])
 
 
-def test_tables_with_bounds_or_priors_are_solved_one_by_one() -> None:
+def test_tables_with_bounds_or_priors_are_solved_one_by_one():
     made = tables(0.02, 0.3, 0.0, count=3)
     sensors = Sensors(force_gain=stats.norm(1.0, 0.01))
     found = solve_many(ProblemBatch(made, Dahl(), sensors=sensors))
     assert_same(found, [solve(TableProblem(table, Dahl(), sensors=sensors)) for table in made])
 
 
-def test_a_start_shared_or_each() -> None:
+def test_a_start_shared_or_each():
     made = tables(0.02, 0.3, 0.0, count=5)
     batch = ProblemBatch(made, Dahl())
     alone = solve_many(batch)
@@ -88,7 +83,7 @@ def test_a_start_shared_or_each() -> None:
         solve_many(batch, start=np.zeros(3))
 
 
-def test_bootstrap_spread_equals_the_stated_one() -> None:
+def test_bootstrap_spread_equals_the_stated_one():
     problem = TableProblem(tables(0.02, 0.3, 0.0, count=1)[0], Dahl())
     found = solve(problem)
     rng = np.random.default_rng(6)
@@ -100,7 +95,7 @@ def test_bootstrap_spread_equals_the_stated_one() -> None:
     assert replicates.stderr.shape == (2000, 2)
 
 
-def test_many_elements_do_not_exhaust_memory() -> None:
+def test_many_elements_do_not_exhaust_memory():
     """Two elements have a grid of a thousand nodes, which few tables may share at once."""
     A = np.geomspace(1e-3, 1e-1, n)
     Z = (Dahl(0.1, 30.0, name="a") + Dahl(1.0, 30.0, name="b")).dynamic_stiffness(A)

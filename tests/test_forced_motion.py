@@ -1,13 +1,8 @@
 """Driven motion: its sensitivities, a moving base, the drive between its samples."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import (
     Backlash,
     BoucWen,
@@ -33,27 +28,27 @@ STIFFNESSES, SLIPS = [2e4, 1e4], [2e-4, 5e-4]
 F_MAX, SIGMA, GAP = 20.0, 4e4, 4e-4
 
 
-def multisine(samples: int, seed: int = 0) -> tuple[FloatArray, Callable[[float], float]]:
+def multisine(samples, seed=0):
     """Return whole periods of a drive of 5 to 150 Hz, and the drive as a function of time."""
     rng = np.random.default_rng(seed)
     lines = np.arange(samples // 2)
     lines = lines[(lines * RATE / samples > 5.0) & (lines * RATE / samples < 150.0)]
     amplitudes = np.exp(2j * np.pi * rng.random(lines.size)) * 50.0 * np.sqrt(2.0 / lines.size)
 
-    def drive(t: float) -> float:
+    def drive(t):
         return float(np.real(amplitudes @ np.exp(2j * np.pi * lines * t * RATE / samples)))
 
     return np.array([drive(i / RATE) for i in range(samples)]), drive
 
 
-def test_a_moving_base_is_a_force_of_minus_mass_times_acceleration() -> None:
+def test_a_moving_base_is_a_force_of_minus_mass_times_acceleration():
     wave, first = multisine(192)[0], np.array([1e-4, 0.0, 0.0])
     base = Driven(BOUC_WEN, wave / 2.0, RATE, "base").motion(first, BOUC_WEN_VALUES)
     force = Driven(BOUC_WEN, -wave, RATE).motion(first, BOUC_WEN_VALUES)
     np.testing.assert_allclose(base.output, force.output, atol=1e-9 * np.abs(force.output).max())
 
 
-def test_sensitivities_are_derivatives() -> None:
+def test_sensitivities_are_derivatives():
     driven = Driven(BOUC_WEN, multisine(512)[0], RATE)
     starts = np.array([1e-4, 0.01, 2.0])
     _, found = slopes(driven, starts, BOUC_WEN_VALUES)
@@ -62,7 +57,7 @@ def test_sensitivities_are_derivatives() -> None:
         assert error < 2e-6, i
 
 
-def test_the_slope_of_a_delay_is_a_difference_of_later_drives() -> None:
+def test_the_slope_of_a_delay_is_a_difference_of_later_drives():
     wave, drive = multisine(192)
     t, h, first = np.arange(wave.size) / RATE, 1e-6, np.array([1e-4, 0.01, 2.0])
     found = Driven(BOUC_WEN, wave, RATE).motion(first, BOUC_WEN_VALUES, derivatives=True)
@@ -83,9 +78,7 @@ def test_the_slope_of_a_delay_is_a_difference_of_later_drives() -> None:
         (Backlash(Dahl()) + LINEAR, [F_MAX, SIGMA, GAP], [2.5e-4]),
     ],
 )
-def test_sensitivities_of_slips_and_gaps_are_derivatives(
-    law: Element, values: list[float], start: list[float]
-) -> None:
+def test_sensitivities_of_slips_and_gaps_are_derivatives(law, values, start):
     driven = Driven(law, multisine(64)[0], RATE)
     starts = np.array([1e-4, 0.01, *start])
     _, found = slopes(driven, starts, np.array(values))
@@ -94,7 +87,7 @@ def test_sensitivities_of_slips_and_gaps_are_derivatives(
         assert error < 2e-6, i
 
 
-def test_sliders_of_iwan_start_on_their_backbone() -> None:
+def test_sliders_of_iwan_start_on_their_backbone():
     law, values = Iwan(), [F_MAX, SIGMA, -0.5, 1.0]
     stiffnesses, places = law.sliders(values)
     for x in (-3e-4, 1e-4, 4e-4, 9e-4):
@@ -102,7 +95,7 @@ def test_sliders_of_iwan_start_on_their_backbone() -> None:
         assert law.initial_states(values, [x / places[-1]]) == pytest.approx(forces)
 
 
-def test_springs_start_with_shares_of_the_forces_at_which_they_slip() -> None:
+def test_springs_start_with_shares_of_the_forces_at_which_they_slip():
     law = MaxwellSlip(SLIPS, STIFFNESSES)
     values, loads = [*STIFFNESSES, *SLIPS], np.linspace(0.9, -0.7, len(SLIPS))
     expected = [k * d * load for k, d, load in zip(STIFFNESSES, SLIPS, loads, strict=True)]
@@ -110,10 +103,10 @@ def test_springs_start_with_shares_of_the_forces_at_which_they_slip() -> None:
 
 
 @pytest.mark.parametrize("periodic", [True, False])
-def test_drive_between_its_samples(periodic: bool) -> None:
+def test_drive_between_its_samples(periodic):
     t = np.arange(400 if periodic else 387) / 400.0
 
-    def wave(at: FloatArray) -> FloatArray:
+    def wave(at):
         slow = 0.0 if periodic else at * (1.0 - at)
         return np.asarray(np.sin(2.0 * np.pi * 5.0 * at) + slow)
 
@@ -125,15 +118,15 @@ def test_drive_between_its_samples(periodic: bool) -> None:
     assert error.max() < (1e-11 if periodic else 2e-2)
 
 
-def test_refusals() -> None:
+def test_refusals():
     with pytest.raises(ModelError, match="has no mass"):
         plant_equations(Model(Dahl()))
 
     class Unknown(Spring):
         kind = ""
 
-        def mechanics(self, *args: object) -> None:
-            Element.mechanics(self, *args)  # type: ignore[arg-type]
+        def mechanics(self, *args):
+            Element.mechanics(self, *args)
 
     with pytest.raises(ModelError, match="no equation of motion"):
         plant_equations(Unknown() + Mass())

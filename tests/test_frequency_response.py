@@ -1,7 +1,5 @@
 """FrequencyResponse: validation, conversion, selection, tables, files, pictures."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from pathlib import Path
@@ -15,11 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 
 from dahl_ident.data import FrequencyResponse, read_frequency_response
 from dahl_ident.errors import DataError, UnitError, ValidationError
-from dahl_ident.units import QUANTITIES, Motion, Quantity
+from dahl_ident.units import QUANTITIES
 
 FIELDS = (
     "frequency_hz",
@@ -40,9 +37,7 @@ FIELDS = (
 )
 
 
-def full_table(
-    n: int = 7, seed: int = 3, motion: Motion = "translation", **changes: Any
-) -> FrequencyResponse:
+def full_table(n=7, seed=3, motion="translation", **changes):
     """A table with everything in it, its errors correlated at random."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(n, 3, 3)) * np.exp(rng.normal(size=(n, 3, 1)) - 5.0)
@@ -72,12 +67,12 @@ def full_table(
     return FrequencyResponse(**{**arguments, **changes})
 
 
-def known(array: NDArray[Any] | None) -> NDArray[Any]:
+def known(array):
     assert array is not None
     return array
 
 
-def assert_same(one: FrequencyResponse, other: FrequencyResponse) -> None:
+def assert_same(one, other):
     for name in FIELDS:
         a, b = getattr(one, name), getattr(other, name)
         if a is None:
@@ -96,7 +91,7 @@ LOGGER_MARKS = {
 
 
 class TestValidation:
-    def test_arrays_are_read_only_copies(self) -> None:
+    def test_arrays_are_read_only_copies(self):
         amplitude = np.array([1e-3, 2e-3])
         data = FrequencyResponse([1.0, 2.0], [1j, 1j], amplitude=amplitude)
         amplitude[0] = 5.0
@@ -106,7 +101,7 @@ class TestValidation:
         with pytest.raises(AttributeError):
             data.drive = np.ones(2)  # type: ignore[misc]
 
-    def test_defaults(self) -> None:
+    def test_defaults(self):
         data = FrequencyResponse([1.0, 2.0], [1j, 3.0], drive=[1.0, 1.0])
         assert data.controlled.tolist() == ["displacement", "displacement"]
         assert data.harmonic.tolist() == [1, 1]
@@ -155,23 +150,23 @@ class TestValidation:
             ({"quality": {"settled": [1j, 2j]}}, "expected numbers or text"),
         ],
     )
-    def test_impossible_fields_are_refused(self, arguments: Any, message: str) -> None:
+    def test_impossible_fields_are_refused(self, arguments, message):
         good = {"frequency_hz": [1.0, 2.0], "response": [1j, 2j], "amplitude": [1e-3, 2e-3]}
         with pytest.raises(ValidationError, match=message):
             FrequencyResponse(**{**good, **arguments})
 
-    def test_amplitude_std_needs_amplitude(self) -> None:
+    def test_amplitude_std_needs_amplitude(self):
         with pytest.raises(ValidationError, match="amplitude_std is given without amplitude"):
             FrequencyResponse([1.0], [1j], drive=[1.0], amplitude_std=[0.1])
 
-    def test_survives_pickle_and_copy(self) -> None:
+    def test_survives_pickle_and_copy(self):
         data = full_table()
         assert_same(data, pickle.loads(pickle.dumps(data)))
         assert_same(data, copy.deepcopy(data))
 
 
 class TestConversion:
-    def test_definitions(self) -> None:
+    def test_definitions(self):
         """X/F and its kin from the phasors themselves (ISO 7626-1)."""
         f = np.array([0.7, 12.0])
         s = 2j * np.pi * f
@@ -191,7 +186,7 @@ class TestConversion:
 
     @pytest.mark.parametrize("target", QUANTITIES)
     @pytest.mark.parametrize("source", QUANTITIES)
-    def test_covariance_travels(self, source: Quantity, target: Quantity) -> None:
+    def test_covariance_travels(self, source, target):
         """Against the Jacobian by central differences of the phasor formula itself."""
         data = full_table(quantity=source, harmonic=1)
         covariance, amplitude_covariance = known(data.covariance), known(data.amplitude_covariance)
@@ -222,7 +217,7 @@ class TestConversion:
         arrays(np.float64, (5, 2), elements=st.floats(-1e3, 1e3).filter(lambda v: abs(v) > 1e-3)),
         st.permutations(QUANTITIES),
     )
-    def test_any_tour_leads_back(self, parts: Any, tour: list[Quantity]) -> None:
+    def test_any_tour_leads_back(self, parts, tour):
         f = np.geomspace(0.01, 1e4, 5)
         covariance = np.tile([[2.0, 0.3], [0.3, 1.0]], (5, 1, 1))
         start = FrequencyResponse(
@@ -235,14 +230,14 @@ class TestConversion:
         np.testing.assert_allclose(back.response, start.response, rtol=1e-12)
         np.testing.assert_allclose(known(back.covariance), covariance, rtol=1e-9)
 
-    def test_harmonics_stay_dynamic_stiffness(self) -> None:
+    def test_harmonics_stay_dynamic_stiffness(self):
         data = FrequencyResponse([1.0, 1.0], [1j, 0.1j], [1e-3, 1e-3], harmonic=[1, 3])
         with pytest.raises(ValidationError, match=r"harmonics 1, 3 cannot become mobility"):
             data.to("mobility")
         assert data.select(harmonic=1).to("mobility").n == 1
         assert data.to("dynamic_stiffness") is data
 
-    def test_zero_has_no_inverse(self) -> None:
+    def test_zero_has_no_inverse(self):
         data = FrequencyResponse([1.0, 2.0], [1j, 0.0], [1e-3, 1e-3])
         with pytest.raises(ValidationError, match=r"response\[1\] is 0"):
             data.to("receptance")
@@ -250,7 +245,7 @@ class TestConversion:
 
 
 class TestSelection:
-    def test_by_level_frequency_harmonic_and_rows(self) -> None:
+    def test_by_level_frequency_harmonic_and_rows(self):
         data = FrequencyResponse(
             [1.0, 2.0, 3.0, 3.0],
             [1j, 2j, 3j, 4j],
@@ -276,16 +271,16 @@ class TestSelection:
             ({"rows": [0, 1]}, "True or False"),
         ],
     )
-    def test_nothing_left_is_an_error(self, conditions: Any, message: str) -> None:
+    def test_nothing_left_is_an_error(self, conditions, message):
         data = FrequencyResponse([1.0, 2.0], [1j, 2j], [1e-3] * 2, level=[0.2, 0.5])
         with pytest.raises(ValidationError, match=message):
             data.select(**conditions)
 
-    def test_level_of_a_table_without_levels(self) -> None:
+    def test_level_of_a_table_without_levels(self):
         with pytest.raises(ValidationError, match="no level"):
             FrequencyResponse([1.0], [1j], [1e-3]).select(level=0.2)
 
-    def test_concatenate(self) -> None:
+    def test_concatenate(self):
         one, other = full_table(4, 1), full_table(5, 2)
         both = FrequencyResponse.concatenate([one, other])
         assert both.n == 9
@@ -302,11 +297,11 @@ class TestSelection:
             full_table(motion="rotation"),
         ],
     )
-    def test_concatenate_refuses_what_differs(self, other: FrequencyResponse) -> None:
+    def test_concatenate_refuses_what_differs(self, other):
         with pytest.raises(ValidationError, match=r"parts\[1\] .* does not go with parts\[0\]"):
             FrequencyResponse.concatenate([full_table(), other])
 
-    def test_runs_are_text_and_can_be_selected(self) -> None:
+    def test_runs_are_text_and_can_be_selected(self):
         data = FrequencyResponse([1.0] * 3, [1j] * 3, [1e-3] * 3, run=[2, 2, 10.5])
         assert data.runs == ["2", "10.5"]
         assert data.select(run="2").n == 2
@@ -316,7 +311,7 @@ class TestSelection:
         with pytest.raises(ValidationError, match="there are none"):
             FrequencyResponse([1.0], [1j], [1e-3]).select(run="a")
 
-    def test_concatenate_refuses_nothing(self) -> None:
+    def test_concatenate_refuses_nothing(self):
         with pytest.raises(ValidationError, match="at least one table"):
             FrequencyResponse.concatenate([])
 
@@ -326,7 +321,7 @@ class TestSelection:
 class TestTables:
     @pytest.mark.parametrize("motion", ["translation", "rotation"])
     @pytest.mark.parametrize("ending", [".csv", ".csv.gz", ".tsv", ".parquet", ".h5", ".hdf5"])
-    def test_files_lose_nothing(self, tmp_path: Path, ending: str, motion: Motion) -> None:
+    def test_files_lose_nothing(self, tmp_path, ending, motion):
         data = full_table(motion=motion)
         path = data.save(tmp_path / f"levels{ending}")
         back = read_frequency_response(path)
@@ -337,20 +332,18 @@ class TestTables:
 
     @pytest.mark.parametrize("quantity", QUANTITIES)
     @pytest.mark.parametrize("motion", ["translation", "rotation"])
-    def test_units_tell_the_quantity(
-        self, tmp_path: Path, quantity: Quantity, motion: Motion
-    ) -> None:
+    def test_units_tell_the_quantity(self, tmp_path, quantity, motion):
         data = full_table(motion=motion).to(quantity)
         assert_same(data, read_frequency_response(data.save(tmp_path / "t.csv")))
 
-    def test_harmonics_and_bare_tables(self, tmp_path: Path) -> None:
+    def test_harmonics_and_bare_tables(self, tmp_path):
         data = FrequencyResponse(
             [1.0, 1.0], [1j, 0.0], drive=[0.1, 0.1], harmonic=[1, 3], controlled="force"
         )
         assert_same(data, read_frequency_response(data.save(tmp_path / "t.csv")))
 
     @pytest.mark.parametrize("ending", [".csv", ".parquet", ".h5"])
-    def test_mean_force_and_even_harmonics(self, tmp_path: Path, ending: str) -> None:
+    def test_mean_force_and_even_harmonics(self, tmp_path, ending):
         covariance = np.array([np.diag([4.0, 0.0]), np.eye(2), np.eye(2)])
         data = FrequencyResponse(
             [1.0] * 3, [-3.0, 50.0 + 9.0j, 1.0 - 2.0j], [1e-3] * 3, covariance=covariance,
@@ -374,7 +367,7 @@ class TestTables:
         ),
         st.lists(st.text(min_size=1).map(str.strip).filter(bool), min_size=6, max_size=6),
     )
-    def test_frame_loses_nothing(self, numbers: Any, labels: list[str]) -> None:
+    def test_frame_loses_nothing(self, numbers, labels):
         data = FrequencyResponse(
             numbers[:, 0], numbers[:, 1] + 1j * numbers[:, 2], numbers[:, 3], level=labels
         )
@@ -389,20 +382,18 @@ class TestTables:
             max_size=3,
         ),
     )
-    def test_csv_loses_nothing(
-        self, tmp_path_factory: pytest.TempPathFactory, numbers: Any, labels: list[str]
-    ) -> None:
+    def test_csv_loses_nothing(self, tmp_path_factory, numbers, labels):
         data = FrequencyResponse(
             numbers[:, 0], numbers[:, 1] + 1j * numbers[:, 2], numbers[:, 3], level=labels
         )
         path = data.save(tmp_path_factory.mktemp("t") / "t.csv")
         assert_same(data, read_frequency_response(path))
 
-    def test_frame_keeps_provenance(self) -> None:
+    def test_frame_keeps_provenance(self):
         data = full_table()
         assert read_frequency_response(data.to_frame()).provenance == data.provenance
 
-    def test_polar_frame(self) -> None:
+    def test_polar_frame(self):
         data = full_table()
         frame = data.to_frame(polar=True)
         assert data.covariance is not None
@@ -422,7 +413,7 @@ class TestTables:
         np.testing.assert_allclose(frame["gain_std [N/m]"] / data.gain, expected[:, 0])
         np.testing.assert_allclose(np.radians(frame["phase_std_deg"]), expected[:, 1])
 
-    def test_units_in_brackets_are_honoured(self) -> None:
+    def test_units_in_brackets_are_honoured(self):
         frame = pd.DataFrame(
             {
                 "frequency [Hz]": [1.0, 2.0],
@@ -436,28 +427,26 @@ class TestTables:
         np.testing.assert_allclose(data.response, [5e3, 4e3] * np.exp(1j * np.radians([30, 20])))
         assert data.quantity == "dynamic_stiffness"
 
-    def test_missing_unit_says_how_to_give_it(self) -> None:
+    def test_missing_unit_says_how_to_give_it(self):
         frame = pd.DataFrame({"frequency_hz": [1.0], "amplitude": [1.0], "real": 1.0, "imag": 1.0})
         with pytest.raises(UnitError, match=r"'amplitude' has no unit; .* 'amplitude \[um\]'"):
             read_frequency_response(frame)
 
-    def test_quality_must_not_hide_a_column(self) -> None:
+    def test_quality_must_not_hide_a_column(self):
         with pytest.raises(ValidationError, match="quality 'gain' is also the name"):
             full_table(quality={"gain": np.arange(7)}).to_frame()
 
-    def test_unknown_ending_and_place(self, tmp_path: Path) -> None:
+    def test_unknown_ending_and_place(self, tmp_path):
         with pytest.raises(ValidationError, match=r"written as \.csv, .*got '.xlsx'"):
             full_table().save(tmp_path / "t.xlsx")
         with pytest.raises(DataError, match="cannot be written: No such file"):
             full_table().save(tmp_path / "absent" / "t.csv")
 
-    def test_interrupted_write_leaves_the_old_file(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_interrupted_write_leaves_the_old_file(self, tmp_path, monkeypatch):
         path = full_table().save(tmp_path / "t.csv")
         before = path.read_bytes()
 
-        def broken(*_: Any) -> None:
+        def broken(*_):
             raise KeyboardInterrupt
 
         monkeypatch.setattr(Path, "replace", broken)
@@ -466,7 +455,7 @@ class TestTables:
         assert path.read_bytes() == before
         assert list(tmp_path.iterdir()) == [path]
 
-    def test_a_file_is_replaced_on_request_only(self, tmp_path: Path) -> None:
+    def test_a_file_is_replaced_on_request_only(self, tmp_path):
         path = full_table().save(tmp_path / "t.csv")
         before = path.read_bytes()
         with pytest.raises(DataError, match=r"the file exists already.*overwrite=True"):
@@ -477,7 +466,7 @@ class TestTables:
 
 @pytest.mark.versions
 class TestControl:
-    def test_one_system_a_level(self) -> None:
+    def test_one_system_a_level(self):
         data = FrequencyResponse(
             [2.0, 1.0, 1.0], [2j, 1j, 5.0], [1e-3] * 3, level=["a", "a", "b"], quantity="receptance"
         )
@@ -487,7 +476,7 @@ class TestControl:
         np.testing.assert_allclose(systems["a"](2j * np.pi * 1.0), 1j)
         np.testing.assert_allclose(systems["a"](4j * np.pi), 2j)
 
-    def test_without_levels(self) -> None:
+    def test_without_levels(self):
         data = FrequencyResponse([1.0, 2.0], [1j, 2j], [1e-3] * 2)
         np.testing.assert_allclose(data.to_control()[None].omega, data.omega)
 
@@ -495,14 +484,14 @@ class TestControl:
         ("arguments", "message"),
         [({"harmonic": [1, 3]}, "no harmonics"), ({}, "1 Hz more than once")],
     )
-    def test_what_is_no_transfer_function(self, arguments: Any, message: str) -> None:
+    def test_what_is_no_transfer_function(self, arguments, message):
         data = FrequencyResponse([1.0, 1.0], [1j, 2j], [1e-3, 2e-3], **arguments)
         with pytest.raises(ValidationError, match=message):
             data.to_control()
 
 
 class TestTelling:
-    def test_repr_shows_levels_ranges_units(self) -> None:
+    def test_repr_shows_levels_ranges_units(self):
         text = repr(full_table(motion="rotation", harmonic=[1, 3, 1, 3, 1, 3, 1]))
         facts = (
             "7 points of dynamic stiffness, rotation",
@@ -520,7 +509,7 @@ class TestTelling:
         for fact in facts:
             assert fact in text, fact
 
-    def test_units(self) -> None:
+    def test_units(self):
         assert full_table(motion="rotation").to("mobility").units == {
             "frequency_hz": "Hz",
             "amplitude": "rad",
@@ -528,16 +517,16 @@ class TestTelling:
             "response": "rad/(N m s)",
         }
 
-    def test_html_escapes(self) -> None:
+    def test_html_escapes(self):
         data = FrequencyResponse([1.0], [1j], [1e-3], level=["<b>"])
         assert "&lt;b&gt;" in data._repr_html_()
         assert "<b>" not in data._repr_html_()
 
-    def test_many_levels_are_counted(self) -> None:
+    def test_many_levels_are_counted(self):
         data = FrequencyResponse(np.arange(1, 31), np.ones(30), np.ones(30), level=np.arange(30))
         assert "... (30 in all)" in repr(data)
 
-    def test_picture_over_frequency_and_over_amplitude(self) -> None:
+    def test_picture_over_frequency_and_over_amplitude(self):
         levels = FrequencyResponse(
             [1.0, 2.0] * 2, [1j, 2j, 3j, 4j], drive=[0.1] * 4, level=["a", "a", "b", "b"]
         )
@@ -558,7 +547,7 @@ class TestTelling:
         plt.close("all")
 
 
-def test_errors_of_the_drive_are_kept_in_files(tmp_path: Path) -> None:
+def test_errors_of_the_drive_are_kept_in_files(tmp_path):
     response = np.array([1e-3 - 1e-4j, 2e-3 - 3e-4j])
     data = FrequencyResponse(
         [1.0, 2.0], response, drive=[0.5, 1.0], controlled="force", quantity="receptance",

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +5,6 @@ from hypothesis import strategies as st
 from numpy.polynomial import Chebyshev
 
 from benchmarks.general_dahl_accuracy import errors
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import linear_dahl
 from dahl_ident.elements.general_dahl import (
     stiffness,
@@ -18,11 +15,11 @@ ODD = (1, 3, 5, 7, 9, 11, 13, 15)
 ALPHAS = st.floats(0.25, 4.0)
 
 
-def at(value: float) -> FloatArray:
+def at(value):
     return np.asarray(value, dtype=np.float64)
 
 
-def larger_part(c: ComplexArray) -> FloatArray:
+def larger_part(c):
     return np.maximum(np.abs(c.real), np.abs(c.imag))
 
 
@@ -33,18 +30,18 @@ def larger_part(c: ComplexArray) -> FloatArray:
         (40.0, 100.0),
     ],
 )
-def test_agrees_with_fifty_digit_integration(beta: float, alpha: float) -> None:
+def test_agrees_with_fifty_digit_integration(beta, alpha):
     found = errors(beta, alpha, (1, 15))
     assert np.max(found[:, 0]) < 1e-12
     assert np.max(found[:, 1:]) < 1e-10
 
 
-def harmonic(beta: FloatArray, alpha: FloatArray, k: int) -> ComplexArray:
+def harmonic(beta, alpha, k):
     """Return c_k."""
     return np.asarray(beta * stiffness(beta, alpha, k)[0])
 
 
-def harmonic_gradient(beta: FloatArray, alpha: FloatArray, k: int) -> list[ComplexArray]:
+def harmonic_gradient(beta, alpha, k):
     """Return c_k, beta dc_k/dbeta and dc_k/dalpha."""
     h, _, by_ln_sigma, by_alpha = stiffness(beta, alpha, k, 2)
     return [np.asarray(beta * part) for part in (h, by_ln_sigma, by_alpha)]
@@ -58,13 +55,13 @@ def harmonic_gradient(beta: FloatArray, alpha: FloatArray, k: int) -> list[Compl
         (2.0, lambda beta: np.tanh(np.arcsinh(2.0 * beta) / 2.0)),
     ],
 )
-def test_turning_force_in_closed_form(alpha: float, exact: np.ufunc) -> None:
+def test_turning_force_in_closed_form(alpha, exact):
     beta = np.geomspace(1e-60, 1.99, 400)
     np.testing.assert_allclose(turning_force(beta, at(alpha)), exact(beta), rtol=1e-14)
 
 
 @pytest.mark.parametrize("k", ODD)
-def test_meets_the_linear_model(k: int) -> None:
+def test_meets_the_linear_model(k):
     beta = np.geomspace(1e-6, 1e6, 400)
     exact, slope = linear_dahl.harmonic_gradient(beta, k)
     c, by_ln_beta, by_alpha = harmonic_gradient(beta, at(1.0), k)
@@ -76,7 +73,7 @@ def test_meets_the_linear_model(k: int) -> None:
         assert np.max(np.abs(near - straight) / larger_part(exact)) < 1e-12 + 1000 * k * step**2
 
 
-def spectral_slope(values: ComplexArray, nodes: FloatArray, width: float) -> ComplexArray:
+def spectral_slope(values, nodes, width):
     """The derivative at the middle of the last axis, `values` being at Chebyshev nodes."""
     fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, nodes.size - 1))
     at_middle = [Chebyshev.basis(n).deriv()(0.0) for n in range(nodes.size)]
@@ -84,7 +81,7 @@ def spectral_slope(values: ComplexArray, nodes: FloatArray, width: float) -> Com
 
 
 @pytest.mark.parametrize("k", [1, 5, 15])
-def test_derivatives_are_those_of_the_values(k: int) -> None:
+def test_derivatives_are_those_of_the_values(k):
     nodes = np.cos(np.pi * (np.arange(14) + 0.5) / 14)
     beta = np.geomspace(1e-3, 1e6, 46)[:, None]
     alpha = np.array([0.3, 0.6, 0.95, 1.0, 1.3, 2.0, 3.9])
@@ -102,7 +99,7 @@ def test_derivatives_are_those_of_the_values(k: int) -> None:
 
 
 @given(exponent=st.floats(-60.0, -5.0), alpha=ALPHAS)
-def test_small_amplitudes_show_alpha_times_beta(exponent: float, alpha: float) -> None:
+def test_small_amplitudes_show_alpha_times_beta(exponent, alpha):
     beta = 10.0**exponent
     h, by_ln_f_max, _, by_alpha = stiffness(at(beta), at(alpha), 1, 2)
     loss = 4.0 * alpha * beta / (3.0 * np.pi)
@@ -112,14 +109,14 @@ def test_small_amplitudes_show_alpha_times_beta(exponent: float, alpha: float) -
     assert complex(by_alpha) == pytest.approx(1j * loss / alpha, rel=1e-4)
 
 
-def test_slips_like_a_square_wave_at_large_amplitudes() -> None:
+def test_slips_like_a_square_wave_at_large_amplitudes():
     for alpha in (0.25, 1.0, 2.0, 4.0):
         for k in ODD:
             c = harmonic(at(1e60), at(alpha), k)
             assert complex(c) == pytest.approx(4j / (np.pi * k), rel=1e-10)
 
 
-def test_broadcasts_and_does_not_depend_on_company() -> None:
+def test_broadcasts_and_does_not_depend_on_company():
     beta, alpha = np.geomspace(1e-3, 1e3, 500), np.array([[0.5], [1.0], [2.5]])
     together = stiffness(beta, alpha, 1, 2)
     for part in together:
@@ -130,7 +127,7 @@ def test_broadcasts_and_does_not_depend_on_company() -> None:
     assert stiffness(np.zeros((0, 2)), at(2.0))[0].shape == (0, 2)
 
 
-def test_no_amplitude_is_a_spring() -> None:
+def test_no_amplitude_is_a_spring():
     h, by_ln_f_max, by_ln_sigma, by_alpha = stiffness(
         np.array([0.0, 1e-250]), np.array([[0.3], [1.0], [3.0]]), 1, 2
     )
@@ -145,7 +142,7 @@ def test_no_amplitude_is_a_spring() -> None:
 
 
 @pytest.mark.parametrize("k", [2, 4, 14])
-def test_even_harmonics_vanish(k: int) -> None:
+def test_even_harmonics_vanish(k):
     beta, alpha = np.array([0.0, 1.0, 1e6]), np.array([[0.5], [2.0]])
     assert harmonic(beta, alpha, k).shape == (2, 3)
     for part in harmonic_gradient(beta, alpha, k):

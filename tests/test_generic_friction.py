@@ -1,17 +1,11 @@
 """A law written in ten lines has everything that an element has, from its slope alone."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
-
 import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
 from dahl_ident import Backlash, Dahl, Friction, Model, Parameter
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.errors import ModelError
 
 pytestmark = pytest.mark.versions
@@ -26,7 +20,7 @@ class Jenkins(Friction):
         Parameter("slip", "m", "displacement at which it slips", lower=0.0, transform="log"),
     )
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         stiffness, slip = values
         return stiffness * (direction * force < stiffness * slip)
 
@@ -36,7 +30,7 @@ class SlopeOfDahl(Friction):
 
     parameters = Dahl.parameters
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         f_max, sigma, alpha = values
         margin = 1.0 - direction * force / f_max
         return sigma * np.sign(margin) * np.abs(margin) ** alpha
@@ -47,12 +41,12 @@ class BoucWen(Friction):
 
     parameters = tuple(Parameter(name, "", name) for name in "abc")
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         a, b, c = values
         return a - np.abs(force) * (b * np.sign(direction * force) + c)
 
 
-def jenkins(k: float, slip: float, A: FloatArray) -> ComplexArray:
+def jenkins(k, slip, A):
     """Return the closed form of the describing function."""
     m = np.minimum(slip / A, 1.0)
     t = np.arccos(1.0 - 2.0 * m)
@@ -60,7 +54,7 @@ def jenkins(k: float, slip: float, A: FloatArray) -> ComplexArray:
     return np.where(slip >= A, k + 0j, slipping)
 
 
-def test_an_elastoplastic_law_has_its_closed_form() -> None:
+def test_an_elastoplastic_law_has_its_closed_form():
     A = np.concatenate([np.geomspace(0.01, 0.999, 15), [1.0], 1.0 + np.geomspace(1e-8, 1e4, 40)])
     N = Jenkins(3.0, 1.0).describing_function(A)
     exact = jenkins(3.0, 1.0, A)
@@ -71,7 +65,7 @@ def test_an_elastoplastic_law_has_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize(("alpha", "within"), [(1.0, 1e-9), (2.0, 1e-9), (0.5, 1e-5)])
-def test_dahl_from_its_slope_agrees_with_its_closed_forms(alpha: float, within: float) -> None:
+def test_dahl_from_its_slope_agrees_with_its_closed_forms(alpha, within):
     values = [np.asarray(v) for v in (1.3, 7.0, alpha)]
     A = np.geomspace(1e-5, 1e4, 181) * 1.3 / 7.0
     at_rest = np.zeros(())
@@ -82,7 +76,7 @@ def test_dahl_from_its_slope_agrees_with_its_closed_forms(alpha: float, within: 
         assert np.max(np.abs(ours - exact) / size) < within * (1.0 if k < 4 else 3.0)
 
 
-def test_batches_of_parameters_and_rest() -> None:
+def test_batches_of_parameters_and_rest():
     law = SlopeOfDahl()
     values = [np.array([[1.0], [2.0]]), np.array([[3.0], [5.0]]), np.array(2.0)]
     A = np.array([0.0, 1e-6, 0.3, 4.0])
@@ -91,7 +85,7 @@ def test_batches_of_parameters_and_rest() -> None:
     assert ours[:, 0].tolist() == [3.0, 5.0]
 
 
-def test_derivatives_agree_with_those_of_the_closed_forms() -> None:
+def test_derivatives_agree_with_those_of_the_closed_forms():
     law = Model(SlopeOfDahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
     exact = Model(Dahl(1.3, 7.0, 2.0)).with_free(["f_max", "sigma", "alpha"])
     A = np.geomspace(1e-2, 1e2, 13)
@@ -108,7 +102,7 @@ def test_derivatives_agree_with_those_of_the_closed_forms() -> None:
 
 
 @pytest.mark.parametrize(("alpha", "scale"), [(0.5, 1.0), (1.0, 1e-3), (2.0, 30.0)])
-def test_the_force_over_time_agrees_with_the_exact_one(alpha: float, scale: float) -> None:
+def test_the_force_over_time_agrees_with_the_exact_one(alpha, scale):
     t = np.linspace(0.0, 10.0, 1500)
     x = scale * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
     ours = SlopeOfDahl(1.0, 1.0, alpha).force(x, 0.1 * min(scale, 1.0))
@@ -116,7 +110,7 @@ def test_the_force_over_time_agrees_with_the_exact_one(alpha: float, scale: floa
     assert np.max(np.abs(ours - exact)) < 2e-7 * np.max(np.abs(exact))
 
 
-def test_the_elastoplastic_force_over_time() -> None:
+def test_the_elastoplastic_force_over_time():
     t = np.linspace(0.0, 10.0, 1500)
     x = 3.0 * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
     force = [0.0]
@@ -125,7 +119,7 @@ def test_the_elastoplastic_force_over_time() -> None:
     np.testing.assert_allclose(Jenkins(3.0, 1.0).force(x), force, atol=1e-12)
 
 
-def test_facts_follow_from_the_slope() -> None:
+def test_facts_follow_from_the_slope():
     values = [np.asarray(v) for v in (1.3, 7.0, 2.0)]
     law = SlopeOfDahl(1.3, 7.0, 2.0)
     assert [float(v) for v in law.knee(values)] == pytest.approx([1.3 / 7.0] * 2)
@@ -154,13 +148,13 @@ class SlopeOfLuGre(Friction):
     rate_independent = False
     parameters = tuple(Parameter(name, "", name) for name in ("f_max", "sigma", "ratio", "speed"))
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         f_max, sigma, ratio, speed = values
         level = f_max * (1.0 + (ratio - 1.0) * np.exp(-((velocity / speed) ** 2)))
         return sigma * (1.0 - direction * force / level)
 
 
-def test_use_of_the_velocity_must_be_declared() -> None:
+def test_use_of_the_velocity_must_be_declared():
     class Forgot(SlopeOfLuGre):
         rate_independent = True
 
@@ -178,12 +172,12 @@ class Offset(Friction):
         Parameter("sigma", "N/m", "contact stiffness", lower=0.0, transform="log"),
     )
 
-    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
+    def slope(self, force, direction, velocity, values):
         f_max, sigma = values
         return (sigma + 0.5 * f_max) * (1.0 - direction * force / f_max)
 
 
-def test_derivatives_of_a_law_whose_units_do_not_agree() -> None:
+def test_derivatives_of_a_law_whose_units_do_not_agree():
     f_max, sigma, A = 1.3, 7.0, np.geomspace(1e-2, 1e1, 7)
     values = [np.asarray(f_max), np.asarray(sigma)]
     ours = Offset().stiffness_gradient(values, A, np.zeros(()))
@@ -194,7 +188,7 @@ def test_derivatives_of_a_law_whose_units_do_not_agree() -> None:
     np.testing.assert_allclose(ours.by_parameter[1], exact.by_parameter[1], rtol=1e-7, atol=1e-9)
 
 
-def test_derivatives_of_the_force_over_time_are_those_of_the_closed_form() -> None:
+def test_derivatives_of_the_force_over_time_are_those_of_the_closed_form():
     t = np.linspace(0.0, 10.0, 1500)
     x = 3.0 * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
     exact = Dahl().force_history_gradient([1.0, 2.0, 1.0], x, state=0.3)
@@ -206,7 +200,7 @@ def test_derivatives_of_the_force_over_time_are_those_of_the_closed_form() -> No
 
 
 @pytest.mark.parametrize("alpha", [0.3, 0.5, 0.9])
-def test_a_force_that_reaches_its_limit_is_that_of_the_closed_form(alpha: float) -> None:
+def test_a_force_that_reaches_its_limit_is_that_of_the_closed_form(alpha):
     """Where the slope's own slope is infinite."""
     for seed in range(25):
         x = np.cumsum(np.random.default_rng(seed).standard_normal(200))
@@ -217,13 +211,13 @@ def test_a_force_that_reaches_its_limit_is_that_of_the_closed_form(alpha: float)
 
 
 @pytest.mark.parametrize("gap", [1e-7, 1e-9, 1e-11])
-def test_a_narrow_gap_hardly_changes_the_force_over_time(gap: float) -> None:
+def test_a_narrow_gap_hardly_changes_the_force_over_time(gap):
     x = 0.5 * np.sin(np.linspace(0.0, 40.0, 900))
     behind = Backlash(Dahl(1.0, 3.0, 2.0), gap).force(x)
     assert np.max(np.abs(behind - Dahl(1.0, 3.0, 2.0).force(x))) < 4.0 * gap + 2e-9
 
 
-def test_scales_of_the_force_follow_from_units_that_agree_with_the_law() -> None:
+def test_scales_of_the_force_follow_from_units_that_agree_with_the_law():
     assert SlopeOfDahl().scale_parameters == ("f_max", "sigma")
     assert Jenkins().scale_parameters == ("stiffness",)
     assert SlopeOfLuGre(1.0, 3.0, 1.5, 0.7).scale_parameters == ()

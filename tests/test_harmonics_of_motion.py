@@ -1,9 +1,5 @@
 """Harmonics of the displacement of driven plants, as rows of a table: X_k over the force."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -19,14 +15,14 @@ STEPS = SteppedSine(
 )  # fmt: skip
 
 
-def table(harmonics: tuple[int, ...] = (1, 3)) -> di.FrequencyResponse:
+def table(harmonics=(1, 3)):
     errors = Table(displacement_std=0.004, force_std=0.002, harmonics=harmonics)
     data = di.simulate(Experiment(di.Dahl(0.1, 30.0) + KNOWN, STEPS, table=errors), seed=5)
     assert isinstance(data, di.FrequencyResponse)
     return data
 
 
-def asymmetric() -> di.FrequencyResponse:
+def asymmetric():
     """Return rows of the mean, the fundamental and the second harmonic, with a covariance."""
     plant = di.Dahl(0.1, 30.0, asymmetry=0.2) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(3.0)
     f, u = (g.ravel() for g in np.meshgrid(np.geomspace(0.4, 2.5, 5), [0.08, 0.2, 0.6]))
@@ -45,7 +41,7 @@ def asymmetric() -> di.FrequencyResponse:
     )  # fmt: skip
 
 
-def test_they_are_fitted_with_the_fundamental() -> None:
+def test_they_are_fitted_with_the_fundamental():
     data = table()
     fit = di.fit(data, di.Dahl(alpha=1.0) + FREE)
     assert fit.status.usable, fit.verdict
@@ -57,7 +53,7 @@ def test_they_are_fitted_with_the_fundamental() -> None:
     assert fit.plot() is not None
 
 
-def test_derivatives_are_differences() -> None:
+def test_derivatives_are_differences():
     sensors = di.Sensors(force_gain=None, displacement_gain=1.02, delay=None)
     problem = TableProblem(table(), di.Dahl(alpha=1.0) + FREE, sensors=sensors)
     theta = problem.to_search([0.11, 28.0, 0.25, 0.33, 1.01, 1e-3])
@@ -74,7 +70,7 @@ def test_derivatives_are_differences() -> None:
     assert apart.max() < 1e-5 * np.abs(problem.predict(theta)).max()
 
 
-def test_means_and_second_harmonics_tell_the_asymmetry() -> None:
+def test_means_and_second_harmonics_tell_the_asymmetry():
     fit = di.fit(asymmetric(), di.Dahl(alpha=1.0, asymmetry=None) + FREE)
     assert fit.status.usable, fit.verdict
     for name, truth in (("f_max", 0.1), ("sigma", 30.0), ("asymmetry", 0.2), ("stiffness", 3.0)):
@@ -82,7 +78,7 @@ def test_means_and_second_harmonics_tell_the_asymmetry() -> None:
         assert abs(found.value - truth) < 4.0 * found.stderr, name
 
 
-def test_files_keep_them(tmp_path: Path) -> None:
+def test_files_keep_them(tmp_path):
     data = table()
     data.save(tmp_path / "rows.csv")
     again = di.read_frequency_response(tmp_path / "rows.csv")
@@ -94,14 +90,14 @@ def test_files_keep_them(tmp_path: Path) -> None:
     np.testing.assert_allclose(stored.best_fit, fit.best_fit, rtol=1e-9)
 
 
-def test_a_describing_function_has_none() -> None:
+def test_a_describing_function_has_none():
     with pytest.raises(DataError, match=r"takes that for a sine \(as asked for\): leave them out"):
         di.fit(table(), di.Dahl(alpha=1.0) + FREE, steady="describing function")
     with pytest.raises(DataError, match="the model has no mass"):
         di.fit(table(), di.Dahl(alpha=1.0) + di.Spring())
 
 
-def test_rows_that_mean_nothing_are_refused() -> None:
+def test_rows_that_mean_nothing_are_refused():
     data = table()
     with pytest.raises(DataError, match="no row holds the fundamental of the same frequency"):
         di.fit(data.select(harmonic=3), di.Dahl(alpha=1.0) + FREE)

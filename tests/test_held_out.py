@@ -1,19 +1,17 @@
 """Bands of one more test: tests left out of measured and of synthetic devices lie inside them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit
-from dahl_ident.diagnostics import ErrorModel, error_model
+from dahl_ident.diagnostics import error_model
 from dahl_ident.diagnostics.error_sources import NOISE, rows_of_tests
 from dahl_ident.diagnostics.held_out import band_factor
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
-def scattering(seed: int, n: int = 12, tails: float = 4.0) -> FrequencyResponse:
+def scattering(seed, n=12, tails=4.0):
     """Return tests that scatter by 4 %, far more than their covariances say, and these are uneven.
 
     As from records of few cycles: deviations of 0.1 to 1 %, known from few degrees of freedom.
@@ -29,7 +27,7 @@ def scattering(seed: int, n: int = 12, tails: float = 4.0) -> FrequencyResponse:
     )  # fmt: skip
 
 
-def microslip(seed: int, levels: int = 5) -> FrequencyResponse:
+def microslip(seed, levels=5):
     """Return a mode with a joint far below slip, whose gain differs from level to level."""
     rng = np.random.default_rng(seed)
     f = np.tile(np.linspace(0.30, 0.75, 9), levels)
@@ -41,7 +39,7 @@ def microslip(seed: int, levels: int = 5) -> FrequencyResponse:
     return FrequencyResponse(f, Z * relative_noise(f.size, 3e-4, seed + 50), A, level=level)
 
 
-def left_out(data: FrequencyResponse, model: Dahl) -> tuple[list[bool], list[float]]:
+def left_out(data, model):
     """Return whether tests lie in the bands of fits to the others, and half widths of these."""
     inside, widths = [], []
     for rows in rows_of_tests(data):
@@ -62,7 +60,7 @@ def left_out(data: FrequencyResponse, model: Dahl) -> tuple[list[bool], list[flo
 
 
 class TestFactor:
-    def test_is_where_the_predictive_tail_is_as_large(self) -> None:
+    def test_is_where_the_predictive_tail_is_as_large(self):
         """Against a search along the tail of the Dirichlet process with Student's t as prior."""
         rng = np.random.default_rng(3)
         for scores in (np.abs(rng.standard_t(2.0, k)) for k in (5, 18, 60, 400)):
@@ -73,14 +71,14 @@ class TestFactor:
             found = band_factor(scores, np.array([7.0]), 0.95)
             assert found[0] == pytest.approx(expected, abs=2e-3)
 
-    def test_is_that_of_student_without_tests(self) -> None:
+    def test_is_that_of_student_without_tests(self):
         found = band_factor(np.empty(0), np.array([4.0, np.inf]), 0.9545)
         np.testing.assert_allclose(found, [stats.t(4).ppf(0.97725), 2.0], rtol=1e-4)
 
 
 class TestLeftOut:
     @staticmethod
-    def errors(n: int) -> ErrorModel:
+    def errors(n):
         rng = np.random.default_rng(4)
         A = np.repeat(np.geomspace(0.1, 10.0, n // 4), 4) * X_C
         shared = np.repeat(np.exp(0.03 * rng.standard_normal(n // 4)), 4)
@@ -90,7 +88,7 @@ class TestLeftOut:
         return found
 
     @pytest.mark.parametrize("n", [32, 160])
-    def test_is_the_prediction_from_the_others(self, n: int) -> None:
+    def test_is_the_prediction_from_the_others(self, n):
         """Universal kriging by its definition, about the estimate without the test."""
         errors = self.errors(n)
         found = errors.left_out
@@ -120,7 +118,7 @@ class TestLeftOut:
                 std = np.sqrt(np.diagonal(units[row] @ D[i, i] @ units[row].T))
                 np.testing.assert_allclose(found.std[k], std, rtol=1e-5)
 
-    def test_the_estimate_is_that_of_a_fit_without_the_test(self) -> None:
+    def test_the_estimate_is_that_of_a_fit_without_the_test(self):
         """One Gauss-Newton step from the whole estimate, which is a fraction of u away."""
         data = table(n=16, noise=0.02, seed=4)
         whole = fit(data, Dahl())
@@ -131,7 +129,7 @@ class TestLeftOut:
             assert np.all(np.abs(apart) < 0.1 * np.array(list(rest.errors.stderr.values())))
 
     @pytest.mark.parametrize("n", [32, 160])
-    def test_falls_with_each_variance(self, n: int) -> None:
+    def test_falls_with_each_variance(self, n):
         """The degrees of freedom come from these derivatives; against differences."""
         errors = self.errors(n)
         rows, step = np.array([0, 1, 6, 7]), 1e-5
@@ -145,13 +143,13 @@ class TestLeftOut:
             slope = (blocks[1] - blocks[0]) / (2.0 * step * variance)
             np.testing.assert_allclose(found[k], -slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
 
-    def test_without_tests_there_are_none(self) -> None:
+    def test_without_tests_there_are_none(self):
         errors = error_model(fit(table(n=2), Dahl(alpha=1.0)).optimum)
         assert errors.left_out is None
 
 
 class TestTestsThatScatter:
-    def test_far_beyond_an_uneven_covariance(self) -> None:
+    def test_far_beyond_an_uneven_covariance(self):
         """Bands hold, though the stated covariances say neither how much nor where."""
         inside: list[bool] = []
         for seed in range(8):
@@ -162,7 +160,7 @@ class TestTestsThatScatter:
             inside += found
         assert 0.88 <= np.mean(inside) < 1.0
 
-    def test_scatter_is_that_of_the_response_however_few_the_degrees_of_freedom(self) -> None:
+    def test_scatter_is_that_of_the_response_however_few_the_degrees_of_freedom(self):
         """Covariances of few degrees of freedom weigh their residuals, not the scatter."""
         found = []
         for seed in range(6):
@@ -175,7 +173,7 @@ class TestTestsThatScatter:
 class TestAtInfinity:
     MODEL = Dahl() + Mass() + Damper() + Spring()
 
-    def test_what_is_determined_has_budget_and_bands(self) -> None:
+    def test_what_is_determined_has_budget_and_bands(self):
         truth = 30.0**2 / 0.1
         covered, inside = [], []
         for seed in range(8):

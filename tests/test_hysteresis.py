@@ -1,7 +1,5 @@
 """The exact force for a displacement history, against integration and its own invariants."""
 
-from __future__ import annotations
-
 import tracemalloc
 from itertools import pairwise
 
@@ -11,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Dahl, hysteresis
 from dahl_ident.elements.hysteresis import force_history, transient_decay
 
@@ -26,11 +23,11 @@ alphas = st.one_of(st.just(1.0), st.floats(0.05, 8.0))
 starts = st.floats(-1.0, 1.0).map(lambda v: v * F_MAX)
 
 
-def generator(seed: int) -> np.random.Generator:
+def generator(seed):
     return np.random.Generator(np.random.PCG64(seed))
 
 
-def by_mpmath(x: FloatArray, alpha: float, initial_force: float) -> FloatArray:
+def by_mpmath(x, alpha, initial_force):
     """The stretch-by-stretch solution with 40 digits."""
     with mp.workdps(40):
         F = mp.mpf(initial_force) / F_MAX
@@ -49,7 +46,7 @@ def by_mpmath(x: FloatArray, alpha: float, initial_force: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_force_agrees_with_multiple_precision_over_any_step(alpha: float) -> None:
+def test_force_agrees_with_multiple_precision_over_any_step(alpha):
     rng = generator(4)
     x = 10.0 ** rng.uniform(-15, 9, 400) * rng.choice([-1.0, 1.0], 400) * X_C
     x[50:250] = np.cumsum(10.0 ** rng.uniform(-15, 1, 200) * rng.choice([-1.0, 1.0], 200)) * X_C
@@ -58,9 +55,7 @@ def test_force_agrees_with_multiple_precision_over_any_step(alpha: float) -> Non
 
 
 @given(x=histories, alpha=alphas, initial_force=starts, between=st.integers(2, 40))
-def test_force_does_not_depend_on_the_sampling(
-    x: FloatArray, alpha: float, initial_force: float, between: int
-) -> None:
+def test_force_does_not_depend_on_the_sampling(x, alpha, initial_force, between):
     coarse = force_history(x, F_MAX, SIGMA, alpha, initial_force)
     dense = np.concatenate(
         [np.linspace(a, b, between, endpoint=False) for a, b in pairwise(x)] + [x[-1:]]
@@ -70,9 +65,7 @@ def test_force_does_not_depend_on_the_sampling(
 
 
 @given(x=histories, alpha=alphas, initial_force=starts)
-def test_force_is_bounded_odd_and_dissipates(
-    x: FloatArray, alpha: float, initial_force: float
-) -> None:
+def test_force_is_bounded_odd_and_dissipates(x, alpha, initial_force):
     force = force_history(x, F_MAX, SIGMA, alpha, initial_force)
     assert np.max(np.abs(force)) <= F_MAX * (1.0 + 1e-15)
     turned = force_history(-x, F_MAX, SIGMA, alpha, -initial_force)
@@ -83,7 +76,7 @@ def test_force_is_bounded_odd_and_dissipates(
 
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("pauses", [[0], [5], [0, 1, 5, 5, 9], [9]])
-def test_standing_still_holds_the_force(alpha: float, pauses: list[int]) -> None:
+def test_standing_still_holds_the_force(alpha, pauses):
     x = generator(5).uniform(-2.0, 2.0, 10) * X_C
     moving = force_history(x, F_MAX, SIGMA, alpha, 0.0)
     index = np.sort(np.concatenate([np.arange(10), pauses]))
@@ -92,7 +85,7 @@ def test_standing_still_holds_the_force(alpha: float, pauses: list[int]) -> None
     )
 
 
-def test_no_motion_keeps_the_initial_force() -> None:
+def test_no_motion_keeps_the_initial_force():
     for n in (0, 1, 2, 7):
         force = force_history(np.full(n, 3.0), F_MAX, SIGMA, 1.0, -0.05)
         assert np.array_equal(force, np.full(n, -0.05))
@@ -100,7 +93,7 @@ def test_no_motion_keeps_the_initial_force() -> None:
 
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
-def test_full_slip_is_left_and_kept_as_the_direction_says(alpha: float, direction: float) -> None:
+def test_full_slip_is_left_and_kept_as_the_direction_says(alpha, direction):
     x = direction * np.array([0.0, 1e-9, 1.0, 1e3]) * X_C
     onward = force_history(x, F_MAX, SIGMA, alpha, direction * F_MAX)
     assert np.array_equal(onward, np.full(4, direction * F_MAX))
@@ -110,7 +103,7 @@ def test_full_slip_is_left_and_kept_as_the_direction_says(alpha: float, directio
 
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e300])
-def test_extreme_displacements_give_finite_forces_quietly(alpha: float, scale: float) -> None:
+def test_extreme_displacements_give_finite_forces_quietly(alpha, scale):
     x = scale * np.array([0.0, 1.0, -1.0, 0.5, 0.5, -0.25])
     for f_max, sigma in ((1e-30, 1e30), (1e30, 1e-30), (1.0, 1.0)):
         force = force_history(x, f_max, sigma, alpha, 0.5 * f_max)
@@ -119,7 +112,7 @@ def test_extreme_displacements_give_finite_forces_quietly(alpha: float, scale: f
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.0])
-def test_memory_stays_small(alpha: float) -> None:
+def test_memory_stays_small(alpha):
     x = generator(6).standard_normal(100_000) * X_C
     tracemalloc.start()
     force = force_history(x, F_MAX, SIGMA, alpha, 0.0)
@@ -128,14 +121,14 @@ def test_memory_stays_small(alpha: float) -> None:
     assert peak < 20 * (x.nbytes + force.nbytes)
 
 
-def loop(amplitude: float, alpha: float, points: int) -> tuple[FloatArray, FloatArray]:
+def loop(amplitude, alpha, points):
     return Dahl(F_MAX, SIGMA, alpha).loop(amplitude, points)
 
 
 @pytest.mark.parametrize("alpha", [0.25, 0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("beta", [0.3, 1.0, 30.0])
 @pytest.mark.parametrize("points", [4, 401])
-def test_steady_loop_is_what_a_history_settles_into(alpha: float, beta: float, points: int) -> None:
+def test_steady_loop_is_what_a_history_settles_into(alpha, beta, points):
     x, force = loop(beta * X_C, alpha, points)
     theta = np.linspace(0.0, 2.0 * np.pi, 1201)[:-1]
     assert x == pytest.approx(beta * X_C * np.cos(np.linspace(0.0, 2.0 * np.pi, points)))
@@ -149,9 +142,7 @@ def test_steady_loop_is_what_a_history_settles_into(alpha: float, beta: float, p
 
 @pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("beta", [0.02, 0.2, 0.6])
-def test_transient_decay_is_the_ratio_of_deviations_a_cycle_apart(
-    alpha: float, beta: float
-) -> None:
+def test_transient_decay_is_the_ratio_of_deviations_a_cycle_apart(alpha, beta):
     x, force = loop(beta * X_C, alpha, 3)
     deviation = 1e-6 * F_MAX
     disturbed = force_history(x, F_MAX, SIGMA, alpha, force[0] + deviation)
@@ -159,12 +150,12 @@ def test_transient_decay_is_the_ratio_of_deviations_a_cycle_apart(
     assert (disturbed[-1] - force[-1]) / deviation == pytest.approx(factor, rel=1e-5)
 
 
-def test_linear_history_derivatives() -> None:
+def test_linear_history_derivatives():
     rng = np.random.default_rng(5)
     x = np.cumsum(rng.standard_normal(400)) * 1e-3
     point = np.array([0.05, 0.2, 30.0])  # initial force, f_max, sigma
 
-    def force(at: FloatArray) -> FloatArray:
+    def force(at):
         start, f_max, sigma = at.tolist()
         return force_history(x, f_max, sigma, 1.0, start)
 
@@ -178,19 +169,19 @@ def test_linear_history_derivatives() -> None:
 
 
 @pytest.mark.parametrize("alpha", [0.7, 1.0, 1.5])
-def test_a_start_at_the_limit_may_exceed_it_by_rounding(alpha: float) -> None:
+def test_a_start_at_the_limit_may_exceed_it_by_rounding(alpha):
     x = np.sin(np.linspace(0.0, 20.0, 200))
     above, at = (force_history(x, 1.0, 30.0, alpha, start) for start in (1.0 + 4e-16, 1.0))
     np.testing.assert_allclose(above, at, atol=1e-9)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 1.0, 1.5])
-def test_force_beyond_the_limit_relaxes_towards_it(alpha: float) -> None:
+def test_force_beyond_the_limit_relaxes_towards_it(alpha):
     # an estimate of the force at the first sample may lie there; against Runge and Kutta's rule
     x = 1e-3 * np.sin(np.linspace(0.0, 12.0, 2001))
     force, found = 1.3, [1.3]
 
-    def slope(force: float, heading: float) -> float:
+    def slope(force, heading):
         margin = 1.0 - heading * force
         return float(1000.0 * np.abs(margin) ** alpha * np.sign(margin))
 

@@ -1,10 +1,7 @@
 """Confidence intervals against closed forms, brute force, other libraries, and each other."""
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from hypothesis import strategies as st
 from scipy import optimize, special, stats
 
 from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
-from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics import identifiability
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
@@ -21,7 +17,7 @@ from dahl_ident.results import FitResult
 from tests.friction_tables import X_C, amplitudes, plant_table, table
 
 
-def spring_table(n: int = 8, seed: int = 3) -> FrequencyResponse:
+def spring_table(n=8, seed=3):
     noise = np.random.default_rng(seed).standard_normal((2, n))
     Z = 5.0 + 0.1 * (noise[0] + 1j * noise[1])
     return FrequencyResponse(np.ones(n), Z, np.geomspace(1e-3, 1.0, n))
@@ -31,19 +27,19 @@ class TestClosedForm:
     """One spring under constant noise is the mean of n numbers: the textbook's t interval."""
 
     @pytest.mark.parametrize("method", ["wald", "profile"])
-    def test_interval_of_a_mean(self, method: str) -> None:
+    def test_interval_of_a_mean(self, method):
         data = spring_table()
         result = fit(data, Spring(), noise="absolute")
         n = data.n
         mean = data.response.real.mean()
         squares = ((data.response.real - mean) ** 2).sum() + (data.response.imag**2).sum()
         error = np.sqrt(squares / (2 * n - 1) / n)
-        for level, lower, upper in result.conf_interval(method)["stiffness"]:  # type: ignore[arg-type]  # parametrised
+        for level, lower, upper in result.conf_interval(method)["stiffness"]:  # parametrised
             t = stats.t.ppf(0.5 + 0.5 * level, 2 * n - 1)
             assert lower == pytest.approx(mean - t * error, abs=1e-7 * error)
             assert upper == pytest.approx(mean + t * error, abs=1e-7 * error)
 
-    def test_known_noise_gives_normal_thresholds(self) -> None:
+    def test_known_noise_gives_normal_thresholds(self):
         data = replace(spring_table(), covariance=np.tile(0.04 * np.eye(2), (8, 1, 1)))
         (interval,) = fit(data, Spring()).conf_interval("wald", levels=[0.95])["stiffness"]
         half = 1.959963984540054 * 0.2 / np.sqrt(8.0)
@@ -51,12 +47,12 @@ class TestClosedForm:
 
 
 class TestOtherLibraries:
-    def test_lmfit_has_the_same_optimum_errors_and_profile(self) -> None:
+    def test_lmfit_has_the_same_optimum_errors_and_profile(self):
         lmfit = importlib.import_module("lmfit")
         data = table(n=8)
         result, amplitude = fit(data, Dahl(alpha=1.0)), amplitudes(data)
 
-        def residuals(p: Any) -> FloatArray:
+        def residuals(p):
             N = Dahl(p["f_max"].value, p["sigma"].value).describing_function(amplitude)
             return np.log(data.response / N).view(np.float64)
 
@@ -85,7 +81,7 @@ class TestOtherLibraries:
 
 
 class TestProfile:
-    def test_limits_lie_where_brute_force_finds_the_threshold(self) -> None:
+    def test_limits_lie_where_brute_force_finds_the_threshold(self):
         result = fit(table(n=8, noise=0.1), Dahl(alpha=1.0))
         optimum = result.optimum
         for index, intervals in enumerate(result.conf_interval("profile").values()):
@@ -93,7 +89,7 @@ class TestProfile:
                 q = special.stdtrit(optimum.dof, 0.5 + 0.5 * level)
                 for limit in np.log(limits):
 
-                    def squares(other: float, at: float = limit, held: int = index) -> float:
+                    def squares(other, at=limit, held=index):
                         theta = np.empty(2)
                         theta[held], theta[1 - held] = at, other
                         return float(np.sum(optimum.problem.residuals(theta) ** 2))
@@ -106,14 +102,14 @@ class TestProfile:
                     rise = (best.fun - 2.0 * optimum.cost) / optimum.scale**2
                     assert rise == pytest.approx(q**2, rel=1e-5)
 
-    def test_microslip_leaves_f_max_open_above(self) -> None:
+    def test_microslip_leaves_f_max_open_above(self):
         result = fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
         for _, lower, upper in result.conf_interval()["f_max"]:
             assert 0.0 < lower < 0.1
             assert upper == np.inf
         assert np.isfinite(result.conf_interval()["sigma"][-1]).all()
 
-    def test_an_optimum_at_infinity_has_a_lower_limit(self) -> None:
+    def test_an_optimum_at_infinity_has_a_lower_limit(self):
         tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(20))
         fits = (fit(data, Dahl(alpha=1.0), throw=False) for data in tables)
         result = next(r for r in fits if r.optimum.status is Status.NO_LOSS)
@@ -131,13 +127,13 @@ class TestProfile:
         rise = (best.fun - result.chisqr) / result.scale**2
         assert rise == pytest.approx(special.stdtrit(result.nfree, 0.97725) ** 2, rel=1e-3)
 
-    def test_an_exact_degeneracy_leaves_everything_open(self) -> None:
+    def test_an_exact_degeneracy_leaves_everything_open(self):
         result = fit(table(), Dahl(), sensors=Sensors(force_gain=None), throw=False)
         for name in ("f_max", "sigma", "force_gain"):
             for interval in result.conf_interval()[name]:
                 assert (interval.lower, interval.upper) == (0.0, np.inf)
 
-    def test_a_bound_ends_an_interval(self) -> None:
+    def test_a_bound_ends_an_interval(self):
         model = Dahl(alpha=1.0) + Spring()
         (own,) = (p for p in model.parameters if p.name == "f_max")
         bounded = model.with_parameters({"f_max": replace(own, upper=0.1002)})
@@ -149,7 +145,7 @@ class TestProfile:
         assert tied.lower == pytest.approx(free.lower, rel=1e-3)
 
     @pytest.mark.parametrize("seed", [4, 8, 53, 204])
-    def test_with_a_hidden_spring_the_limits_are_those_of_a_global_search(self, seed: int) -> None:
+    def test_with_a_hidden_spring_the_limits_are_those_of_a_global_search(self, seed):
         """The profile's valley is bent and long; fits with the value fixed find it from scratch.
 
         But for the first table, the optimum lies in microslip with the spring at minus infinity,
@@ -167,7 +163,7 @@ class TestProfile:
                         rise = 2.0 * (held.optimum.cost - result.optimum.cost) / result.scale**2
                         assert rise == pytest.approx(target, rel=0.02)
 
-    def test_robust_fits_have_intervals_like_those_of_their_covariance(self) -> None:
+    def test_robust_fits_have_intervals_like_those_of_their_covariance(self):
         result = fit(table(), Dahl(), loss="huber")
         wald, profile = result.conf_interval("wald"), result.conf_interval("profile")
         np.testing.assert_allclose(profile.lower[1], wald.lower[1], rtol=2e-3)
@@ -181,9 +177,7 @@ class TestProfile:
         st.sampled_from([1e-4, 0.01, 0.3]),
         st.integers(0, 10),
     )
-    def test_never_raises_and_holds_the_estimate(
-        self, low: float, decades: float, n: int, noise: float, seed: int
-    ) -> None:
+    def test_never_raises_and_holds_the_estimate(self, low, decades, n, noise, seed):
         data = table(beta=(10.0**low, 10.0 ** (low + decades)), n=n, noise=noise, seed=seed)
         result = fit(data, Dahl(), throw=False)
         found = result.conf_interval("profile")
@@ -196,7 +190,7 @@ class TestProfile:
 
     @settings(max_examples=10)
     @given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
-    def test_follow_the_units(self, force: float, length: float) -> None:
+    def test_follow_the_units(self, force, length):
         data = table(n=6, noise=0.05)
         N, m = 10.0**force, 10.0**length
         other = FrequencyResponse(data.frequency_hz, data.response * N / m, data.amplitude * m)
@@ -207,19 +201,19 @@ class TestProfile:
 
 
 class TestBootstrap:
-    def test_agrees_with_the_profile_where_all_is_well(self) -> None:
+    def test_agrees_with_the_profile_where_all_is_well(self):
         result = fit(table(), Dahl())
         profile, bootstrap = result.conf_interval("profile"), result.conf_interval("bootstrap")
         width = profile.upper[1] - profile.lower[1]
         assert (np.abs(bootstrap.lower[1] - profile.lower[1]) < 0.05 * width).all()
         assert (np.abs(bootstrap.upper[1] - profile.upper[1]) < 0.05 * width).all()
 
-    def test_works_for_driven_plants(self) -> None:
+    def test_works_for_driven_plants(self):
         result = fit(plant_table(), Dahl() + Spring(), fixed=None, throw=False)
         found = result.conf_interval("bootstrap", replicates=99)
         assert set(found) == {"f_max", "sigma", "stiffness"}
 
-    def test_the_seed_decides(self) -> None:
+    def test_the_seed_decides(self):
         result = fit(table(n=8), Dahl())
         one, same, other = (
             result.conf_interval("bootstrap", replicates=199, seed=s) for s in (1, 1, 2)
@@ -227,19 +221,19 @@ class TestBootstrap:
         np.testing.assert_array_equal(one.lower, same.lower)
         assert (one.lower != other.lower).all()
 
-    def test_is_open_where_replicates_run_away(self) -> None:
+    def test_is_open_where_replicates_run_away(self):
         result = fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
         found = result.conf_interval("bootstrap", replicates=499)
         assert found["f_max"][0].upper == np.inf
         assert found["sigma"][0].upper < np.inf
 
-    def test_refuses_robust_losses_and_few_replicates(self) -> None:
+    def test_refuses_robust_losses_and_few_replicates(self):
         with pytest.raises(ValidationError, match="robust loss huber"):
             fit(table(), Dahl(), loss="huber").conf_interval("bootstrap")
         with pytest.raises(ValidationError, match="replicates is 5; expected a whole number >= 99"):
             fit(table(), Dahl()).conf_interval("bootstrap", replicates=5)
 
-    def test_few_degrees_of_freedom_a_row(self) -> None:
+    def test_few_degrees_of_freedom_a_row(self):
         data = table()
         size = (0.01 * np.abs(data.response)) ** 2
         C = size[:, None, None] * np.eye(2)
@@ -254,16 +248,16 @@ class TestBootstrap:
 
 
 class TestTable:
-    def result(self) -> FitResult:
+    def result(self):
         return fit(table(n=8), Dahl())
 
-    def test_methods_side_by_side(self) -> None:
+    def test_methods_side_by_side(self):
         compared = self.result().compare_intervals()
         assert not compared.disagreements
         assert "The methods that count noise alone agree." in str(compared)
         assert "profile intervals (noise scale estimated: t and F with 14 degrees" in str(compared)
 
-    def test_disagreement_is_flagged(self) -> None:
+    def test_disagreement_is_flagged(self):
         result = fit(table(beta=(1e-3, 1e-2)), Dahl())
         compared = result.compare_intervals(["wald", "profile"])
         flagged = {(d.name, d.side) for d in compared.disagreements}
@@ -271,7 +265,7 @@ class TestTable:
         assert "sigma" not in {name for name, _ in flagged}
         assert "by wald and open by profile; trust the latter" in str(compared)
 
-    def test_mapping_and_frame(self) -> None:
+    def test_mapping_and_frame(self):
         found = self.result().conf_interval()
         assert list(found) == ["f_max", "sigma"]
         assert len(found) == 2
@@ -283,17 +277,17 @@ class TestTable:
             found["mass"]
 
     @pytest.mark.parametrize("levels", [[0.0], [1.0], [], [2.0], [np.nan]])
-    def test_impossible_levels(self, levels: list[float]) -> None:
+    def test_impossible_levels(self, levels):
         with pytest.raises(ValidationError, match="levels"):
             self.result().conf_interval(levels=levels)
 
-    def test_unknown_method(self) -> None:
+    def test_unknown_method(self):
         with pytest.raises(
             ValidationError, match="method is 'bayes'; expected one of combined, wald"
         ):
-            self.result().conf_interval("bayes")  # type: ignore[arg-type]  # the test's point
+            self.result().conf_interval("bayes")  # the test's point
 
-    def test_no_degrees_of_freedom_leave_everything_open(self) -> None:
+    def test_no_degrees_of_freedom_leave_everything_open(self):
         data = FrequencyResponse([1.0], [20.0 + 5.0j], amplitude=[X_C])
         result = fit(data, Dahl(), throw=False)
         assert result.nfree == 0
@@ -305,7 +299,7 @@ class TestOneInterval:
     """Whatever states an estimate states one point, and one uncertainty."""
 
     @staticmethod
-    def fitted(case: str) -> FitResult:
+    def fitted(case):
         if case == "described":
             return fit(table(n=12, noise=0.01, seed=3), Dahl())
         if case == "misfit":  # a spring in parallel that the model does not have
@@ -315,7 +309,7 @@ class TestOneInterval:
         return fit(few, Dahl(), throw=False)
 
     @pytest.mark.parametrize("case", ["described", "misfit", "few and noisy"])
-    def test_of_every_parameter(self, case: str) -> None:
+    def test_of_every_parameter(self, case):
         found = self.fitted(case)
         intervals, summary = found.conf_interval().at(0.9545), found.summary()
         again = FitResult.from_json(found.to_json())
@@ -340,7 +334,7 @@ class TestOneInterval:
             assert again.params[name].stderr == pytest.approx(p.stderr, rel=1e-6)
 
     @pytest.mark.parametrize("case", ["described", "misfit", "few and noisy"])
-    def test_of_every_response(self, case: str) -> None:
+    def test_of_every_response(self, case):
         found = self.fitted(case)
         law = Dahl(*(found.params[name].value for name in ("f_max", "sigma", "alpha")))
         A = amplitudes(found.data)
@@ -353,7 +347,7 @@ class TestOneInterval:
 
 
 @pytest.mark.parametrize("name", ["alpha_2", "outliers"])
-def test_every_method_begins_at_the_one_estimate(name: str) -> None:
+def test_every_method_begins_at_the_one_estimate(name):
     """Also where the exponent was assumed, and where a misfit counts."""
     result = fit(load_dataset(name), Dahl())
     stated = {p.name: p.value for p in result.model.parameters}
@@ -367,7 +361,7 @@ def test_every_method_begins_at_the_one_estimate(name: str) -> None:
             assert (found.upper[:, i] > value).all()
 
 
-def test_an_open_parameter_has_one_limit_and_no_expanded_uncertainty() -> None:
+def test_an_open_parameter_has_one_limit_and_no_expanded_uncertainty():
     result = fit(load_dataset("microslip"), Dahl())
     limits = result.conf_interval()["f_max"][1]
     stated = result.budget()["f_max"]
@@ -379,7 +373,7 @@ def test_an_open_parameter_has_one_limit_and_no_expanded_uncertainty() -> None:
 
 
 @pytest.mark.parametrize("runs", [2, 3])
-def test_an_interval_is_no_narrower_than_the_means_of_few_runs_say(runs: int) -> None:
+def test_an_interval_is_no_narrower_than_the_means_of_few_runs_say(runs):
     """However well they agree: the textbook's t interval of their means covers as often."""
     rng, size = np.random.default_rng(8), 10
     for _ in range(4):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -22,11 +20,9 @@ from dahl_ident import (
     steady_state,
 )
 from dahl_ident import fit as any_fit
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, ModelError, ValidationError
-from dahl_ident.fitting import Optimum, Status, ipopt, solve
+from dahl_ident.fitting import Status, ipopt, solve
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.problem import TableProblem as AnyProblem
 from dahl_ident.sensors import Sensors
@@ -44,25 +40,23 @@ PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
 UNKNOWN_PLANT = Dahl() + Mass() + Damper() + Spring()
 
 
-def noise(n: int, size: float = 0.02, seed: int = 1) -> ComplexArray:
+def noise(n, size=0.02, seed=1):
     rng = np.random.default_rng(seed)
     return np.asarray(size * (rng.standard_normal(n) + 1j * rng.standard_normal(n)))
 
 
-def friction_data(
-    truth: Element = FRICTION, size: float = 0.02, **columns: Any
-) -> FrequencyResponse:
+def friction_data(truth=FRICTION, size=0.02, **columns):
     N = truth.dynamic_stiffness(AMPLITUDE, 2.0 * np.pi)
     measured = N * np.exp(noise(AMPLITUDE.size, size))
     return FrequencyResponse(np.ones(AMPLITUDE.size), measured, AMPLITUDE, **columns)
 
 
-def covariance_of(truth: Element = FRICTION, size: float = 0.02) -> FloatArray:
+def covariance_of(truth=FRICTION, size=0.02):
     N = truth.dynamic_stiffness(AMPLITUDE, 2.0 * np.pi)
     return np.abs(N)[:, None, None] ** 2 * size**2 * np.eye(2)
 
 
-def of_quantity(receptance: ComplexArray, frequency_hz: FloatArray, quantity: str) -> ComplexArray:
+def of_quantity(receptance, frequency_hz, quantity):
     """Return another standard quantity of the same motion."""
     s, R = 2j * np.pi * frequency_hz, receptance
     return {
@@ -71,9 +65,7 @@ def of_quantity(receptance: ComplexArray, frequency_hz: FloatArray, quantity: st
     }[quantity]  # fmt: skip
 
 
-def plant_data(
-    levels: int = 5, frequencies: int = 12, quantity: Any = "receptance", size: float = 0.02
-) -> FrequencyResponse:
+def plant_data(levels=5, frequencies=12, quantity="receptance", size=0.02):
     drive = np.repeat(np.geomspace(0.02, 5.0, levels), frequencies)
     frequency = np.tile(np.geomspace(0.03, 3.0, frequencies), levels)
     R = of_quantity(response(PLANT, frequency, drive).receptance, frequency, quantity)
@@ -86,7 +78,7 @@ def plant_data(
     )
 
 
-def assert_same(found: Optimum, expected: Optimum) -> None:
+def assert_same(found, expected):
     """The same optimum to 1e-7 of each value or, near zero, of its error; the same covariance."""
     assert found.status is expected.status
     assert found.method == "ipopt"
@@ -159,7 +151,7 @@ CASES: dict[str, Callable[[], AnyProblem]] = {
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.versions
-def test_same_optimum_as_least_squares(case: str) -> None:
+def test_same_optimum_as_least_squares(case):
     problem = CASES[case]()
     assert_same(solve_ipopt(problem), solve(problem))
 
@@ -168,7 +160,7 @@ SOFT = BoucWen(30.0, 300.0, 150.0) + Mass(0.3) + Damper(0.5) + Spring(3.0)
 UNKNOWN_SOFT = BoucWen(q=300.0, p=150.0) + Mass(0.3) + Damper() + Spring(3.0)
 
 
-def exact_data(plant: Element) -> FrequencyResponse:
+def exact_data(plant):
     drive = np.repeat([0.04, 0.2, 1.0], 5)
     frequency = np.tile(np.geomspace(0.3, 2.0, 5), 3)
     R = steady_state.response(plant, frequency, drive, steady="exact").receptance
@@ -181,7 +173,7 @@ def exact_data(plant: Element) -> FrequencyResponse:
 @pytest.mark.parametrize(
     ("plant", "unknown"), [(PLANT, UNKNOWN_PLANT), (SOFT, UNKNOWN_SOFT)], ids=["Dahl", "BoucWen"]
 )
-def test_exact_steady_motion(plant: Element, unknown: Element) -> None:
+def test_exact_steady_motion(plant, unknown):
     """The same optimum as least squares, and on a constraint that of one parameter fewer."""
     problem = AnyProblem(exact_data(plant), unknown)
     assert problem.is_exact
@@ -200,7 +192,7 @@ SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
 
 
 @pytest.mark.parametrize("loss", ["huber", "student_t"])
-def test_robust_losses(loss: str) -> None:
+def test_robust_losses(loss):
     data = friction_data(covariance=covariance_of())
     spoiled = data.response * np.where(np.arange(data.n) == 7, 1.3, 1.0)
     problem = TableProblem(
@@ -210,7 +202,7 @@ def test_robust_losses(loss: str) -> None:
     assert_same(solve_ipopt(problem, loss=loss), solve(problem, loss=loss))
 
 
-def test_bound() -> None:
+def test_bound():
     model = Dahl()
     f_max = model.parameters[0]
     bounded = model + Spring(1e-3)
@@ -222,11 +214,11 @@ def test_bound() -> None:
 
 
 @pytest.mark.versions
-def test_equality_is_the_estimate_of_the_ratio_fixed() -> None:
+def test_equality_is_the_estimate_of_the_ratio_fixed():
     problem = TableProblem(friction_data(), Dahl())
     found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] == 250 * p["f_max"]])
 
-    def cost(ln_f_max: float) -> float:
+    def cost(ln_f_max):
         theta = np.array([ln_f_max, ln_f_max + np.log(250.0)])
         return float(np.sum(problem.residuals(theta) ** 2))
 
@@ -240,7 +232,7 @@ def test_equality_is_the_estimate_of_the_ratio_fixed() -> None:
     assert found.covariance == pytest.approx(np.full((2, 2), variance), rel=1e-6)
 
 
-def test_equality_can_make_an_undetermined_parameter_known() -> None:
+def test_equality_can_make_an_undetermined_parameter_known():
     problem = TableProblem(friction_data(), Dahl() + Spring(name="own") + Spring(name="other"))
     alone = solve_ipopt(problem)
     assert alone.status is Status.SINGULAR
@@ -254,7 +246,7 @@ def test_equality_can_make_an_undetermined_parameter_known() -> None:
     assert tied.values[2] == pytest.approx(3.0 * tied.values[3], rel=1e-9)
 
 
-def test_inequality_binds_only_where_it_has_to() -> None:
+def test_inequality_binds_only_where_it_has_to():
     problem = TableProblem(friction_data(), Dahl())
     free = solve(problem)
     loose = solve_ipopt(problem, constraints=lambda p: [p["sigma"] >= 250 * p["f_max"]])
@@ -267,10 +259,10 @@ def test_inequality_binds_only_where_it_has_to() -> None:
     assert tight.values == pytest.approx(equal.values, rel=1e-6)
 
 
-def test_constraint_holds_a_plant_together() -> None:
+def test_constraint_holds_a_plant_together():
     problem = TableProblem(plant_data(4, 6), UNKNOWN_PLANT)
 
-    def ratio(p: Symbols) -> list[ca.SX]:
+    def ratio(p):
         return [p["damping"] ** 2 == 0.36 * p["mass"] * p["stiffness"]]
 
     found = solve_ipopt(problem, constraints=ratio)
@@ -278,7 +270,7 @@ def test_constraint_holds_a_plant_together() -> None:
     assert found.success
     assert damping**2 == pytest.approx(0.36 * mass * stiffness, rel=1e-8)
 
-    def tied(x: FloatArray) -> FloatArray:
+    def tied(x):
         m, k = np.exp(x[2:])
         return np.asarray(problem.residuals(np.array([x[0], x[1], m, 0.6 * np.sqrt(m * k), k])))
 
@@ -287,7 +279,7 @@ def test_constraint_holds_a_plant_together() -> None:
     assert found.cost == pytest.approx(expected.cost, rel=1e-10)
 
 
-def test_constraint_makes_an_optimum_at_infinity_finite() -> None:
+def test_constraint_makes_an_optimum_at_infinity_finite():
     """Microslip with a free spring: sigma and f_max run away together until f_max is held."""
     small = np.geomspace(1e-6, 1e-4, 16)
     N = FRICTION.describing_function(small) * (1.0 + noise(16, 3e-4, seed=4))
@@ -301,7 +293,7 @@ def test_constraint_makes_an_optimum_at_infinity_finite() -> None:
     assert held.cost == pytest.approx(expected.cost, rel=1e-9)
 
 
-def test_noise_of_the_drive() -> None:
+def test_noise_of_the_drive():
     """Against the joint least squares over parameters and true drives."""
     n, s, own = 24, 0.03, 0.02
     exact = plant_data(4, 6, size=0.0)
@@ -312,7 +304,7 @@ def test_noise_of_the_drive() -> None:
     cross = -(s**2) * (R * drive)
     shared = np.stack([cross.real, cross.imag], axis=1)
 
-    def table(true_drive: FloatArray) -> FrequencyResponse:
+    def table(true_drive):
         return FrequencyResponse(
             exact.frequency_hz, R, drive=true_drive, controlled="force", quantity="receptance",
             covariance=C,
@@ -325,7 +317,7 @@ def test_noise_of_the_drive() -> None:
     joint[:, 0, 1:] = joint[:, 1:, 0] = shared / drive[:, None]
     whiten = np.linalg.inv(np.linalg.cholesky(joint))
 
-    def residuals(x: FloatArray) -> FloatArray:
+    def residuals(x):
         r = R - TableProblem(table(drive * np.exp(-x[5:])), UNKNOWN_PLANT).predict(x[:5])
         together = np.stack([x[5:], r.real, r.imag], axis=1)
         return np.asarray(np.einsum("nij,nj->ni", whiten, together)).ravel()
@@ -359,18 +351,18 @@ def test_noise_of_the_drive() -> None:
         ),
     ],
 )
-def test_bad_constraints(constraints: Any, error: type[Exception], message: str) -> None:
+def test_bad_constraints(constraints, error, message):
     problem = TableProblem(friction_data(), Dahl())
     with pytest.raises(error, match=message):
         solve_ipopt(problem, constraints=constraints)
 
 
-def test_no_constraints_in_the_list() -> None:
+def test_no_constraints_in_the_list():
     problem = TableProblem(friction_data(), Dahl())
     assert_same(solve_ipopt(problem, constraints=lambda _: []), solve(problem))
 
 
-def test_misplaced_errors_of_the_drive() -> None:
+def test_misplaced_errors_of_the_drive():
     with pytest.raises(ValidationError, match="no row is force-controlled"):
         solve_ipopt(TableProblem(friction_data(), Dahl()), drive_std=0.1)
     with pytest.raises(ValidationError, match="relative noise and linear loss"):
@@ -389,7 +381,7 @@ def test_misplaced_errors_of_the_drive() -> None:
         )
 
 
-def test_plant_with_several_amplitudes_stays_on_the_one_measured() -> None:
+def test_plant_with_several_amplitudes_stays_on_the_one_measured():
     plant = FRICTION + Mass(0.3) + Damper(-0.4) + Spring(20.0)
     frequency, drive = np.tile(np.linspace(0.3, 2.6, 13), 2), np.repeat([0.05, 0.1], 13)
     every = response(plant, frequency, drive, all_roots=True)
@@ -407,7 +399,7 @@ def test_plant_with_several_amplitudes_stays_on_the_one_measured() -> None:
     assert_same(solve_ipopt(problem), solve(problem))
 
 
-def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_that_runs_out_of_steps_says_so(monkeypatch):
     monkeypatch.setattr(ipopt, "_ITERATIONS", 1)
     problem = TableProblem(friction_data(), Dahl())
     found = solve_ipopt(problem, constraints=lambda p: [p["sigma"] <= 250 * p["f_max"]])
@@ -416,7 +408,7 @@ def test_search_that_runs_out_of_steps_says_so(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.versions
-def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_printed(capfd):
     solve_ipopt(TableProblem(friction_data(), Dahl()), constraints=lambda p: [p["sigma"] <= 29])
     assert capfd.readouterr() == ("", "")
 
@@ -429,12 +421,12 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
         ("sigma <= 1", "constraints is 'sigma <= 1'; expected a function: lambda p"),
     ],
 )
-def test_what_is_no_list_of_constraints_is_refused(constraints: Any, message: str) -> None:
+def test_what_is_no_list_of_constraints_is_refused(constraints, message):
     with pytest.raises(ValidationError, match=message):
         solve_ipopt(TableProblem(friction_data(), Dahl()), constraints=constraints)
 
 
-def test_noise_of_the_drive_is_judged_as_it_was_fitted() -> None:
+def test_noise_of_the_drive_is_judged_as_it_was_fitted():
     """Residuals, intervals and errors of an exact model count what its drive is off by."""
     exact = plant_data(3, 4, size=0.0)
     drive = exact.drive * np.exp(noise(12, 0.05, seed=8).real)
@@ -462,10 +454,10 @@ def test_noise_of_the_drive_is_judged_as_it_was_fitted() -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_constraint_that_the_data_contradict_is_said_so(known: bool) -> None:
+def test_a_constraint_that_the_data_contradict_is_said_so(known):
     data = friction_data(covariance=covariance_of() if known else None)
 
-    def tied(ratio: float) -> FitResult:
+    def tied(ratio):
         return fit(
             data, Dahl(), method="ipopt", constraints=lambda p: [p["sigma"] == ratio * p["f_max"]]
         )

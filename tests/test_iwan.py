@@ -1,7 +1,5 @@
 """The four-parameter Iwan law against high precision, sums of Jenkins elements, and time."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest
@@ -13,13 +11,13 @@ from dahl_ident.problem import TableProblem
 AT_REST = np.zeros(())
 
 
-def exact(law: Iwan, A: float, k: int) -> complex:
+def exact(law, A, k):
     """Return N_k by integration of the stiffness along the backbone curve, to 25 digits."""
     _, sigma, chi, ratio = (mpmath.mpf(float(v)) for v in law.known_values())
     r, g = mpmath.mpf(A) / mpmath.mpf(law.onset), chi + 1
     end = mpmath.acos(1 - 2 * min(1 / r, mpmath.mpf(1)))
 
-    def integrand(t: mpmath.mpf) -> mpmath.mpc:
+    def integrand(t):
         stiff = 1 - (r * mpmath.sin(t / 2) ** 2) ** g / (1 + ratio)
         return stiff * mpmath.sin(t) * mpmath.expjpi(-k * t / mpmath.pi)
 
@@ -27,7 +25,7 @@ def exact(law: Iwan, A: float, k: int) -> complex:
     return complex(2j * sigma / (mpmath.pi * k) * mpmath.quad(integrand, places))
 
 
-def random_laws(n: int, seed: int) -> list[tuple[Iwan, float]]:
+def random_laws(n, seed):
     rng = np.random.default_rng(seed)
     laws = [
         Iwan(*10.0 ** rng.uniform(-2.0, 3.0, 2), rng.uniform(-0.99, 1.0), 10 ** rng.uniform(-2, 2))
@@ -36,7 +34,7 @@ def random_laws(n: int, seed: int) -> list[tuple[Iwan, float]]:
     return [(law, law.onset * 10.0 ** rng.uniform(-4.0, 2.0)) for law in laws]
 
 
-def test_harmonics_to_high_precision() -> None:
+def test_harmonics_to_high_precision():
     with mpmath.workdps(25):
         for i, (law, A) in enumerate(random_laws(24, 3)):
             k = (1, 3, 7, 61)[i % 4]
@@ -47,7 +45,7 @@ def test_harmonics_to_high_precision() -> None:
             assert law.dynamic_stiffness(A, harmonic=2) == 0.0
 
 
-def test_derivatives_are_differences() -> None:
+def test_derivatives_are_differences():
     places, weights = np.array([1.0, -1.0, 2.0, -2.0]), np.array([8.0, -8.0, -1.0, 1.0]) / 12e-4
     for i, (law, A) in enumerate(random_laws(200, 4)):
         k, at = (1, 3, 5)[i % 3], [*law.known_values(), np.asarray(A)]
@@ -63,7 +61,7 @@ def test_derivatives_are_differences() -> None:
 
 
 @pytest.mark.parametrize("chi", [-0.6, 0.0, 0.5])
-def test_it_is_a_sum_of_many_jenkins_elements(chi: float) -> None:
+def test_it_is_a_sum_of_many_jenkins_elements(chi):
     law, n = Iwan(2.0, 5.0, chi, 0.6), 3000
     edges = law.onset * np.linspace(0.0, 1.0, n + 1)
     slips = 0.5 * (edges[1:] + edges[:-1])
@@ -78,7 +76,7 @@ def test_it_is_a_sum_of_many_jenkins_elements(chi: float) -> None:
     np.testing.assert_allclose(law.force(x), total.force(x), atol=2e-4)
 
 
-def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction() -> None:
+def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction():
     law = Iwan(100.0, 1e7, -0.4, 1.0)
     loss = law.dissipated_energy(law.onset * np.array([1e-4, 1e-3]))
     assert np.log10(loss[1] / loss[0]) == pytest.approx(2.6, abs=1e-9)
@@ -89,7 +87,7 @@ def test_microslip_is_a_power_law_and_macroslip_is_coulomb_friction() -> None:
         Iwan(chi=-1.5)
 
 
-def test_a_step_beyond_the_exponents_range_has_no_response() -> None:
+def test_a_step_beyond_the_exponents_range_has_no_response():
     """Searches may try it; other rows keep theirs."""
     model = Iwan(ratio=1.0) + Mass() + Damper()
     true = Iwan(10.0, 1e4, -0.5, 1.0) + Mass(1.0) + Damper(1.0)

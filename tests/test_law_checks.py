@@ -1,8 +1,6 @@
 """A user's law is checked when it is first used; every mistake has an error of its own."""
 
 # ruff: noqa: ARG005  # the laws below take every argument
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -17,19 +15,19 @@ from dahl_ident.errors import DahlIdentError, ModelError, ValidationError
 Slope = Callable[..., Any]
 
 
-def positive(name: str, unit: str = "") -> di.Parameter:
+def positive(name, unit=""):
     return di.Parameter(name, unit, name, lower=0.0, transform="log")
 
 
 USUAL = (positive("f_max", "N"), positive("sigma", "N/m"))
 
 
-def law(slope: Slope, parameters: Any = USUAL, **attributes: Any) -> type[di.Friction]:
+def law(slope, parameters=USUAL, **attributes):
     """Return a new class, which nothing has used before."""
     return type("Mine", (di.Friction,), {"slope": slope, "parameters": parameters, **attributes})
 
 
-def dahl(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+def dahl(self, force, direction, velocity, values):
     return values[1] * (1.0 - direction * force / values[0])
 
 
@@ -130,14 +128,14 @@ WRONG: dict[str, tuple[Slope, str]] = {
 
 
 @pytest.mark.parametrize("name", SOUND)
-def test_sound_laws_pass(name: str) -> None:
+def test_sound_laws_pass(name):
     cls = law(SOUND[name])
     for given in ((), (1e-6, 1e9), (1e5, 1e-3), (None, 2.0)):
         assert isinstance(cls(*given), di.Friction)
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_mistakes_are_named(name: str) -> None:
+def test_mistakes_are_named(name):
     slope, message = WRONG[name]
     with pytest.raises(ModelError, match=message):
         law(slope)(0.2, 3.0)
@@ -145,7 +143,7 @@ def test_mistakes_are_named(name: str) -> None:
         law(slope)()
 
 
-def test_the_energy_created_is_that_of_the_loop() -> None:
+def test_the_energy_created_is_that_of_the_loop():
     """The loop between two forces, by another quadrature."""
     f, sigma = 0.2, 3.0
     slope, _ = WRONG["energy"]
@@ -158,10 +156,10 @@ def test_the_energy_created_is_that_of_the_loop() -> None:
     assert created == pytest.approx(-exact, rel=0.02)
 
 
-def test_no_loop_is_an_error_and_not_a_number() -> None:
+def test_no_loop_is_an_error_and_not_a_number():
     """The slope is at least sigma (1 + F^2/f^2)/2, so F is infinite within 2 pi f/sigma."""
 
-    def hardening(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def hardening(self, force, direction, velocity, values):
         f, sigma = values
         return sigma * (1.0 + (force / f) ** 2 - 0.5 * direction * np.tanh(force / f))
 
@@ -199,12 +197,12 @@ def test_no_loop_is_an_error_and_not_a_number() -> None:
         (positive("a", "N"), r"parameters is Parameter\(name='a'.* expected a tuple"),
     ],
 )
-def test_declarations_are_checked(parameters: Any, message: str) -> None:
+def test_declarations_are_checked(parameters, message):
     with pytest.raises(ValidationError, match=message):
         law(dahl, parameters)()
 
 
-def test_several_states_are_refused() -> None:
+def test_several_states_are_refused():
     class Two(law(dahl)):  # type: ignore[misc]
         states = ("f", "g")
 
@@ -212,10 +210,10 @@ def test_several_states_are_refused() -> None:
         Two(0.2, 3.0)
 
 
-def test_a_law_is_checked_once() -> None:
+def test_a_law_is_checked_once():
     calls = []
 
-    def slope(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         calls.append(np.shape(force))
         return dahl(self, force, direction, velocity, values)
 
@@ -227,11 +225,11 @@ def test_a_law_is_checked_once() -> None:
     assert len(calls) == before
 
 
-def test_a_law_that_is_sound_for_some_values_is_not_refused() -> None:
+def test_a_law_that_is_sound_for_some_values_is_not_refused():
     """Bouc-Wen with exponent 1: values decide, not the class."""
     free = tuple(di.Parameter(name, "", name) for name in "abc")
 
-    def slope(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def slope(self, force, direction, velocity, values):
         a, b, c = values
         return a - np.abs(force) * (b * np.sign(direction * force) + c)
 
@@ -242,28 +240,28 @@ def test_a_law_that_is_sound_for_some_values_is_not_refused() -> None:
         cls(-3.0, 0.9, 0.4)
 
 
-def plant(slope: Slope) -> di.Model:
+def plant(slope):
     return law(slope)(1.0, 3.0) + di.Mass(0.3) + di.Damper(0.24)
 
 
-def drive(model: di.Model) -> None:
+def drive(model):
     from dahl_ident.elements import plant_equations
 
     plant_equations(model)
 
 
 @pytest.mark.versions
-def test_what_cannot_be_compiled_is_named() -> None:
-    def loops(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+def test_what_cannot_be_compiled_is_named():
+    def loops(self, force, direction, velocity, values):
         found = np.zeros(np.broadcast(force, direction, values[0]).shape)
         found[...] = dahl(self, force, direction, velocity, values)
         return found
 
-    def on_type(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def on_type(self, force, direction, velocity, values):
         numbers = isinstance(force, np.ndarray)
         return dahl(self, force, direction, velocity, values) * (1.0 if numbers else 2.0)
 
-    def asks(self: Any, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+    def asks(self, force, direction, velocity, values):
         if isinstance(force, np.ndarray):
             return dahl(self, force, direction, velocity, values)
         return values[1] if direction > 0 else values[0]

@@ -4,11 +4,8 @@ The stiffness, its derivatives and the description of every law are judged there
 estimated from data of its own, by every method, and what follows from a fit is made of it.
 """
 
-from __future__ import annotations
-
 import json
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +13,6 @@ from scipy.optimize import brentq
 
 import dahl_ident as di
 from dahl_ident import Model
-from dahl_ident.elements import Element
-from tests.command_line import Runner
 from tests.test_every_law import LAWS
 from tests.test_generic_friction import Jenkins
 
@@ -28,11 +23,11 @@ _ROWS = {"lugre": 4, "jenkins": 6}  # their loops are integrated, for every row 
 _NOISE = 0.005
 
 
-def known(kind: str) -> Element:
+def known(kind):
     return LAWS[kind][0]
 
 
-def asked(kind: str) -> Model:
+def asked(kind):
     """Return the law with its first parameters unknown and the others known."""
     law = known(kind)
     changes = {p.name: p.described("free") for p in law.parameters[:_FREE]}
@@ -40,7 +35,7 @@ def asked(kind: str) -> Model:
     return Model(law).with_parameters(changes)
 
 
-def data(kind: str) -> di.FrequencyResponse:
+def data(kind):
     rng = np.random.default_rng(11)
     A = np.geomspace(0.4, 5.0, _ROWS.get(kind, 12))
     e = rng.standard_normal((2, A.size)) * _NOISE
@@ -48,17 +43,17 @@ def data(kind: str) -> di.FrequencyResponse:
     return di.FrequencyResponse(np.ones(A.size), Z, A, quantity="dynamic_stiffness")
 
 
-def best(fit: di.FitResult) -> dict[str, float]:
+def best(fit):
     """Return the least-squares optimum, by name."""
     return dict(zip(fit.var_names, fit.optimum.values.tolist(), strict=True))
 
 
 @cache
-def fitted(kind: str) -> di.FitResult:
+def fitted(kind):
     return di.fit(data(kind), asked(kind))
 
 
-def all_amplitudes(plant: Element, frequency_hz: float, drive: float) -> list[float]:
+def all_amplitudes(plant, frequency_hz, drive):
     """Return every amplitude at which the plant needs the drive, by a bracketing root search."""
     omega = 2.0 * np.pi * frequency_hz
     A = np.geomspace(1e-9, 1e3, 2000)
@@ -75,7 +70,7 @@ def all_amplitudes(plant: Element, frequency_hz: float, drive: float) -> list[fl
 
 @pytest.mark.parametrize(("frequency_hz", "drive"), [(0.4, 1.1), (0.0, 0.05), (1.5, 3.0)])
 @every_kind
-def test_response_is_what_a_root_search_finds(kind: str, frequency_hz: float, drive: float) -> None:
+def test_response_is_what_a_root_search_finds(kind, frequency_hz, drive):
     plant = known(kind) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3, name="base")
     response = di.response(plant, frequency_hz, drive, all_roots=True, steady="describing function")
     expected = all_amplitudes(plant, frequency_hz, drive)
@@ -83,7 +78,7 @@ def test_response_is_what_a_root_search_finds(kind: str, frequency_hz: float, dr
     np.testing.assert_allclose(np.ravel(response.amplitude), expected, rtol=1e-7)
 
 
-def test_no_element_that_depends_on_amplitude_is_taken_as_linear() -> None:
+def test_no_element_that_depends_on_amplitude_is_taken_as_linear():
     plant = Jenkins(3.0, 0.004, name="joint") + di.Damper(0.05) + di.Spring(2.0)
     response = di.response(plant, 0.5, 0.05, steady="describing function")
     (expected,) = all_amplitudes(plant, 0.5, 0.05)
@@ -93,7 +88,7 @@ def test_no_element_that_depends_on_amplitude_is_taken_as_linear() -> None:
 
 
 @every_kind
-def test_least_squares_finds_the_truth_and_knows_it(kind: str) -> None:
+def test_least_squares_finds_the_truth_and_knows_it(kind):
     fit = fitted(kind)
     assert fit.success
     for parameter in known(kind).parameters[:_FREE]:
@@ -108,7 +103,7 @@ def test_least_squares_finds_the_truth_and_knows_it(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["maxwell_slip", "jenkins"])  # a closed form; integrated
-def test_ipopt_and_grid_agree_with_it(kind: str) -> None:
+def test_ipopt_and_grid_agree_with_it(kind):
     fit = fitted(kind)
     other = di.fit(fit.data, asked(kind), method="ipopt")
     assert other.optimum.values == pytest.approx(fit.optimum.values, rel=1e-4)
@@ -117,7 +112,7 @@ def test_ipopt_and_grid_agree_with_it(kind: str) -> None:
         assert abs(grid.params[name].value - best(fit)[name]) < 1.5 * fit.stderr_noise[name]
 
 
-def test_a_chain_agrees_with_the_fit_and_its_energy_with_the_closed_form() -> None:
+def test_a_chain_agrees_with_the_fit_and_its_energy_with_the_closed_form():
     fit = fitted("jenkins")
     chain = di.posterior(fit, seed=1, steps=60)
     for name in fit.var_names:
@@ -129,7 +124,7 @@ def test_a_chain_agrees_with_the_fit_and_its_energy_with_the_closed_form() -> No
         assert abs(energy.value - 4.0 * 3.0 * 0.3 * (2.0 - 0.3)) < 4.0 * energy.stderr
 
 
-def test_file_report_and_command_line_know_it(tmp_path: Path, run: Runner) -> None:
+def test_file_report_and_command_line_know_it(tmp_path, run):
     fit, file = fitted("jenkins"), tmp_path / "fit.json"
     file.write_text(fit.to_json())
     facts = json.loads(di.report(fit, tmp_path / "page.json").read_text())

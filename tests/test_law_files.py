@@ -1,7 +1,5 @@
 """A law in a user's file: command line, campaigns, saved fits, worker processes."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import json
@@ -10,7 +8,6 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,6 @@ import dahl_ident as di
 from dahl_ident.elements import KINDS
 from dahl_ident.elements.law_files import load_laws
 from dahl_ident.errors import DataError, ModelError, ValidationError
-from tests.command_line import Runner
 
 LAW = '''
 import dahl_ident as di
@@ -46,7 +42,7 @@ DATA = ("--levels", "1e-3:3e-2:6", "--force-std", "0.01")
 
 
 @pytest.fixture
-def file(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+def file(tmp_path, request):
     """Return a file with a law whose kind nothing else has."""
     (tmp_path / "limits.py").write_text("LOWEST = 0.0\n")
     path = tmp_path / "my_laws.py"
@@ -54,11 +50,11 @@ def file(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     return path
 
 
-def kind_of(path: Path) -> str:
+def kind_of(path):
     return f"jenkins_{abs(hash(path))}"
 
 
-def table(path: Path) -> Path:
+def table(path):
     A = np.geomspace(1e-3, 3e-2, 12)
     (law, _) = load_laws(path)
     rng = np.random.default_rng(3)
@@ -68,7 +64,7 @@ def table(path: Path) -> Path:
     return data.save(path.parent / "d1.csv", overwrite=True)
 
 
-def test_commands_know_it(file: Path, run: Runner) -> None:
+def test_commands_know_it(file, run):
     folder, kind, laws = file.parent, kind_of(file), ("--laws", str(file))
     csv, saved = str(folder / "d1.csv"), str(folder / "fit.json")
     truth = ("--element", f"{kind}(k=30, f_max=0.1)")
@@ -84,7 +80,7 @@ def test_commands_know_it(file: Path, run: Runner) -> None:
     assert run("export", saved, *laws, "--to", "draws", "--size", "3").out.count("\n") == 4
 
 
-def test_options_files_take_it(file: Path, run: Runner) -> None:
+def test_options_files_take_it(file, run):
     options = file.parent / "options.toml"
     options.write_text(f"laws = {str(file)!r}\n[fit]\nelement = {kind_of(file)!r}\n")
     assert run("fit", str(table(file)), "--config", str(options)).status == 0
@@ -104,7 +100,7 @@ def test_options_files_take_it(file: Path, run: Runner) -> None:
          "    def slope(self, *_):\n        return 1.0\n", r"A: a has the bounds \(2.0, 1.0\)"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: str) -> None:
+def test_what_is_wrong_with_a_file_is_said(tmp_path, text, message):
     path = tmp_path / "my_laws.py"
     path.write_text(text)
     with pytest.raises((ModelError, ValidationError), match=message):
@@ -113,13 +109,13 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, message: s
         load_laws(tmp_path / "nowhere.py")
 
 
-def test_a_kind_that_is_not_known_says_what_to_give(file: Path, run: Runner) -> None:
+def test_a_kind_that_is_not_known_says_what_to_give(file, run):
     wrong = run("fit", str(table(file)), "--element", "unheard")
     assert wrong.status == 1
     assert "expected a law from a file given with --laws, or one of " in wrong.err
 
 
-def test_a_changed_file_is_run_again(file: Path) -> None:
+def test_a_changed_file_is_run_again(file):
     (before, _) = load_laws(file)
     assert load_laws(file)[0] is before
     file.write_text(LAW.format(kind=kind_of(file), factor=2.0))
@@ -129,7 +125,7 @@ def test_a_changed_file_is_run_again(file: Path) -> None:
     assert stiffness == pytest.approx([3.0, 6.0])
 
 
-def test_pickles_bring_it_to_a_process_that_has_not_seen_it(file: Path) -> None:
+def test_pickles_bring_it_to_a_process_that_has_not_seen_it(file):
     (law, _) = load_laws(file)
     gap = di.Backlash(law(3.0, f_max=None, name="joint"), 0.1)  # type: ignore[call-arg]
     plant = gap + law(5.0, 1.0) + di.Mass(0.3)  # type: ignore[call-arg]
@@ -141,7 +137,7 @@ def test_pickles_bring_it_to_a_process_that_has_not_seen_it(file: Path) -> None:
     assert (done.stdout, done.stderr) == (b"3.000000000\n", b"")
 
 
-def test_a_pool_of_processes_samples_it(file: Path) -> None:
+def test_a_pool_of_processes_samples_it(file):
     data = di.read_frequency_response(table(file))
     (law, _) = load_laws(file)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
@@ -149,7 +145,7 @@ def test_a_pool_of_processes_samples_it(file: Path) -> None:
     assert found.params["k"].value == pytest.approx(30.0, rel=0.05)
 
 
-def test_a_saved_fit_says_which_file_it_needs(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_saved_fit_says_which_file_it_needs(file, monkeypatch):
     data, kind = di.read_frequency_response(table(file)), kind_of(file)
     (law, _) = load_laws(file)
     text = di.fit(data, law()).to_json()
@@ -167,7 +163,7 @@ def test_a_saved_fit_says_which_file_it_needs(file: Path, monkeypatch: pytest.Mo
         di.FitResult.from_json(text)
 
 
-def test_a_saved_fit_of_records_says_it_too(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_saved_fit_of_records_says_it_too(file, monkeypatch):
     (law, _) = load_laws(file)
     t = np.arange(60) / 20.0
     x = 1e-2 * np.sin(5.0 * t) * np.cos(0.7 * t)
@@ -181,7 +177,7 @@ def test_a_saved_fit_of_records_says_it_too(file: Path, monkeypatch: pytest.Monk
         di.FitResult.from_json(text)
 
 
-def test_a_campaign_takes_it_to_its_workers(file: Path, run: Runner) -> None:
+def test_a_campaign_takes_it_to_its_workers(file, run):
     folder, kind = file.parent, kind_of(file)
     table(file).rename(folder / "d0.csv")
     table(file)
@@ -204,9 +200,7 @@ def test_a_campaign_takes_it_to_its_workers(file: Path, run: Runner) -> None:
         di.campaign(lab)
 
 
-def test_a_module_that_is_imported_and_given_is_one_law(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_module_that_is_imported_and_given_is_one_law(file, monkeypatch):
     monkeypatch.syspath_prepend(str(file.parent))
     module = importlib.import_module("my_laws")
     (law, _) = load_laws(file)

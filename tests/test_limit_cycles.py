@@ -1,10 +1,7 @@
 """Limit cycles against the closed loop in the time domain, closed forms, Routh and Nyquist."""
 
-from __future__ import annotations
-
 import itertools
 from functools import partial
-from typing import Any
 
 import control
 import numpy as np
@@ -15,7 +12,6 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from dahl_ident import Dahl, Damper, LinearSystem, Mass, Spring
-from dahl_ident.arrays import FloatArray
 from dahl_ident.control_interop import FrictionNonlinearity, LimitCycle, limit_cycles
 from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError, ValidationError
@@ -27,15 +23,13 @@ described = partial(limit_cycles, steady="describing function")
 FRICTION = Dahl(1.0, 1e4)
 
 
-def pid_loop(proportional: float, integral: float, derivative: float, lag: float = 0.0) -> Any:
+def pid_loop(proportional, integral, derivative, lag=0.0):
     """Displacement over disturbance force of a free mass of 1 kg under PID control."""
     pid = proportional + integral / s + derivative * s / (lag * s + 1) ** 2
     return control.feedback(1 / s**2, pid)
 
 
-def turning_points(
-    loop: Any, friction: Element, kick: float, frequency_hz: float, duration: float
-) -> tuple[FloatArray, FloatArray]:
+def turning_points(loop, friction, kick, frequency_hz, duration):
     """Return times and displacements of the reversals of a loop that was kicked and left alone."""
     plant = friction + (
         loop if isinstance(loop, Element) else LinearSystem(loop, quantity="receptance")
@@ -52,7 +46,7 @@ def turning_points(
     return time[turns], x[turns]
 
 
-def swing(x: FloatArray) -> FloatArray:
+def swing(x):
     """Return half the distance between consecutive reversals."""
     return np.asarray(np.abs(np.diff(x)) / 2.0)
 
@@ -61,7 +55,7 @@ HUNTING = pid_loop(100.0, 300.0, 20.0, 0.02)
 
 
 @pytest.mark.parametrize("kick", [0.002, 0.3], ids=["from below", "from above"])
-def test_hunting_of_a_pid_loop_in_the_time_domain(kick: float) -> None:
+def test_hunting_of_a_pid_loop_in_the_time_domain(kick):
     assert np.all(HUNTING.poles().real < 1e-9)
     (cycle,) = limit_cycles(HUNTING, FRICTION)
     assert cycle.stable
@@ -72,7 +66,7 @@ def test_hunting_of_a_pid_loop_in_the_time_domain(kick: float) -> None:
     assert 0.5 / np.diff(time)[-20:].mean() == pytest.approx(cycle.frequency_hz, rel=2e-3)
 
 
-def test_no_hunting_where_none_is_predicted() -> None:
+def test_no_hunting_where_none_is_predicted():
     """A Dahl contact alone has no falling friction: a sound PID loop comes to rest."""
     loop = pid_loop(100.0, 300.0, 20.0, 0.001)
     assert limit_cycles(loop, FRICTION) == ()
@@ -86,7 +80,7 @@ ACTIVE = Mass(0.3) + Damper(-0.3) + Spring(0.3)
 GRIP = Dahl(0.1, 30.0)
 
 
-def test_disturbances_die_at_the_predicted_rate() -> None:
+def test_disturbances_die_at_the_predicted_rate():
     cycle = described(ACTIVE, GRIP)[0]
     time, x = turning_points(ACTIVE, GRIP, 0.002, cycle.frequency_hz, 24.0)
     size, when = swing(x), time[1:]
@@ -99,7 +93,7 @@ def test_disturbances_die_at_the_predicted_rate() -> None:
 
 
 @pytest.mark.parametrize(("kick", "grows"), [(0.65, False), (0.84, True), (1.09, True)])
-def test_unstable_cycle_parts_rest_from_runaway(kick: float, grows: bool) -> None:
+def test_unstable_cycle_parts_rest_from_runaway(kick, grows):
     loop = Mass(0.3) + Damper(-0.03) + Spring(3.0)
     hold, part = limit_cycles(loop, GRIP)
     assert hold.stable
@@ -112,17 +106,17 @@ def test_unstable_cycle_parts_rest_from_runaway(kick: float, grows: bool) -> Non
     assert growth == pytest.approx(part.growth_rate, rel=0.1)
 
 
-def swings(speed: float, duration: float) -> tuple[FloatArray, FloatArray]:
+def swings(speed, duration):
     """Return times and displacements of the reversals of ACTIVE with GRIP, kicked from rest."""
 
-    def rates(t: float, y: FloatArray) -> list[float]:
+    def rates(t, y):
         x, v, F = y
         return [v, (0.3 * v - 0.3 * x - F) / 0.3, 30.0 * v * (1.0 - np.sign(v) * F / 0.1)]
 
-    def turns(t: float, y: FloatArray) -> float:
+    def turns(t, y):
         return float(y[1])
 
-    def far(t: float, y: FloatArray) -> float:
+    def far(t, y):
         return float(abs(y[0]) - 1.0)
 
     far.terminal = True  # type: ignore[attr-defined]
@@ -134,14 +128,14 @@ def swings(speed: float, duration: float) -> tuple[FloatArray, FloatArray]:
 
 
 class TestExactCycles:
-    def test_the_stable_one_is_where_a_kick_ends(self) -> None:
+    def test_the_stable_one_is_where_a_kick_ends(self):
         cycle = limit_cycles(ACTIVE, GRIP)[0]
         time, x = swings(0.01, 120.0)
         assert swing(x)[-6:] == pytest.approx(np.full(6, swing(x)[-1]), rel=1e-3)
         assert 0.5 / np.diff(time)[-6:].mean() == pytest.approx(cycle.frequency_hz, rel=1e-4)
         assert swing(x)[-1] == pytest.approx(cycle.amplitude, rel=4.0 * cycle.share)
 
-    def test_the_unstable_one_parts_rest_from_runaway(self) -> None:
+    def test_the_unstable_one_parts_rest_from_runaway(self):
         """The describing function's is 10 % smaller and 5 % faster than the motion in between."""
         low, high = 0.1, 1.0
         for _ in range(16):
@@ -155,23 +149,23 @@ class TestExactCycles:
         assert swing(x)[1:4].mean() == pytest.approx(cycle.amplitude, rel=cycle.share)
         assert described(ACTIVE, GRIP)[1].amplitude < 0.92 * swing(x)[1:4].mean()
 
-    def test_limits_that_differ_give_a_mean_and_even_harmonics(self) -> None:
+    def test_limits_that_differ_give_a_mean_and_even_harmonics(self):
         uneven = Dahl(0.1, 30.0, asymmetry=0.3)
         even = limit_cycles(ACTIVE, GRIP)[0]
         cycle = limit_cycles(ACTIVE, uneven)[0]
         assert cycle.stable
         assert cycle.share > 2.0 * even.share
 
-    def test_loops_without_an_equation_of_motion_say_so(self) -> None:
+    def test_loops_without_an_equation_of_motion_say_so(self):
         sampled = limit_cycles(control.c2d(control.ss(HUNTING), 1e-3, "tustin"), FRICTION)
         assert "no equation of motion in continuous time" in sampled.approximate
         assert limit_cycles(HUNTING, FRICTION).approximate == ""
 
 
-def test_negative_damping_against_the_closed_form() -> None:
+def test_negative_damping_against_the_closed_form():
     """m omega^2 = k + Re N(A) and c omega = Im N(A), one unknown after the other."""
 
-    def loss(log_amplitude: float) -> float:
+    def loss(log_amplitude):
         N = complex(GRIP.describing_function(np.exp(log_amplitude)))
         return N.imag - 0.3 * float(np.sqrt((0.3 + N.real) / 0.3))
 
@@ -188,9 +182,7 @@ def test_negative_damping_against_the_closed_form() -> None:
     excess=st.floats(0.05, 20.0),
     stuck=st.floats(1.5, 1e3),
 )
-def test_pid_loops_follow_routh(
-    proportional: float, derivative: float, excess: float, stuck: float
-) -> None:
+def test_pid_loops_follow_routh(proportional, derivative, excess, stuck):
     """s^3 + d s^2 + p s + i is stable up to i = d p, with the contact held up to i = d (p + sigma).
 
     Friction that turns a stable loop into an unstable one as it slips has one cycle, unstable;
@@ -210,7 +202,7 @@ def test_pid_loops_follow_routh(
     assert value == pytest.approx(-1.0, rel=1e-7)
 
 
-def crossings_of_the_roots(loop: Any, friction: Element) -> list[tuple[float, float, bool]]:
+def crossings_of_the_roots(loop, friction):
     """Cycles from roots of d(s) + N(A) n(s) that pass the imaginary axis: a method of its own."""
     transfer = control.tf(loop)
     num, den = transfer.num[0][0], transfer.den[0][0]
@@ -241,7 +233,7 @@ TWO = Dahl(1.0, 1e3, name="bearing") + Dahl(0.05, 3e4, 1.6, name="seal")
     ],
     ids=["hunting", "two elements", "much integral", "no integral", "alpha 1/2", "two modes"],
 )
-def test_cycles_are_where_roots_pass_the_axis(loop: Any, friction: Element) -> None:
+def test_cycles_are_where_roots_pass_the_axis(loop, friction):
     cycles = limit_cycles(loop, friction)
     reference = crossings_of_the_roots(loop, friction)
     assert len(cycles) == len(reference) >= 1
@@ -251,7 +243,7 @@ def test_cycles_are_where_roots_pass_the_axis(loop: Any, friction: Element) -> N
         assert cycle.stable == stable
 
 
-def test_every_kind_of_system_has_the_same_cycle() -> None:
+def test_every_kind_of_system_has_the_same_cycle():
     (cycle,) = described(HUNTING, FRICTION)
     omega = np.geomspace(1.0, 1000.0, 900)
     for loop in (
@@ -268,7 +260,7 @@ def test_every_kind_of_system_has_the_same_cycle() -> None:
     assert described(control.frd(HUNTING, omega[omega < 50.0]), FRICTION) == ()
 
 
-def test_delay_brings_hunting_as_its_pade_approximation_says() -> None:
+def test_delay_brings_hunting_as_its_pade_approximation_says():
     """An FRD holds the delay itself; ten poles of Pade's approximation simulate it."""
     delay, pid = 0.02, 100 + 20 * s
     omega = np.geomspace(1.0, 2000.0, 3000)
@@ -281,14 +273,14 @@ def test_delay_brings_hunting_as_its_pade_approximation_says() -> None:
     assert approximate.frequency_hz == pytest.approx(cycle.frequency_hz, rel=1e-6)
 
 
-def test_discrete_loop_nears_its_continuous_origin() -> None:
+def test_discrete_loop_nears_its_continuous_origin():
     (cycle,) = described(HUNTING, FRICTION)
     (sampled,) = described(control.c2d(control.ss(HUNTING), 1e-3, "tustin"), FRICTION)
     assert sampled.amplitude == pytest.approx(cycle.amplitude, rel=1e-3)
     assert sampled.stable
 
 
-def test_python_control_finds_the_same_crossings() -> None:
+def test_python_control_finds_the_same_crossings():
     cycles = described(ACTIVE, GRIP)
     theirs = control.describing_function_response(
         control.tf([1.0], [0.3, -0.3, 0.3]), FrictionNonlinearity(GRIP),
@@ -299,7 +291,7 @@ def test_python_control_finds_the_same_crossings() -> None:
         assert cycle.omega == pytest.approx(omega, rel=0.02)
 
 
-def test_loebs_criterion_is_the_sign_of_the_growth_rate() -> None:
+def test_loebs_criterion_is_the_sign_of_the_growth_rate():
     for cycle in described(ACTIVE, GRIP):
         slope = complex(GRIP.gradient(cycle.amplitude, ["amplitude"])["amplitude"])
         by_omega = -2.0 * 0.3 * cycle.omega - 0.3j
@@ -307,7 +299,7 @@ def test_loebs_criterion_is_the_sign_of_the_growth_rate() -> None:
         assert cycle.stable == (loeb > 0.0)
 
 
-def test_bad_arguments_are_named() -> None:
+def test_bad_arguments_are_named():
     with pytest.raises(ModelError, match=r"loop holds Dahl\(.*pass it as friction"):
         limit_cycles(ACTIVE + GRIP, GRIP)
     with pytest.raises(ModelError, match=r"friction holds Mass"):
@@ -325,12 +317,12 @@ def test_bad_arguments_are_named() -> None:
     assert LimitCycle(1.0, 0.5, -1.0).omega == pytest.approx(np.pi)
 
 
-def test_an_empty_result_says_why() -> None:
+def test_an_empty_result_says_why():
     calm = limit_cycles(Mass(1.0) + Damper(1.0) + Spring(1.0), GRIP)
     assert calm == ()
     assert "at no amplitude" in repr(calm)
 
 
-def test_a_loop_of_the_wrong_sign_is_refused() -> None:
+def test_a_loop_of_the_wrong_sign_is_refused():
     with pytest.raises(ModelError, match="loop has a negative mass, so its sign is wrong"):
         limit_cycles(-HUNTING, Dahl(f_max=1.0, sigma=1e4))

@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 import math
 
 import mpmath as mp
 import numpy as np
 import pytest
 
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.linear_dahl import (
     describing_function,
     describing_function_gradient,
@@ -17,7 +14,7 @@ SWITCHES = (0.2, 8.0, 75.0, 300.0)  # of the kernel, and of scipy's Bessel funct
 ODD = (1, 3, 5, 7, 9, 11, 13, 15)
 
 
-def grid(per_decade: int) -> FloatArray:
+def grid(per_decade):
     """Amplitudes from 1e-12 to 1e12 at random places of a logarithmic grid, and the switches."""
     rng = np.random.default_rng(20240607)
     steps = np.arange(-12, 12, 1 / per_decade)
@@ -29,7 +26,7 @@ def grid(per_decade: int) -> FloatArray:
     return np.concatenate([full, near, [1e-12, 1e12]])
 
 
-def exact_gradient(beta: float) -> tuple[complex, complex, complex]:
+def exact_gradient(beta):
     """h, -beta h' and h + beta h' from Bessel functions at 100 digits, up to 60 of them lost."""
     with mp.workdps(100):
         b = mp.mpf(beta)
@@ -43,7 +40,7 @@ def exact_gradient(beta: float) -> tuple[complex, complex, complex]:
         return complex(h), complex(-slope), complex(h + slope)
 
 
-def exact_harmonic(beta: float, k: int) -> tuple[complex, complex]:
+def exact_harmonic(beta, k):
     """c_k and beta dc_k/dbeta; the sine part is a finite sum, by integration by parts."""
     with mp.workdps(60):
         b = mp.mpf(beta)
@@ -65,38 +62,38 @@ def exact_harmonic(beta: float, k: int) -> tuple[complex, complex]:
 
 
 @pytest.fixture(scope="module")
-def betas() -> FloatArray:
+def betas():
     return grid(60)
 
 
 @pytest.fixture(scope="module")
-def exact(betas: FloatArray) -> ComplexArray:
+def exact(betas):
     """The three outputs of the gradient at `betas`, shape (3, n)."""
     return np.array([exact_gradient(b) for b in betas]).T
 
 
-def modulus_error(value: ComplexArray, reference: ComplexArray) -> float:
+def modulus_error(value, reference):
     return float(np.max(np.abs(value - reference) / np.abs(reference)))
 
 
-def part_error(value: FloatArray, reference: FloatArray) -> float:
+def part_error(value, reference):
     return float(np.max(np.abs(value / reference - 1.0)))
 
 
-def test_each_part_of_the_describing_function(betas: FloatArray, exact: ComplexArray) -> None:
+def test_each_part_of_the_describing_function(betas, exact):
     h = describing_function(betas)
     assert part_error(h.real, exact[0].real) < 1e-14
     assert part_error(h.imag, exact[0].imag) < 2e-14
 
 
-def test_derivatives_in_modulus(betas: FloatArray, exact: ComplexArray) -> None:
+def test_derivatives_in_modulus(betas, exact):
     h, by_ln_f_max, by_ln_sigma = describing_function_gradient(betas)
     np.testing.assert_array_equal(h, describing_function(betas))
     assert modulus_error(by_ln_f_max, exact[1]) < 1e-13
     assert modulus_error(by_ln_sigma, exact[2]) < 1e-12
 
 
-def test_each_part_of_the_derivatives(betas: FloatArray, exact: ComplexArray) -> None:
+def test_each_part_of_the_derivatives(betas, exact):
     _, by_ln_f_max, by_ln_sigma = describing_function_gradient(betas)
     away = np.abs(np.log(betas / 1.7)) > 0.3  # from the changes of sign
     assert part_error(by_ln_f_max.real, exact[1].real) < 1e-12
@@ -106,7 +103,7 @@ def test_each_part_of_the_derivatives(betas: FloatArray, exact: ComplexArray) ->
 
 
 @pytest.mark.parametrize("k", ODD)
-def test_odd_harmonics_and_their_derivatives(k: int) -> None:
+def test_odd_harmonics_and_their_derivatives(k):
     betas = grid(6)
     c, by_ln_beta = harmonic_gradient(betas, k)
     reference = np.array([exact_harmonic(b, k) for b in betas]).T
@@ -117,7 +114,7 @@ def test_odd_harmonics_and_their_derivatives(k: int) -> None:
 
 
 @pytest.mark.parametrize(("k", "tolerance"), [(31, 1e-11), (101, 1e-9)])
-def test_high_harmonics(k: int, tolerance: float) -> None:
+def test_high_harmonics(k, tolerance):
     switch = k * k / 3.0
     betas = np.array([1e-6, 0.1, 3.0, 100.0, 0.999 * switch, 1.001 * switch, 1e6])
     reference = np.array([exact_harmonic(b, k) for b in betas]).T
@@ -127,7 +124,7 @@ def test_high_harmonics(k: int, tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (3, 4), (2, 0, 3), (8191,), (8193,), (3, 5500)])
-def test_shapes_and_blocks(shape: tuple[int, ...]) -> None:
+def test_shapes_and_blocks(shape):
     beta = 10.0 ** np.random.default_rng(3).uniform(-3.0, 4.0, shape)
     values = (*describing_function_gradient(beta), *harmonic_gradient(beta, 3))
     assert {value.shape for value in values} == {shape}
@@ -137,7 +134,7 @@ def test_shapes_and_blocks(shape: tuple[int, ...]) -> None:
         np.testing.assert_allclose([v[index] for v in values], one_by_one, rtol=1e-12)
 
 
-def test_the_first_harmonic_is_beta_times_h(betas: FloatArray) -> None:
+def test_the_first_harmonic_is_beta_times_h(betas):
     h, _, by_ln_sigma = describing_function_gradient(betas)
     c, by_ln_beta = harmonic_gradient(betas, 1)
     np.testing.assert_array_equal(c, betas * h)
@@ -145,7 +142,7 @@ def test_the_first_harmonic_is_beta_times_h(betas: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("k", [2, 4, 14, 100])
-def test_even_harmonics_are_exactly_zero(k: int) -> None:
+def test_even_harmonics_are_exactly_zero(k):
     for value in harmonic_gradient(np.array([0.0, 1e-12, 1.0, 1e3, 1e12]), k):
         assert value.dtype == np.complex128
         np.testing.assert_array_equal(value, np.zeros(5))

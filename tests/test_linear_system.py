@@ -1,17 +1,15 @@
 """LinearSystem against the lumped elements, scipy's polynomials and python-control itself."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 
 import numpy as np
 import pytest
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray
 from dahl_ident.elements import Dahl, Damper, LinearSystem, Mass, Parameter, Spring
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.units import QUANTITIES, Quantity
+from dahl_ident.units import QUANTITIES
 
 control: Any = importlib.import_module("control")
 
@@ -21,7 +19,7 @@ STIFFNESS: ComplexArray = K - M * OMEGA**2 + 1j * OMEGA * C
 INVERSE = ("receptance", "mobility", "accelerance")
 
 
-def transfer_function(quantity: Quantity) -> Any:
+def transfer_function(quantity):
     s = control.tf("s")
     Z = M * s**2 + C * s + K
     return {
@@ -34,12 +32,12 @@ def transfer_function(quantity: Quantity) -> Any:
     }[quantity]
 
 
-def relative_error(value: ComplexArray, truth: ComplexArray = STIFFNESS) -> float:
+def relative_error(value, truth=STIFFNESS):
     return float(np.max(np.abs(value / truth - 1.0)))
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_every_quantity_of_one_mode_is_the_same_stiffness(quantity: Quantity) -> None:
+def test_every_quantity_of_one_mode_is_the_same_stiffness(quantity):
     element = LinearSystem(transfer_function(quantity), quantity=quantity)
     assert relative_error(element.dynamic_stiffness(1e-3, OMEGA)) < 1e-12
     frd = control.frd(transfer_function(quantity), OMEGA)
@@ -49,7 +47,7 @@ def test_every_quantity_of_one_mode_is_the_same_stiffness(quantity: Quantity) ->
 
 
 @pytest.mark.parametrize("quantity", INVERSE)
-def test_state_space_agrees_with_the_lumped_elements(quantity: Quantity) -> None:
+def test_state_space_agrees_with_the_lumped_elements(quantity):
     element = LinearSystem(control.ss(transfer_function(quantity)), quantity=quantity)
     lumped = Mass(M) + Damper(C) + Spring(K)
     assert (
@@ -60,13 +58,13 @@ def test_state_space_agrees_with_the_lumped_elements(quantity: Quantity) -> None
     )
 
 
-def two_modes(omega: FloatArray) -> ComplexArray:
+def two_modes(omega):
     return np.asarray(
         1.0 / (4.0 - omega**2 + 0.04j * omega) + 0.5 / (100.0 - omega**2 + 0.2j * omega)
     )
 
 
-def test_frd_between_its_points_follows_two_modes_that_a_receptance_spline_misses() -> None:
+def test_frd_between_its_points_follows_two_modes_that_a_receptance_spline_misses():
     omega = np.linspace(0.5, 15.0, 400)
     between = np.linspace(0.52, 14.9, 2111)
     frd = control.frd(two_modes(omega), omega)
@@ -80,7 +78,7 @@ def test_frd_between_its_points_follows_two_modes_that_a_receptance_spline_misse
     assert relative_error(theirs[peak], truth[peak]) > 1e-3
 
 
-def test_frd_in_any_order_and_with_few_points() -> None:
+def test_frd_in_any_order_and_with_few_points():
     shuffled = np.array([3.0, 1.0, 2.0])
     Z = K - M * shuffled**2 + 1j * shuffled * C
     element = LinearSystem(control.frd(1.0 / Z, shuffled), quantity="receptance")
@@ -90,7 +88,7 @@ def test_frd_in_any_order_and_with_few_points() -> None:
     assert single.dynamic_stiffness(0.0, 3.0) == 2.0 + 1.0j
 
 
-def test_frd_is_not_extrapolated() -> None:
+def test_frd_is_not_extrapolated():
     element = LinearSystem(control.frd(1.0 / STIFFNESS, OMEGA), quantity="receptance")
     with pytest.raises(ValidationError, match=r"reaches from 0\.05 to 60 rad/s .* 61 rad/s"):
         element.dynamic_stiffness(1e-3, [1.0, 61.0])
@@ -98,7 +96,7 @@ def test_frd_is_not_extrapolated() -> None:
         element.dynamic_stiffness(1e-3, 0.049)
 
 
-def test_discrete_system_is_evaluated_on_the_unit_circle_up_to_half_its_rate() -> None:
+def test_discrete_system_is_evaluated_on_the_unit_circle_up_to_half_its_rate():
     rate = 50.0
     discrete = control.c2d(transfer_function("receptance"), 1.0 / rate)
     element = LinearSystem(discrete, quantity="receptance")
@@ -111,7 +109,7 @@ def test_discrete_system_is_evaluated_on_the_unit_circle_up_to_half_its_rate() -
         element.dynamic_stiffness(1e-3, [1.0, 158.0])
 
 
-def test_pole_of_the_receptance_is_zero_stiffness() -> None:
+def test_pole_of_the_receptance_is_zero_stiffness():
     s = control.tf("s")
     free_mass = LinearSystem(1 / (M * s**2), quantity="receptance")
     assert free_mass.dynamic_stiffness(1e-3, 0.0) == 0.0
@@ -125,13 +123,13 @@ def test_pole_of_the_receptance_is_zero_stiffness() -> None:
         ("mechanical_impedance", "the mechanical_impedance is .*inf.* at 0 rad/s"),
     ],
 )
-def test_quantity_that_says_nothing_at_rest_is_refused_there(quantity: Quantity, text: str) -> None:
+def test_quantity_that_says_nothing_at_rest_is_refused_there(quantity, text):
     element = LinearSystem(transfer_function(quantity), quantity=quantity)
     with pytest.raises(ValidationError, match=text):
         element.dynamic_stiffness(1e-3, 0.0)
 
 
-def test_nan_in_the_data_is_refused() -> None:
+def test_nan_in_the_data_is_refused():
     element = LinearSystem(control.frd([1.0, np.nan, 2.0], [1.0, 2.0, 3.0]), quantity="mobility")
     with pytest.raises(ValidationError, match=r"the mobility is nan.* at 2 rad/s"):
         element.dynamic_stiffness(1e-3, 1.5)
@@ -150,24 +148,22 @@ def test_nan_in_the_data_is_refused() -> None:
         (control.tf([1.0], [1.0, 0.5], True), None, "discrete without a sampling time"),
     ],
 )
-def test_what_is_no_system_is_refused(
-    system: Any, parameters: dict[str, float] | None, text: str
-) -> None:
+def test_what_is_no_system_is_refused(system, parameters, text):
     with pytest.raises(ValidationError, match=text):
         LinearSystem(system, quantity="receptance", parameters=parameters)
 
 
-def test_quantity_has_to_be_said() -> None:
+def test_quantity_has_to_be_said():
     wrong: Any = "X/F"
     with pytest.raises(ValidationError, match=r"quantity is 'X/F'; expected one of receptance"):
         LinearSystem(transfer_function("receptance"), quantity=wrong)
 
 
-def mode(mass: float, damping: float, stiffness: float) -> Any:
+def mode(mass, damping, stiffness):
     return control.tf([1.0], [mass, damping, stiffness])
 
 
-def test_function_of_parameters_has_the_lumped_elements_derivatives() -> None:
+def test_function_of_parameters_has_the_lumped_elements_derivatives():
     element = LinearSystem(
         mode,
         quantity="receptance",
@@ -190,7 +186,7 @@ def test_function_of_parameters_has_the_lumped_elements_derivatives() -> None:
     np.testing.assert_array_equal(element.stiffness(batch, A, OMEGA), ours.value)
 
 
-def test_argument_of_zero_has_no_step() -> None:
+def test_argument_of_zero_has_no_step():
     element = LinearSystem(
         mode, quantity="receptance", parameters={"mass": M, "damping": 0.0, "stiffness": K}
     )
@@ -198,7 +194,7 @@ def test_argument_of_zero_has_no_step() -> None:
         element.stiffness_gradient(element.known_values(), np.array(1.0), OMEGA)
 
 
-def test_linear_system_with_friction_replaces_the_lumped_part() -> None:
+def test_linear_system_with_friction_replaces_the_lumped_part():
     plant = Dahl(0.1, 30.0) + LinearSystem(transfer_function("receptance"), quantity="receptance")
     lumped = Dahl(0.1, 30.0) + Mass(M) + Damper(C) + Spring(K)
     A = np.geomspace(1e-5, 1.0, 7)[:, None]
@@ -208,7 +204,7 @@ def test_linear_system_with_friction_replaces_the_lumped_part() -> None:
     np.testing.assert_array_equal(third, lumped.dynamic_stiffness(A, OMEGA, harmonic=3))
 
 
-def test_measured_response_has_no_force_over_time() -> None:
+def test_measured_response_has_no_force_over_time():
     element = LinearSystem(control.frd(1.0 / STIFFNESS, OMEGA), quantity="receptance")
     with pytest.raises(ModelError, match=r"receptance of F.*not a rational function of s"):
         element.force([0.0, 1.0])

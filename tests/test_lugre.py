@@ -1,7 +1,5 @@
 """LuGre friction: settled sines, motion in time, and when it cannot be told from Dahl."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
@@ -13,7 +11,7 @@ LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
 
 
 @pytest.mark.parametrize(("A", "omega"), [(3e-3, 1.0), (0.1, 50.0), (3.0, 1e-3)])
-def test_the_settled_force_has_the_harmonics(A: float, omega: float) -> None:
+def test_the_settled_force_has_the_harmonics(A, omega):
     """Against exponential steps over samples that are dense where the motion turns round."""
     fine = np.concatenate([np.geomspace(1e-6, 0.05, 1500), np.linspace(0.05, np.pi / 2, 6001)[1:]])
     quarter = np.concatenate([[0.0], fine])
@@ -31,7 +29,7 @@ def test_the_settled_force_has_the_harmonics(A: float, omega: float) -> None:
     assert LAW.dynamic_stiffness(A, omega, harmonic=2) == pytest.approx(0.0, abs=1e-9 * size)
 
 
-def test_without_stribeck_effect_it_is_linear_dahl_with_a_damper() -> None:
+def test_without_stribeck_effect_it_is_linear_dahl_with_a_damper():
     A, w = np.geomspace(1e-5, 10.0, 13)[:, None], np.array([0.1, 10.0])
     plain = LuGre(2.0, 50.0, 1.0, 0.1, 0.0, 0.7).dynamic_stiffness(A, w)
     dahl = (Dahl(2.0, 50.0) + Damper(0.7)).dynamic_stiffness(A, w)
@@ -43,7 +41,7 @@ def test_without_stribeck_effect_it_is_linear_dahl_with_a_damper() -> None:
                                atol=1e-8 * np.abs(dahl).max())  # fmt: skip
 
 
-def test_the_distance_from_dahl_says_when_sines_show_a_difference() -> None:
+def test_the_distance_from_dahl_says_when_sines_show_a_difference():
     A = np.geomspace(1e-3, 0.3, 10)
     law = LuGre(1.0, 300.0, 1.5, 0.02)
     assert law.distance_from_dahl(A, np.asarray(1e-4)) < 1e-4  # all speeds below Stribeck's
@@ -51,7 +49,7 @@ def test_the_distance_from_dahl_says_when_sines_show_a_difference() -> None:
     assert law.distance_from_dahl(A, np.asarray(1.0)) > 0.02
 
 
-def test_facts_and_refusals() -> None:
+def test_facts_and_refusals():
     with pytest.raises(ModelError, match="depends on the rate"):
         LAW.describing_function(1.0)
     with pytest.raises(ModelError, match="depends on the rate"):

@@ -1,7 +1,5 @@
 """Parallel Jenkins elements: closed forms, Masing's rules, and the density found from data."""
 
-from __future__ import annotations
-
 import re
 
 import mpmath
@@ -20,9 +18,7 @@ from dahl_ident import (
     PowerDamper,
     fit,
 )
-from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.slip_density import slip_density
-from dahl_ident.elements import Element
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.test_generic_friction import Jenkins
 
@@ -30,7 +26,7 @@ SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
 LAW = MaxwellSlip(SLIPS, STIFF)
 
 
-def sliders(x: FloatArray, start: FloatArray) -> FloatArray:
+def sliders(x, start):
     """Return the force of the three elements, each clipped at its limit, step by step."""
     f, total = start, [float(start.sum())]
     for step in np.diff(x):
@@ -40,7 +36,7 @@ def sliders(x: FloatArray, start: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("k", [1, 3, 5, 7])
-def test_a_jenkins_element_against_an_integral(k: int) -> None:
+def test_a_jenkins_element_against_an_integral(k):
     for ratio in (1e-9, 1e-4, 0.3, 0.77, 0.999, 1.0, 1.3):
         found = complex(MaxwellSlip([ratio], [1.0]).dynamic_stiffness(1.0, harmonic=k))
         with mpmath.workdps(30):
@@ -54,7 +50,7 @@ def test_a_jenkins_element_against_an_integral(k: int) -> None:
         assert abs(found - exact) < 1e-11 * size
 
 
-def test_derivatives_are_exact_and_one_sided_at_a_kink() -> None:
+def test_derivatives_are_exact_and_one_sided_at_a_kink():
     A = np.array([0.05, 0.1, 0.2, 0.7, 3.0])
     values = [np.asarray(v) for v in (*STIFF, *SLIPS)]
     for k in (1, 3):
@@ -77,7 +73,7 @@ def test_derivatives_are_exact_and_one_sided_at_a_kink() -> None:
         )
 
 
-def test_the_force_over_time_is_that_of_the_sliders() -> None:
+def test_the_force_over_time_is_that_of_the_sliders():
     rng = np.random.default_rng(0)
     for trial in range(60):
         x = np.cumsum(rng.normal(size=rng.integers(3, 300)) * 10.0 ** rng.uniform(-2.0, 0.0))
@@ -88,7 +84,7 @@ def test_the_force_over_time_is_that_of_the_sliders() -> None:
         np.testing.assert_allclose(LAW.force(x, float(start.sum())), sliders(x, start), atol=1e-11)
 
 
-def test_facts_and_refusals() -> None:
+def test_facts_and_refusals():
     values = [np.asarray(v) for v in (*STIFF, *SLIPS)]
     assert [float(v) for v in LAW.force_limits(values)] == pytest.approx([1.9, 1.9])
     assert [float(v) for v in LAW.knee(values)] == [0.1, 1.0]
@@ -109,7 +105,7 @@ def test_facts_and_refusals() -> None:
         LAW.force([0.0, 1.0], 2.0)
 
 
-def table(law: Element, *, noise: float = 0.0, seed: int = 1) -> FrequencyResponse:
+def table(law, *, noise=0.0, seed=1):
     A, f = np.geomspace(3e-2, 3.0, 24), np.tile([0.5, 1.0], 12)
     rng = np.random.default_rng(seed)
     Z = law.dynamic_stiffness(A, 2.0 * np.pi * f)
@@ -117,7 +113,7 @@ def table(law: Element, *, noise: float = 0.0, seed: int = 1) -> FrequencyRespon
     return FrequencyResponse(f, Z, A)
 
 
-def test_stiffnesses_are_estimated_at_given_and_at_free_slips() -> None:
+def test_stiffnesses_are_estimated_at_given_and_at_free_slips():
     found = fit(table(LAW, noise=0.003), MaxwellSlip(SLIPS))
     for name, true in zip(("stiffness_1", "stiffness_2", "stiffness_3"), STIFF, strict=True):
         estimate = found.params[name]
@@ -131,7 +127,7 @@ def test_stiffnesses_are_estimated_at_given_and_at_free_slips() -> None:
         )
 
 
-def test_the_least_misfit_is_least() -> None:
+def test_the_least_misfit_is_least():
     data = table(LAW + Mass(0.1) + Damper(0.2), noise=0.01)
     found = slip_density(data, Mass(0.1) + Damper())
     assert 0.003 < found.least_misfit < 0.0101
@@ -155,7 +151,7 @@ def test_the_least_misfit_is_least() -> None:
     assert np.sqrt(np.mean(left**2)) == pytest.approx(found.misfit, rel=1e-9)
 
 
-def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements() -> None:
+def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements():
     assert slip_density(table(Dahl(1.0, 6.0))).least_misfit > 0.05
     assert slip_density(table(Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
     assert slip_density(table(LAW)).least_misfit < 0.003
@@ -168,7 +164,7 @@ def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements() -> None:
         (Dahl(1.0, 6.0) + PowerDamper(0.5, 0.5), r"leaves less than \d+ % .*: the rest is noise"),
     ],
 )
-def test_the_verdict_says_what_such_laws_leave(truth: Element, said: str) -> None:
+def test_the_verdict_says_what_such_laws_leave(truth, said):
     data = table(truth, noise=0.01)
     found = fit(data, Dahl(), throw=False)
     assert re.search(said, found.verdict)
@@ -176,7 +172,7 @@ def test_the_verdict_says_what_such_laws_leave(truth: Element, said: str) -> Non
     assert f"{100.0 * bound:.2g} % (rms of the fundamental)" in found.verdict
 
 
-def test_the_density_is_refused() -> None:
+def test_the_density_is_refused():
     data = table(LAW)
     with pytest.raises(ModelError, match="expected linear elements"):
         slip_density(data, Dahl())
@@ -184,7 +180,7 @@ def test_the_density_is_refused() -> None:
         slip_density(data.select(rows=np.arange(24) < 2))
 
 
-def test_the_verdict_is_silent_where_such_laws_leave_more_than_the_model() -> None:
+def test_the_verdict_is_silent_where_such_laws_leave_more_than_the_model():
     data = table(Dahl(1.0, 6.0, alpha=2.0), noise=0.01)
     found = fit(data, Dahl(), throw=False)
     assert found.goodness.objections

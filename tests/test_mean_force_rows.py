@@ -1,31 +1,26 @@
 """Rows of the mean force (k = 0) are real: their real part alone is weighed."""
 
-from __future__ import annotations
-
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import optimize
 
 import dahl_ident as di
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.noise import Student
 from dahl_ident.problem import TableProblem
-from tests.command_line import Runner
 
 F_MAX, SIGMA, ASYMMETRY = 0.8, 400.0, 0.2
 HARMONICS = (0, 1, 2, 3)
 AMPLITUDES = np.geomspace(4e-4, 4e-2, 9)
 
 
-def predicted(f_max: float, sigma: float, asymmetry: float) -> ComplexArray:
+def predicted(f_max, sigma, asymmetry):
     law = di.Dahl(f_max, sigma, asymmetry=asymmetry)
     return np.ravel([law.dynamic_stiffness(AMPLITUDES, harmonic=k) for k in HARMONICS])
 
 
-def covariances() -> FloatArray:
+def covariances():
     """Return a covariance for each row: one part for k = 0, correlated parts for the others."""
     std = np.tile(0.3 / AMPLITUDES**0.5 * 0.02, len(HARMONICS)) * SIGMA * 0.02
     C = np.array([[1.0, 0.4], [0.4, 0.7]]) * std[:, None, None] ** 2
@@ -33,7 +28,7 @@ def covariances() -> FloatArray:
     return C
 
 
-def table(seed: int, dof: float | None = None) -> di.FrequencyResponse:
+def table(seed, dof=None):
     rng = np.random.default_rng(seed)
     C, n = covariances(), AMPLITUDES.size
     e = np.array([rng.multivariate_normal([0.0, 0.0], c) for c in C])
@@ -48,7 +43,7 @@ def table(seed: int, dof: float | None = None) -> di.FrequencyResponse:
     )
 
 
-def whitened(values: FloatArray, data: di.FrequencyResponse) -> FloatArray:
+def whitened(values, data):
     """Return residuals of unit variance: one number for k = 0, two for other rows."""
     rest, C, n = data.response - predicted(*values), covariances(), AMPLITUDES.size
     pairs = np.column_stack([rest.real, rest.imag])[n:]
@@ -56,7 +51,7 @@ def whitened(values: FloatArray, data: di.FrequencyResponse) -> FloatArray:
     return np.concatenate([rest.real[:n] / np.sqrt(C[:n, 0, 0]), others.ravel()])
 
 
-def test_the_fit_is_that_of_the_residuals_written_out() -> None:
+def test_the_fit_is_that_of_the_residuals_written_out():
     data = table(seed=1)
     mine = di.fit(data, di.Dahl(asymmetry=None))
     theirs = optimize.least_squares(
@@ -73,7 +68,7 @@ def test_the_fit_is_that_of_the_residuals_written_out() -> None:
     )
 
 
-def test_chi_square_has_the_mean_of_its_degrees_of_freedom() -> None:
+def test_chi_square_has_the_mean_of_its_degrees_of_freedom():
     values = np.array([F_MAX, SIGMA, ASYMMETRY])
     truth = np.array([np.log(F_MAX), np.log(SIGMA), ASYMMETRY])
     tables = [table(seed) for seed in range(40)]
@@ -87,9 +82,7 @@ def test_chi_square_has_the_mean_of_its_degrees_of_freedom() -> None:
 
 @pytest.mark.parametrize("parts", [1, 2])
 @pytest.mark.parametrize("dof", [5.0, 8.0])
-def test_the_score_of_an_estimated_covariance_varies_as_its_information_says(
-    parts: int, dof: float
-) -> None:
+def test_the_score_of_an_estimated_covariance_varies_as_its_information_says(parts, dof):
     # y' S^-1 y with a covariance S of dof degrees of freedom, true covariance 1: variance of the
     # score and mean of the stated information are one number
     rng = np.random.default_rng(5)
@@ -109,9 +102,7 @@ def test_the_score_of_an_estimated_covariance_varies_as_its_information_says(
     assert 4.0 * spread < 0.05 * np.mean(stated)  # dof + 1.5 in place of dof + 1 moves it by 5 %
 
 
-def test_pictures_and_the_printed_points_show_each_row_as_what_it_is(
-    run: Runner, tmp_path: Path
-) -> None:
+def test_pictures_and_the_printed_points_show_each_row_as_what_it_is(run, tmp_path):
     fit = di.fit(table(seed=4), di.Dahl(asymmetry=None))
     lines = {str(line.get_label()): line for line in fit.plot_residuals().lines}
     second = np.asarray(lines["imaginary part"].get_ydata(), dtype=float)

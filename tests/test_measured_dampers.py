@@ -1,7 +1,5 @@
 """Measured dampers: what laws beyond Dahl find in whole records, from no guess."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -13,7 +11,6 @@ from dahl_ident import (
     Backlash,
     Dahl,
     Damper,
-    Element,
     Mass,
     PowerDamper,
     Record,
@@ -28,7 +25,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], float]:
+def estimated(records, model):
     """Return the estimates, and the share of the force's rms that is left."""
     found = fit(records, model, output="force", throw=False).optimum
     left = np.concatenate(found.problem.split_residuals(found.values))
@@ -36,7 +33,7 @@ def estimated(records: list[Record], model: Element) -> tuple[dict[str, float], 
     return dict(zip(found.problem.names, found.values.tolist(), strict=True)), float(share)
 
 
-def test_a_friction_damper_with_a_gap() -> None:
+def test_a_friction_damper_with_a_gap():
     """Three whole tests at 0.5 Hz: stiffness as others found it; the gap exceeds 3 mm."""
     records = [
         read_record(f, displacement="displacement", force="friction force")
@@ -48,7 +45,7 @@ def test_a_friction_damper_with_a_gap() -> None:
     assert 3.0e-3 < values["gap"] < 4.5e-3
 
 
-def cranked(pattern: str) -> list[Record]:
+def cranked(pattern):
     """Return a series of the magneto-rheological damper, every second record."""
     records = []
     for file in sorted((FOLDER / "mr_damper").glob(pattern))[::2]:
@@ -68,7 +65,7 @@ def cranked(pattern: str) -> list[Record]:
     ("pattern", "most"),
     [("ensaio[0-9]*.1.mat", 0.14), ("ensaio.A.*.mat", 0.12), ("ensaio.vali.*", 0.07)],
 )
-def test_magneto_rheological_dampers_ask_for_a_power_law(pattern: str, most: float) -> None:
+def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     model = Dahl() + PowerDamper() + Spring() + Mass()
     values, share = estimated(cranked(pattern), model)
     assert share < most

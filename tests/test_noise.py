@@ -1,7 +1,5 @@
 """Noise models: residuals and densities against scipy.stats and brute force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,6 @@ from scipy import optimize, stats
 from dahl_ident import Dahl, FrequencyResponse
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.rows import Rows
-from dahl_ident.elements.facts import Sine, StiffnessGradient, Values
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.fitting import solve_many
 from dahl_ident.noise import Measured, Student, bend, noise_for
@@ -25,15 +22,15 @@ MEASURED = TRUE * np.exp(0.05 * (RNG.normal(size=n) + 1j * RNG.normal(size=n)))
 COVARIANCE = np.abs(TRUE)[:, None, None] ** 2 * np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
 
 
-def table(response: ComplexArray = MEASURED, **columns: object) -> FrequencyResponse:
-    return FrequencyResponse(np.ones(n), response, A, **columns)  # type: ignore[arg-type]
+def table(response=MEASURED, **columns):
+    return FrequencyResponse(np.ones(n), response, A, **columns)
 
 
-def pairs(z: ComplexArray) -> FloatArray:
+def pairs(z):
     return np.stack([z.real, z.imag], axis=-1)
 
 
-def test_relative_noise_has_constant_variance_of_ln_gain_and_phase() -> None:
+def test_relative_noise_has_constant_variance_of_ln_gain_and_phase():
     problem = TableProblem(table(), Dahl())
     assert problem.noise == "relative"
     theta = problem.to_search([0.12, 25.0])
@@ -47,7 +44,7 @@ def test_relative_noise_has_constant_variance_of_ln_gain_and_phase() -> None:
     assert problem.log_likelihood(theta, 0.07) == pytest.approx(density, rel=1e-12)
 
 
-def test_absolute_noise_has_constant_variance_in_the_datas_quantity() -> None:
+def test_absolute_noise_has_constant_variance_in_the_datas_quantity():
     problem = TableProblem(table(), Dahl(), noise="absolute")
     theta = problem.to_search([0.12, 25.0])
     expected = pairs(MEASURED - Dahl(0.12, 25.0).describing_function(A))
@@ -56,7 +53,7 @@ def test_absolute_noise_has_constant_variance_in_the_datas_quantity() -> None:
     assert problem.log_likelihood(theta, 0.5) == pytest.approx(density, rel=1e-12)
 
 
-def test_measured_noise_has_the_datas_covariance() -> None:
+def test_measured_noise_has_the_datas_covariance():
     problem = TableProblem(table(covariance=COVARIANCE), Dahl())
     assert problem.noise == "measured"
     assert problem.scale_known
@@ -68,7 +65,7 @@ def test_measured_noise_has_the_datas_covariance() -> None:
     assert np.sum(problem.residuals(theta) ** 2) == pytest.approx(squares, rel=1e-12)
 
 
-def test_few_degrees_of_freedom_count_less_the_farther_a_row_lies() -> None:
+def test_few_degrees_of_freedom_count_less_the_farther_a_row_lies():
     dof = np.array([3.0, 4.0, 6.0, 9.0, 20.0, 50.0, np.inf, np.inf])
     problem = TableProblem(table(covariance=COVARIANCE, dof=dof), Dahl())
     gaussian = TableProblem(table(covariance=COVARIANCE), Dahl())
@@ -81,7 +78,7 @@ def test_few_degrees_of_freedom_count_less_the_farther_a_row_lies() -> None:
     assert rise == pytest.approx(0.5 * np.sum(z - loss), rel=1e-9)
 
 
-def test_stated_covariances_with_few_degrees_of_freedom_hold() -> None:
+def test_stated_covariances_with_few_degrees_of_freedom_hold():
     """600 experiments whose covariances were estimated from 6 degrees of freedom each."""
     rng, dof, tables = np.random.default_rng(11), 6, []
     factor = np.linalg.cholesky(COVARIANCE)
@@ -104,12 +101,12 @@ def test_stated_covariances_with_few_degrees_of_freedom_hold() -> None:
 
 
 @pytest.mark.parametrize("rounding", [0.0, 1e-8])
-def test_few_predictions_find_the_true_amplitudes(rounding: float) -> None:
+def test_few_predictions_find_the_true_amplitudes(rounding):
     """Also where a law is only known to some digits, as from an integration."""
     rng, calls = np.random.default_rng(0), 0
 
     class Rounded(Dahl):
-        def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        def settled(self, values, sine, derivatives):
             nonlocal calls
             calls += 1
             exact = super().settled(values, sine, derivatives)
@@ -124,7 +121,7 @@ def test_few_predictions_find_the_true_amplitudes(rounding: float) -> None:
     assert found == pytest.approx(exact.residuals(theta), rel=1e-5, abs=1e-5)
 
 
-def test_amplitude_errors_are_profiled_out() -> None:
+def test_amplitude_errors_are_profiled_out():
     s = 0.08
     cross = 0.5 * s * A[:, None] * np.sqrt(np.diagonal(COVARIANCE, axis1=1, axis2=2))
     data = table(covariance=COVARIANCE, amplitude_std=s * A, amplitude_covariance=cross)
@@ -137,7 +134,7 @@ def test_amplitude_errors_are_profiled_out() -> None:
         joint[0, 1:] = joint[1:, 0] = cross[row] / A[row]
         inverse: FloatArray = np.asarray(np.linalg.inv(joint), dtype=np.float64)
 
-        def chi_square(error: float, row: int = row, inverse: FloatArray = inverse) -> float:
+        def chi_square(error, row=row, inverse=inverse):
             N = Dahl(0.12, 25.0).describing_function(A[row] * np.exp(-error))
             r = MEASURED[row] - N
             e = np.array([error, r.real, r.imag])
@@ -156,7 +153,7 @@ def test_amplitude_errors_are_profiled_out() -> None:
     np.testing.assert_allclose(J.T @ r, slope, rtol=1e-7)
 
 
-def test_amplitude_errors_do_not_flatten_the_curve() -> None:
+def test_amplitude_errors_do_not_flatten_the_curve():
     """Averaged over 400 tables; taking noisy amplitudes as exact misses sigma by 20 deviations."""
     rng, s = np.random.default_rng(3), 0.3
     true_A = np.geomspace(1e-3, 1e-2, n)
@@ -179,7 +176,7 @@ def test_amplitude_errors_do_not_flatten_the_curve() -> None:
     assert bias[1][1] > 12.0
 
 
-def test_harmonics_refer_to_the_measured_fundamental() -> None:
+def test_harmonics_refer_to_the_measured_fundamental():
     pivot = Dahl(0.1, 30.0)
     both = [pivot.dynamic_stiffness(0.01, harmonic=k) for k in (1, 3)]
     data = FrequencyResponse(np.ones(2), np.multiply(both, 1.1), [0.01, 0.01], harmonic=[1, 3])
@@ -189,7 +186,7 @@ def test_harmonics_refer_to_the_measured_fundamental() -> None:
     assert r[1] == pytest.approx(0.1 * both[1] / (1.1 * np.abs(both[0])))
 
 
-def test_bend_keeps_direction_and_squares_to_the_loss() -> None:
+def test_bend_keeps_direction_and_squares_to_the_loss():
     y = np.array([0.0, 1e-9, 0.5 + 1j, 30.0 - 40.0j])
     rho = Student(np.array(5.0))
     bent, _ = bend(y, [], rho)
@@ -206,7 +203,7 @@ TWO_POINTS = FrequencyResponse(
 )
 
 
-def test_weights_and_density_of_harmonics_are_those_of_their_own_fundamental() -> None:
+def test_weights_and_density_of_harmonics_are_those_of_their_own_fundamental():
     noise = noise_for(Rows.of(TWO_POINTS), "relative")
     np.testing.assert_allclose(noise.weights, [0.2, 0.2, 0.1, 0.1])
     assert noise.log_area == pytest.approx(-4.0 * np.log(5.0 * 10.0))
@@ -214,7 +211,7 @@ def test_weights_and_density_of_harmonics_are_those_of_their_own_fundamental() -
 
 
 @pytest.mark.parametrize("kind", ["relative", "absolute", "measured"])
-def test_replicates_have_the_residuals_that_were_asked_for(kind: str) -> None:
+def test_replicates_have_the_residuals_that_were_asked_for(kind):
     covariance = np.array([[0.5, 0.3], [0.3, 2.0]]) * np.array([1.0, 2.0, 3.0, 4.0])[:, None, None]
     rows = Rows.of(replace(TWO_POINTS, covariance=covariance))
     predicted = rows.response * (1.1 + 0.1j)
@@ -227,7 +224,7 @@ def test_replicates_have_the_residuals_that_were_asked_for(kind: str) -> None:
     np.testing.assert_allclose(noise_for(again, kind).residual(predicted), y, rtol=1e-12)
 
 
-def test_weights_of_a_covariance_count_the_parts_that_have_one() -> None:
+def test_weights_of_a_covariance_count_the_parts_that_have_one():
     covariance = [[[0.5, 0.0], [0.0, 1.5]], [[0.25, 0.0], [0.0, 0.0]]]
     mean = FrequencyResponse([1.0, 1.0], [1 + 1j, 0.5], [1.0, 1.0], covariance=covariance,
                              harmonic=[1, 0], dof=6.0)  # fmt: skip
@@ -239,14 +236,14 @@ def test_weights_of_a_covariance_count_the_parts_that_have_one() -> None:
 
 
 @pytest.mark.parametrize("kind", ["relative", "absolute"])
-def test_residuals_of_harmonics_have_their_own_derivatives(kind: str) -> None:
+def test_residuals_of_harmonics_have_their_own_derivatives(kind):
     noise, h = noise_for(Rows.of(TWO_POINTS), kind), 1e-6
     predicted, by = TWO_POINTS.response * (1.1 + 0.1j), np.array([1.0, -2.0j, 3.0 + 1.0j, 0.5])
     up, down = (noise.residual(predicted + s * h * by) for s in (1.0, -1.0))
     np.testing.assert_allclose(noise.change(predicted, by), (up - down) / (2.0 * h), rtol=1e-8)
 
 
-def test_losses_have_their_own_derivatives() -> None:
+def test_losses_have_their_own_derivatives():
     rho, z, h = Student(np.array(5.0)), np.array([0.3, 2.0, 40.0]), 1e-5
     loss, slope, curvature = rho(z)
     np.testing.assert_allclose(loss, 3.0 * np.log(1.0 + z / 5.0), rtol=1e-14)
@@ -269,13 +266,11 @@ def test_losses_have_their_own_derivatives() -> None:
         ({"harmonic": [1] * 7 + [3]}, None, r"row \[7\] is a harmonic, but no row holds"),
     ],
 )
-def test_data_that_the_noise_model_cannot_weigh(
-    columns: dict[str, object], noise: str | None, message: str
-) -> None:
+def test_data_that_the_noise_model_cannot_weigh(columns, noise, message):
     with pytest.raises(DataError, match=message):
-        TableProblem(table(**columns), Dahl(), noise=noise)  # type: ignore[arg-type]
+        TableProblem(table(**columns), Dahl(), noise=noise)
 
 
-def test_an_unknown_noise_model_is_named() -> None:
+def test_an_unknown_noise_model_is_named():
     with pytest.raises(ValidationError, match="noise is 'white'; expected one of measured"):
         TableProblem(table(), Dahl(), noise="white")

@@ -1,10 +1,6 @@
 """The notebooks: each opens with its aim and holds its outputs; `make docs` compares them."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,16 +10,16 @@ LARGEST = 300_000  # bytes
 NOTEBOOKS = notebooks()
 
 
-def _cells(path: Path) -> list[dict[str, Any]]:
+def _cells(path):
     return list(json.loads(path.read_text(encoding="utf-8"))["cells"])
 
 
-def test_notebooks_are_numbered_without_a_gap() -> None:
+def test_notebooks_are_numbered_without_a_gap():
     assert [int(path.name[:2]) for path in NOTEBOOKS] == list(range(1, len(NOTEBOOKS) + 1))
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_opens_with_its_aim_and_holds_its_outputs(path: Path) -> None:
+def test_opens_with_its_aim_and_holds_its_outputs(path):
     cells = _cells(path)
     opening = "".join(cells[0]["source"])
     assert opening.startswith(f"# {int(path.name[:2])} ")

@@ -1,7 +1,5 @@
 """The package as its users meet it: its names, its weight, its wheel."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import os
@@ -69,24 +67,24 @@ USUAL = {
 }
 
 
-def test_public_names_are_frozen() -> None:
+def test_public_names_are_frozen():
     assert sorted(di.__all__) == PUBLIC_NAMES
 
 
-def test_no_two_classes_share_a_name() -> None:
+def test_no_two_classes_share_a_name():
     files = (ROOT / "dahl_ident").rglob("*.py")
     nodes = (node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8"))))
     names = Counter(n.name.lstrip("_") for n in nodes if isinstance(n, ast.ClassDef))
     assert [name for name, count in names.items() if count > 1] == []
 
 
-def test_rooms_are_reached_through_the_package() -> None:
+def test_rooms_are_reached_through_the_package():
     assert di.control.limit_cycles.__module__.startswith("dahl_ident.control_interop")
     assert di.synthetic.SteppedSine.__doc__
     assert issubclass(di.errors.FitError, di.errors.DahlIdentError)
 
 
-def test_what_a_signature_needs_is_where_the_function_is() -> None:
+def test_what_a_signature_needs_is_where_the_function_is():
     rooms = [di, di.control, di.synthetic]
     for room in rooms:
         for name in room.__all__:
@@ -103,19 +101,19 @@ def test_what_a_signature_needs_is_where_the_function_is() -> None:
 
 @pytest.mark.parametrize("name", PUBLIC_NAMES)
 @pytest.mark.versions
-def test_every_public_name_loads_and_is_documented(name: str) -> None:
+def test_every_public_name_loads_and_is_documented(name):
     value = getattr(di, name)
     assert name in dir(di)
     assert value.__doc__
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
+def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'dahl_ident' has no attribute 'dahl'"):
         di.dahl  # noqa: B018 - the access is the test
 
 
 @pytest.mark.versions
-def test_import_loads_no_heavy_library() -> None:
+def test_import_loads_no_heavy_library():
     code = "import sys, dahl_ident; print(' '.join(sys.modules))"
     loaded = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True
@@ -125,7 +123,7 @@ def test_import_loads_no_heavy_library() -> None:
 
 
 @pytest.mark.versions
-def test_fitting_a_table_loads_only_what_it_needs() -> None:
+def test_fitting_a_table_loads_only_what_it_needs():
     code = "import sys, dahl_ident; dahl_ident.fit; print(' '.join(sys.modules))"
     loaded = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True
@@ -134,7 +132,7 @@ def test_fitting_a_table_loads_only_what_it_needs() -> None:
     assert not heavy & set(loaded)
 
 
-def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
+def test_wheel_installs_and_runs_elsewhere(tmp_path):
     uv = [sys.executable, "-m", "uv"]
     build = [*uv, "build", "--quiet", "--wheel", "--out-dir", str(tmp_path), str(ROOT)]
     subprocess.run(build, check=True)
@@ -166,7 +164,7 @@ def test_wheel_installs_and_runs_elsewhere(tmp_path: Path) -> None:
     assert out[2:] == ["30", "2305"]
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_the_version_is_the_same_everywhere():
     (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     (newest, *_) = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert cited == newest == di.__version__
@@ -179,7 +177,7 @@ SECURITY_RELEASES = {  # the first that mends what is public about earlier ones
 }  # fmt: skip
 
 
-def test_dependencies_begin_at_security_releases_and_pins_meet_them() -> None:
+def test_dependencies_begin_at_security_releases_and_pins_meet_them():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [entry for extra in project["optional-dependencies"].values() for entry in extra]
     wanted = [Requirement(entry) for entry in [*project["dependencies"], *extras]]
@@ -198,7 +196,7 @@ def test_dependencies_begin_at_security_releases_and_pins_meet_them() -> None:
             assert one.specifier.contains(version), f"{one} is pinned to {version}"
 
 
-def test_every_package_that_is_imported_is_declared() -> None:
+def test_every_package_that_is_imported_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [entry for extra in project["optional-dependencies"].values() for entry in extra]
     declared = {Requirement(one).name.lower() for one in [*project["dependencies"], *extras]}

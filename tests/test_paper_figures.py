@@ -5,8 +5,6 @@ paper misprints: gain 4 f_max/(pi A) in gross slip, sigma = 3.2 in Fig. 6, phase
 where sigma A = f_max.
 """
 
-from __future__ import annotations
-
 import math
 
 import mpmath
@@ -15,7 +13,6 @@ import pytest
 from scipy.integrate import quad
 
 from dahl_ident import Dahl, Damper, Mass, Spring, response
-from dahl_ident.arrays import FloatArray
 from tests import paper_series
 
 SIGMA_OF_FIG = {3: 10.0, 4: 3.0, 5: 1.0}
@@ -23,13 +20,13 @@ PLANT = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
 LEVELS = np.geomspace(1e-4, 1e1, 51)[:, None]
 
 
-def test_fig_2_force_at_the_reversals() -> None:
+def test_fig_2_force_at_the_reversals():
     x, force = Dahl(f_max=1.0, sigma=1.0).loop(1.0, points=5)
     np.testing.assert_allclose(x[[0, 2]], [1.0, -1.0])
     np.testing.assert_allclose(force[[0, 2]], [np.tanh(1.0), -np.tanh(1.0)], rtol=1e-14)
 
 
-def partial_sum(friction: Dahl, theta: FloatArray, last: int) -> FloatArray:
+def partial_sum(friction, theta, last):
     """Return the Fourier series of Eqn. 1 for A = 1 up to a harmonic."""
     total = np.zeros(theta.shape)
     for k in range(1, last + 1):
@@ -38,10 +35,10 @@ def partial_sum(friction: Dahl, theta: FloatArray, last: int) -> FloatArray:
     return total
 
 
-def left_over(beta: float, last: int) -> float:
+def left_over(beta, last):
     """Return the r.m.s. force beyond a harmonic, from Eqn. 11 and the paper's own series."""
 
-    def force(theta: float) -> float:
+    def force(theta):
         return -1.0 + (1.0 + math.tanh(beta)) * math.exp(beta * (math.cos(theta) - 1.0))
 
     power = quad(lambda theta: force(theta) ** 2, 0.0, np.pi, epsabs=1e-13)[0] / np.pi
@@ -54,7 +51,7 @@ def left_over(beta: float, last: int) -> float:
 
 
 @pytest.mark.parametrize("sigma", SIGMA_OF_FIG.values(), ids=lambda s: f"sigma={s:g}")
-def test_figs_3_to_5_partial_sums_approach_the_loop(sigma: float) -> None:
+def test_figs_3_to_5_partial_sums_approach_the_loop(sigma):
     friction = Dahl(f_max=1.0, sigma=sigma)
     points = 4097
     _, force = friction.loop(1.0, points=points)
@@ -69,7 +66,7 @@ def test_figs_3_to_5_partial_sums_approach_the_loop(sigma: float) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.32, 1.0, 3.2, 10.0])
-def test_fig_6_gain_and_phase(sigma: float) -> None:
+def test_fig_6_gain_and_phase(sigma):
     friction = Dahl(f_max=1.0, sigma=sigma)
     knee = friction.characteristic_displacement
     assert friction.gain(1e-6 * knee) == pytest.approx(sigma, rel=1e-9)
@@ -82,7 +79,7 @@ def test_fig_6_gain_and_phase(sigma: float) -> None:
     assert np.degrees(friction.phase(far)) == pytest.approx(90.0, abs=0.02)
 
 
-def test_fig_6_curves_are_one_curve_shifted() -> None:
+def test_fig_6_curves_are_one_curve_shifted():
     A = np.geomspace(0.1, 100.0, 61)
     one = Dahl(f_max=1.0, sigma=1.0)
     for sigma in (0.1, 0.32, 3.2, 10.0):
@@ -91,7 +88,7 @@ def test_fig_6_curves_are_one_curve_shifted() -> None:
         np.testing.assert_allclose(other.phase(A / sigma), one.phase(A), rtol=1e-12)
 
 
-def test_fig_7_static_gain_changes_over_between_two_drives() -> None:
+def test_fig_7_static_gain_changes_over_between_two_drives():
     gain = np.abs(
         response(PLANT, 0.0, [1e-4, 0.1, 0.2, 10.0], steady="describing function").receptance
     )
@@ -101,7 +98,7 @@ def test_fig_7_static_gain_changes_over_between_two_drives() -> None:
     assert gain[3] == pytest.approx(1.0 / 0.3, rel=2e-3)
 
 
-def test_fig_7_resonance_moves_from_stiff_and_sharp_to_soft_and_damped() -> None:
+def test_fig_7_resonance_moves_from_stiff_and_sharp_to_soft_and_damped():
     f = np.geomspace(0.01, 10.0, 2000)
     gain = np.abs(response(PLANT, f, LEVELS, steady="describing function").receptance)
     peak = f[np.argmax(gain, axis=1)]

@@ -1,11 +1,8 @@
 """Plans of measurements: optimal, as good as they say, and within every limit."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +10,11 @@ import pytest
 
 import dahl_ident as di
 from benchmarks import planning
-from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics import error_sources, prediction_error
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import solve_many
-from dahl_ident.planning import Plan, forecast
+from dahl_ident.planning import forecast
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime
 from dahl_ident.planning.design import (
     Exchange,
@@ -37,9 +33,7 @@ NEAR = {"f_max": (0.099, 0.101), "sigma": (29.7, 30.3)}
 KNEE = {"displacement": (0.1 * X_C, 10.0 * X_C), "frequency_hz": 5.0}
 
 
-def _objective(
-    seed: int, K: int, P: int, *, targets: int = 0, scatter: float = 0.0, draws: int = 3
-) -> Objective:
+def _objective(seed, K, P, *, targets=0, scatter=0.0, draws=3):
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((draws, K, 2, P)) * rng.lognormal(0.0, 1.0, (1, K, 1, 1))
     offsets = np.broadcast_to(np.eye(2), (draws, K, 2, 2))
@@ -49,7 +43,7 @@ def _objective(
     return Objective((Term(packed, known, scatter, wanted),))
 
 
-def _bench(seed: int, K: int) -> BenchTime:
+def _bench(seed, K):
     rng = np.random.default_rng(seed)
     return BenchTime(
         rng.uniform(1.0, 4.0, K), rng.uniform(0.05, 0.7, K), rng.uniform(0.1, 1.0, K), 0.5, 0.01
@@ -58,7 +52,7 @@ def _bench(seed: int, K: int) -> BenchTime:
 
 class TestContinuousDesign:
     @pytest.mark.parametrize("P", [2, 3, 4])
-    def test_the_derivative_of_ln_det_never_exceeds_the_number_of_parameters(self, P: int) -> None:
+    def test_the_derivative_of_ln_det_never_exceeds_the_number_of_parameters(self, P):
         objective, time = _objective(P, 200, P, draws=1), 7.0
         f = np.random.default_rng(P).uniform(1.0, 5.0, 200)
         design = continuous_design(objective, f, time, tolerance=1e-3, iterations=4000)
@@ -72,7 +66,7 @@ class TestContinuousDesign:
         assert design.seconds.sum() == pytest.approx(time)
 
     @pytest.mark.parametrize(("targets", "scatter"), [(0, 0.3), (1, 0.0), (1, 0.3), (3, 0.3)])
-    def test_no_other_design_is_better(self, targets: int, scatter: float) -> None:
+    def test_no_other_design_is_better(self, targets, scatter):
         objective = _objective(5, 40, 3, targets=targets, scatter=scatter)
         f, rng = np.ones(40), np.random.default_rng(0)
         design = continuous_design(objective, f, 10.0, tolerance=1e-3, iterations=8000)
@@ -85,7 +79,7 @@ class TestContinuousDesign:
         "change",
         [{}, {"starts": np.array([0, 1])}, {"targets": None}, {"targets": None, "departures": 1}],
     )
-    def test_the_gradient_is_that_of_the_value(self, change: dict[str, Any]) -> None:
+    def test_the_gradient_is_that_of_the_value(self, change):
         objective = _objective(3, 6, 3, targets=3, scatter=0.2)
         objective = replace(objective, terms=(replace(objective.terms[0], **change),))
         cycles = np.random.default_rng(1).uniform(1.0, 9.0, 6)
@@ -95,7 +89,7 @@ class TestContinuousDesign:
             (up, _), (down, _) = objective.at(cycles + step), objective.at(cycles - step)
             assert gradient[k] == pytest.approx((up - down) / 2e-5, rel=1e-5)
 
-    def test_scatter_of_a_run_is_two_more_parameters(self) -> None:
+    def test_scatter_of_a_run_is_two_more_parameters(self):
         rng = np.random.default_rng(8)
         rows = rng.standard_normal((1, 5, 2, 3))
         packed = packed_information(rows, np.broadcast_to(np.eye(2), (1, 5, 2, 2)), 0.4)
@@ -109,7 +103,7 @@ class TestContinuousDesign:
 
 
 class TestModelError:
-    def _fit(self) -> Any:
+    def _fit(self):
         """Return a fit of Dahl friction to one with another exponent: 5 % of model error."""
         A = np.geomspace(0.2, 5.0, 12) * X_C
         exact = di.Dahl(F_MAX, SIGMA, alpha=1.6).describing_function(A)
@@ -117,7 +111,7 @@ class TestModelError:
         return di.fit(FrequencyResponse(np.ones(12), exact * np.exp(0.002 * noise.T @ [1, 1j]), A),
                       LINEAR)  # fmt: skip
 
-    def test_departures_predict_what_kriging_does(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_departures_predict_what_kriging_does(self, monkeypatch):
         monkeypatch.setattr(prediction_error, "_NEGLIGIBLE", 1e-9)
         monkeypatch.setattr(error_sources, "_SMOOTH", 1e-9)
         errors = self._fit().errors
@@ -140,7 +134,7 @@ class TestModelError:
         # a plan weighs by all errors, a fit by noise and misfit
         assert own == pytest.approx(errors.generalised, rel=0.02)
 
-    def test_levels_are_spread_by_the_model_error(self) -> None:
+    def test_levels_are_spread_by_the_model_error(self):
         fit, limits = self._fit(), {**KNEE, "time": 60}
         plan = di.plan(fit, limits=limits, target="response", candidates=25)
         alone = di.plan(LINEAR, ranges=NEAR, noise=0.002, limits=limits, candidates=25)
@@ -152,7 +146,7 @@ class TestModelError:
         assert told.before == pytest.approx(weighed, rel=0.15)
         assert told.after > 2.0 * alone.expected["f_max"].after
 
-    def test_time_that_does_not_help_is_not_spent(self) -> None:
+    def test_time_that_does_not_help_is_not_spent(self):
         plan = di.plan(
             LINEAR, ranges=NEAR, limits=KNEE, noise=0.01, scatter=0.02, runs=1,
             target={"f_max": 0.01}, draws=20, candidates=30,
@@ -163,7 +157,7 @@ class TestModelError:
 
 class TestLevelsWithFixedCosts:
     @pytest.mark.parametrize("seed", range(8))
-    def test_exchange_finds_what_brute_force_finds(self, seed: int) -> None:
+    def test_exchange_finds_what_brute_force_finds(self, seed):
         objective, bench, time = _objective(seed, 5, 2), _bench(seed, 5), 16.0
         found = Exchange(objective, bench, np.arange(5)).best(time)
         assert bench.seconds(found.levels, found.cycles) <= time + 1e-9
@@ -171,7 +165,7 @@ class TestLevelsWithFixedCosts:
         assert found.value >= best - 0.01
 
     @pytest.mark.parametrize("seed", range(6))
-    def test_rising_force_is_the_cheapest_order(self, seed: int) -> None:
+    def test_rising_force_is_the_cheapest_order(self, seed):
         beta = np.random.default_rng(seed).uniform(0.05, 3.0, 5)
         bench = BenchTime(np.ones(5), np.exp(-4.0 * beta), np.tanh(beta), 0.0, 0.01)
         least = min(
@@ -180,18 +174,18 @@ class TestLevelsWithFixedCosts:
         )
         assert bench.settling_cycles(bench.order(range(5))).sum() <= least + 1  # rounding
 
-    def test_the_fixed_times_of_many_sets_are_those_of_each(self) -> None:
+    def test_the_fixed_times_of_many_sets_are_those_of_each(self):
         bench, sets = _bench(4, 6), np.array([[0, 3, 5], [4, 1, 2], [5, 0, 1]])
         assert bench.fixed(sets) == pytest.approx([float(bench.fixed(one)) for one in sets])
 
-    def test_settling_follows_the_transient(self) -> None:
+    def test_settling_follows_the_transient(self):
         beta = 0.1
         bench = BenchTime(np.ones(1), np.array([np.exp(-4.0 * beta)]), np.ones(1), 0.0, 0.01)
         (cycles,) = bench.settling_cycles([0])
         # Dahl's force along cycles of a sine at beta, a step at a time, from two starts
         path = np.diff(beta * np.sin(np.linspace(0.0, 2.0 * np.pi, 2001)))
 
-        def after(count: int, force: float) -> float:
+        def after(count, force):
             for dx in np.tile(path, count):
                 force = np.sign(dx) + (force - np.sign(dx)) * np.exp(-abs(dx))
             return float(force)
@@ -201,7 +195,7 @@ class TestLevelsWithFixedCosts:
         assert left[0] <= 0.01 < left[1]
 
 
-def _brute_force(objective: Objective, bench: BenchTime, time: float, most: int) -> float:
+def _brute_force(objective, bench, time, most):
     """Return the best criterion over all sets of levels and whole cycles that use the time."""
     best = -np.inf
     for size in range(1, most + 1):
@@ -222,7 +216,7 @@ def _brute_force(objective: Objective, bench: BenchTime, time: float, most: int)
 
 
 class TestPlan:
-    def test_prediction_is_the_covariance_of_the_fit(self) -> None:
+    def test_prediction_is_the_covariance_of_the_fit(self):
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 30}, noise=0.02)
         errors = _errors(plan, LINEAR.with_values(TRUTH), 0.02, 200)
         achieved = errors.std(axis=0)
@@ -230,13 +224,13 @@ class TestPlan:
         # 200 fits give a standard deviation within 5 %: three of these
         assert achieved == pytest.approx(predicted, rel=0.15)
 
-    def test_it_beats_a_logarithmic_grid(self) -> None:
+    def test_it_beats_a_logarithmic_grid(self):
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 25}, noise=0.02, target="f_max")
         even = plan.search.expected_after(25.0, grid=True)
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
 
     @pytest.mark.parametrize("model", [LINEAR, di.Dahl()])
-    def test_data_of_the_shortest_plan_can_be_used(self, model: Any) -> None:
+    def test_data_of_the_shortest_plan_can_be_used(self, model):
         """One level would be enough for the friction force, were it certain that it slips."""
         limits = {"displacement": (1e-4, 10.0 * X_C), "frequency_hz": 5.0}
         ranges, target = {"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}, {"f_max": 0.02}
@@ -253,7 +247,7 @@ class TestPlan:
         assert "too few to tell a wrong model from noise" in str(short)
 
     @pytest.mark.parametrize("known", [False, True])
-    def test_its_data_alone_can_be_used(self, known: bool) -> None:
+    def test_its_data_alone_can_be_used(self, known):
         """One amplitude, or two levels without a covariance, cannot show a wrong model."""
         limits = {"displacement": (1e-4, 9.0 * X_C), "frequency_hz": 5.0, "time": 60.0}
         plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max", draws=20)
@@ -264,7 +258,7 @@ class TestPlan:
         ]
         assert sum(usable) >= 19
 
-    def test_levels_do_not_lean_on_ranges(self) -> None:
+    def test_levels_do_not_lean_on_ranges(self):
         """In gross slip two close levels would do for the spring if stiffness were known."""
         plan = di.plan(
             LINEAR + di.Spring(), ranges={**NEAR, "stiffness": (29.7, 30.3)}, noise=0.01, draws=20,
@@ -276,12 +270,12 @@ class TestPlan:
         # 118 cycles of 1 % at one level, everything else known: 0.092 %
         assert 0.00092 < plan.expected["stiffness"].after < 0.0012
 
-    def test_information_that_cancels_is_no_error(self) -> None:
+    def test_information_that_cancels_is_no_error(self):
         found = forecast.covariance_of(np.array([[[1e20, 1e20], [1e20, 1e20]]]))
         assert np.all(np.isfinite(found))
         assert np.all(np.diagonal(found[0]) >= 0.0)
 
-    def test_a_target_is_reached_in_the_least_time(self) -> None:
+    def test_a_target_is_reached_in_the_least_time(self):
         target = {"f_max": 0.004, "f_max/sigma": 0.006}
         common: dict[str, Any] = {"ranges": NEAR, "noise": 0.02, "draws": 20}
         plan = di.plan(LINEAR, limits=KNEE, target=target, **common)
@@ -293,7 +287,7 @@ class TestPlan:
         assert not less.reached
         assert less.seconds <= 0.93 * plan.seconds
 
-    def test_a_time_that_rounding_exceeds_still_counts(self) -> None:
+    def test_a_time_that_rounding_exceeds_still_counts(self):
         """Whole cycles fill the first time tried but for rounding; a tenth is enough."""
         limits = {"displacement": (1e-4, 1e-2), "frequency_hz": 5.0}
         ranges = {"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}
@@ -303,7 +297,7 @@ class TestPlan:
         assert plan.reached
         assert plan.seconds < 5.0
 
-    def test_a_plan_takes_at_most_a_month(self) -> None:
+    def test_a_plan_takes_at_most_a_month(self):
         plan = di.plan(
             LINEAR, ranges=NEAR, limits=KNEE, noise=0.02, target={"f_max": 1e-9}, draws=10,
             candidates=20,
@@ -312,7 +306,7 @@ class TestPlan:
         assert plan.seconds == pytest.approx(30.0 * 86400.0, rel=1e-3)
         assert "no plan takes more than 30 days" in str(plan)
 
-    def test_drives_that_friction_cannot_hold_are_left_out(self) -> None:
+    def test_drives_that_friction_cannot_hold_are_left_out(self):
         plan = di.plan(
             LINEAR, ranges={"f_max": (0.05, 0.2), "sigma": (15.0, 60.0)}, controlled="force",
             noise=0.01, limits={"force": 1.0, "frequency_hz": 5.0, "time": 60.0}, candidates=60,
@@ -320,7 +314,7 @@ class TestPlan:
         draws = plan.search.forecast.knowledge.values
         assert max(step.level for step in plan.steps) < draws[:, 0].min()
 
-    def test_earlier_data_shorten_it(self) -> None:
+    def test_earlier_data_shorten_it(self):
         rng = np.random.default_rng(2)
         A = np.geomspace(0.01, 0.3, 12) * X_C
         clean = di.Dahl(F_MAX, SIGMA).describing_function(A)
@@ -340,7 +334,7 @@ class TestPlan:
         # what is missing is f_max: the plan goes where it shows
         assert max(step.level for step in after.steps) > 2.0 * X_C
 
-    def test_every_limit_is_kept_and_the_one_that_prevents_is_named(self) -> None:
+    def test_every_limit_is_kept_and_the_one_that_prevents_is_named(self):
         limits = {"displacement": (1e-4 * X_C, 1e-3 * X_C), "frequency_hz": (1, 5), "time": 600}
         plan = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01)
         assert all(step.level <= 1.0001e-3 * X_C for step in plan.steps)
@@ -356,7 +350,7 @@ class TestPlan:
             N = abs(di.Dahl(F_MAX, SIGMA).describing_function(step.level))
             assert step.level * N <= 0.08 * 1.02
 
-    def test_a_suspected_exponent_is_seen(self) -> None:
+    def test_a_suspected_exponent_is_seen(self):
         limits = {**KNEE, "time": 60}
         plain = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="f_max")
         careful = di.plan(
@@ -366,7 +360,7 @@ class TestPlan:
         assert _exponent_error(careful) <= 0.02 < _exponent_error(plain)
         assert careful.reached
 
-    def test_an_assumed_exponent_counts_as_in_a_fit(self) -> None:
+    def test_an_assumed_exponent_counts_as_in_a_fit(self):
         plan = di.plan(di.Dahl(), ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.02)
         assert plan.expected["alpha"].before == pytest.approx(np.log(4.0) / np.sqrt(12.0))
         fit = di.fit(_measured(plan, 0.02, 1), di.Dahl())
@@ -374,7 +368,7 @@ class TestPlan:
             found = fit.params[name]
             assert found.stderr / found.value == pytest.approx(plan.expected[name].after, rel=0.25)
 
-    def test_a_suspected_lack_of_symmetry_needs_even_harmonics(self) -> None:
+    def test_a_suspected_lack_of_symmetry_needs_even_harmonics(self):
         plan = di.plan(
             LINEAR, ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.01,
             larger=di.Dahl(asymmetry=0.05),
@@ -382,14 +376,14 @@ class TestPlan:
         )  # fmt: skip
         assert plan.reached
 
-    def test_parameters_of_either_sign_are_planned(self) -> None:
+    def test_parameters_of_either_sign_are_planned(self):
         plan = di.plan(
             di.BoucWen(), ranges={"sigma": (29.0, 31.0), "q": (200.0, 400.0), "p": (-100.0, 300.0)},
             limits={**KNEE, "time": 60}, noise=0.01, draws=20, candidates=40,
         )  # fmt: skip
         assert all(e.after < 0.25 for e in plan.expected.values())
 
-    def test_a_suspected_gap_is_seen(self) -> None:
+    def test_a_suspected_gap_is_seen(self):
         plan = di.plan(
             LINEAR, ranges=NEAR, limits={**KNEE, "time": 60}, noise=0.01, draws=20,
             larger=di.Backlash(di.Dahl(alpha=1.0), gap=0.5 * X_C), suspects={"gap": 0.02},
@@ -398,7 +392,7 @@ class TestPlan:
         assert plan.reached
         assert sum(step.level > 0.25 * X_C for step in plan.steps) > 1
 
-    def test_scatter_asks_for_more_runs(self) -> None:
+    def test_scatter_asks_for_more_runs(self):
         limits = {**KNEE, "time": 300}
         one = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="sigma")
         many = di.plan(LINEAR, ranges=NEAR, limits=limits, noise=0.01, target="sigma", scatter=0.02)
@@ -406,7 +400,7 @@ class TestPlan:
         assert many.expected["sigma"].scatter_share > 0.5
         assert many.seconds <= 300.0
 
-    def test_least_time_with_scatter_takes_as_few_runs_as_needed(self) -> None:
+    def test_least_time_with_scatter_takes_as_few_runs_as_needed(self):
         # 2 % between runs leaves 1 % only with more than four
         plan = di.plan(
             LINEAR, ranges=NEAR, limits={**KNEE, "time": 3000}, noise=0.01, scatter=0.02,
@@ -415,7 +409,7 @@ class TestPlan:
         assert (plan.reached, plan.runs) == (True, 5)
         assert plan.seconds < 320.0
 
-    def test_an_expanded_uncertainty_is_wanted_by_name(self) -> None:
+    def test_an_expanded_uncertainty_is_wanted_by_name(self):
         common: dict[str, Any] = {"ranges": NEAR, "limits": KNEE, "noise": 0.02, "draws": 20}
         standard = di.plan(LINEAR, target={"f_max": 0.004}, **common)
         expanded = di.plan(LINEAR, target={"U(f_max)": 0.008}, **common)
@@ -425,7 +419,7 @@ class TestPlan:
         assert told["U(f_max)"].after == pytest.approx(2.0 * told["f_max"].after, rel=1e-4)
         assert "U(...) expanded" in str(expanded)
 
-    def test_few_runs_widen_an_expanded_uncertainty(self) -> None:
+    def test_few_runs_widen_an_expanded_uncertainty(self):
         plan = di.plan(
             LINEAR, ranges=NEAR, limits={**KNEE, "time": 600}, noise=0.001, scatter=0.02, runs=4,
             target=["U(f_max)"], draws=20, candidates=40,
@@ -434,7 +428,7 @@ class TestPlan:
         # Student's t of three degrees of freedom: 3.31 at 95.45 %; scatter is nearly all
         assert told["U(f_max)"].after == pytest.approx(3.31 * told["f_max"].after, rel=0.02)
 
-    def test_a_driven_plant_is_planned_by_its_drive(self) -> None:
+    def test_a_driven_plant_is_planned_by_its_drive(self):
         plant = LINEAR + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
         plan = di.plan(
             plant, ranges=NEAR, controlled="force", noise=0.01, draws=30, candidates=100,
@@ -445,7 +439,7 @@ class TestPlan:
         assert errors.std(axis=0) == pytest.approx(predicted, rel=0.22)
         assert all(0.02 <= step.level <= 2.0 for step in plan.steps)
 
-    def test_points_with_several_amplitudes_are_avoided(self) -> None:
+    def test_points_with_several_amplitudes_are_avoided(self):
         plant = LINEAR + di.Mass(0.3) + di.Damper(-0.24) + di.Spring(3.0)
         drive, f = np.geomspace(0.05, 1.0, 12), np.full(12, 0.5)
         known = plant.with_values(TRUTH)
@@ -462,7 +456,7 @@ class TestPlan:
         single = drive[count == 1]
         assert all(np.isclose(single, step.level).any() for step in plan.steps)
 
-    def test_the_waveform_holds_the_plan(self, tmp_path: Path) -> None:
+    def test_the_waveform_holds_the_plan(self, tmp_path):
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02)
         place = plan.write_waveform(tmp_path / "exciter.csv", 200.0)
         table = np.loadtxt(place, delimiter=",", skiprows=1)
@@ -475,7 +469,7 @@ class TestPlan:
         with pytest.raises(ValidationError, match="at least ten samples a cycle: 50"):
             plan.write_waveform(tmp_path / "coarse.csv", 10.0)
 
-    def test_text_picture_and_data(self, tmp_path: Path) -> None:
+    def test_text_picture_and_data(self, tmp_path):
         plan = di.plan(LINEAR, ranges=NEAR, limits={**KNEE, "time": 20}, noise=0.02, draws=10)
         assert f"{len(plan.steps)} levels in" in str(plan)
         assert plan.to_frame()["seconds"].sum() == pytest.approx(plan.seconds)
@@ -505,7 +499,7 @@ class TestPlan:
             ({"ranges": {**NEAR, "c": (1, 2)}}, "ranges names c"),
         ],
     )
-    def test_bad_input_says_what_to_do(self, options: dict[str, Any], message: str) -> None:
+    def test_bad_input_says_what_to_do(self, options, message):
         good: dict[str, Any] = {
             "ranges": NEAR,
             "limits": {**KNEE, "time": 30},
@@ -520,7 +514,7 @@ class TestProof:
     """Small versions of ``python -m benchmarks.planning``, which has the numbers at full size."""
 
     @pytest.mark.parametrize("index", [0, 1])
-    def test_intervals_are_narrower_than_a_grid_makes_them(self, index: int) -> None:
+    def test_intervals_are_narrower_than_a_grid_makes_them(self, index):
         for row in planning.compare(planning.scenarios()[index], 150, 100 + index):
             # of 150 tables the error of a standard deviation is 5.8 %
             assert row.agreement == pytest.approx(1.0, abs=0.18)
@@ -528,11 +522,11 @@ class TestProof:
                 assert row.gain > planning.GAIN
 
     @pytest.mark.parametrize("off", [30.0, 1.0 / 30.0])
-    def test_a_sequence_recovers_from_a_poor_guess(self, off: float) -> None:
+    def test_a_sequence_recovers_from_a_poor_guess(self, off):
         spent, oracle = planning.sequence(off, seed=0)
         assert spent <= planning.SEQUENCE * oracle
 
-    def test_whole_experiments_give_what_was_predicted(self) -> None:
+    def test_whole_experiments_give_what_was_predicted(self):
         scenario = planning.scenarios()[1]
         plan = scenario.plan(50.0, None)
         got = planning.achieved(scenario, planning.Design.of(plan), 30, 0, whole=True)
@@ -541,7 +535,7 @@ class TestProof:
             assert error == pytest.approx(plan.expected[name].after, rel=0.4)
 
 
-def _measured(plan: Plan, noise: float, seed: int, *, known: bool = True) -> FrequencyResponse:
+def _measured(plan, noise, seed, *, known=True):
     """Return a table measured as the plan says, with its covariance where that is known."""
     A = np.array([step.level for step in plan.steps])
     std = noise / np.sqrt([step.measured_cycles for step in plan.steps])
@@ -552,7 +546,7 @@ def _measured(plan: Plan, noise: float, seed: int, *, known: bool = True) -> Fre
     return FrequencyResponse(np.full(len(A), 5.0), response, A, covariance=covariance)
 
 
-def _errors(plan: Plan, truth: di.Model, noise: float, count: int) -> FloatArray:
+def _errors(plan, truth, noise, count):
     """Return relative errors of f_max and sigma in fits to tables measured as the plan says."""
     rng = np.random.default_rng(3)
     steps = [step for step in plan.steps for _ in range(plan.runs)]
@@ -580,7 +574,7 @@ def _errors(plan: Plan, truth: di.Model, noise: float, count: int) -> FloatArray
     return np.asarray(found[:, own] / [F_MAX, SIGMA] - 1.0)
 
 
-def _exponent_error(plan: Plan) -> float:
+def _exponent_error(plan):
     """Return the standard uncertainty of ln alpha when the plan is fitted with it free."""
     A = np.array([step.level for step in plan.steps])
     std = 0.01 / np.sqrt([step.measured_cycles for step in plan.steps])

@@ -1,10 +1,7 @@
 """Plans of motions in time: as good as they say, the best of all, and within every limit."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +9,8 @@ import pytest
 
 import dahl_ident as di
 from benchmarks import planning
-from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
-from dahl_ident.planning import Multisine, Plan, Trapezoid
+from dahl_ident.planning import Multisine, Trapezoid
 from dahl_ident.problem import RecordProblem
 
 TRUTH = {"f_max": 0.1, "sigma": 30.0}
@@ -31,14 +27,14 @@ FEW: tuple[Motion, ...] = (
 )
 
 
-def _plan(candidates: Any, limits: Any, **options: Any) -> Plan:
+def _plan(candidates, limits, **options):
     return di.plan(
         LINEAR, ranges=NEAR, noise={"force": NOISE}, sample_rate=RATE, candidates=candidates,
         limits={**BENCH, **limits}, draws=6, **options,
     )  # fmt: skip
 
 
-def _covariance(motions: list[tuple[Any, int]]) -> FloatArray:
+def _covariance(motions):
     """Return that of ln f_max and ln sigma by a fit to the records at every sample."""
     records = []
     for motion, repeats in motions:
@@ -56,7 +52,7 @@ def _covariance(motions: list[tuple[Any, int]]) -> FloatArray:
 
 class TestMotions:
     @pytest.mark.parametrize("motion", [*FEW, Trapezoid(0.001, 0.2, 0.1), Multisine(0.3, 3.1, 1.0)])
-    def test_a_period_starts_and_ends_at_rest_within_its_peaks(self, motion: Motion) -> None:
+    def test_a_period_starts_and_ends_at_rest_within_its_peaks(self, motion):
         time = np.linspace(0.0, 2.0 * motion.period, 200_001)
         x = motion.displacement(time)
         v = np.gradient(x, time)
@@ -66,7 +62,7 @@ class TestMotions:
         assert x[0] == pytest.approx(x[100_000], abs=1e-9 * found[0])
         assert abs(v[0]) < 1e-3 * found[1]
 
-    def test_a_multisine_has_equal_lines_in_its_band(self) -> None:
+    def test_a_multisine_has_equal_lines_in_its_band(self):
         motion = Multisine(0.5, 3.0, 2.0)
         lines = np.abs(np.fft.rfft(motion.displacement(np.arange(64) / 32.0))) / 32.0
         assert lines[1:7] == pytest.approx(np.full(6, lines[1]), rel=1e-9)
@@ -76,25 +72,25 @@ class TestMotions:
 
 class TestPlan:
     @pytest.mark.parametrize("motion", FEW)
-    def test_the_prediction_is_the_covariance_of_the_records_fit(self, motion: Motion) -> None:
+    def test_the_prediction_is_the_covariance_of_the_records_fit(self, motion):
         plan = _plan([motion], {"time": 20.0})
         (step,) = plan.steps
         expected = np.sqrt(np.diagonal(_covariance([(motion, step.measured_cycles)])))
         told = [plan.expected[name].after for name in TRUTH]
         assert told == pytest.approx(expected.tolist(), rel=0.02)
 
-    def test_few_repeats_pay_for_the_state_at_the_start(self) -> None:
+    def test_few_repeats_pay_for_the_state_at_the_start(self):
         # two repeats of a stroke of 2 x_c: the first is spent on the unknown state
         plan = _plan([FEW[0]], {"time": 1.0 + 2.0 * FEW[0].period + 0.01})
         expected = np.sqrt(np.diagonal(_covariance([(FEW[0], 2)])))
         assert [plan.expected[name].after for name in TRUTH] == pytest.approx(expected, rel=0.02)
 
     @pytest.mark.parametrize("target", ["sigma", None])
-    def test_brute_force_finds_nothing_better(self, target: str | None) -> None:
+    def test_brute_force_finds_nothing_better(self, target):
         time, best = 16.0, np.inf
         plan = _plan(FEW, {"time": time}, target=target)
 
-        def loss(covariance: FloatArray) -> float:
+        def loss(covariance):
             if target is None:
                 return float(np.linalg.slogdet(covariance)[1]) / 2.0
             return float(np.log(covariance[1, 1]))
@@ -118,7 +114,7 @@ class TestPlan:
         assert own <= best + 0.03  # 1.5 % of a standard uncertainty
 
     @pytest.mark.parametrize("kind", ["trapezoid", "multisine"])
-    def test_a_target_is_reached_within_every_limit(self, kind: str) -> None:
+    def test_a_target_is_reached_within_every_limit(self, kind):
         plan = _plan(kind, {"force": 0.11, "speed": 0.03}, target={"f_max": 0.002, "sigma": 0.003})
         assert plan.reached
         assert all(
@@ -131,14 +127,14 @@ class TestPlan:
         assert not less.reached
         assert "the limit of time prevents it" in str(less)
 
-    def test_simulated_experiments_achieve_what_is_predicted(self) -> None:
+    def test_simulated_experiments_achieve_what_is_predicted(self):
         plan = _plan("trapezoid", {"time": 20.0})
         achieved = planning.achieved_by_records(plan, LINEAR, TRUTH, RATE, NOISE, 40, seed=1)
         for name, error in achieved.items():
             # of 40 experiments the error of a standard deviation is 11 %
             assert plan.expected[name].after == pytest.approx(error, rel=0.33)
 
-    def test_earlier_records_shorten_it(self) -> None:
+    def test_earlier_records_shorten_it(self):
         time = np.arange(800) / RATE
         x = FEW[0].displacement(time)
         noise = NOISE * np.random.default_rng(0).standard_normal(time.size)
@@ -168,7 +164,7 @@ class TestPlan:
         assert told.after <= 0.003
         assert plan.seconds <= _plan("trapezoid", {}, target=target).seconds
 
-    def test_a_motion_of_few_long_repeats_is_not_preferred(self) -> None:
+    def test_a_motion_of_few_long_repeats_is_not_preferred(self):
         # with a repeat counted as in a long record, the plan took 1.26 times the best motion alone
         target = {"f_max": 0.002, "sigma": 0.003}
         plan = _plan("trapezoid", {}, target=target)
@@ -179,14 +175,14 @@ class TestPlan:
         assert plan.reached
         assert plan.seconds < 1.05 * min(one.seconds for one in alone if one.reached)
 
-    def test_the_curve_goes_through_the_plan(self) -> None:
+    def test_the_curve_goes_through_the_plan(self):
         plan = _plan("trapezoid", {}, target={"f_max": 0.002, "sigma": 0.003})
         for name, (times, planned, _) in plan.curves().items():
             at = times.tolist().index(plan.seconds)
             assert planned[at] == plan.expected[name].after <= plan.target[name]
             assert (np.diff(planned[np.isfinite(planned)]) < 0.0).all()
 
-    def test_motions_of_two_kinds_stand_below_their_own_headings(self) -> None:
+    def test_motions_of_two_kinds_stand_below_their_own_headings(self):
         first, second = (_plan([one], {"time": 10.0}) for one in (FEW[1], FEW[3]))
         text = str(replace(first, steps=first.steps + second.steps)).splitlines()
         heading = next(line for line in text if "stroke [m]" in line)
@@ -201,7 +197,7 @@ class TestPlan:
             end = heading.index(column) + len(column)
             assert lines[kind][:end].split()[-1] == value
 
-    def test_the_move_to_the_start_stays_within_the_limits(self, tmp_path: Path) -> None:
+    def test_the_move_to_the_start_stays_within_the_limits(self, tmp_path):
         limits = {"time": 30.0, "speed": 0.05, "acceleration": 0.5}
         motion = (Trapezoid(0.02, 0.02, 0.4),)
         # of a quintic over 0.01 m: 15/8 0.01/0.05 s by its speed, less by its acceleration
@@ -218,7 +214,7 @@ class TestPlan:
         with pytest.raises(ValidationError, match=r"start of motion 1 takes 0\.38 s"):
             _plan(motion, hard, change_over=0.377).write_waveform(tmp_path / "hard.csv", 1000.0)
 
-    def test_the_table_and_the_waveform_hold_the_plan(self, tmp_path: Path) -> None:
+    def test_the_table_and_the_waveform_hold_the_plan(self, tmp_path):
         plan = _plan((FEW[1], FEW[3]), {"time": 30.0}, target="sigma")
         table = plan.to_frame()
         assert table["seconds"].sum() == pytest.approx(plan.seconds)
@@ -263,7 +259,7 @@ class TestPlan:
             ({"limits": {**BENCH, "time": 0.5}}, "the quickest motion takes"),
         ],
     )
-    def test_bad_input_says_what_to_do(self, options: dict[str, Any], message: str) -> None:
+    def test_bad_input_says_what_to_do(self, options, message):
         good: dict[str, Any] = {
             "ranges": NEAR, "noise": {"force": NOISE}, "sample_rate": RATE, "draws": 3,
             "candidates": "trapezoid", "limits": {**BENCH, "time": 30.0},
@@ -271,7 +267,7 @@ class TestPlan:
         with pytest.raises(ValidationError, match=message):
             di.plan(LINEAR, **{**good, **options})
 
-    def test_bad_motions_say_what_was_expected(self) -> None:
+    def test_bad_motions_say_what_was_expected(self):
         with pytest.raises(ValidationError, match="stroke of a trapezoid"):
             Trapezoid(-1.0, 1.0, 1.0)
         with pytest.raises(ValidationError, match="expected rising frequencies"):

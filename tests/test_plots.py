@@ -4,14 +4,11 @@ Pictures are compared with their labels, which must not collide. After a wanted 
 ``pytest tests/test_plots.py --mpl-generate-path=tests/baseline``.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -42,7 +39,7 @@ DRAWS = np.random.default_rng(5).multivariate_normal(
 BASELINE_VERSION = "3.11"
 
 
-def same_picture(draw: Callable[[], Figure]) -> Callable[[], Figure]:
+def same_picture(draw):
     """Compare the figure, labels included, with its picture by the same matplotlib."""
     compare = pytest.mark.mpl_image_compare(
         baseline_dir="baseline", tolerance=4, savefig_kwargs={"dpi": 90}, style="default"
@@ -55,14 +52,14 @@ def same_picture(draw: Callable[[], Figure]) -> Callable[[], Figure]:
     return compared
 
 
-def the_figure(axes: Any) -> Figure:
+def the_figure(axes):
     """Return the figure of some axes, in which no labels collide."""
     figure: Figure = np.ravel(np.asarray(axes, dtype=object))[0].figure
     assert colliding_labels(figure) == []
     return figure
 
 
-def colliding_labels(figure: Any) -> list[tuple[str, str]]:
+def colliding_labels(figure):
     """Return the pairs of texts that overlap, and those that leave the page."""
     page = figure.bbox.padded(1.0)
     boxes = [(t.get_text(), t.get_window_extent(), t.get_rotation() % 90) for t in _drawn(figure)]
@@ -75,12 +72,12 @@ def colliding_labels(figure: Any) -> list[tuple[str, str]]:
     return found
 
 
-def _drawn(figure: Any) -> list[Text]:
+def _drawn(figure):
     """Return the texts that are drawn: tick labels beyond the limits, for one, are not."""
     drawn: list[Text] = []
     draw = Text.draw
 
-    def noted(self: Text, renderer: Any) -> None:
+    def noted(self, renderer):
         if self.get_visible() and self.get_text().strip():
             drawn.append(self)
         draw(self, renderer)
@@ -91,12 +88,12 @@ def _drawn(figure: Any) -> list[Text]:
     return drawn
 
 
-def _inside(box: Bbox, page: Bbox) -> bool:
+def _inside(box, page):
     return bool(page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1)
 
 
 @same_picture
-def test_amplitude_response() -> Figure:
+def test_amplitude_response():
     fine = np.geomspace(A[0], A[-1], 60)
     R = FRICTION.describing_function(fine)
     gain, phase = np.abs(R), np.angle(R)
@@ -109,7 +106,7 @@ def test_amplitude_response() -> Figure:
 
 
 @same_picture
-def test_universal_curve() -> Figure:
+def test_universal_curve():
     beta = np.geomspace(1e-3, 1e4, 200)
     marks = [(1.0, complex(describing_function(np.array([1.0]))[0]))]
     axes = plots.plot_universal_curve(N / 30.0, curve=describing_function(beta), marked_beta=marks)
@@ -117,7 +114,7 @@ def test_universal_curve() -> Figure:
 
 
 @same_picture
-def test_loops() -> Figure:
+def test_loops():
     sizes = (1e-3, 3e-3, 1e-2)
     loops = [(*FRICTION.loop(size), f"{size:g} m") for size in sizes]
     measured = [(x, 1.05 * force) for x, force in (FRICTION.loop(size, 60) for size in sizes)]
@@ -125,7 +122,7 @@ def test_loops() -> Figure:
 
 
 @same_picture
-def test_frequency_response_of_figure_7() -> Figure:
+def test_frequency_response_of_figure_7():
     plant = FRICTION + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
     f = np.geomspace(0.05, 5.0, 40)
     levels = []
@@ -137,12 +134,12 @@ def test_frequency_response_of_figure_7() -> Figure:
 
 
 @same_picture
-def test_residuals() -> Figure:
+def test_residuals():
     return the_figure(plots.plot_residuals(A, SCATTER[0], SCATTER[1], suspicious=[3]))
 
 
 @same_picture
-def test_profile() -> Figure:
+def test_profile():
     value = np.linspace(0.09, 0.11, 21)
     axes = plots.plot_profile(
         value, ((value - 0.1) / 0.004) ** 2, best=0.1, limits={"68 %": 1.0, "95 %": 4.0},
@@ -152,29 +149,29 @@ def test_profile() -> Figure:
 
 
 @same_picture
-def test_correlation() -> Figure:
+def test_correlation():
     return the_figure(plots.plot_correlation(["f_max", "sigma"], [[1.0, -0.7], [-0.7, 1.0]]))
 
 
 @same_picture
-def test_information() -> Figure:
+def test_information():
     share = A / A.sum()
     return the_figure(plots.plot_information(A, {"f_max": share, "sigma": share[::-1]}))
 
 
 @same_picture
-def test_corner() -> Figure:
+def test_corner():
     return the_figure(plots.plot_corner(["a [N]", "b [m]"], DRAWS, truth={"a [N]": 1.05}))
 
 
 @same_picture
-def test_trace() -> Figure:
+def test_trace():
     chain = DRAWS.reshape(100, 30, 2)
     return the_figure(plots.plot_trace(["a", "b"], chain, discard=20))
 
 
 @same_picture
-def test_cycles() -> Figure:
+def test_cycles():
     decay = 0.5 ** np.arange(8)
     axes = plots.plot_cycles(
         30.0 + 5j + decay * (1 - 2j), 1e-3 * decay, left_out=2, response_std=0.05, mean_std=1e-5
@@ -183,7 +180,7 @@ def test_cycles() -> Figure:
 
 
 @same_picture
-def test_budget() -> Figure:
+def test_budget():
     shares = {"noise": (0.2, 0.05), "force calibration": (0.75, 0.9), "between runs": (0.05, 0.05)}
     rows = [
         (name, source, share)
@@ -194,20 +191,20 @@ def test_budget() -> Figure:
 
 
 @same_picture
-def test_margins() -> Figure:
+def test_margins():
     gain = np.where(A > 1e-2, np.inf, 1.0 / A)
     return the_figure(plots.plot_margins(A, gain, 50.0 + 1e3 * A))
 
 
 @same_picture
-def test_nichols() -> Figure:
+def test_nichols():
     f = np.geomspace(0.1, 10.0, 50)
     levels = [(f"{k} N", 1.0 / (1.0 - f**2 + 0.2j * k * f)) for k in (1, 2, 4)]
     return the_figure(plots.plot_nichols(levels, gain_label="receptance [m/N]"))
 
 
 @same_picture
-def test_waveforms() -> Figure:
+def test_waveforms():
     t = np.linspace(0.0, 2.0, 400)
     x = 1e-2 * np.sin(2 * np.pi * t)
     force = FRICTION.force(x)
@@ -216,7 +213,7 @@ def test_waveforms() -> Figure:
 
 
 @pytest.mark.versions
-def test_records_draw_themselves() -> None:
+def test_records_draw_themselves():
     record = di.Record([0.0, 0.1, 0.2], velocity=[0.0, 1.0, 0.0], force=[0.0, 2.0, 1.0])
     rows = record.plot()
     assert [axis.get_ylabel() for axis in rows] == ["velocity [m/s]", "force [N]"]
@@ -230,7 +227,7 @@ def test_records_draw_themselves() -> None:
     plt.close("all")
 
 
-def test_margins_that_are_infinite_everywhere_are_drawn() -> None:
+def test_margins_that_are_infinite_everywhere_are_drawn():
     margins = LoopMargins(A, np.full(12, np.inf), np.full(12, 60.0), np.ones(12))
     top, _ = margins.plot()
     assert [text.get_text() for text in top.get_legend().get_texts()] == ["infinite"]
@@ -252,7 +249,7 @@ AWKWARD = {  # name, centre, spread, logarithmic
 }
 
 
-def _awkward(count: int) -> tuple[list[str], np.ndarray[Any, Any], list[bool]]:
+def _awkward(count):
     chosen = list(AWKWARD.values())[:count]
     normal = np.random.default_rng(3).standard_normal((3200, count))
     draws = np.stack(
@@ -267,7 +264,7 @@ def _awkward(count: int) -> tuple[list[str], np.ndarray[Any, Any], list[bool]]:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 @pytest.mark.versions
-def test_labels_of_corner_and_trace_do_not_collide(count: int) -> None:
+def test_labels_of_corner_and_trace_do_not_collide(count):
     names, draws, log = _awkward(count)
     grid = plots.plot_corner(names, draws, log=log)
     assert colliding_labels(grid[0, 0].figure) == []
@@ -278,7 +275,7 @@ def test_labels_of_corner_and_trace_do_not_collide(count: int) -> None:
 
 @pytest.mark.parametrize("name", AWKWARD)
 @pytest.mark.parametrize("width", [2.4, 4.6])
-def test_labels_of_profiles_do_not_collide(name: str, width: float) -> None:
+def test_labels_of_profiles_do_not_collide(name, width):
     label, centre, spread, log = AWKWARD[name]
     z = np.linspace(-3.2, 3.2, 21)
     value = np.exp(centre + spread * z) if log else centre + spread * z
@@ -292,15 +289,15 @@ def test_labels_of_profiles_do_not_collide(name: str, width: float) -> None:
     plt.close("all")
 
 
-def _amplitude(ax: Any) -> Any:
+def _amplitude(ax):
     return plots.plot_amplitude_response(A, N, ax=ax)
 
 
-def _frequency(ax: Any) -> Any:
+def _frequency(ax):
     return plots.plot_frequency_response([("1 N", A, N)], ax=ax)
 
 
-def _cycles(ax: Any) -> Any:
+def _cycles(ax):
     return plots.plot_cycles(N, A, ax=ax)
 
 
@@ -315,7 +312,7 @@ SINGLES: dict[str, Callable[[Axes], Axes]] = {
 }
 
 
-def test_residuals_are_joined_along_each_curve_only() -> None:
+def test_residuals_are_joined_along_each_curve_only():
     axis = plots.plot_residuals([1, 2, 1, 2], [1, 2, 3, 4], [0, 0, 0, 0], group=[0, 0, 1, 1])
     joined = [list(np.asarray(x.get_ydata())) for x in axis.lines if x.get_linestyle() == "-"]
     assert [1, 2] in joined
@@ -324,7 +321,7 @@ def test_residuals_are_joined_along_each_curve_only() -> None:
     plt.close("all")
 
 
-def test_a_fitted_phase_lies_on_the_turn_of_its_points() -> None:
+def test_a_fitted_phase_lies_on_the_turn_of_its_points():
     x = np.array([1.0, 2.0, 3.0])
     measured = np.exp(1j * np.radians([179.0, 181.0, 183.0]))
     fitted = plots.Curve(x, np.exp(1j * np.radians([-181.5, -179.5, -177.5])))
@@ -336,7 +333,7 @@ def test_a_fitted_phase_lies_on_the_turn_of_its_points() -> None:
 
 @pytest.mark.parametrize("draw", SINGLES.values(), ids=SINGLES.keys())
 @pytest.mark.versions
-def test_single_plots_draw_on_the_axes_given(draw: Callable[[Axes], Axes]) -> None:
+def test_single_plots_draw_on_the_axes_given(draw):
     figure, ax = plt.subplots()
     assert draw(ax) is ax
     assert figure.axes == [ax]
@@ -345,7 +342,7 @@ def test_single_plots_draw_on_the_axes_given(draw: Callable[[Axes], Axes]) -> No
 
 @pytest.mark.parametrize("draw", PAIRS)
 @pytest.mark.versions
-def test_plots_of_two_parts_draw_on_the_axes_given(draw: Callable[[Any], Any]) -> None:
+def test_plots_of_two_parts_draw_on_the_axes_given(draw):
     figure, pair = plt.subplots(2, 1)
     assert list(draw(pair)) == list(pair)
     assert len(figure.axes) == 2
@@ -356,14 +353,14 @@ def test_plots_of_two_parts_draw_on_the_axes_given(draw: Callable[[Any], Any]) -
     plt.close(figure)
 
 
-def test_corner_refuses_axes_of_another_shape() -> None:
+def test_corner_refuses_axes_of_another_shape():
     figure, grid = plt.subplots(1, 2)
     with pytest.raises(ValidationError, match=r"ax has shape \(2,\); expected \(2, 2\)"):
         plots.plot_corner(["a", "b"], DRAWS, ax=grid)
     plt.close(figure)
 
 
-def test_only_wide_ranges_are_drawn_over_their_logarithm() -> None:
+def test_only_wide_ranges_are_drawn_over_their_logarithm():
     draws = np.stack([DRAWS[:, 0], np.exp(20.0 * DRAWS[:, 1])], axis=-1)
     grid = plots.plot_corner(["narrow", "wide"], draws, log=[True, True])
     assert (grid[1, 0].get_xscale(), grid[1, 0].get_yscale()) == ("linear", "log")
@@ -373,7 +370,7 @@ def test_only_wide_ranges_are_drawn_over_their_logarithm() -> None:
 
 
 @pytest.mark.versions
-def test_every_axis_has_its_unit() -> None:
+def test_every_axis_has_its_unit():
     top, bottom = _amplitude(None)
     assert (top.get_ylabel(), bottom.get_ylabel()) == ("gain [N/m]", "phase [degrees]")
     assert bottom.get_xlabel() == "displacement amplitude [m]"
@@ -397,18 +394,18 @@ SEEN_BY = {  # matrices of Machado, Oliveira and Fernandes 2009, for missing rec
 }
 
 
-def _luminance(colours: Any) -> Any:
+def _luminance(colours):
     """Return the relative luminance of sRGB colours (WCAG 2)."""
     c = np.asarray(colours)
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return linear @ [0.2126, 0.7152, 0.0722]
 
 
-def _distances(colours: Any) -> Any:
+def _distances(colours):
     return np.linalg.norm(colours[:, None] - colours[None], axis=-1)
 
 
-def test_lines_and_markers_stand_out_from_the_page() -> None:
+def test_lines_and_markers_stand_out_from_the_page():
     """At least 3 to 1 against white (WCAG 2, graphical objects)."""
     levels = [c for n in range(1, 30) for c in style.level_colours(n)]
     for colour in (*style.SERIES, style.FIT, style.GREY, *levels):
@@ -416,7 +413,7 @@ def test_lines_and_markers_stand_out_from_the_page() -> None:
 
 
 @pytest.mark.parametrize("reader", SEEN_BY)
-def test_series_differ_for_every_reader(reader: str) -> None:
+def test_series_differ_for_every_reader(reader):
     colours = np.array([mpl.colors.to_rgb(c) for c in style.SERIES])
     seen = np.clip(colours @ SEEN_BY[reader].T, 0.0, 1.0)
     assert _distances(seen)[np.triu_indices(len(seen), 1)].min() > 0.12
@@ -425,7 +422,7 @@ def test_series_differ_for_every_reader(reader: str) -> None:
 
 @pytest.mark.parametrize("reader", [*SEEN_BY, "grey print"])
 @pytest.mark.parametrize("count", [2, 5, 9, 12])
-def test_levels_differ_for_every_reader(reader: str, count: int) -> None:
+def test_levels_differ_for_every_reader(reader, count):
     """Two levels of one line style or marker differ in colour, in a grey print in lightness."""
     colours = np.array([mpl.colors.to_rgb(c) for c in style.level_colours(count)])
     if reader == "grey print":
@@ -442,7 +439,7 @@ def test_levels_differ_for_every_reader(reader: str, count: int) -> None:
             assert own[i] != own[j] or apart[i, j] > least, (i, j, apart[i, j])
 
 
-def test_repeated_measurements_of_a_level_are_not_joined() -> None:
+def test_repeated_measurements_of_a_level_are_not_joined():
     top, _ = plots.plot_frequency_response(
         [("curve", [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]), ("repeats", [1.0, 1.0, 2.0], [1.0, 3.0, 2.0])]
     )
@@ -457,18 +454,18 @@ def test_repeated_measurements_of_a_level_are_not_joined() -> None:
         (5.0, "N/m", "5 N/m"), (2.5e3, "N", "2.5 kN"), (float("inf"), "N", "inf N"),
     ],
 )  # fmt: skip
-def test_engineering_notation(value: float, unit: str, text: str) -> None:
+def test_engineering_notation(value, unit, text):
     assert engineering(value, unit) == text
 
 
-def test_the_house_style_stays_in_its_figures() -> None:
+def test_the_house_style_stays_in_its_figures():
     before = dict(mpl.rcParams)
     plots.plot_residuals(A, A, A)
     assert dict(mpl.rcParams) == before
     plt.close("all")
 
 
-def test_axes_of_the_user_are_drawn_on_in_the_house_style() -> None:
+def test_axes_of_the_user_are_drawn_on_in_the_house_style():
     with mpl.rc_context({"legend.fontsize": 13.0, "lines.linewidth": 4.0}):
         figure, ax = plt.subplots()
         plots.plot_loops([(A, A, "a")], ax=ax)
@@ -480,7 +477,7 @@ def test_axes_of_the_user_are_drawn_on_in_the_house_style() -> None:
 
 
 @pytest.mark.versions
-def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path: Path) -> None:
+def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path):
     backend = tmp_path / "notebook_like.py"
     backend.write_text(
         "import matplotlib\n"
@@ -500,7 +497,7 @@ def test_a_notebook_stays_interactive_after_the_first_picture(tmp_path: Path) ->
         subprocess.run([sys.executable, "-c", code.format(draw=draw)], check=True, env=environment)
 
 
-def test_residuals_of_a_fit_over_amplitude_frequency_and_velocity() -> None:
+def test_residuals_of_a_fit_over_amplitude_frequency_and_velocity():
     f = np.linspace(0.5, 3.0, 12)
     data = di.FrequencyResponse(f, N * np.exp(0.01 * (SCATTER[0] + 1j * SCATTER[1])), A)
     fit = di.fit(data, di.Dahl(), throw=False)

@@ -1,11 +1,7 @@
 """The posterior that users hold: against importance points, and in every form it takes."""
 
-from __future__ import annotations
-
 import json
 from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,11 +21,11 @@ LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
 @pytest.fixture(scope="module")
-def posterior() -> Posterior:
+def posterior():
     return di.posterior(friction_table(), di.Dahl(), seed=1, uncertainty="noise")
 
 
-def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
+def scenarios():
     gain = di.Sensors(force_gain=stats.norm(1.0, 0.05))
     return {
         "knee": (friction_table(30, noise=0.01), di.Dahl(), {}),
@@ -45,7 +41,7 @@ def scenarios() -> dict[str, tuple[di.FrequencyResponse, Any, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("name", scenarios())
-def test_sampling_agrees_with_integration(name: str) -> None:
+def test_sampling_agrees_with_integration(name):
     data, model, options = scenarios()[name]
     drawn = di.posterior(data, model, seed=3, ess=200.0, **options, uncertainty="noise")
     grid = di.posterior(data, model, **options, method="grid", uncertainty="noise", tolerance=1e-2)
@@ -81,7 +77,7 @@ def test_sampling_agrees_with_integration(name: str) -> None:
             assert abs(squares.mean() - variance) < 4.0 * error
 
 
-def test_the_summary_is_that_of_the_draws(posterior: Posterior) -> None:
+def test_the_summary_is_that_of_the_draws(posterior):
     table = posterior.summary()
     values = posterior.values
     assert list(table.index) == ["f_max", "sigma", "noise_scale"]
@@ -95,7 +91,7 @@ def test_the_summary_is_that_of_the_draws(posterior: Posterior) -> None:
 
 
 @pytest.mark.versions
-def test_emcees_names(posterior: Posterior) -> None:
+def test_emcees_names(posterior):
     whole = posterior.get_chain()
     assert whole.shape == (posterior.steps, 128, 3)
     some = posterior.get_chain(discard=100, thin=3)
@@ -108,7 +104,7 @@ def test_emcees_names(posterior: Posterior) -> None:
         posterior.get_chain(discard=-1)
 
 
-def test_a_short_chain_is_marked_and_keeps_its_ess_to_itself() -> None:
+def test_a_short_chain_is_marked_and_keeps_its_ess_to_itself():
     short = di.posterior(friction_table(), di.Dahl(), seed=1, steps=60, uncertainty="noise")
     assert not short.converged
     assert str(short).startswith("NOT CONVERGED after 60 steps: ")
@@ -117,13 +113,11 @@ def test_a_short_chain_is_marked_and_keeps_its_ess_to_itself() -> None:
     assert "NOT CONVERGED" in repr(short)
 
 
-def test_a_chain_that_never_moved_is_refused_with_its_chain(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def stay(half: Any, guide: Any, random: Any) -> Any:
+def test_a_chain_that_never_moved_is_refused_with_its_chain(monkeypatch):
+    def stay(half, guide, random):
         return half, np.full(half.shape[:-1], -np.inf)
 
-    def moves(ensembles: int, decorrelation: Any) -> list[tuple[EnsembleMove, float]]:
+    def moves(ensembles, decorrelation):
         return [(EnsembleMove(stay, ensembles), 1.0)]
 
     monkeypatch.setattr("dahl_ident.bayes.chain.moves_for", moves)
@@ -132,7 +126,7 @@ def test_a_chain_that_never_moved_is_refused_with_its_chain(
     assert caught.value.posterior.get_chain().shape == (40, 128, 3)
 
 
-def test_the_report_names_priors(posterior: Posterior) -> None:
+def test_the_report_names_priors(posterior):
     text = str(posterior)
     assert text.startswith("Converged: ")
     assert "f_max: log-uniform from" in text
@@ -140,7 +134,7 @@ def test_the_report_names_priors(posterior: Posterior) -> None:
     assert "MISFIT" not in text
 
 
-def test_a_prior_dominated_parameter_is_named() -> None:
+def test_a_prior_dominated_parameter_is_named():
     data = friction_table(10, 0.0003, 0.003, 0.05)
     posterior = di.posterior(data, di.Dahl(), seed=1, uncertainty="noise")
     (rule,) = posterior.prior_influences
@@ -148,7 +142,7 @@ def test_a_prior_dominated_parameter_is_named() -> None:
     assert "f_max is known from its prior: posterior width 0." in str(posterior)
 
 
-def test_derived_quantities(posterior: Posterior) -> None:
+def test_derived_quantities(posterior):
     x_c = posterior.function(lambda f_max, sigma, **_: f_max / sigma)
     exact = posterior.values[:, 0] / posterior.values[:, 1]
     assert x_c["median"] == pytest.approx(np.median(exact))
@@ -157,7 +151,7 @@ def test_derived_quantities(posterior: Posterior) -> None:
         posterior.function(lambda **_: 1.0)
 
 
-def test_prediction_bands_hold_the_best_fit(posterior: Posterior) -> None:
+def test_prediction_bands_hold_the_best_fit(posterior):
     data = posterior.data
     band = posterior.predict(data.frequency_hz, amplitude=data.amplitude)
     optimum = di.fit(data, di.Dahl()).optimum  # noise alone, at the exponent that is assumed
@@ -172,7 +166,7 @@ def test_prediction_bands_hold_the_best_fit(posterior: Posterior) -> None:
         assert (value < limits[1]).all()
 
 
-def test_every_result_has_one_interface() -> None:
+def test_every_result_has_one_interface():
     data = friction_table()
     results: list[di.FitResult | Posterior] = [
         di.fit(data, di.Dahl()),
@@ -214,7 +208,7 @@ def test_every_result_has_one_interface() -> None:
 
 
 @pytest.mark.versions
-def test_results_are_saved_and_never_overwritten(tmp_path: Path) -> None:
+def test_results_are_saved_and_never_overwritten(tmp_path):
     grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     place = grid.save(tmp_path / "grid.json")
     stored = json.loads(place.read_text())
@@ -225,7 +219,7 @@ def test_results_are_saved_and_never_overwritten(tmp_path: Path) -> None:
         grid.save(tmp_path / "grid.txt")
 
 
-def test_options_of_the_other_method_are_refused() -> None:
+def test_options_of_the_other_method_are_refused():
     with pytest.raises(ValidationError, match="steps given with method='grid', which has no such"):
         di.posterior(friction_table(), di.Dahl(), method="grid", steps=100, uncertainty="noise")
     with pytest.raises(ValidationError, match="tolerance given with method='mcmc'"):
@@ -234,7 +228,7 @@ def test_options_of_the_other_method_are_refused() -> None:
         di.posterior(friction_table(), di.Dahl(), method="nuts", uncertainty="noise")
 
 
-def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None:
+def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one():
     data = with_covariance(friction_table(30, 0.1, 10.0, 0.02), 0.02)
     right = di.posterior(data, di.Dahl(), seed=1, steps=100, uncertainty="noise")
     assert [check.statistic for check in right.checks] == ["size", "largest", "neighbours"]
@@ -245,7 +239,7 @@ def test_predictive_checks_pass_the_right_model_and_fail_the_wrong_one() -> None
     assert "MISFIT: neighbouring rows err in the same direction" in str(wrong)
 
 
-def test_checks_of_a_right_model_are_calibrated() -> None:
+def test_checks_of_a_right_model_are_calibrated():
     # over many tables, the shares must not be crowded at the end that means a misfit
     shares = []
     for seed in range(8):
@@ -255,7 +249,7 @@ def test_checks_of_a_right_model_are_calibrated() -> None:
     assert np.mean(np.array(shares) < 0.05) < 0.2
 
 
-def test_student_t_is_a_density() -> None:
+def test_student_t_is_a_density():
     # one row: its density over the measured response integrates to 1
     amplitude = np.array([2e-3])
     model = di.Dahl(f_max=0.1, sigma=30.0).describing_function(amplitude)
@@ -273,7 +267,7 @@ def test_student_t_is_a_density() -> None:
 
 
 @pytest.mark.versions
-def test_arviz_gets_every_group(posterior: Posterior) -> None:
+def test_arviz_gets_every_group(posterior):
     exported = posterior.to_arviz()
     groups = set(exported.groups())
     assert {
@@ -292,7 +286,7 @@ def test_arviz_gets_every_group(posterior: Posterior) -> None:
     assert np.abs(observed).max() < 4.0 * replicated.std()
 
 
-def test_pictures(posterior: Posterior) -> None:
+def test_pictures(posterior):
     plt = import_module("matplotlib.pyplot")
     assert posterior.plot_corner().shape == (3, 3)
     assert len(posterior.plot_trace()) == 3

@@ -1,7 +1,5 @@
 """Posteriors that count every source of error: against matrices, Student's t, and the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -19,13 +17,13 @@ LINEAR = di.Dahl(alpha=1.0)
 Q = (0.02275, 0.97725)
 
 
-def days(seed: int, rows: int = 1) -> di.FrequencyResponse:
+def days(seed, rows=1):
     data, _ = several_days("f_max", 0.02)(np.random.default_rng(seed))
     return di.FrequencyResponse.concatenate([data] * rows) if rows > 1 else data
 
 
 @pytest.mark.parametrize("rows", [1, 3])
-def test_the_likelihood_is_that_of_the_covariance_by_source(rows: int) -> None:
+def test_the_likelihood_is_that_of_the_covariance_by_source(rows):
     """Of 36 rows, and of 108, which are compressed to what their errors share."""
     fit = di.fit(days(3, rows), LINEAR)
     errors = fit.errors
@@ -59,7 +57,7 @@ def test_the_likelihood_is_that_of_the_covariance_by_source(rows: int) -> None:
     assert logsumexp(terms) + np.log(ln_s[1] - ln_s[0]) == pytest.approx(whole[0], abs=1e-6)
 
 
-def test_intervals_are_those_of_the_budget_where_all_is_linear() -> None:
+def test_intervals_are_those_of_the_budget_where_all_is_linear():
     fit = di.fit(days(3), LINEAR)
     budget = fit.budget()["f_max"]
     assert budget.dof < 4.0
@@ -73,7 +71,7 @@ def test_intervals_are_those_of_the_budget_where_all_is_linear() -> None:
     assert share == pytest.approx(0.9545, abs=0.03)
 
 
-def test_coverage_with_scatter_between_days() -> None:
+def test_coverage_with_scatter_between_days():
     inside = {"noise": 0, "combined": 0}
     for seed in range(8):
         fit = di.fit(days(100 + seed), LINEAR)
@@ -85,7 +83,7 @@ def test_coverage_with_scatter_between_days() -> None:
     assert inside["noise"] <= 5
 
 
-def test_an_exponent_that_was_not_given_is_sampled_over_its_range() -> None:
+def test_an_exponent_that_was_not_given_is_sampled_over_its_range():
     microslip = friction_table(10, 0.003, 0.03, 0.02)
     grid = di.posterior(microslip, di.Dahl(sigma=30.0), method="grid", tolerance=1e-2)
     assert grid.names == ("f_max", "alpha", "noise_scale")
@@ -98,7 +96,7 @@ def test_an_exponent_that_was_not_given_is_sampled_over_its_range() -> None:
         di.posterior(friction_table(), four, method="grid")
 
 
-def test_the_verdict_says_what_is_counted() -> None:
+def test_the_verdict_says_what_is_counted():
     fit = di.fit(days(3), LINEAR)
     combined = di.posterior(fit, method="grid", tolerance=1e-2)
     assert "Counted: noise; scatter between runs" in combined.verdict
@@ -110,7 +108,7 @@ def test_the_verdict_says_what_is_counted() -> None:
     assert alone.uncertainty == "noise"
 
 
-def test_a_parameter_that_a_default_prior_sets_is_not_determined() -> None:
+def test_a_parameter_that_a_default_prior_sets_is_not_determined():
     microslip = friction_table(10, 0.0003, 0.003, 0.05)
     for uncertainty in ("noise", "combined"):
         open_ = di.posterior(microslip, LINEAR, method="grid", uncertainty=uncertainty)
@@ -120,7 +118,7 @@ def test_a_parameter_that_a_default_prior_sets_is_not_determined() -> None:
     assert known.status.usable
 
 
-def test_refusals() -> None:
+def test_refusals():
     with pytest.raises(
         ValidationError, match="uncertainty is 'all'; expected one of combined, noise"
     ):
@@ -135,7 +133,7 @@ def test_refusals() -> None:
         di.posterior(tied, method="grid")
 
 
-def test_what_rows_share_may_be_all_there_is() -> None:
+def test_what_rows_share_may_be_all_there_is():
     """Residuals along one smooth curve leave no noise of their own."""
     A = np.geomspace(0.1, 10.0, 12) * 0.1 / 30.0
     plant = di.Dahl(0.1, 30.0) + di.Spring(0.3)

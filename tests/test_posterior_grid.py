@@ -1,9 +1,6 @@
 """Importance points against closed forms, scipy's integration, product rules, and their limits."""
 
-from __future__ import annotations
-
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +9,12 @@ from scipy import stats
 from scipy.integrate import trapezoid
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.bayes.density import Density
-from dahl_ident.bayes.importance import WeightedPoints, integrate
+from dahl_ident.bayes.importance import integrate
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior, joint_prior
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.problem import TableProblem
-from dahl_ident.results import Posterior
 from tests.bayes_cases import (
     FRICTION,
     X_C,
@@ -32,16 +27,16 @@ TIGHT = with_covariance(friction_table(30, 0.1, 10.0, 0.01), 0.01)  # f_max to 0
 LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
 
 
-def box(dims: int, low: float, high: float) -> JointPrior:
+def box(dims, low, high):
     parameters = [Parameter(f"p{i}", "", "a number") for i in range(dims)]
     return JointPrior(tuple(ParameterPrior(p, (low, high)) for p in parameters))
 
 
-def gaussian_grid(mean: FloatArray, covariance: FloatArray, prior: JointPrior) -> WeightedPoints:
+def gaussian_grid(mean, covariance, prior):
     density = stats.multivariate_normal(mean, covariance)
     low, high = prior.limits
 
-    def log_density(theta: FloatArray) -> FloatArray:
+    def log_density(theta):
         inside = ((theta >= low) & (theta <= high)).all(axis=1)
         return np.where(inside, np.atleast_1d(density.logpdf(theta)), -np.inf)
 
@@ -51,7 +46,7 @@ def gaussian_grid(mean: FloatArray, covariance: FloatArray, prior: JointPrior) -
 
 @pytest.mark.parametrize("dims", [1, 2, 3])
 @pytest.mark.parametrize("correlation", [0.0, 0.97])
-def test_a_gaussian_in_a_wide_box(dims: int, correlation: float) -> None:
+def test_a_gaussian_in_a_wide_box(dims, correlation):
     std = np.array([0.5, 0.002, 0.05])[:dims]
     matrix = np.full((dims, dims), correlation) + (1.0 - correlation) * np.eye(dims)
     mean = np.array([1.0, -2.0, 0.3])[:dims]
@@ -64,13 +59,13 @@ def test_a_gaussian_in_a_wide_box(dims: int, correlation: float) -> None:
         assert stats.norm.cdf(found) == pytest.approx(LEVELS, abs=1e-3)
 
 
-def test_a_wall_cuts_the_density() -> None:
+def test_a_wall_cuts_the_density():
     grid = gaussian_grid(np.array([0.2, 0.0]), np.diag([1.0, 0.01]), box(2, 0.0, 10.0))
     inside = stats.norm.sf(-0.2) * 0.5
     assert grid.log_evidence == pytest.approx(np.log(inside), abs=1e-3)
 
 
-def test_one_parameter_against_scipy() -> None:
+def test_one_parameter_against_scipy():
     data = friction_table(rows=5, noise=0.3)
     prior = (0.01, 1.0)
     grid = di.posterior(
@@ -78,7 +73,7 @@ def test_one_parameter_against_scipy() -> None:
     )
     problem = TableProblem(data, di.Dahl(sigma=30.0))
 
-    def density(theta: float, moment: int = 0) -> float:
+    def density(theta, moment=0):
         # the scale integrated out by hand: Gamma(n) / (2 (pi S)^n) / |R|^2 ...
         y = np.log(data.response / problem.predict(np.array([theta])))
         S = float(np.sum(np.abs(y) ** 2))
@@ -96,7 +91,7 @@ def test_one_parameter_against_scipy() -> None:
     assert grid.std()[0] == pytest.approx(np.sqrt(moments[2] / moments[0] - mean**2), rel=1e-3)
 
 
-def gauss(low: float, high: float, panels: int) -> tuple[FloatArray, FloatArray]:
+def gauss(low, high, panels):
     """Return nodes and weights of Gauss's rule of 8 points in each of many panels."""
     x, w = np.polynomial.legendre.leggauss(8)
     walls = np.linspace(low, high, panels + 1)
@@ -104,9 +99,7 @@ def gauss(low: float, high: float, panels: int) -> tuple[FloatArray, FloatArray]
     return (walls[:-1, None] + half * (1.0 + x)).ravel(), (half * w).ravel()
 
 
-def brute_force(
-    grid: Posterior, priors: dict[str, Any], panels: int
-) -> tuple[FloatArray, FloatArray]:
+def brute_force(grid, priors, panels):
     """Return nodes all over the prior, (..., D), and the probability that the grid gives them."""
     density = Density(grid.problem, joint_prior(grid.problem, priors))
     rules = [gauss(low, high, panels) for low, high in np.transpose(density.prior.limits)]
@@ -119,7 +112,7 @@ def brute_force(
 
 
 @pytest.mark.parametrize("seed", [0, 5, 10, 13])
-def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> None:
+def test_few_points_and_much_noise_stay_inside_the_stated_error(seed):
     random = np.random.default_rng(seed)
     low, noise = 10.0 ** random.uniform([-2.0, -1.2], [1.5, 0.0])
     data = friction_table(int(random.integers(2, 6)), low, 30.0 * low, noise, seed)
@@ -131,7 +124,7 @@ def test_few_points_and_much_noise_stay_inside_the_stated_error(seed: int) -> No
 
 
 @pytest.mark.parametrize("rows", [2, 12])
-def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows: int) -> None:
+def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows):
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
     data = friction_table(rows, noise=0.1)
     grid = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
@@ -171,9 +164,7 @@ def test_the_noise_scale_is_a_mixture_of_inverse_gammas(rows: int) -> None:
     ],
     ids=["peak", "heavy tails", "open to the wall", "microslip", "spring cut by walls"],
 )
-def test_the_stated_error_holds_against_brute_force(
-    data: di.FrequencyResponse, model: Any, priors: dict[str, Any], panels: int
-) -> None:
+def test_the_stated_error_holds_against_brute_force(data, model, priors, panels):
     grid = di.posterior(data, model, priors=priors, method="grid", uncertainty="noise")
     assert grid.error < 1e-3
     nodes, mass = brute_force(grid, priors, panels)
@@ -194,8 +185,8 @@ def test_the_stated_error_holds_against_brute_force(
                 assert share == pytest.approx(below, abs=1e-4)
 
 
-def test_a_second_mode_is_found_from_the_prior() -> None:
-    def log_density(theta: FloatArray) -> FloatArray:
+def test_a_second_mode_is_found_from_the_prior():
+    def log_density(theta):
         first, second = (-0.5 * np.sum((theta - m) ** 2, axis=1) for m in ([0, 0], [12.0, 9.0]))
         return np.asarray(np.logaddexp(first, second))
 
@@ -203,7 +194,7 @@ def test_a_second_mode_is_found_from_the_prior() -> None:
     assert grid.log_evidence == pytest.approx(np.log(4.0 * np.pi), abs=1e-3)
 
 
-def test_a_bolted_ridge_keeps_its_time() -> None:
+def test_a_bolted_ridge_keeps_its_time():
     # what once took millions of points: f_max open to its wall with a free spring
     data = spring_table(1e-3, 20, 0.003, 0.03)
     grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
@@ -213,7 +204,7 @@ def test_a_bolted_ridge_keeps_its_time() -> None:
     assert (rule_.name, rule_.at_upper_end) == ("f_max", True)
 
 
-def test_friction_that_may_be_none_at_either_end() -> None:
+def test_friction_that_may_be_none_at_either_end():
     # sigma alone shows; with a free spring friction may as well be none
     data = di.load_dataset("microslip")
     assert isinstance(data, di.FrequencyResponse)
@@ -224,7 +215,7 @@ def test_friction_that_may_be_none_at_either_end() -> None:
     assert abs(grid.log_evidence + 23.52020) < grid.error
 
 
-def test_an_accuracy_that_is_not_reached_is_said() -> None:
+def test_an_accuracy_that_is_not_reached_is_said():
     grid = di.posterior(
         friction_table(), di.Dahl(), method="grid", uncertainty="noise", tolerance=1e-6
     )
@@ -233,7 +224,7 @@ def test_an_accuracy_that_is_not_reached_is_said() -> None:
     assert grid.evaluations < 300_000
 
 
-def test_the_same_answer_at_every_call() -> None:
+def test_the_same_answer_at_every_call():
     first, second = (
         di.posterior(TIGHT, di.Dahl(), method="grid", uncertainty="noise", tolerance=1e-2)
         for _ in range(2)
@@ -242,7 +233,7 @@ def test_the_same_answer_at_every_call() -> None:
     np.testing.assert_array_equal(first.points[1], second.points[1])
 
 
-def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> None:
+def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one():
     data = friction_table(rows=8, noise=0.05)
     priors = {"f_max": (0.01, 1.0), "sigma": (3.0, 300.0)}
     plain = di.posterior(data, di.Dahl(), priors=priors, method="grid", uncertainty="noise")
@@ -258,7 +249,7 @@ def test_evidence_of_a_free_exponent_is_lower_where_the_exponent_is_one() -> Non
     assert wider.log_evidence < plain.log_evidence
 
 
-def test_scale_free_and_scale_known_agree_for_many_rows() -> None:
+def test_scale_free_and_scale_known_agree_for_many_rows():
     table = friction_table(rows=200, noise=0.02)
     free, known = (
         di.posterior(data, di.Dahl(), method="grid", uncertainty="noise", tolerance=5e-3)
@@ -270,7 +261,7 @@ def test_scale_free_and_scale_known_agree_for_many_rows() -> None:
     assert float(free.quantile("noise_scale", 0.5)) == pytest.approx(0.02, rel=0.12)
 
 
-def test_a_microslip_posterior_names_the_prior() -> None:
+def test_a_microslip_posterior_names_the_prior():
     grid = di.posterior(
         friction_table(10, 0.0003, 0.003, 0.05), di.Dahl(), method="grid", uncertainty="noise"
     )
@@ -290,7 +281,7 @@ def test_a_microslip_posterior_names_the_prior() -> None:
         stats.lognorm(0.1, scale=1.0),
     ],
 )
-def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
+def test_data_outweigh_the_tail_of_a_prior(prior):
     grid = di.posterior(
         TIGHT, di.Dahl(), priors={"f_max": prior}, method="grid", uncertainty="noise"
     )
@@ -307,7 +298,7 @@ def test_data_outweigh_the_tail_of_a_prior(prior: Any) -> None:
     assert not grid.trusted
 
 
-def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
+def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit():
     walled = di.posterior(
         TIGHT, di.Dahl(), priors={"f_max": (1.0, 2.0)}, method="grid", uncertainty="noise"
     )
@@ -319,7 +310,7 @@ def test_a_prior_that_keeps_the_data_out_is_told_with_its_misfit() -> None:
     assert "Noise alone is counted; with every source" in free.verdict
 
 
-def test_marginals_are_densities_with_the_right_quantiles() -> None:
+def test_marginals_are_densities_with_the_right_quantiles():
     grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     for name in grid.names:
         ends = grid.quantile(name, np.array([1e-5, 0.3, 1.0 - 1e-5]))
@@ -334,7 +325,7 @@ def test_marginals_are_densities_with_the_right_quantiles() -> None:
         grid.marginal("f_max", [-1.0])
 
 
-def test_expectation_and_draws() -> None:
+def test_expectation_and_draws():
     grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     x_c = grid.function(lambda f_max, sigma: f_max / sigma)["mean"]
     assert x_c == pytest.approx(X_C, rel=0.05)
@@ -345,14 +336,14 @@ def test_expectation_and_draws() -> None:
 
 
 @pytest.mark.parametrize("bad", [0.0, 1.0, 1.5, np.nan])
-def test_quantiles_of_what_is_no_probability_are_refused(bad: float) -> None:
+def test_quantiles_of_what_is_no_probability_are_refused(bad):
     grid = di.posterior(friction_table(), di.Dahl(), method="grid", uncertainty="noise")
     for name in grid.names:
         with pytest.raises(ValidationError, match=r"probabilities\[1\] is .*; expected"):
             grid.quantile(name, [0.5, bad])
 
 
-def test_refusals() -> None:
+def test_refusals():
     data = friction_table()
     plant = di.Dahl() + di.Spring() + di.Damper()
     with pytest.raises(SamplingError, match=r"4 parameters are free \(f_max, sigma, stiffness"):

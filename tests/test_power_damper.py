@@ -1,7 +1,5 @@
 """A damper with a power of the speed."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from dahl_ident import Damper, Mass, Model, PowerDamper, Spring, response
 from dahl_ident.errors import ValidationError
 
 
-def exactly(c: float, p: float, A: float, omega: float, k: int) -> complex:
+def exactly(c, p, A, omega, k):
     with mpmath.workdps(25):
         height = mpmath.mpf(c) * (mpmath.mpf(A) * omega) ** p
         share = mpmath.quad(
@@ -20,7 +18,7 @@ def exactly(c: float, p: float, A: float, omega: float, k: int) -> complex:
 
 
 @pytest.mark.parametrize("p", [0.1, 0.5, 1.0, 1.7, 2.0, 3.0])
-def test_harmonics_against_quadrature(p: float) -> None:
+def test_harmonics_against_quadrature(p):
     law = PowerDamper(2.0, p)
     for k in (1, 3, 5, 7):
         ours = complex(law.dynamic_stiffness(0.3, 7.0, harmonic=k))
@@ -30,7 +28,7 @@ def test_harmonics_against_quadrature(p: float) -> None:
         assert complex(law.dynamic_stiffness(0.3, 7.0, harmonic=k - 1)) == 0.0
 
 
-def test_its_special_cases() -> None:
+def test_its_special_cases():
     A, omega = np.array([0.01, 0.1, 1.0]), 3.0
     np.testing.assert_allclose(
         PowerDamper(2.0, 1.0).dynamic_stiffness(A, omega),
@@ -46,7 +44,7 @@ def test_its_special_cases() -> None:
 
 @pytest.mark.parametrize("p", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("k", [1, 3])
-def test_derivatives_against_high_precision(p: float, k: int) -> None:
+def test_derivatives_against_high_precision(p, k):
     law = Model(PowerDamper(2.0, p)).with_free(["coefficient", "exponent", "reference_speed"])
     A, omega, h = 0.3, 7.0, 1e-5
     found = law.stiffness_gradient(law.known_values(), np.asarray(A), np.asarray(omega), k)
@@ -60,7 +58,7 @@ def test_derivatives_against_high_precision(p: float, k: int) -> None:
     assert abs(complex(found.by_parameter[2]) + p * value) < 1e-11 * size
 
 
-def test_force_and_refusals() -> None:
+def test_force_and_refusals():
     law = PowerDamper(2.0, 0.5, name="oil")
     assert law.force([0.0, 0.0], velocity=[0.25, -4.0]).tolist() == [1.0, -4.0]
     assert [p.dimension for p in law.parameters] == [(1, 0, 0), (0, 0, 0), (0, 1, -1)]
@@ -70,7 +68,7 @@ def test_force_and_refusals() -> None:
         PowerDamper(1.0, 3.5)
 
 
-def test_a_driven_plant_at_several_frequencies_has_the_amplitudes_of_each_alone() -> None:
+def test_a_driven_plant_at_several_frequencies_has_the_amplitudes_of_each_alone():
     plant = PowerDamper(1.0, 0.5) + Mass(0.05) + Spring(1.0)
     f, drive = np.array([0.1, 0.5, 1.5]), np.array([0.2, 1.0, 3.0])
     together = response(plant, f, drive, steady="describing function").amplitude

@@ -1,19 +1,17 @@
 """Derivatives of a driven plant's response, by the implicit function theorem."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest
 
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.elements import Dahl, Damper, Mass, Model, Spring
+from dahl_ident.elements import Dahl, Damper, Mass, Spring
 from dahl_ident.problem import TableProblem
 
 FIG_7 = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 0.24, "stiffness": 0.3}
 
 
-def driven(model: Model, frequency: list[float], drive: list[float]) -> TableProblem:
+def driven(model, frequency, drive):
     """Return a problem whose force was controlled; its measured values do not matter here."""
     n = len(frequency)
     data = FrequencyResponse(
@@ -22,11 +20,11 @@ def driven(model: Model, frequency: list[float], drive: list[float]) -> TablePro
     return TableProblem(data, model, noise="absolute", steady="describing function")
 
 
-def receptance_40_digits(p: list[mpmath.mpf], omega: float, drive: mpmath.mpf) -> mpmath.mpc:
+def receptance_40_digits(p, omega, drive):
     """Return X/u_0 of linear Dahl friction, mass, damper and spring, by bisection."""
     f_max, sigma, mass, damping, stiffness = p
 
-    def Z(A: mpmath.mpf) -> mpmath.mpc:
+    def Z(A):
         beta = sigma * A / f_max
         real = 2 * mpmath.besseli(1, beta) / (beta * mpmath.cosh(beta))
         imag = 4 / mpmath.pi * (1 - mpmath.tanh(beta) / beta) / beta
@@ -43,7 +41,7 @@ def receptance_40_digits(p: list[mpmath.mpf], omega: float, drive: mpmath.mpf) -
 
 
 @pytest.mark.parametrize(("frequency", "drive"), [(0.05, 0.05), (0.3, 0.12), (1.4, 0.3)])
-def test_against_40_digits(frequency: float, drive: float) -> None:
+def test_against_40_digits(frequency, drive):
     problem = driven(Dahl() + Mass() + Damper() + Spring(), [frequency], [drive])
     values = [FIG_7[name] for name in problem.names]
     theta = problem.to_search(values)
@@ -68,7 +66,7 @@ def test_against_40_digits(frequency: float, drive: float) -> None:
             assert slope == pytest.approx(complex((sides[0] - sides[1]) / (2 * step)), rel=1e-9)
 
 
-def test_with_a_free_exponent_and_two_friction_elements() -> None:
+def test_with_a_free_exponent_and_two_friction_elements():
     plant = Dahl(name="a", alpha=None) + Dahl(name="b") + Mass() + Damper()
     problem = driven(plant, [0.2, 1.0, 2.0] * 3, [0.3] * 3 + [1.1] * 3 + [4.0] * 3)
     values = {
@@ -84,7 +82,7 @@ def test_with_a_free_exponent_and_two_friction_elements() -> None:
         np.testing.assert_allclose(ours[:, i], numerical, atol=1e-7 * np.abs(numerical).max())
 
 
-def test_a_missing_amplitude_has_no_prediction() -> None:
+def test_a_missing_amplitude_has_no_prediction():
     # undamped resonance at 1 rad/s, where friction takes at most 4 f_max/pi
     problem = driven(Dahl() + Mass(1.0) + Spring(1.0), [0.5 / np.pi, 1.0 / np.pi], [2.0, 2.0])
     theta = problem.to_search([1.0, 10.0])
@@ -92,12 +90,12 @@ def test_a_missing_amplitude_has_no_prediction() -> None:
     assert np.isnan(problem.prediction_jacobian(theta)[:, 0]).tolist() == [True, False]
 
 
-def test_by_level() -> None:
+def test_by_level():
     """Of drives and amplitudes, against responses at levels a little higher and lower."""
     A = np.geomspace(1e-3, 0.1, 6)
     controlled = ["force", "displacement"] * 3
 
-    def at(factor: float) -> TableProblem:
+    def at(factor):
         data = FrequencyResponse(
             np.full(6, 0.3), np.ones(6), factor * A, drive=factor * A, controlled=controlled
         )

@@ -1,7 +1,5 @@
 """TableProblem: predictions, residuals and derivatives against mpmath, closed forms and loops."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +12,6 @@ from scipy import stats
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, response
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.problem import ProblemBatch, TableProblem
 
@@ -29,7 +26,7 @@ RNG = np.random.default_rng(2)
 NOISE = np.exp(0.05 * (RNG.normal(size=n) + 1j * RNG.normal(size=n)))
 
 
-def odd(value: object) -> Any:
+def odd(value):
     """Return what no type checker lets pass."""
     return value
 
@@ -44,12 +41,12 @@ QUANTITIES = {
 }
 
 
-def plant() -> Element:
+def plant():
     f_max, sigma, mass, damping, stiffness = TRUE
     return Dahl(f_max, sigma) + Mass(mass) + Damper(damping) + Spring(stiffness)
 
 
-def data(quantity: str = "dynamic_stiffness", controlled: Any = "displacement") -> Any:
+def data(quantity="dynamic_stiffness", controlled="displacement"):
     power, exponent = QUANTITIES[quantity]
     R = (1j * OMEGA) ** power * plant().dynamic_stiffness(A, OMEGA) ** exponent * NOISE
     spread = np.abs(R)[:, None, None] ** 2
@@ -60,11 +57,11 @@ def data(quantity: str = "dynamic_stiffness", controlled: Any = "displacement") 
         DRIVE,
         covariance=spread * np.array([[4e-4, 1e-4], [1e-4, 9e-4]]),
         controlled=controlled,
-        quantity=quantity,  # type: ignore[arg-type]  # one of the six above
+        quantity=quantity,  # one of the six above
     )
 
 
-def mp_stiffness(theta: list[Any], amplitude: Any, omega: Any) -> Any:
+def mp_stiffness(theta, amplitude, omega):
     """Return Z of the plant with mpmath, theta = (ln f_max, ln sigma, mass, damping, stiffness)."""
     f_max, sigma = mp.exp(theta[0]), mp.exp(theta[1])
     b = sigma * amplitude / f_max
@@ -74,7 +71,7 @@ def mp_stiffness(theta: list[Any], amplitude: Any, omega: Any) -> Any:
     return sigma * (real + mp.mpc(0, 1) * imag) + linear
 
 
-def mp_driven(theta: list[Any], drive: Any, omega: Any, near: float) -> Any:
+def mp_driven(theta, drive, omega, near):
     amplitude = mp.findroot(
         lambda a: a * abs(mp_stiffness(theta, a, omega)) - drive, mp.mpf(near), tol=1e-50
     )
@@ -82,7 +79,7 @@ def mp_driven(theta: list[Any], drive: Any, omega: Any, near: float) -> Any:
 
 
 @pytest.mark.parametrize("controlled", ["displacement", "force"])
-def test_predictions_and_derivatives_agree_with_mpmath(controlled: str) -> None:
+def test_predictions_and_derivatives_agree_with_mpmath(controlled):
     problem = TableProblem(data("receptance", controlled), FREE, steady="describing function")
     values = np.array(TRUE) * [1.1, 0.9, 1.05, 0.95, 1.2]
     theta = problem.to_search(values)
@@ -96,7 +93,7 @@ def test_predictions_and_derivatives_agree_with_mpmath(controlled: str) -> None:
         for row in (0, 3, 5):
             omega = mp.mpf(float(OMEGA[row]))
 
-            def receptance(*at: Any, row: int = row, omega: Any = omega) -> Any:
+            def receptance(*at, row=row, omega=omega):
                 if controlled == "force":
                     drive = mp.mpf(float(DRIVE[row]))
                     return 1 / mp_driven(list(at), drive, omega, float(driven[row]))
@@ -117,9 +114,7 @@ def test_predictions_and_derivatives_agree_with_mpmath(controlled: str) -> None:
 @pytest.mark.parametrize("controlled", ["displacement", "force", "mixed"])
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("steady", ["exact", "describing function"])
-def test_jacobian_is_the_residuals_derivative(
-    quantity: str, controlled: str, noise: str, steady: Any
-) -> None:
+def test_jacobian_is_the_residuals_derivative(quantity, controlled, noise, steady):
     words = np.where(np.arange(n) % 2, "force", "displacement")
     table = data(quantity, words if controlled == "mixed" else controlled)
     sensors = Sensors(stats.norm(1.0, 0.01), None, stats.norm(0.0, 1e-3))
@@ -143,7 +138,7 @@ def test_jacobian_is_the_residuals_derivative(
 
 
 @pytest.mark.parametrize("controlled", ["displacement", "force"])
-def test_many_vectors_at_once_equal_one_at_a_time(controlled: str) -> None:
+def test_many_vectors_at_once_equal_one_at_a_time(controlled):
     problem = TableProblem(data("mobility", controlled), FREE)
     theta = problem.to_search(TRUE) + 0.05 * RNG.normal(size=(4, 5))
     same = 1e-5 if problem.is_exact else 1e-10
@@ -161,7 +156,7 @@ def test_many_vectors_at_once_equal_one_at_a_time(controlled: str) -> None:
         np.testing.assert_allclose(call(theta), each, rtol=same, atol=same * np.abs(each).max())
 
 
-def test_a_batch_equals_its_tables_one_by_one() -> None:
+def test_a_batch_equals_its_tables_one_by_one():
     tables = [
         FrequencyResponse(FREQUENCY * s, Dahl(0.1, 30.0).describing_function(A * s) * NOISE, A * s)
         for s in (1.0, 1.5, 3.0)
@@ -178,7 +173,7 @@ def test_a_batch_equals_its_tables_one_by_one() -> None:
     np.testing.assert_allclose(batch.table(1).residuals(theta[1]), each[1].residuals(theta[1]))
 
 
-def test_replicates_share_all_but_the_response() -> None:
+def test_replicates_share_all_but_the_response():
     problem = TableProblem(data(), FREE)
     responses = data().response * np.array([[1.0], [1.2]])
     batch = ProblemBatch.replicates(problem, responses)
@@ -191,7 +186,7 @@ def test_replicates_share_all_but_the_response() -> None:
 
 
 @given(force=st.floats(-30.0, 30.0), motion=st.floats(-30.0, 30.0), x=st.floats(-1.0, 1.0))
-def test_residuals_do_not_depend_on_units(force: float, motion: float, x: float) -> None:
+def test_residuals_do_not_depend_on_units(force, motion, x):
     a, b = 10.0**force, 10.0**motion
     N = Dahl(0.1, 30.0).describing_function(A) * NOISE
     theta = np.log([0.1, 30.0]) + x
@@ -203,12 +198,12 @@ def test_residuals_do_not_depend_on_units(force: float, motion: float, x: float)
 
 
 @given(values=st.lists(st.floats(1e-30, 1e30), min_size=2, max_size=2))
-def test_search_coordinates_round_trip(values: list[float]) -> None:
+def test_search_coordinates_round_trip(values):
     problem = TableProblem(FrequencyResponse(np.ones(n), NOISE, A), Dahl())
     np.testing.assert_allclose(problem.to_values(problem.to_search(values)), values, rtol=1e-13)
 
 
-def test_profiled_likelihood_is_its_maximum_over_the_scale() -> None:
+def test_profiled_likelihood_is_its_maximum_over_the_scale():
     problem = TableProblem(data(), FREE, noise="relative")
     theta = problem.to_search(np.array(TRUE) * 1.05)
     scales = np.geomspace(0.01, 1.0, 2001)
@@ -217,7 +212,7 @@ def test_profiled_likelihood_is_its_maximum_over_the_scale() -> None:
     assert problem.log_likelihood(theta) >= over_scale.max()
 
 
-def test_no_steady_state_has_no_likelihood() -> None:
+def test_no_steady_state_has_no_likelihood():
     resonance = 2.0 * np.pi
     table = FrequencyResponse(
         [1.0], [1.0], drive=[1.0], controlled="force", quantity="receptance", amplitude=[1.0]
@@ -231,7 +226,7 @@ def test_no_steady_state_has_no_likelihood() -> None:
     assert np.isnan(problem.predict(f_max)[1]).all()
 
 
-def test_like_elements_are_ordered_by_x_c() -> None:
+def test_like_elements_are_ordered_by_x_c():
     two = Dahl(name="a") + Dahl(name="b")
     problem = TableProblem(FrequencyResponse(np.ones(n), NOISE, A), two)
     theta = np.log([[1.0, 2.0, 0.1, 3.0], [0.1, 3.0, 1.0, 2.0]])
@@ -240,7 +235,7 @@ def test_like_elements_are_ordered_by_x_c() -> None:
     np.testing.assert_allclose(unlike.in_order(theta[:, :3]), theta[:, :3])
 
 
-def test_free_and_fixed_reach_model_and_sensors() -> None:
+def test_free_and_fixed_reach_model_and_sensors():
     problem = TableProblem(
         data(), plant(), free=["f_max", "delay"], sensors=Sensors(force_gain=None),
         fixed={"force_gain": 1.1},
@@ -335,8 +330,6 @@ def test_free_and_fixed_reach_model_and_sensors() -> None:
         ),
     ],
 )
-def test_what_cannot_be_estimated_is_refused(
-    build: Callable[[], object], error: type[Exception], message: str
-) -> None:
+def test_what_cannot_be_estimated_is_refused(build, error, message):
     with pytest.raises(error, match=message):
         build()

@@ -1,7 +1,5 @@
 """Files of dynamic signal analysers, made here byte by byte from their manuals."""
 
-from __future__ import annotations
-
 import importlib
 import struct
 from pathlib import Path
@@ -21,26 +19,24 @@ LEVELS = (0.05, 0.2, 0.6)
 REAL_PART = {"real": {"unit": "mm/N"}}
 
 
-def receptance(force: float) -> Any:
+def receptance(force):
     """Of a driven plant, in m/N."""
     plant = FRICTION + di.Mass(0.01) + di.Damper(0.02)
     return di.response(plant, FREQUENCY, drive=force).displacement / force
 
 
-def trace(values: Any) -> str:
+def trace(values):
     """The ASCII file of an SR785: the number of points, then real and imaginary parts."""
     return f"{values.size}\r\n" + "".join(f"{v.real:.9e}, {v.imag:.9e}\r\n" for v in values)
 
 
 class TestSr785:
-    def read(self, path: Path, **options: Any) -> di.FrequencyResponse:
+    def read(self, path, **options):
         how = {"sweep": "1:100Hz log", "drive": "0.2 N", "columns": REAL_PART}
         return read_frequency_response(path, **{**how, **options})
 
     @pytest.mark.parametrize("separator", [", ", "\t", " "])
-    def test_a_trace_that_looks_like_magnitude_and_phase_is_doubted(
-        self, separator: str, tmp_path: Path
-    ) -> None:
+    def test_a_trace_that_looks_like_magnitude_and_phase_is_doubted(self, separator, tmp_path):
         path = tmp_path / "trace.asc"
         R = receptance(0.2)
         pairs = zip(np.abs(R).tolist(), np.degrees(np.angle(R)).tolist(), strict=True)
@@ -55,7 +51,7 @@ class TestSr785:
         data = read_frequency_response(path, columns=columns, **given)
         np.testing.assert_allclose(data.response, R, rtol=1e-7)
 
-    def test_trace(self, tmp_path: Path) -> None:
+    def test_trace(self, tmp_path):
         path = tmp_path / "trace.asc"
         path.write_text(trace(1e3 * receptance(0.2)), newline="")
         data = self.read(path)
@@ -67,14 +63,14 @@ class TestSr785:
         linear = self.read(path, sweep="10:30Hz linear", frequency_hz=(15.5, 20.5))
         np.testing.assert_allclose(linear.frequency_hz, np.arange(16.0, 21.0))
 
-    def test_auto_level_holds_the_response(self, tmp_path: Path) -> None:
+    def test_auto_level_holds_the_response(self, tmp_path):
         path = tmp_path / "trace.asc"
         path.write_text(trace(1e3 * receptance(0.2)))
         data = self.read(path, drive=None, amplitude="5 um rms")
         assert set(np.asarray(data.controlled)) == {"displacement"}
         np.testing.assert_allclose(np.asarray(data.amplitude), 5e-6 * np.sqrt(2.0))
 
-    def test_other_columns_and_a_column_map(self, tmp_path: Path) -> None:
+    def test_other_columns_and_a_column_map(self, tmp_path):
         values = 1e3 * receptance(0.2)
         path = tmp_path / "trace.asc"
         rows = np.column_stack([20 * np.log10(np.abs(values)), np.degrees(np.angle(values))])
@@ -85,7 +81,7 @@ class TestSr785:
         data = read_frequency_response(path, columns=tmp_path / "columns.toml", drive="0.2 N")
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=1e-7)
 
-    def test_what_is_missing_is_asked_for(self, tmp_path: Path) -> None:
+    def test_what_is_missing_is_asked_for(self, tmp_path):
         path = tmp_path / "trace.asc"
         path.write_text(trace(1e3 * receptance(0.2)))
         with pytest.raises(DataError, match=r"give sweep=|sweep='1:100Hz log'"):
@@ -99,7 +95,7 @@ class TestSr785:
                 self.read(path, sweep=sweep)
 
     @pytest.mark.parametrize("by", [-1, 1])
-    def test_rows_are_counted(self, by: int, tmp_path: Path) -> None:
+    def test_rows_are_counted(self, by, tmp_path):
         text = trace(receptance(0.2)).splitlines()
         text = [*text, "1.0, 2.0"] if by > 0 else text[:-1]
         path = tmp_path / "trace.asc"
@@ -107,9 +103,7 @@ class TestSr785:
         with pytest.raises(DataError, match=f"first line says 21 points, and {21 + by} follow"):
             self.read(path)
 
-    def test_one_file_for_each_level(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_one_file_for_each_level(self, tmp_path, capsys):
         for force in LEVELS:
             path = tmp_path / f"pivot_{1000 * force:g}mN.asc"
             path.write_text(trace(1e3 * receptance(force)))
@@ -126,19 +120,19 @@ class TestSr785:
         assert "runs differ" not in out
 
 
-def unit(label: str) -> bytes:
+def unit(label):
     return struct.pack(">10sf8b", label.encode(), 1.0, *[0] * 8)
 
 
 def sdf(
-    results: list[tuple[str, int, Any]],
-    units: tuple[str, str] = ("m", "N"),
-    sensitivities: tuple[float, float] = (200.0, 0.1),
-    logarithmic: bool = True,
-    revision: int = 2,
-    overloaded: int = 0,
-    averages: int = 40,
-) -> bytes:
+    results,
+    units=("m", "N"),
+    sensitivities=(200.0, 0.1),
+    logarithmic=True,
+    revision=2,
+    overloaded=0,
+    averages=40,
+):
     """An SDF file of two channels, response over reference, all results on one axis.
 
     Sizes and places of the fields are those of the Standard Data Format Utilities User's Guide.
@@ -177,12 +171,12 @@ def sdf(
 
 
 class TestSdf:
-    def place(self, folder: Path, content: bytes, name: str = "TRACE.DAT") -> Path:
+    def place(self, folder, content, name="TRACE.DAT"):
         (folder / name).write_bytes(content)
         return folder / name
 
     @pytest.mark.parametrize("name", ["TRACE.DAT", "trace.sdf", "trace"])
-    def test_a_swept_sine(self, name: str, tmp_path: Path) -> None:
+    def test_a_swept_sine(self, name, tmp_path):
         volts = receptance(0.2) * 200.0 / 0.1  # V/m of the response over V/N of the force
         path = self.place(tmp_path, sdf([("Freq Resp", 4, volts)]), name)
         data = read_frequency_response(path, drive="0.2 N")
@@ -191,7 +185,7 @@ class TestSdf:
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=2e-7)
         assert "Freq Resp" in str(inspect(path))
 
-    def test_quantities_follow_from_the_units(self, tmp_path: Path) -> None:
+    def test_quantities_follow_from_the_units(self, tmp_path):
         content = sdf([("Freq Resp", 4, receptance(0.2))], ("g's", "lbf"), (1.0, 1.0))
         path = self.place(tmp_path, content)
         data = read_frequency_response(path, drive="0.2 N", passive=False)
@@ -208,7 +202,7 @@ class TestSdf:
         )
         np.testing.assert_allclose(named.response, 1e-3 * receptance(0.2), rtol=2e-7)
 
-    def test_the_coherence_gives_the_standard_deviation(self, tmp_path: Path) -> None:
+    def test_the_coherence_gives_the_standard_deviation(self, tmp_path):
         coherence = np.linspace(0.9, 0.999, FREQUENCY.size)
         content = sdf(
             [("Freq Resp", 4, receptance(0.2)), ("Coherence", 8, coherence)],
@@ -221,12 +215,12 @@ class TestSdf:
         np.testing.assert_allclose(covariance[:, 0, 0], expected, rtol=1e-4)
         np.testing.assert_allclose(covariance[:, 1, 1], expected, rtol=1e-4)
 
-    def test_an_overload_is_told(self, tmp_path: Path) -> None:
+    def test_an_overload_is_told(self, tmp_path):
         path = self.place(tmp_path, sdf([("Freq Resp", 4, receptance(0.2))], overloaded=1))
         with pytest.warns(DataWarning, match=r"channel \d was overloaded"):
             read_frequency_response(path, drive="0.2 N")
 
-    def test_damage(self, tmp_path: Path) -> None:
+    def test_damage(self, tmp_path):
         content = sdf([("Freq Resp", 4, receptance(0.2))])
         for changed in (content[:-4], content[:300], content[:70]):
             path = self.place(tmp_path, changed)
@@ -267,7 +261,7 @@ class TestHeaders:
         "Operator,me\nExcitation Level (mN),200\nFrequency (Hz),Real (mm/N),Imag (mm/N)\n{,}",
         '"Title=sweep up"\n"Drive Level=200 mN"\n"Frequency (Hz)","Real (mm/N)","Imag (mm/N)"\n{,}',
     ])  # fmt: skip
-    def test_level_from_the_header(self, content: str, tmp_path: Path) -> None:
+    def test_level_from_the_header(self, content, tmp_path):
         mark = content[-2]
         rows = "".join(f"{f!r}{mark}{v.real!r}{mark}{v.imag!r}\n" for f, v in self.ROWS)
         path = tmp_path / "export.txt"
@@ -280,7 +274,7 @@ class TestHeaders:
         other = read_frequency_response(path, drive="0.3 N")
         assert set(np.asarray(other.drive)) == {0.3}
 
-    def test_an_amplitude_of_the_response_is_its_gain(self, tmp_path: Path) -> None:
+    def test_an_amplitude_of_the_response_is_its_gain(self, tmp_path):
         text = "Frequency;Amplitude;Phase\nHz;mm/N;deg\n"
         for f, v in self.ROWS:
             text += f"{f!r};{abs(v)!r};{float(np.degrees(np.angle(v)))!r}\n"
@@ -290,7 +284,7 @@ class TestHeaders:
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=1e-12)
         assert set(np.asarray(data.drive)) == {0.2}
 
-    def test_columns_can_be_counted(self, tmp_path: Path) -> None:
+    def test_columns_can_be_counted(self, tmp_path):
         rows = "".join(f"{f!r},{v.real!r},{v.imag!r}\n" for f, v in self.ROWS)
         path = tmp_path / "export.csv"
         path.write_text(f"Frequency [Hz],FRF [mm/N],FRF [mm/N]\n{rows}")
@@ -300,7 +294,7 @@ class TestHeaders:
         data = read_frequency_response(path, drive="0.2 N", columns=columns)
         np.testing.assert_allclose(data.response, receptance(0.2), rtol=1e-12)
 
-    def test_a_held_response(self, tmp_path: Path) -> None:
+    def test_a_held_response(self, tmp_path):
         rows = "".join(f"{f!r},{v.real!r},{v.imag!r}\n" for f, v in self.ROWS)
         path = tmp_path / "export.csv"
         path.write_text(
@@ -316,14 +310,14 @@ class TestHeaders:
         "Trigger level: 0.2 N", "Level 3: 5 N", "Force sensor: 10 mV", "Drive level: 0.2",
         "Drive level: 0.2 N\nDrive level: 0.3 N", "Drive level: 2 V",
     ])  # fmt: skip
-    def test_other_lines_state_none(self, line: str, tmp_path: Path) -> None:
+    def test_other_lines_state_none(self, line, tmp_path):
         rows = "".join(f"{f!r},{v.real!r},{v.imag!r}\n" for f, v in self.ROWS)
         path = tmp_path / "export.csv"
         path.write_text(f"{line}\nFrequency [Hz],Real [mm/N],Imag [mm/N]\n{rows}")
         with pytest.raises(DataError, match="neither an amplitude nor a drive"):
             read_frequency_response(path)
 
-    def test_universal_files(self, tmp_path: Path) -> None:
+    def test_universal_files(self, tmp_path):
         pyuff: Any = importlib.import_module("pyuff")
         paths: list[Path] = []
         for force in LEVELS:
@@ -346,7 +340,7 @@ class TestHeaders:
         lambda b: b.replace(b"e-", b"D-").replace(b"e+", b"D+"),
         lambda b: b"    -1\n  1858\n 1 2 3\nfree text\n    -1\n" + b,
     ])  # fmt: skip
-    def test_universal_files_of_others(self, change: Any, tmp_path: Path) -> None:
+    def test_universal_files_of_others(self, change, tmp_path):
         pyuff: Any = importlib.import_module("pyuff")
         path = tmp_path / "frf.unv"
         pyuff.UFF(str(path)).write_sets([{

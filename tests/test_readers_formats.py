@@ -1,7 +1,5 @@
 """Files other than text, each written by the library of its format and read back."""
 
-from __future__ import annotations
-
 import gc
 import gzip
 import importlib
@@ -11,13 +9,11 @@ import sys
 import warnings
 import zipfile
 from inspect import signature
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 from scipy.io import savemat
 
 from dahl_ident.data import Record, inspect, read_frequency_response, read_record
@@ -35,19 +31,19 @@ FREQUENCY = np.array([10.0, 12.5, 15.0])
 RECEPTANCE = np.array([1e-4 - 2e-4j, -3e-5 - 5e-4j, -4e-4 - 1e-5j])
 
 
-def assert_the_run(record: Record, rtol: float = 1e-14) -> None:
+def assert_the_run(record, rtol=1e-14):
     for name, expected in (("time", TIME), ("displacement", X), ("force", F)):
         np.testing.assert_allclose(
             getattr(record, name), expected, rtol=rtol, atol=rtol * np.abs(expected).max()
         )
 
 
-def cells() -> list[list[Any]]:
+def cells():
     return [[t, x, f] for t, x, f in zip(TIME, X * 1e3, F / 1e3, strict=True)]
 
 
 class TestExcel:
-    def book(self, path: Path, *, sheets: tuple[str, ...] = ("run",), top: Any = ()) -> Path:
+    def book(self, path, *, sheets=("run",), top=()):
         book = openpyxl.Workbook()
         book.remove(book.worksheets[0])
         for name in sheets:
@@ -58,11 +54,11 @@ class TestExcel:
         book.save(path)
         return path
 
-    def test_only_table(self, tmp_path: Path) -> None:
+    def test_only_table(self, tmp_path):
         top = [["Rig", None, "5"], [None, None, None]]
         assert_the_run(read_record(self.book(tmp_path / "run.xlsx", top=top)))
 
-    def test_row_of_units(self, tmp_path: Path) -> None:
+    def test_row_of_units(self, tmp_path):
         book = openpyxl.Workbook()
         sheet = book.worksheets[0]
         for row in [["time", "x", "F"], ["s", "mm", "kN"], *cells()]:
@@ -70,7 +66,7 @@ class TestExcel:
         book.save(tmp_path / "run.xlsx")
         assert_the_run(read_record(tmp_path / "run.xlsx"))
 
-    def test_sheets(self, tmp_path: Path) -> None:
+    def test_sheets(self, tmp_path):
         path = self.book(tmp_path / "run.xlsx", sheets=("a", "b"))
         with pytest.raises(DataError, match="sheets a, b hold tables; name one with sheet='a'"):
             read_record(path)
@@ -80,7 +76,7 @@ class TestExcel:
         with pytest.raises(DataError, match="no table of numbers on notes"):
             read_record(path, sheet="notes")
 
-    def test_text_in_a_cell(self, tmp_path: Path) -> None:
+    def test_text_in_a_cell(self, tmp_path):
         path = self.book(tmp_path / "run.xlsx", top=[["rig"]])
         book = openpyxl.load_workbook(path)
         book["run"]["B5"] = "broken"
@@ -92,7 +88,7 @@ class TestExcel:
         with pytest.raises(DataError, match="row 5, column 'x': the cell is empty or NaN"):
             read_record(path)
 
-    def test_a_changed_digit(self, tmp_path: Path) -> None:
+    def test_a_changed_digit(self, tmp_path):
         path, plain = self.book(tmp_path / "run.xlsx"), tmp_path / "plain.xlsx"
         with zipfile.ZipFile(path) as packed, zipfile.ZipFile(plain, "w") as stored:
             for name in packed.namelist():
@@ -105,18 +101,18 @@ class TestExcel:
 
 
 class TestParquet:
-    def test_columns(self, tmp_path: Path) -> None:
+    def test_columns(self, tmp_path):
         frame = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"])
         frame.to_parquet(tmp_path / "run.parquet")
         assert_the_run(read_record(tmp_path / "run.parquet"))
 
-    def test_a_named_index_is_a_column(self, tmp_path: Path) -> None:
+    def test_a_named_index_is_a_column(self, tmp_path):
         frame = pd.DataFrame({"x [mm]": X * 1e3, "F [kN]": F / 1e3})
         frame.index = pd.Index(TIME, name="time [s]")
         frame.to_parquet(tmp_path / "run.parquet")
         assert_the_run(read_record(tmp_path / "run.parquet"))
 
-    def test_nullable_numbers(self, tmp_path: Path) -> None:
+    def test_nullable_numbers(self, tmp_path):
         frame = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"]).convert_dtypes()
         frame.to_parquet(tmp_path / "run.parquet")
         assert_the_run(read_record(tmp_path / "run.parquet"))
@@ -125,7 +121,7 @@ class TestParquet:
         with pytest.raises(DataError, match="row 4, column 'x': the cell is empty or NaN"):
             read_record(tmp_path / "run.parquet")
 
-    def test_filters_behind_the_columns(self, tmp_path: Path) -> None:
+    def test_filters_behind_the_columns(self, tmp_path):
         pq: Any = pytest.importorskip("pyarrow.parquet")
         if "bloom_filter_options" not in signature(pq.write_table).parameters:
             pytest.skip("this release of Arrow writes no Bloom filters")
@@ -136,7 +132,7 @@ class TestParquet:
         assert_the_run(read_record(tmp_path / "run.parquet"))
 
     @pytest.mark.parametrize("at", [4, 600, -1])
-    def test_added_bytes(self, at: int, tmp_path: Path) -> None:
+    def test_added_bytes(self, at, tmp_path):
         path = tmp_path / "run.parquet"
         table = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"])
         table.to_parquet(path, compression=None)
@@ -151,7 +147,7 @@ class TestParquet:
             read_record(path)
 
 
-def matlab_content() -> dict[str, Any]:
+def matlab_content():
     levels = [
         {"f": FREQUENCY, "H": RECEPTANCE * k, "u0": np.full(3, float(k)), "name": f"level {k}"}
         for k in (1, 2, 3)
@@ -165,12 +161,12 @@ def matlab_content() -> dict[str, Any]:
     }
 
 
-def write_v73(path: Path) -> Path:
+def write_v73(path):
     """The same content as MATLAB lays it out in HDF5: transposed, structs as groups."""
     with h5py.File(path, "w", userblock_size=512) as root:
         refs = root.create_group("#refs#")
 
-        def put(group: Any, name: str, value: Any, kind: bytes = b"double") -> None:
+        def put(group, name, value, kind=b"double"):
             if isinstance(value, str):
                 value, kind = np.array([[ord(c)] for c in value], dtype=np.uint16), b"char"
             array = np.atleast_2d(value)
@@ -180,7 +176,7 @@ def write_v73(path: Path) -> Path:
                 array = pairs
             group.create_dataset(name, data=array).attrs["MATLAB_class"] = np.bytes_(kind)
 
-        def references(group: Any, name: str, values: list[Any], cell: bool) -> None:
+        def references(group, name, values, cell):
             found = []
             for i, value in enumerate(values):
                 put(refs, f"{name}{i}", value)
@@ -212,7 +208,7 @@ def write_v73(path: Path) -> Path:
 
 
 @pytest.fixture(params=["v5", "v7", "v7.3"])
-def matlab(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def matlab(request, tmp_path):
     path = tmp_path / "lab.mat"
     if request.param == "v7.3":
         return write_v73(path)
@@ -221,17 +217,17 @@ def matlab(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 class TestMatlab:
-    def test_paths_into_structs(self, matlab: Path) -> None:
+    def test_paths_into_structs(self, matlab):
         run = {"time": "rig.run.t [s]", "displacement": "rig.run.x [mm]", "force": "rig.run.F [kN]"}
         assert_the_run(read_record(matlab, columns=run))
 
-    def test_columns_of_a_matrix(self, matlab: Path) -> None:
+    def test_columns_of_a_matrix(self, matlab):
         run = {"time": "table[:,0]", "displacement": "table[:,1]", "force": "table[:,2]"}
         units = {"time": "s", "displacement": "mm", "force": "kN"}
         columns = {role: {"column": name, "unit": units[role]} for role, name in run.items()}
         assert_the_run(read_record(matlab, columns=columns))
 
-    def test_one_struct_of_an_array(self, matlab: Path) -> None:
+    def test_one_struct_of_an_array(self, matlab):
         columns = {
             "frequency": "sweep.levels[2].f [Hz]",
             "response": "sweep.levels[2].H [m/N]",
@@ -241,7 +237,7 @@ class TestMatlab:
         np.testing.assert_allclose(data.response, 3 * RECEPTANCE)
         assert data.levels == []
 
-    def test_all_structs_of_an_array(self, matlab: Path) -> None:
+    def test_all_structs_of_an_array(self, matlab):
         columns = {
             "frequency": {"column": "sweep.levels[*].f", "unit": "Hz"},
             "response": {"column": "sweep.levels[*].H", "unit": "m/N"},
@@ -258,7 +254,7 @@ class TestMatlab:
         ):
             read_frequency_response(matlab, columns=columns)
 
-    def test_contents(self, matlab: Path) -> None:
+    def test_contents(self, matlab):
         contents = inspect(matlab)
         names = {c.name: c for c in contents.channels}
         assert names["rig.run.t"].shape == (64,)
@@ -268,14 +264,14 @@ class TestMatlab:
         assert "nothing" not in names
         assert 'column = "sweep.levels[*].H"' not in contents.column_map  # H is not a usual name
 
-    def test_single_numbers_are_no_channels_of_a_record(self, tmp_path: Path) -> None:
+    def test_single_numbers_are_no_channels_of_a_record(self, tmp_path):
         content = {"T": 0.25, "f": 4.0, "time": TIME, "x": X, "F": F}
         savemat(tmp_path / "a.mat", content)
         proposed = inspect(tmp_path / "a.mat").column_map
         assert re.findall(r'column = "(\w+)"', proposed) == ["time", "x", "F"]
         assert "even, 64 samples" in inspect(tmp_path / "a.mat").sampling
 
-    def test_no_such_path(self, matlab: Path) -> None:
+    def test_no_such_path(self, matlab):
         with pytest.raises(DataError, match=r"no column is called 'rig.run.q'; there are .*rig"):
             read_record(matlab, time="rig.run.q", displacement="rig.run.x", force="rig.run.F")
         with pytest.raises(DataError, match=r"nothing matches 'sweep.\*.f'"):
@@ -286,27 +282,27 @@ class TestMatlab:
                 columns={"frequency": "sweep.levels[*].f", "response": "sweep.level*[0].H"},
             )
 
-    def test_lengths(self, matlab: Path) -> None:
+    def test_lengths(self, matlab):
         with pytest.raises(DataError, match="differ in length: displacement 64, time 64, force 3"):
             read_record(
                 matlab, time="rig.run.t [s]", displacement="rig.run.x [mm]", force="cells[0] [N]"
             )
 
-    def test_units_are_asked_for(self, matlab: Path) -> None:
+    def test_units_are_asked_for(self, matlab):
         with pytest.raises(UnitError, match=r"column 'rig.run.t' has no unit"):
             read_record(matlab, force="rig.run.F [kN]", displacement="rig.run.x [mm]")
 
-    def test_nan_names_its_index(self, tmp_path: Path) -> None:
+    def test_nan_names_its_index(self, tmp_path):
         savemat(tmp_path / "a.mat", {"t": TIME, "x": np.where(TIME[9] == TIME, np.nan, X), "F": F})
         with pytest.raises(DataError, match="index 9, column 'x': the cell is empty or NaN"):
             read_record(tmp_path / "a.mat", time="t [s]", displacement="x [m]", force="F [N]")
 
-    def test_no_matlab_file(self, tmp_path: Path) -> None:
+    def test_no_matlab_file(self, tmp_path):
         (tmp_path / "a.mat").write_bytes(b"\x07\x08\x00" * 99)
         with pytest.raises(DataError, match="the file is damaged or no MATLAB file"):
             read_record(tmp_path / "a.mat")
 
-    def test_nothing_but_a_cube(self, tmp_path: Path) -> None:
+    def test_nothing_but_a_cube(self, tmp_path):
         savemat(tmp_path / "a.mat", {"cube": np.zeros((3, 4, 5))})
         message = r"no vector or matrix of numbers; cube \(\(3, 4, 5\), float64\) is not used"
         with pytest.raises(DataError, match=message):
@@ -314,7 +310,7 @@ class TestMatlab:
 
 
 class TestHdf5:
-    def test_datasets_with_units(self, tmp_path: Path) -> None:
+    def test_datasets_with_units(self, tmp_path):
         with h5py.File(tmp_path / "run.h5", "w") as root:
             for name, values, unit in (("time", TIME, "s"), ("x", X * 1e3, "mm"), ("F", F, b"N")):
                 root.create_dataset(f"rig/{name}", data=values).attrs["units"] = unit
@@ -327,7 +323,7 @@ class TestHdf5:
             read_record(tmp_path / "run.h5", displacement="displacement")
         assert_the_run(read_record(tmp_path / "run.h5", displacement="position"))
 
-    def test_compound(self, tmp_path: Path) -> None:
+    def test_compound(self, tmp_path):
         rows = np.array(list(zip(TIME, X, F, strict=True)), dtype=[(n, "f8") for n in "txF"])
         with h5py.File(tmp_path / "run.h5", "w") as root:
             root["data"] = rows
@@ -335,9 +331,7 @@ class TestHdf5:
         assert_the_run(read_record(tmp_path / "run.h5", columns=run))
 
 
-def uff_function(
-    data: NDArray[Any], x: NDArray[Any], kind: int, numerator: int, **changes: Any
-) -> dict[str, Any]:
+def uff_function(data, x, kind, numerator, **changes):
     """One data set 58."""
     return {
         "type": 58, "func_type": kind, "rsp_node": 1, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3,
@@ -348,7 +342,7 @@ def uff_function(
     }  # fmt: skip
 
 
-def write_uff(path: Path, *sets: dict[str, Any]) -> Path:
+def write_uff(path, *sets):
     pyuff: Any = importlib.import_module("pyuff")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # pyuff leaves binary files open
@@ -365,7 +359,7 @@ MILLIMETRES = {**SI, "units_code": 5, "length": 1e3, "force": 1e3}
 
 class TestUniversalFile:
     @pytest.mark.parametrize("binary", [0, 1])
-    def test_frequency_response(self, tmp_path: Path, binary: int) -> None:
+    def test_frequency_response(self, tmp_path, binary):
         path = write_uff(
             tmp_path / "beam.uff", SI, uff_function(RECEPTANCE, FREQUENCY, 4, 8, binary=binary)
         )
@@ -377,9 +371,7 @@ class TestUniversalFile:
     @pytest.mark.parametrize(
         ("numerator", "quantity"), [(8, "receptance"), (11, "mobility"), (12, "accelerance")]
     )
-    def test_data_types_and_unit_systems(
-        self, tmp_path: Path, numerator: int, quantity: str
-    ) -> None:
+    def test_data_types_and_unit_systems(self, tmp_path, numerator, quantity):
         """Millimetres over millinewtons are metres over newtons."""
         function = uff_function(-1j * RECEPTANCE, FREQUENCY, 4, numerator)
         path = write_uff(tmp_path / "beam.unv", MILLIMETRES, function)
@@ -387,20 +379,20 @@ class TestUniversalFile:
         assert data.quantity == quantity
         np.testing.assert_allclose(data.response, -1j * RECEPTANCE, rtol=1e-11)
 
-    def test_labels_come_first(self, tmp_path: Path) -> None:
+    def test_labels_come_first(self, tmp_path):
         function = uff_function(
             RECEPTANCE, FREQUENCY, 4, 8, ordinate_axis_units_lab="mm", orddenom_axis_units_lab="N"
         )
         data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
         np.testing.assert_allclose(data.response, 1e-3 * RECEPTANCE, rtol=1e-11)
 
-    def test_directions_turn_the_sign(self, tmp_path: Path) -> None:
+    def test_directions_turn_the_sign(self, tmp_path):
         function = uff_function(-RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=-3)
         data = read_frequency_response(write_uff(tmp_path / "a.uff", SI, function), drive="1 N")
         np.testing.assert_allclose(data.response, RECEPTANCE, rtol=1e-11)
         assert "FRF 1:-Z/2:+Z: sign turned, as its directions say" in data.provenance["notes"]
 
-    def test_rotation(self, tmp_path: Path) -> None:
+    def test_rotation(self, tmp_path):
         function = uff_function(RECEPTANCE, FREQUENCY, 4, 8, rsp_dir=6, ref_dir=6)
         inches = {**SI, "units_code": 7, "length": 1 / 0.0254, "force": 1 / 4.4482216152605}
         path = write_uff(tmp_path / "a.uff", inches, function)
@@ -410,7 +402,7 @@ class TestUniversalFile:
             data.response, RECEPTANCE / (4.4482216152605 * 0.0254), rtol=1e-11
         )
 
-    def test_several_functions(self, tmp_path: Path) -> None:
+    def test_several_functions(self, tmp_path):
         functions = [uff_function(k * RECEPTANCE, FREQUENCY, 4, 8, rsp_node=k) for k in (1, 2)]
         path = write_uff(tmp_path / "a.uff", SI, *functions)
         with pytest.raises(DataError, match=r"2 columns may be the response: FRF 1:\+Z/2:\+Z"):
@@ -418,7 +410,7 @@ class TestUniversalFile:
         data = read_frequency_response(path, drive="1 N", columns={"response": "FRF 2:+Z/2:+Z"})
         np.testing.assert_allclose(data.response, 2 * RECEPTANCE, rtol=1e-11)
 
-    def test_time_records(self, tmp_path: Path) -> None:
+    def test_time_records(self, tmp_path):
         path = write_uff(
             tmp_path / "run.uff",
             SI,
@@ -427,16 +419,14 @@ class TestUniversalFile:
         )
         assert_the_run(read_record(path), rtol=1e-10)
 
-    def test_units_outside_ascii(self, tmp_path: Path) -> None:
+    def test_units_outside_ascii(self, tmp_path):
         label = {"ordinate_axis_units_lab": "m/s2", "orddenom_axis_units_lab": "N"}
         path = write_uff(tmp_path / "a.uff", uff_function(RECEPTANCE, FREQUENCY, 4, 12, **label))
         path.write_bytes(path.read_bytes().replace(b"m/s2", "m/s²".encode("cp1252")))
         data = read_frequency_response(path, drive="1 N", passive=False)
         assert data.quantity == "accelerance"
 
-    def test_other_data_sets_are_passed_without_a_word(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_other_data_sets_are_passed_without_a_word(self, tmp_path, capsys):
         path = write_uff(tmp_path / "a.uff", uff_function(RECEPTANCE, FREQUENCY, 4, 8))
         group: list[list[Any]] = [[1, 0, 0, 0, 0, 0, 0, 1], ["left side"], [8, 110, 0, 0]]
         lines = ["".join(f"{cell:>10}" for cell in row) for row in group]
@@ -445,7 +435,7 @@ class TestUniversalFile:
         inspect(path)
         assert not capsys.readouterr().out
 
-    def test_refusal(self, tmp_path: Path) -> None:
+    def test_refusal(self, tmp_path):
         function = uff_function(RECEPTANCE, FREQUENCY, 4, 8)
         with pytest.raises(UnitError, match=r"column 'FRF 1:\+Z/2:\+Z' has no unit"):
             read_frequency_response(write_uff(tmp_path / "a.uff", function), drive="1 N")
@@ -463,7 +453,7 @@ class TestUniversalFile:
         with pytest.raises(DataError, match=r"damaged|cut off|no frequency response"):
             read_frequency_response(path, drive="1 N")
 
-    def test_damage_names_its_data_set(self, tmp_path: Path) -> None:
+    def test_damage_names_its_data_set(self, tmp_path):
         sets = [SI, uff_function(X, TIME, 1, 8), uff_function(F, TIME, 1, 13, rsp_node=2)]
         path = write_uff(tmp_path / "run.uff", *sets)
         before, last = path.read_bytes().rsplit(b"    58", 1)
@@ -473,7 +463,7 @@ class TestUniversalFile:
 
 
 class TestTdms:
-    def write(self, path: Path, **properties: Any) -> Path:
+    def write(self, path, **properties):
         nptdms: Any = importlib.import_module("nptdms")
         wave = {"wf_increment": 1 / 128.0, "wf_start_offset": 0.0, **properties}
         channels = [
@@ -484,10 +474,10 @@ class TestTdms:
             writer.write_segment(channels)
         return path
 
-    def test_waveforms(self, tmp_path: Path) -> None:
+    def test_waveforms(self, tmp_path):
         assert_the_run(read_record(self.write(tmp_path / "run.tdms")))
 
-    def test_units_in_the_channels_names(self, tmp_path: Path) -> None:
+    def test_units_in_the_channels_names(self, tmp_path):
         nptdms: Any = importlib.import_module("nptdms")
         wave = {"wf_increment": 1 / 128.0}
         with nptdms.TdmsWriter(str(tmp_path / "run.tdms")) as writer:
@@ -498,13 +488,13 @@ class TestTdms:
         assert_the_run(read_record(tmp_path / "run.tdms"))
         assert_the_run(read_record(tmp_path / "run.tdms", displacement="rig/Displacement (mm)"))
 
-    def test_without_timing(self, tmp_path: Path) -> None:
+    def test_without_timing(self, tmp_path):
         path = self.write(tmp_path / "run.tdms", wf_increment=0.0)
         with pytest.raises(DataError, match=r"no column holds the time; there are rig/disp"):
             read_record(path)
         assert_the_run(read_record(path, sample_rate=128.0))
 
-    def test_bytes_between_the_samples(self, tmp_path: Path) -> None:
+    def test_bytes_between_the_samples(self, tmp_path):
         path = self.write(tmp_path / "run.tdms")
         data = path.read_bytes()
         path.write_bytes(data[:-100] + bytes(8) + data[-100:])
@@ -535,14 +525,14 @@ X_Value\tdisplacement\tforce\tComment
 
 class TestLvm:
     @pytest.mark.parametrize("mark", [".", ","])
-    def test_channels(self, tmp_path: Path, mark: str) -> None:
+    def test_channels(self, tmp_path, mark):
         rows = (f"{t!r}\t{x * 1e3!r}\t{f!r}" for t, x, f in zip(
             TIME.tolist(), X.tolist(), F.tolist(), strict=True))  # fmt: skip
         text = LVM.format(mark=mark) + "\n".join(rows).replace(".", mark) + "\n"
         (tmp_path / "run.lvm").write_text(text)
         assert_the_run(read_record(tmp_path / "run.lvm"))
 
-    def test_labels_outside_utf_8_with_units_in_them(self, tmp_path: Path) -> None:
+    def test_labels_outside_utf_8_with_units_in_them(self, tmp_path):
         rows = (f"{t!r}\t{x * 1e6!r}\t{f!r}" for t, x, f in zip(
             TIME.tolist(), X.tolist(), F.tolist(), strict=True))  # fmt: skip
         head = LVM.format(mark=".").replace("Y_Unit_Label\tmm\tN\n", "")
@@ -550,7 +540,7 @@ class TestLvm:
         (tmp_path / "run.lvm").write_text(head + "\n".join(rows) + "\n", encoding="cp1252")
         assert_the_run(read_record(tmp_path / "run.lvm", displacement="Verlängerung"), 1e-12)
 
-    def test_without_and_with_many_x_columns(self, tmp_path: Path) -> None:
+    def test_without_and_with_many_x_columns(self, tmp_path):
         values = list(zip(TIME.tolist(), (X * 1e3).tolist(), F.tolist(), strict=True))
         head = LVM.format(mark=".")
         none = head.replace("X_Columns\tOne", "X_Columns\tNo")
@@ -566,7 +556,7 @@ class TestLvm:
 
 
 class TestLvmStrictly:
-    def text(self, rows: list[str], samples: int = 64) -> str:
+    def text(self, rows, samples=64):
         return (
             LVM.format(mark=".").replace(
                 "Channels\t2", f"Channels\t2\nSamples\t{samples}\t{samples}"
@@ -575,20 +565,20 @@ class TestLvmStrictly:
             + "\n"
         )
 
-    def rows(self) -> list[str]:
+    def rows(self):
         return [f"{t!r}\t{x * 1e3!r}\t{f!r}" for t, x, f in zip(
             TIME.tolist(), X.tolist(), F.tolist(), strict=True)]  # fmt: skip
 
-    def read(self, tmp_path: Path, text: str) -> Record:
+    def read(self, tmp_path, text):
         (tmp_path / "run.lvm").write_text(text)
         return read_record(tmp_path / "run.lvm")
 
-    def test_every_sample_is_there(self, tmp_path: Path) -> None:
+    def test_every_sample_is_there(self, tmp_path):
         assert_the_run(self.read(tmp_path, self.text(self.rows())))
         with pytest.raises(DataError, match="60 samples where its header says 64"):
             self.read(tmp_path, self.text(self.rows()[:60]))
 
-    def test_glued_and_blank_lines(self, tmp_path: Path) -> None:
+    def test_glued_and_blank_lines(self, tmp_path):
         rows = self.rows()
         glued = [*rows[:5], rows[5] + rows[6], *rows[7:]]
         with pytest.raises(DataError, match=r"line \d+: 5 fields; expected the 3|is not a number"):
@@ -601,12 +591,12 @@ class TestLvmStrictly:
             self.read(tmp_path, head + "\n".join(blank) + "\n")
 
     @pytest.mark.parametrize("count", ["6_4", "\u00b2", "1" * 30])
-    def test_what_is_no_number_of_samples(self, tmp_path: Path, count: str) -> None:
+    def test_what_is_no_number_of_samples(self, tmp_path, count):
         with pytest.raises(DataError, match="is not a number of samples"):
             self.read(tmp_path, self.text(self.rows()).replace("\t64\t64", f"\t{count}\t64"))
 
     @pytest.mark.parametrize("odd", ["1_000", "0x10", "1,5", "--"])
-    def test_what_is_no_number(self, tmp_path: Path, odd: str) -> None:
+    def test_what_is_no_number(self, tmp_path, odd):
         rows = self.rows()
         rows[3] = f"{TIME[3]}\t{odd}\t1"
         with pytest.raises(DataError, match=f"'{odd}' is not a number"):
@@ -614,7 +604,7 @@ class TestLvmStrictly:
 
 
 class TestOpenDocument:
-    def test_sheet(self, tmp_path: Path) -> None:
+    def test_sheet(self, tmp_path):
         row = "<table:table-row>{}</table:table-row>"
         text = '<table:table-cell office:value-type="string"><text:p>{}</text:p></table:table-cell>'
         number = '<table:table-cell office:value-type="float" office:value="{!r}"/>'
@@ -640,7 +630,7 @@ class TestOpenDocument:
 class TestHostileFiles:
     """Files that claim more than they hold; each is refused before memory or time go."""
 
-    def test_a_sheet_with_a_cell_in_its_last_corner(self, tmp_path: Path) -> None:
+    def test_a_sheet_with_a_cell_in_its_last_corner(self, tmp_path):
         book = openpyxl.Workbook()
         book.worksheets[0].append(["time [s]", "x [mm]"])
         book.worksheets[0]["XFD1048576"] = 1
@@ -648,7 +638,7 @@ class TestHostileFiles:
         with pytest.raises(DataError, match="the workbook is damaged, or too large"):
             read_record(tmp_path / "far.xlsx")
 
-    def test_whole_numbers_of_any_size(self, tmp_path: Path) -> None:
+    def test_whole_numbers_of_any_size(self, tmp_path):
         book = openpyxl.Workbook()
         for row in [["time [s]", "x [mm]", "F [N]"], [0, 1, 1], [1, 987654321, 2]]:
             book.worksheets[0].append(row)
@@ -662,7 +652,7 @@ class TestHostileFiles:
         with pytest.raises(DataError, match="row 3, column 'x'"):
             read_record(tmp_path / "run.xlsx")
 
-    def test_hdf5_of_exabytes(self, tmp_path: Path) -> None:
+    def test_hdf5_of_exabytes(self, tmp_path):
         with h5py.File(tmp_path / "a.h5", "w") as file:
             for name in ("time", "displacement", "force"):
                 item = file.create_dataset(name, (1 << 58,), "f8", chunks=(1024,))
@@ -670,7 +660,7 @@ class TestHostileFiles:
         with pytest.raises(DataError, match=r"would take .* PB"):
             read_record(tmp_path / "a.h5")
 
-    def test_nested_groups_and_null_references(self, tmp_path: Path) -> None:
+    def test_nested_groups_and_null_references(self, tmp_path):
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file.create_group("/".join("g" * 60))
         with pytest.raises(DataError, match="nested deeper than 32 levels"):
@@ -681,7 +671,7 @@ class TestHostileFiles:
             null.attrs["MATLAB_class"] = np.bytes_("cell")
         assert len(inspect(path).channels) > 5
 
-    def test_nested_parquet(self, tmp_path: Path) -> None:
+    def test_nested_parquet(self, tmp_path):
         frame = pd.DataFrame(cells(), columns=["time [s]", "x [mm]", "F [kN]"])
         frame["list"] = [[1, 2]] * len(frame)
         frame["struct"] = pd.Series([{"a": 1}] * len(frame), dtype=object)
@@ -700,12 +690,12 @@ class TestHostileFiles:
             '{"time [s]":[0,1],"x [m]":[0,1],"F [N]":[0,1],"F [N]":[1,2]}',
         ],
     )
-    def test_json_that_is_no_table(self, tmp_path: Path, content: str) -> None:
+    def test_json_that_is_no_table(self, tmp_path, content):
         (tmp_path / "a.json").write_text(content)
         with pytest.raises(DataError):
             read_record(tmp_path / "a.json")
 
-    def test_bytes_behind_an_npy_array(self, tmp_path: Path) -> None:
+    def test_bytes_behind_an_npy_array(self, tmp_path):
         np.save(tmp_path / "a.npy", np.arange(8.0))
         data = (tmp_path / "a.npy").read_bytes() + bytes(8)
         (tmp_path / "a.npy").write_bytes(data)
@@ -714,13 +704,13 @@ class TestHostileFiles:
             with pytest.raises(DataError, match="damaged: 8 bytes behind its array"):
                 read_record(tmp_path / name)
 
-    def test_an_archive_that_unpacks_to_more_than_its_limit(self, tmp_path: Path) -> None:
+    def test_an_archive_that_unpacks_to_more_than_its_limit(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("x.npy", bytes(300_000_000))
         with pytest.raises(DataError, match=r"the content would take 300 MB, and the file has"):
             read_record(tmp_path / "a.npz")
 
-    def test_objects_in_npz_are_not_run(self, tmp_path: Path) -> None:
+    def test_objects_in_npz_are_not_run(self, tmp_path):
         np.savez(tmp_path / "a.npz", a=np.array([{"x": 1}], dtype=object))
         with pytest.raises(DataError, match="the file is damaged: Object arrays cannot be loaded"):
             read_record(tmp_path / "a.npz")
@@ -749,11 +739,11 @@ class TestDictionaries:
              {"name": "F", "data": F, "fs": 128, "unit_str": "N"}],
         ],
     )  # fmt: skip
-    def test_json(self, tmp_path: Path, content: Any) -> None:
+    def test_json(self, tmp_path, content):
         (tmp_path / "run.json").write_text(json.dumps(content, default=lambda a: a.tolist()))
         assert_the_run(read_record(tmp_path / "run.json"))
 
-    def test_npz_and_npy(self, tmp_path: Path) -> None:
+    def test_npz_and_npy(self, tmp_path):
         named: dict[str, Any] = {"time [s]": TIME, "x [mm]": X * 1e3, "F [N]": F}
         np.savez(tmp_path / "run.npz", **named)
         assert_the_run(read_record(tmp_path / "run.npz"))
@@ -770,7 +760,7 @@ class TestDictionaries:
             read_record(tmp_path / "run.npy", time="t [s]", displacement="x [m]", force="F [N]")
         )
 
-    def test_sdypy_there_and_back(self) -> None:
+    def test_sdypy_there_and_back(self):
         record = Record(TIME, displacement=X, force=F)
         assert_the_run(read_record(record.to_sdypy()))
         uneven = Record(TIME**2 + 1.0, velocity=X, drive=F)
@@ -790,7 +780,7 @@ class TestDictionaries:
             ({"data": np.zeros((3, 3))}, "expected a list of numbers"),
         ],
     )
-    def test_sdypy_refusals(self, change: dict[str, Any], message: str) -> None:
+    def test_sdypy_refusals(self, change, message):
         channels = [{"name": n, "data": v, "fs": 128.0, "unit_str": u}
                     for n, v, u in (("x", X, "m"), ("F", F, "N"))]  # fmt: skip
         with pytest.raises(DataError, match=message):
@@ -813,12 +803,12 @@ class TestWrongExtension:
             ("a.foo", b"PK\x03\x04....", "a ZIP archive is not read"),
         ],
     )
-    def test_content_decides(self, tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    def test_content_decides(self, tmp_path, name, content, message):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=message):
             inspect(tmp_path / name)
 
-    def test_unknown_extensions_are_read_by_content(self, tmp_path: Path) -> None:
+    def test_unknown_extensions_are_read_by_content(self, tmp_path):
         savemat(tmp_path / "run.mat", {"t": TIME, "x": X, "F": F})
         (tmp_path / "run.mat").rename(tmp_path / "run.bin")
         run = {"time": "t [s]", "displacement": "x [m]", "force": "F [N]"}
@@ -834,14 +824,7 @@ class TestWrongExtension:
         ("nptdms", "tdms", "a.tdms", b"TDSm"),
     ],
 )
-def test_missing_packages_are_named(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    module: str,
-    extra: str,
-    name: str,
-    content: bytes,
-) -> None:
+def test_missing_packages_are_named(tmp_path, monkeypatch, module, extra, name, content):
     (tmp_path / name).write_bytes(content)
     monkeypatch.setitem(sys.modules, module, None)
     message = rf"{module} is needed .* pip install 'dahl_ident\[{extra}\]'"
@@ -849,7 +832,7 @@ def test_missing_packages_are_named(
         inspect(tmp_path / name)
 
 
-def test_errors_name_the_level(tmp_path: Path) -> None:
+def test_errors_name_the_level(tmp_path):
     levels = [{"f": FREQUENCY, "u": [1.0, 1.0, v], "H": RECEPTANCE} for v in (1.0, -1.0)]
     savemat(tmp_path / "a.mat", {"s": np.array(levels, dtype=object)})
     columns = {
@@ -861,7 +844,7 @@ def test_errors_name_the_level(tmp_path: Path) -> None:
         read_frequency_response(tmp_path / "a.mat", columns=columns)
 
 
-def test_doubts_name_indices(tmp_path: Path) -> None:
+def test_doubts_name_indices(tmp_path):
     savemat(tmp_path / "a.mat", {"f": FREQUENCY, "u": np.ones(3), "H": RECEPTANCE.conj()})
     columns = {"frequency": "f [Hz]", "drive": "u [N]", "response": "H [m/N]"}
     with pytest.raises(DataError, match="creates energy"):
@@ -872,7 +855,7 @@ def test_doubts_name_indices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("Ts", 0.01), ("fs", 100.0)])
-def test_a_sample_rate_in_the_file_is_proposed(tmp_path: Path, name: str, value: float) -> None:
+def test_a_sample_rate_in_the_file_is_proposed(tmp_path, name, value):
     path = tmp_path / "run.mat"
     savemat(path, {name: value, "x": np.sin(np.arange(50.0)), "F": np.arange(50.0)})
     assert "# sample_rate = 100  # Hz, " in inspect(path).column_map

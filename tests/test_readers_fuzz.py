@@ -1,12 +1,8 @@
 """Whatever the bytes: a valid object, or an error that this package raises on purpose."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import warnings
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +13,6 @@ from scipy.io import savemat
 
 from dahl_ident.data import (
     FrequencyResponse,
-    Record,
     inspect,
     read_frequency_response,
     read_record,
@@ -48,7 +43,7 @@ GOOD = [
 
 
 @st.composite
-def tables(draw: st.DrawFn) -> bytes:
+def tables(draw):
     """Tables that are right, or nearly so: a few names, cells and lines are replaced."""
     delimiter = draw(st.sampled_from([",", ";", "\t", "|", " ", ", "]))
     header = list(draw(st.sampled_from(GOOD)))
@@ -74,7 +69,7 @@ def tables(draw: st.DrawFn) -> bytes:
     return (end.join(lines) + draw(st.sampled_from(["", end]))).encode(encoding, "replace")
 
 
-def check_record(record: Record) -> None:
+def check_record(record):
     assert np.isfinite(record.time).all()
     assert (np.diff(record.time) > 0.0).all()
     assert np.isfinite(record.motion_samples).all()
@@ -82,7 +77,7 @@ def check_record(record: Record) -> None:
     repr(record)
 
 
-def check_response(data: FrequencyResponse) -> None:
+def check_response(data):
     assert (data.frequency_hz > 0.0).all()
     assert np.isfinite(data.response).all()
     for values in (data.amplitude, data.drive):
@@ -90,7 +85,7 @@ def check_response(data: FrequencyResponse) -> None:
     repr(data)
 
 
-def read_every_way(path: Path) -> None:
+def read_every_way(path):
     """Read a file as everything it may be; only this package's errors and doubts may come out."""
     record_map = {"time": "column 1 [s]", "displacement": "column 2 [m]", "force": "column 3 [N]"}
     ways: list[Any] = [
@@ -111,18 +106,18 @@ def read_every_way(path: Path) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def _parsed_once(monkeypatch):
     monkeypatch.setattr(readers, "_parsed", reader_fuzz.ParsedOnce(readers._parsed))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("fuzz")
 
 
 @settings(max_examples=80)
 @given(tables())
-def test_tables_that_are_nearly_right(folder: Path, content: bytes) -> None:
+def test_tables_that_are_nearly_right(folder, content):
     path = folder / "table.csv"
     path.write_bytes(content)
     read_every_way(path)
@@ -130,13 +125,13 @@ def test_tables_that_are_nearly_right(folder: Path, content: bytes) -> None:
 
 @settings(max_examples=60)
 @given(st.one_of(st.binary(max_size=400), st.text(max_size=200).map(lambda t: t.encode())))
-def test_any_bytes(folder: Path, content: bytes) -> None:
+def test_any_bytes(folder, content):
     path = folder / "file.txt"
     path.write_bytes(content)
     read_every_way(path)
 
 
-def response_table() -> bytes:
+def response_table():
     Z = 1e3 * (1.0 + 0.3j) * np.linspace(1.0, 0.5, 6)
     data = FrequencyResponse(
         np.linspace(1, 9, 6), Z, np.geomspace(1e-5, 1e-3, 6), covariance=[np.eye(2)] * 6, dof=4.0,
@@ -154,7 +149,7 @@ TABLE = response_table()
 @given(
     st.integers(0, len(TABLE) - 1), st.integers(0, 255), st.sampled_from(["cut", "swap", "drop"])
 )
-def test_one_damaged_byte(folder: Path, place: int, byte: int, how: str) -> None:
+def test_one_damaged_byte(folder, place, byte, how):
     damaged = {
         "cut": TABLE[:place],
         "swap": TABLE[:place] + bytes([byte]) + TABLE[place + 1 :],
@@ -167,7 +162,7 @@ def test_one_damaged_byte(folder: Path, place: int, byte: int, how: str) -> None
 
 @settings(max_examples=30)
 @given(st.integers(0, 10_000), st.integers(0, 255), st.booleans())
-def test_damaged_matlab_file(folder: Path, place: int, byte: int, cut: bool) -> None:
+def test_damaged_matlab_file(folder, place, byte, cut):
     buffer = io.BytesIO()
     content = {"time": np.arange(9.0), "lab": {"x": np.arange(9.0), "F": [1.0, 2.0]}}
     save: Any = savemat
@@ -189,9 +184,7 @@ MEASURED = st.floats(-1e6, 1e6).filter(lambda value: value == 0.0 or abs(value) 
     st.sampled_from(["\n", "\r\n", "\r"]),
     st.sampled_from(["", "# made by a logger\n", "Rig 5\n\n", "rate;5\n"]),
 )
-def test_good_tables_are_read_to_the_last_digit(
-    folder: Path, rows: list[tuple[float, float]], dialect: tuple[str, str], end: str, preamble: str
-) -> None:
+def test_good_tables_are_read_to_the_last_digit(folder, rows, dialect, end, preamble):
     delimiter, mark = dialect
     lines = [f"{a!r}{delimiter}{b!r}".replace(".", mark) for a, b in rows]
     text = preamble + end.join([f"a{delimiter}b", *lines])
@@ -209,7 +202,7 @@ MUTANTS, FEWER = 20, {"xlsx": 4, "uff": 8}
 
 
 @pytest.fixture(scope="module")
-def reader() -> Iterator[reader_fuzz.Reader]:
+def reader():
     reader_fuzz.files()  # before the process starts: it then has the libraries
     reader = reader_fuzz.Reader()
     yield reader
@@ -217,7 +210,7 @@ def reader() -> Iterator[reader_fuzz.Reader]:
 
 
 @pytest.mark.parametrize("name", list(reader_fuzz.files()))
-def test_damaged_files_are_read_right_or_refused(name: str, reader: reader_fuzz.Reader) -> None:
+def test_damaged_files_are_read_right_or_refused(name, reader):
     content = reader_fuzz.files()[name]
     assert reader.judge(name, content, "none") == ("accepted", "")
     mutants = FEWER.get(name, MUTANTS)

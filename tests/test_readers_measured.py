@@ -1,7 +1,5 @@
 """Measurements made by others, read as their laboratories left them."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from pathlib import Path
@@ -12,7 +10,7 @@ from scipy.integrate import trapezoid
 from scipy.io import loadmat
 
 from benchmarks.measured import BEAM
-from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
+from dahl_ident.data import inspect, read_frequency_response, read_record
 
 MEASURED = os.environ.get("DAHL_IDENT_MEASURED_DATA")
 pytestmark = pytest.mark.skipif(
@@ -24,14 +22,14 @@ FILES = sorted((FOLDER / "brfd").glob("*.csv"))
 
 
 @pytest.fixture(scope="module")
-def beam(tmp_path_factory: pytest.TempPathFactory) -> FrequencyResponse:
+def beam(tmp_path_factory):
     columns = tmp_path_factory.mktemp("lab") / "brb.toml"
     columns.write_text(BEAM)
     return read_frequency_response(FOLDER / "brb" / "ForcedFrequencyResponses.mat", columns=columns)
 
 
 class TestBrakeReussBeam:
-    def test_twelve_levels_with_one_map(self, beam: FrequencyResponse) -> None:
+    def test_twelve_levels_with_one_map(self, beam):
         assert beam.n == 12 * 41
         assert beam.levels == [f"ForceControl[{i}]" for i in range(4)] + [
             f"ResponseControl[{i}]" for i in range(8)
@@ -42,7 +40,7 @@ class TestBrakeReussBeam:
             held = "force" if label.startswith("Force") else "displacement"
             assert set(beam.select(level=label).controlled) == {held}
 
-    def test_numbers_are_the_file_s(self, beam: FrequencyResponse) -> None:
+    def test_numbers_are_the_file_s(self, beam):
         content = loadmat(
             str(FOLDER / "brb" / "ForcedFrequencyResponses.mat"), simplify_cells=True
         )["FRdata"]
@@ -55,7 +53,7 @@ class TestBrakeReussBeam:
             expected = displacement / raw["force"] * np.exp(1j * raw["phase"])
             np.testing.assert_allclose(part.response, expected, rtol=1e-13)
 
-    def test_the_beam_dissipates(self, beam: FrequencyResponse) -> None:
+    def test_the_beam_dissipates(self, beam):
         """Passive at every point, and resonant within the band, as a displacement's phase says."""
         Z = beam.to("dynamic_stiffness")
         assert (Z.response.imag > 0.0).all()
@@ -63,18 +61,18 @@ class TestBrakeReussBeam:
             real = Z.select(level=label).response.real
             assert real[0] > 0.0 > real[-1]
 
-    def test_force_of_a_response_controlled_level_varies(self, beam: FrequencyResponse) -> None:
+    def test_force_of_a_response_controlled_level_varies(self, beam):
         for label in beam.levels[4:]:
             part = beam.select(level=label)
             assert part.drive.min() < 0.5 * part.drive.max()
             assert part.amplitude.max() < 1.2 * part.amplitude.min()
 
-    def test_inspect_proposes_the_paths(self) -> None:
+    def test_inspect_proposes_the_paths(self):
         contents = inspect(FOLDER / "brb" / "ForcedFrequencyResponses.mat")
         for name in ("frequency", "amplitude", "force", "phase"):
             assert f'column = "FRdata.*[*].{name}"' in contents.column_map
 
-    def test_survives_a_file(self, beam: FrequencyResponse, tmp_path: Path) -> None:
+    def test_survives_a_file(self, beam, tmp_path):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             back = read_frequency_response(beam.save(tmp_path / "brb.csv.gz"))
@@ -84,7 +82,7 @@ class TestBrakeReussBeam:
 
 class TestFrictionDamper:
     @pytest.mark.parametrize("path", FILES, ids=[file.stem for file in FILES])
-    def test_every_file_is_a_record(self, path: Path) -> None:
+    def test_every_file_is_a_record(self, path):
         record = read_record(path, displacement="displacement", force="friction force")
         raw = np.loadtxt(path, delimiter=",", skiprows=1)
         np.testing.assert_array_equal(record.time, raw[:, 0])
@@ -98,10 +96,10 @@ class TestFrictionDamper:
             "columns not used: velocity, actuator force 1, actuator force 2"
         ]
 
-    def test_there_are_ten(self) -> None:
+    def test_there_are_ten(self):
         assert len(list((FOLDER / "brfd").glob("*.csv"))) == 10
 
-    def test_the_damper_dissipates(self) -> None:
+    def test_the_damper_dissipates(self):
         """Work over a whole test is positive, in joules that kip and inch alone would not give."""
         record = read_record(
             FOLDER / "brfd" / "band30lb_0.5Hz_1in.csv",
@@ -111,7 +109,7 @@ class TestFrictionDamper:
         work = float(trapezoid(record.force_samples, record.displacement))
         assert 1e3 < work < 1e5
 
-    def test_of_two_motions_the_displacement_is_used(self) -> None:
+    def test_of_two_motions_the_displacement_is_used(self):
         record = read_record(FOLDER / "brfd" / "band30lb_2Hz_0.5in.csv", force="friction force")
         assert record.motion_channel == "displacement"
         assert "displacement is used, and not velocity" in (record.provenance or {})["notes"]

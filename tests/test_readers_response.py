@@ -1,16 +1,11 @@
 """Tables of response: every form they come in, doubts about them, many files into one."""
 
-from __future__ import annotations
-
 import math
 import warnings
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 
 from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, UnitError, ValidationError
@@ -22,13 +17,13 @@ AMPLITUDE = np.array([1e-3, 2e-3, 4e-3])
 STIFFNESS = np.array([3e3 + 4e3j, 1e3 + 2e3j, 5e2 + 1e2j])
 
 
-def read(table: dict[str, Any], **options: Any) -> FrequencyResponse:
+def read(table, **options):
     """Read columns as a table, without its file."""
     frame = pd.DataFrame(table)
     return read_frequency_response(frame, **options)
 
 
-def known(array: NDArray[Any] | None) -> NDArray[Any]:
+def known(array):
     assert array is not None
     return array
 
@@ -57,7 +52,7 @@ class TestForms:
             {"frf [N/m]": [f"{z.real:.17g} {z.imag:+.17g}i" for z in STIFFNESS]},
         ],
     )
-    def test_all_forms_agree(self, columns: dict[str, Any]) -> None:
+    def test_all_forms_agree(self, columns):
         data = read({**BASE, **columns})
         np.testing.assert_allclose(data.response, STIFFNESS, rtol=1e-13)
         np.testing.assert_allclose(known(data.amplitude), AMPLITUDE)
@@ -72,7 +67,7 @@ class TestForms:
             ("amplitude [um/s^2]", 2),
         ],
     )
-    def test_amplitudes_of_any_motion(self, header: str, power: int) -> None:
+    def test_amplitudes_of_any_motion(self, header, power):
         columns = {**RECTANGULAR, header: AMPLITUDE * OMEGA**power * 1e6}
         del columns["amplitude [mm]"]
         np.testing.assert_allclose(known(read(columns).amplitude), AMPLITUDE, rtol=1e-13)
@@ -80,7 +75,7 @@ class TestForms:
     @pytest.mark.parametrize(
         ("header", "factor"), [("[N]", 1.0), ("[N rms]", math.sqrt(2)), ("[N pp]", 0.5)]
     )
-    def test_markers(self, header: str, factor: float) -> None:
+    def test_markers(self, header, factor):
         force = AMPLITUDE * abs(STIFFNESS)
         data = read({**RECTANGULAR, f"drive {header}": force / factor})
         np.testing.assert_allclose(known(data.drive), force, rtol=1e-14)
@@ -94,7 +89,7 @@ class TestForms:
             ("freq [kHz]", FREQUENCY / 1e3),
         ],
     )
-    def test_frequencies(self, header: str, values: Any) -> None:
+    def test_frequencies(self, header, values):
         columns = {**RECTANGULAR, header: values}
         del columns["frequency_hz"]
         np.testing.assert_allclose(read(columns).frequency_hz, FREQUENCY, rtol=1e-14)
@@ -109,12 +104,12 @@ class TestForms:
             ("kg", "apparent_mass", -STIFFNESS / OMEGA**2),
         ],
     )
-    def test_the_unit_tells_the_quantity(self, unit: str, quantity: str, response: Any) -> None:
+    def test_the_unit_tells_the_quantity(self, unit, quantity, response):
         data = read({**BASE, f"real [{unit}]": response.real, f"imag [{unit}]": response.imag})
         assert data.quantity == quantity
         np.testing.assert_allclose(data.to("dynamic_stiffness").response, STIFFNESS, rtol=1e-13)
 
-    def test_rotation(self) -> None:
+    def test_rotation(self):
         data = read(
             {
                 "frequency_hz": FREQUENCY,
@@ -128,7 +123,7 @@ class TestForms:
         np.testing.assert_allclose(data.response, STIFFNESS * factor)
         assert data.unit == "N m/rad"
 
-    def test_phase_with_amplitude_and_drive(self) -> None:
+    def test_phase_with_amplitude_and_drive(self):
         """The phase is that of the quantity named, whatever motion the amplitude is."""
         columns = {
             "frequency_hz": FREQUENCY,
@@ -141,7 +136,7 @@ class TestForms:
         with pytest.raises(DataError, match="say which quantity's it is"):
             read(columns)
 
-    def test_one_amplitude_or_drive_for_all(self) -> None:
+    def test_one_amplitude_or_drive_for_all(self):
         response = {"real [N/m]": STIFFNESS.real, "imag [N/m]": STIFFNESS.imag}
         columns = {"frequency_hz": FREQUENCY, **response}
         data = read(columns, drive="200 mN pp")
@@ -156,7 +151,7 @@ class TestForms:
         with pytest.raises(DataError, match="drive is '0 N'; expected a value > 0"):
             read(columns, drive="0 N")
 
-    def test_drive_in_volts(self) -> None:
+    def test_drive_in_volts(self):
         columns = {**RECTANGULAR, "drive [mV]": AMPLITUDE * abs(STIFFNESS) / 12.5 * 1e3}
         mapped = {"drive_factor": "12.5 N/V", "drive_factor_uncertainty": 0.02}
         data = read(columns, columns=mapped)
@@ -169,7 +164,7 @@ class TestForms:
         with pytest.raises(UnitError, match=r"drive_factor has the unit \[N/A\]; expected"):
             read(columns, columns={"drive_factor": "12.5 N/A"})
 
-    def test_what_is_assumed_is_said(self) -> None:
+    def test_what_is_assumed_is_said(self):
         data = read(RECTANGULAR)
         assert data.provenance["notes"] == [
             "amplitude [mm] taken as zero to peak: the table does not say",
@@ -180,7 +175,7 @@ class TestForms:
             "amplitude": "amplitude [mm pk]"})  # fmt: skip
         assert "notes" not in known_provenance(silent)
 
-    def test_sign_of_the_phase(self) -> None:
+    def test_sign_of_the_phase(self):
         columns = {
             **BASE,
             "gain [N/m]": abs(STIFFNESS),
@@ -190,11 +185,11 @@ class TestForms:
         np.testing.assert_allclose(data.response, STIFFNESS)
 
 
-def known_provenance(data: FrequencyResponse) -> dict[str, Any]:
+def known_provenance(data):
     return dict(data.provenance)
 
 
-def test_units_at_the_end_of_names(tmp_path: Path) -> None:
+def test_units_at_the_end_of_names(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(
         "freq_Hz,drive_mN,receptance_re_m_per_N,receptance_im_m_per_N\n1,200,2e-3,-1e-3\n"
@@ -207,7 +202,7 @@ def test_units_at_the_end_of_names(tmp_path: Path) -> None:
     np.testing.assert_allclose(known(record.displacement), [1e-6, 2e-6])
 
 
-def test_columns_without_a_role_are_covariates(tmp_path: Path) -> None:
+def test_columns_without_a_role_are_covariates(tmp_path):
     others = {"tension": [10, 20, 20], "gap": [1.0, np.nan, 2.0], "note": ["a", "b", "c"]}
     data = read({**RECTANGULAR, **others})
     assert list(data.quality) == ["tension"]  # of numbers, all of them finite
@@ -221,7 +216,7 @@ def test_columns_without_a_role_are_covariates(tmp_path: Path) -> None:
 
 
 class TestErrors:
-    def test_standard_deviations(self) -> None:
+    def test_standard_deviations(self):
         n = len(STIFFNESS)
         data = read({**RECTANGULAR, "std": [1.0, 2.0, 3.0], "dof": [3.0, np.inf, 5.0]})
         np.testing.assert_allclose(
@@ -231,7 +226,7 @@ class TestErrors:
         data = read({**RECTANGULAR, "real_std [kN/m]": [1.0] * n, "imag_std": [2.0] * n})
         np.testing.assert_allclose(known(data.covariance), [np.diag([1e6, 4.0])] * n)
 
-    def test_polar_standard_deviations(self) -> None:
+    def test_polar_standard_deviations(self):
         """Against the sample covariance of drawn gains and phases."""
         rng = np.random.default_rng(5)
         data = read(
@@ -255,7 +250,7 @@ class TestErrors:
                 known(data.covariance)[k], sample, rtol=0.02, atol=0.02 * np.abs(sample).max()
             )
 
-    def test_polar_table_reads_back(self) -> None:
+    def test_polar_table_reads_back(self):
         data = read({**RECTANGULAR, "std": [30.0, 20.0, 10.0]})
         again = read_frequency_response(data.to_frame(polar=True))
         np.testing.assert_allclose(again.response, data.response)
@@ -279,7 +274,7 @@ class TestErrors:
             ({"dof": 3.0}, DataError, "dof is given without covariance"),
         ],
     )
-    def test_bad_errors(self, columns: Any, error: type[Exception], message: str) -> None:
+    def test_bad_errors(self, columns, error, message):
         with pytest.raises(error, match=message):
             read({**RECTANGULAR, **columns})
 
@@ -303,28 +298,28 @@ class TestRefusal:
             ({"controlled": "speed"}, "row 1, column 'controlled': found speed"),
         ],
     )
-    def test_bad_cells(self, columns: dict[str, Any], message: str) -> None:
+    def test_bad_cells(self, columns, message):
         with pytest.raises(DataError, match=message):
             read({**RECTANGULAR, **columns})
 
-    def test_negative_gain(self) -> None:
+    def test_negative_gain(self):
         with pytest.raises(DataError, match=r"row 3, column 'gain': found -1.0 .* a gain >= 0"):
             read({**BASE, "gain [N/m]": [1.0, 1.0, -1.0], "phase_deg": 10.0})
 
     @pytest.mark.parametrize(("role", "value"), [("amplitude", "5 um"), ("drive", "0.2 N")])
-    def test_a_column_and_a_value_for_the_file(self, role: str, value: str) -> None:
+    def test_a_column_and_a_value_for_the_file(self, role, value):
         table = {**RECTANGULAR, "drive [N]": [1.0, 2.0, 3.0]}
         message = f"{role}='{value}' is given, and column '{role}' holds the {role} too"
         with pytest.raises(DataError, match=message):
             read(table, **{role: value})
 
-    def test_no_response(self) -> None:
+    def test_no_response(self):
         with pytest.raises(DataError, match="no response; expected real and imag, gain"):
             read(BASE)
         with pytest.raises(DataError, match="'response' holds no complex numbers"):
             read({**BASE, "response [N/m]": 1.0})
 
-    def test_units(self) -> None:
+    def test_units(self):
         with pytest.raises(UnitError, match=r"imag in \[N s/m\] is mechanical_impedance"):
             read({**RECTANGULAR, "imag [N s/m]": 1.0}, columns={"imag": "imag [N s/m]",
                  "quantity": "dynamic_stiffness"})  # fmt: skip
@@ -335,56 +330,56 @@ class TestRefusal:
         with pytest.raises(UnitError, match="does not say what 0 dB is"):
             read({**BASE, "gain [dB]": 1.0, "phase_deg": 1.0})
 
-    def test_real_and_imaginary_part_are_of_one_quantity(self) -> None:
+    def test_real_and_imaginary_part_are_of_one_quantity(self):
         with pytest.raises(UnitError, match="real is dynamic_stiffness, imag mechanical_impedance"):
             read({**BASE, "real [N/m]": 1.0, "imag [N s/m]": 1.0})
 
-    def test_zero_hertz_can_be_left_out(self) -> None:
+    def test_zero_hertz_can_be_left_out(self):
         columns = {**RECTANGULAR, "frequency_hz": [0.0, 1.0, 2.0], "real [N/m]": [np.nan, 1.0, 1.0]}
         frame = pd.DataFrame(columns)
         with pytest.raises(DataError, match=r"a frequency > 0; frequency_hz=\(low, high\) keeps"):
             read_frequency_response(frame)
 
-    def test_empty_frame(self) -> None:
+    def test_empty_frame(self):
         with pytest.raises(DataError, match="the table is empty"):
             read_frequency_response(pd.DataFrame())
 
 
 class TestDoubts:
-    def test_clean_tables_raise_no_doubt(self) -> None:
+    def test_clean_tables_raise_no_doubt(self):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             read({**RECTANGULAR, "drive [N]": AMPLITUDE * abs(STIFFNESS)})
 
-    def test_radians_in_a_degree_column(self) -> None:
+    def test_radians_in_a_degree_column(self):
         with pytest.warns(DataWarning, match=r"no phase is above 2 pi; .*: row 1, row 2, row 3"):
             read({**BASE, "gain [N/m]": 1.0, "phase_deg": np.angle(STIFFNESS)})
 
-    def test_degrees_in_a_radian_column(self) -> None:
+    def test_degrees_in_a_radian_column(self):
         with pytest.warns(DataWarning, match=r"above 4 pi; are they degrees\?: row 1, row 2$"):
             read({**BASE, "gain [N/m]": 1.0, "phase [rad]": [53.13, 63.43, 11.31]}, passive=False)
 
-    def test_rms_against_zero_to_peak(self) -> None:
+    def test_rms_against_zero_to_peak(self):
         force = AMPLITUDE * abs(STIFFNESS) * [1.0, 1.0, 1 / math.sqrt(2)]
         with pytest.warns(DataWarning, match=r"\(rms against zero to peak\?\): row 3$"):
             read({**RECTANGULAR, "drive [N]": force})
 
-    def test_single_rows_that_create_energy(self) -> None:
+    def test_single_rows_that_create_energy(self):
         with pytest.warns(DataWarning, match="the phase's sign creates energy: row 2$"):
             read({**RECTANGULAR, "imag [N/m]": STIFFNESS.imag * [1.0, -1.0, 1.0],
                   "amplitude [mm]": [1.0, 1.0, 1.0]})  # fmt: skip
 
-    def test_a_table_that_creates_energy(self) -> None:
+    def test_a_table_that_creates_energy(self):
         wrong = {**RECTANGULAR, "imag [N/m]": -STIFFNESS.imag}
         with pytest.raises(DataError, match=r"creates energy: .* 10.4 times its standard error"):
             read(wrong)
         assert read(wrong, passive=False).n == 3
 
-    def test_receptance_with_the_sign_of_a_stiffness(self) -> None:
+    def test_receptance_with_the_sign_of_a_stiffness(self):
         with pytest.raises(DataError, match="count the phase the other way round"):
             read({**BASE, "gain [m/N]": 1e-3, "phase_deg": [10.0, 20.0, 30.0]})
 
-    def test_noise_is_no_created_energy(self) -> None:
+    def test_noise_is_no_created_energy(self):
         """Loss below the noise is negative half the time; three sigma refuses 1 in 740."""
         rng = np.random.default_rng(20)
         refused = 0
@@ -398,25 +393,25 @@ class TestDoubts:
                 refused += 1
         assert refused <= 2  # a binomial of 100 and 0.00135 exceeds 2 once in 2,600 seeds
 
-    def test_known_loss_below_zero_is_refused(self) -> None:
+    def test_known_loss_below_zero_is_refused(self):
         with pytest.raises(DataError, match="creates energy"):
             read({**RECTANGULAR, "imag [N/m]": -4.0, "std": 1.0})
         with pytest.warns(DataWarning, match="creates energy"):
             # four standard errors from two degrees of freedom are not proof
             read({**RECTANGULAR, "imag [N/m]": [-9.0, 300.0, 300.0], "std": 1.0})
 
-    def test_harmonics_may_have_any_sign(self) -> None:
+    def test_harmonics_may_have_any_sign(self):
         data = read({**RECTANGULAR, "imag [N/m]": [-1e3, 2e3, -1e3], "harmonic": [3, 1, 5]})
         assert data.harmonic.tolist() == [3, 1, 5]
 
-    def test_many_rows_are_counted(self) -> None:
+    def test_many_rows_are_counted(self):
         n = 30
         columns = {"frequency_hz": np.arange(1.0, n + 1), "amplitude [m]": 1.0, "gain [N/m]": 1.0}
         with pytest.warns(DataWarning, match="row 10 and 20 more$"):
             read({**columns, "phase_deg": np.linspace(0.5, 1.5, n)})
 
 
-def exported(folder: Path, name: str, drive: float) -> Path:
+def exported(folder, name, drive):
     """One file of an analyser: frequency and response, the level in the name alone."""
     frame = pd.DataFrame(
         {
@@ -432,27 +427,27 @@ def exported(folder: Path, name: str, drive: float) -> Path:
 class TestSilentErrors:
     """What was once read without a word."""
 
-    def table(self, gain: list[float], phase: list[float]) -> pd.DataFrame:
+    def table(self, gain, phase):
         n = len(gain)
         return pd.DataFrame({
             "frequency_hz": np.ones(n), "amplitude [m]": np.arange(1.0, n + 1.0),
             "gain [N/m]": gain, "phase_deg": phase,
         })  # fmt: skip
 
-    def test_one_phase_against_all_others(self) -> None:
+    def test_one_phase_against_all_others(self):
         with pytest.warns(DataWarning, match="creates energy: row 2"):
             read_frequency_response(self.table([9, 8, 7, 6], [5.0, -8.0, 9.0, 12.0]))
         with pytest.warns(DataWarning, match="creates energy: row 3"):
             read_frequency_response(self.table([9, 8, 7], [5.0, 9.0, -8.0]))
 
-    def test_small_radians_under_degrees(self) -> None:
+    def test_small_radians_under_degrees(self):
         with pytest.warns(DataWarning, match="gain varies by 33 % at 1 Hz, .* in radians"):
             read_frequency_response(self.table([9, 8, 7, 6], [0.1, 0.2, 0.3, 0.4]))
         with pytest.warns(DataWarning, match="gain varies by 33 % at 1 Hz, .* in radians"):
             read_frequency_response(self.table([9, 8, 6], [0.1, 0.2, 0.3]))
 
     @pytest.mark.parametrize("code", [-9999.0, 9999.0, 1e30, -32768.0])
-    def test_marks_of_missing_values(self, code: float) -> None:
+    def test_marks_of_missing_values(self, code):
         table = self.table([9, 8, 7, 6, 5], [5.0, 8.0, 9.0, 12.0, 13.0])
         table.loc[2, "phase_deg"] = code
         with pytest.raises(DataError, match=r"row 3, column 'phase_deg': the cell is .*missing"):
@@ -460,7 +455,7 @@ class TestSilentErrors:
         large = self.table([9999, 8000, 7000, 6000, 5000], [5.0, 8.0, 9.0, 12.0, 13.0])
         assert read_frequency_response(large).n == 5
 
-    def test_masks(self) -> None:
+    def test_masks(self):
         masked = np.ma.array([1e-3, 2e-3], mask=[False, True])
         with pytest.raises(ValidationError, match="amplitude: some values are masked"):
             FrequencyResponse([1.0, 1.0], [1j, 1j], masked)
@@ -471,7 +466,7 @@ class TestSilentErrors:
             FrequencyResponse([1.0, 1.0], [1j, 1j], [1.0, 1.0], run=runs)
 
     @pytest.mark.parametrize(("unit", "expected"), [("m/V", 0.5), ("mm/V", 0.5e-3), ("V/m", 2.0)])
-    def test_gain_for_a_drive(self, unit: str, expected: float) -> None:
+    def test_gain_for_a_drive(self, unit, expected):
         table = self.table([1.0, 1.0], [-25.0, -25.0] if unit != "V/m" else [25.0, 25.0])
         table = table.rename(columns={"gain [N/m]": f"gain [{unit}]"})
         data = read_frequency_response(table, drive_factor="2 N/V", drive_factor_uncertainty=0.01)
@@ -480,14 +475,14 @@ class TestSilentErrors:
         assert data.quantity == ("dynamic_stiffness" if unit == "V/m" else "receptance")
 
     @pytest.mark.parametrize("text", ["{level[0]} N", "{level.__class__} N", "{0} N", "{level!r}"])
-    def test_braces_hold_names_only(self, tmp_path: Path, text: str) -> None:
+    def test_braces_hold_names_only(self, tmp_path, text):
         (tmp_path / "a1N.csv").write_text("frequency_hz,real [N/m],imag [N/m]\n1,1,1\n")
         with pytest.raises(DataError, match="cannot be filled from the file's name"):
             read_frequency_response(tmp_path / "a1N.csv", level_from_name="a(.)N", drive=text)
 
 
 class TestManyFiles:
-    def test_level_and_drive_from_the_name(self, tmp_path: Path) -> None:
+    def test_level_and_drive_from_the_name(self, tmp_path):
         paths = [exported(tmp_path, f"beam_{u}N_a.csv", u) for u in (0.2, 0.5, 1.5)]
         data = read_frequency_response(
             paths, level_from_name=r"_([\d.]+)N", drive="{level} N rms", controlled="force"
@@ -498,7 +493,7 @@ class TestManyFiles:
         assert [p["file"] for p in sources] == [str(p) for p in paths]
         assert sources[1]["options"] == {"controlled": "force", "drive": "0.5 N rms", "level": 0.5}
 
-    def test_every_file_is_a_run(self, tmp_path: Path) -> None:
+    def test_every_file_is_a_run(self, tmp_path):
         header = "frequency_hz,amplitude [m],real [N/m],imag [N/m]"
         for name in ("monday.csv", "tuesday.csv"):
             (tmp_path / name).write_text(f"{header}\n1,1,2,1\n")
@@ -511,7 +506,7 @@ class TestManyFiles:
         )
         assert days.runs == ["day mon", "day tue"]
 
-    def test_a_level_in_a_file_of_its_own_is_no_run(self, tmp_path: Path) -> None:
+    def test_a_level_in_a_file_of_its_own_is_no_run(self, tmp_path):
         header = "frequency_hz,drive [N],real [m/N],imag [m/N]"
         names = ("20mN", "50mN", "90mN")
         for name in names:
@@ -531,7 +526,7 @@ class TestManyFiles:
             several = read_frequency_response([*paths, tmp_path / f"{other}.csv"])
             assert sorted(several.runs or ()) == sorted([*names, other])
 
-    def test_one_amplitude_at_several_frequencies_is_no_run(self, tmp_path: Path) -> None:
+    def test_one_amplitude_at_several_frequencies_is_no_run(self, tmp_path):
         header = "frequency_hz,amplitude [m],real [N/m],imag [N/m]"
         names = ("low 1Hz", "high 1Hz", "low 2Hz", "high 2Hz")
         for name, (hz, x) in zip(names, ((1, 1), (1, 3), (2, 1.02), (2, 2.9)), strict=True):
@@ -542,7 +537,7 @@ class TestManyFiles:
         (tmp_path / "again.csv").write_text(f"{header}\n1.0002,1.05,2,1\n")
         assert len(read_frequency_response([*paths, tmp_path / "again.csv"]).runs or ()) == 5
 
-    def test_the_run_is_found_by_name(self, tmp_path: Path) -> None:
+    def test_the_run_is_found_by_name(self, tmp_path):
         path = tmp_path / "t.csv"
         path.write_text(
             "file,frequency_hz,amplitude [m],real [N/m],imag [N/m],day\na,1,1,2,1,1\nb,1,1,2,1,2\n"
@@ -552,7 +547,7 @@ class TestManyFiles:
         with pytest.raises(DataError, match="its own runs"):
             read_frequency_response(path, run="c")
 
-    def test_named_groups(self, tmp_path: Path) -> None:
+    def test_named_groups(self, tmp_path):
         path = exported(tmp_path, "runB_5um.csv", 1.0)
         data = read_frequency_response(
             path, level_from_name=r"(?P<level>run.)_(?P<x>\w+)\.", amplitude="{x}"
@@ -560,7 +555,7 @@ class TestManyFiles:
         assert data.levels == ["runB"]
         np.testing.assert_allclose(known(data.amplitude), 5e-6)
 
-    def test_range(self, tmp_path: Path) -> None:
+    def test_range(self, tmp_path):
         path = exported(tmp_path, "a.csv", 1.0)
         assert read_frequency_response(path, drive="1 N", frequency_hz=(1.5, 9.0)).n == 2
         with pytest.raises(DataError, match="no frequency lies from 7 to 9 Hz"):
@@ -577,12 +572,12 @@ class TestManyFiles:
             ({"sheet": "x", "drive": "1 N"}, "the file is not a workbook"),
         ],
     )
-    def test_refusal(self, tmp_path: Path, options: Any, message: str) -> None:
+    def test_refusal(self, tmp_path, options, message):
         path = exported(tmp_path, "beam_0.2N.csv", 0.2)
         with pytest.raises((DataError, UnitError), match=message):
             read_frequency_response([path], **options)
 
-    def test_files_that_do_not_go_together(self, tmp_path: Path) -> None:
+    def test_files_that_do_not_go_together(self, tmp_path):
         one = exported(tmp_path, "a.csv", 1.0)
         other = tmp_path / "b.csv"
         other.write_text("frequency_hz,real [N/m],imag [N/m]\n1,1,1\n")
@@ -593,7 +588,7 @@ class TestManyFiles:
 
 
 class TestInspect:
-    def test_proposes_a_map_that_reads(self, tmp_path: Path) -> None:
+    def test_proposes_a_map_that_reads(self, tmp_path):
         path = tmp_path / "a.csv"
         path.write_text(
             "f0 [Hz],Weg [um],Kraft [N],|H| [um/N],arg H [deg],n\n1,2,1,2,-30,7\n2,4,1,4,-60,7\n"
@@ -605,7 +600,7 @@ class TestInspect:
         assert "Kraft" in repr(contents)
         assert "<td" in contents._repr_html_()
 
-    def test_columns_with_names_of_their_own_are_nothing_else(self, tmp_path: Path) -> None:
+    def test_columns_with_names_of_their_own_are_nothing_else(self, tmp_path):
         path, columns = tmp_path / "ours.csv", tmp_path / "ours.toml"
         table = load_dataset("noisy")
         assert isinstance(table, FrequencyResponse)
@@ -618,13 +613,13 @@ class TestInspect:
         same = read_frequency_response(path, columns=columns)
         np.testing.assert_array_equal(same.covariance, table.covariance)
 
-    def test_f_is_force_with_time_or_motion_and_frequency_else(self, tmp_path: Path) -> None:
+    def test_f_is_force_with_time_or_motion_and_frequency_else(self, tmp_path):
         path = tmp_path / "a.csv"
         for names, role in (("f,x_um,K", "frequency"), ("t,x,f", "force"), ("x,y,f", "force")):
             path.write_text(f"{names}\n1,100,29.9\n2,900,28.4\n")
             assert f'[{role}]\ncolumn = "f"' in inspect(path).column_map
 
-    def test_missing_units_are_left_to_fill_in(self, tmp_path: Path) -> None:
+    def test_missing_units_are_left_to_fill_in(self, tmp_path):
         path, columns = tmp_path / "a.csv", tmp_path / "lab.toml"
         path.write_text("frequency,drive [N],gain,phase_deg\n1,1,1,10\n2,1,1,20\n")
         blank = 'unit = ""  # the file does not say: fill in'
@@ -637,7 +632,7 @@ class TestInspect:
         columns.write_text(text)
         assert read_frequency_response(path, columns=columns).quantity == "dynamic_stiffness"
 
-    def test_many_gaps_are_summarised(self, tmp_path: Path) -> None:
+    def test_many_gaps_are_summarised(self, tmp_path):
         time = np.delete(np.arange(400) / 100.0, [*range(5, 400, 10), 206])
         rows = "".join(f"{t},{np.sin(t)},{np.cos(t)}\n" for t in time)
         path = tmp_path / "gaps.csv"
@@ -647,7 +642,7 @@ class TestInspect:
             "the longest 2.04 to 2.07 s, the first 0.04 to 0.06 s, the last 3.94 to 3.96 s",
         )
 
-    def test_sampling_and_gaps(self, tmp_path: Path) -> None:
+    def test_sampling_and_gaps(self, tmp_path):
         path = tmp_path / "run.csv"
         time = np.r_[0:50, 60:99] / 100.0
         pd.DataFrame({"time [s]": time, "x [mm]": 1.0, "F [N]": 1.0}).to_csv(path, index=False)

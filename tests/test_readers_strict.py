@@ -1,7 +1,5 @@
 """What files of laboratories get wrong is refused, or named; what they mean is understood."""
 
-from __future__ import annotations
-
 import gzip
 import importlib
 import io
@@ -35,18 +33,18 @@ NAMED: dict[str, Any] = {
 }  # fmt: skip
 
 
-def place(folder: Path, name: str, content: bytes | str) -> Path:
+def place(folder, name, content):
     path = folder / name
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
-def csv(columns: Any, header: str = "time [s],x [m],F [N]") -> str:
+def csv(columns, header="time [s],x [m],F [N]"):
     rows = (",".join(map(repr, row)) for row in np.asarray(columns).T.tolist())
     return "\n".join([header, *rows]) + "\n"
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+def told(capsys, *words):
     with pytest.raises(SystemExit) as end:
         main([str(word) for word in words])
     return int(end.value.code or 0), *capsys.readouterr()
@@ -62,19 +60,19 @@ class TestSecondHeaders:
         "name", ["csv", "semicolon", "csv.gz", "csv.bz2", "lvm", "json", "xlsx"]
     )
     @pytest.mark.parametrize("row", [1, 20, 50])
-    def test_of_records(self, name: str, header: tuple[str, ...], row: int, tmp_path: Path) -> None:
+    def test_of_records(self, name, header, row, tmp_path):
         content = reader_fuzz.written(name, COLUMNS, (row, header))
         with pytest.raises(DataError):
             read_record(place(tmp_path, f"run{ENDINGS[name]}", content), **MAP)
 
-    def test_of_tables(self, tmp_path: Path) -> None:
+    def test_of_tables(self, tmp_path):
         rows = "1,5,30,1\n1,6,29,2\n1,7,28,3\n1,8,27,3\n"
         head = "frequency_hz,amplitude [um],gain [N/m],phase_deg\n"
         text = head + rows + head.replace("um", "mm") + 3 * rows
         with pytest.raises(DataError, match=r"line 2 is a row of numbers like those from .*line 7"):
             read_frequency_response(place(tmp_path, "t.csv", text))
 
-    def test_in_a_comment(self, tmp_path: Path) -> None:
+    def test_in_a_comment(self, tmp_path):
         lines = csv(COLUMNS).splitlines()
         lines.insert(20, "# time [s],x [mm],F [N]")
         with pytest.raises(DataError, match=r"line 21: .* names the columns again"):
@@ -85,7 +83,7 @@ class TestSecondHeaders:
         "time (s),x (mm),F (N)",
     ])  # fmt: skip
     @pytest.mark.parametrize("at", [0, 1])
-    def test_above_the_numbers(self, line: str, at: int, tmp_path: Path) -> None:
+    def test_above_the_numbers(self, line, at, tmp_path):
         lines = csv(COLUMNS).splitlines()
         lines.insert(1 if line.startswith("[") else at, line)
         with pytest.raises(DataError, match=r"several lines .* name the columns|more than one hea"):
@@ -94,7 +92,7 @@ class TestSecondHeaders:
     @pytest.mark.parametrize(
         "line", ["time (s),x (m),F (N)", "[s],[m],[N]", "# made by hand, x, F"]
     )
-    def test_that_agree_are_one(self, line: str, tmp_path: Path) -> None:
+    def test_that_agree_are_one(self, line, tmp_path):
         lines = csv(COLUMNS).splitlines()
         lines.insert(1, line)
         record = read_record(place(tmp_path, "run.csv", "\n".join(lines)), **MAP)
@@ -103,7 +101,7 @@ class TestSecondHeaders:
 
 class TestOtherFiles:
     @pytest.fixture(params=["pipe", "device", "socket", "folder"])
-    def irregular(self, request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    def irregular(self, request, tmp_path):
         path = tmp_path / "x.csv"
         if request.param == "pipe":
             os.mkfifo(path)
@@ -117,9 +115,9 @@ class TestOtherFiles:
         return path
 
     def test_are_refused_at_once(
-        self, irregular: Path, request: pytest.FixtureRequest, tmp_path: Path,
-        capsys: pytest.CaptureFixture[str],
-    ) -> None:  # fmt: skip
+        self, irregular, request, tmp_path,
+        capsys
+    ):  # fmt: skip
         kind = request.node.callspec.params["irregular"]
         good = place(tmp_path, "good.csv", csv(COLUMNS))
         ways: list[Callable[[], Any]] = [
@@ -136,7 +134,7 @@ class TestOtherFiles:
 
 
 class TestHdf5:
-    def file(self, folder: Path, x: Callable[[Any], Any]) -> Path:
+    def file(self, folder, x):
         h5py: Any = importlib.import_module("h5py")
         path = folder / "run.h5"
         with h5py.File(path, "w") as root:
@@ -145,7 +143,7 @@ class TestHdf5:
             x(root).attrs["unit"] = "m"
         return path
 
-    def test_values_of_other_files_are_refused(self, tmp_path: Path) -> None:
+    def test_values_of_other_files_are_refused(self, tmp_path):
         h5py: Any = importlib.import_module("h5py")
         (tmp_path / "raw").write_bytes(X.tobytes())
         outside = [(str(tmp_path / "raw"), 0, X.nbytes)]
@@ -161,8 +159,8 @@ class TestHdf5:
             with pytest.raises(DataError, match=f"the values of x are {what}"):
                 read_record(self.file(tmp_path, x))
 
-    def test_packed_values_are_unpacked(self, tmp_path: Path) -> None:
-        def x(root: Any) -> Any:
+    def test_packed_values_are_unpacked(self, tmp_path):
+        def x(root):
             stored = np.round((X - 1e-4) / 1e-7).astype("i2")
             stored[7] = -999
             found = root.create_dataset("x", data=stored)
@@ -177,14 +175,14 @@ class TestHdf5:
         found = read_record(path, missing="drop").motion_samples
         np.testing.assert_allclose(found, np.delete(X, 7), atol=6e-8)
 
-    def test_behind_a_block_of_the_user(self, tmp_path: Path) -> None:
+    def test_behind_a_block_of_the_user(self, tmp_path):
         h5py: Any = importlib.import_module("h5py")
         with h5py.File(tmp_path / "run.h5", "w", userblock_size=1024) as root:
             for name, values, unit in (("time", TIME, "s"), ("x", X, "m"), ("F", F, "N")):
                 root.create_dataset(name, data=values).attrs["unit"] = unit
         np.testing.assert_array_equal(read_record(tmp_path / "run.h5").motion_samples, X)
 
-    def test_added_bytes_are_noticed(self, tmp_path: Path) -> None:
+    def test_added_bytes_are_noticed(self, tmp_path):
         path = self.file(tmp_path, lambda root: root.create_dataset("x", data=X))
         content = path.read_bytes()
         path.write_bytes(content[:3000] + b"\0" * 8 + content[3000:])
@@ -192,10 +190,8 @@ class TestHdf5:
         with pytest.raises(DataError, match=rf"has {size + 8} bytes, and says .* {size}"):
             read_record(path)
 
-    def test_each_of_many_objects_is_looked_at_once(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def x(root: Any) -> Any:
+    def test_each_of_many_objects_is_looked_at_once(self, tmp_path, monkeypatch):
+        def x(root):
             for i in range(200):
                 root.create_dataset(f"{i}/d", data=np.arange(3.0)).attrs["unit"] = "mm"
             return root.create_dataset("x", data=X)
@@ -210,7 +206,7 @@ class TestHdf5:
 
 class TestSize:
     @pytest.mark.parametrize("cell", ["1" * 30_000 + "x", "(" + " " * 30_000 + "x", "1," * 15_000])
-    def test_long_cells_end(self, cell: str, tmp_path: Path) -> None:
+    def test_long_cells_end(self, cell, tmp_path):
         lines = csv(COLUMNS).splitlines()
         lines[30] = f'{TIME[29]!r},"{cell}",1.0'
         path = place(tmp_path, "run.csv", "\n".join(lines))
@@ -231,28 +227,24 @@ class TestSize:
              b"X_Value\tx\n", b"1\t1\n", b""),
         ],
     )  # fmt: skip
-    def test_archives_within_the_limit(
-        self, name: str, head: bytes, row: bytes, end: bytes, tmp_path: Path
-    ) -> None:
+    def test_archives_within_the_limit(self, name, head, row, end, tmp_path):
         content = head + row * ((130_000_000 - len(head)) // len(row)) + end
         path = place(tmp_path, name, gzip.compress(content, 1))
         with pytest.raises(DataError, match=r"would take .* at most 134 MB are read from it"):
             read_record(path)
 
-    def test_comments_without_end(self, tmp_path: Path) -> None:
+    def test_comments_without_end(self, tmp_path):
         content = csv(COLUMNS).encode() + b"#\n" * 1_000_000
         with pytest.raises(DataError, match="more than 20000 comments stand among the numbers"):
             read_record(place(tmp_path, "run.csv.gz", gzip.compress(content, 1)))
 
-    def test_one_long_word_does_not_widen_all(self, tmp_path: Path) -> None:
+    def test_one_long_word_does_not_widen_all(self, tmp_path):
         text = "run,x [m]\n" + f"{'a' * 5000},1\n" + "b,2\n" * 200_000
         with pytest.raises(DataError, match="takes more memory than there is"):
             inspect(place(tmp_path, "run.csv", text))
 
-    def test_no_memory_is_one_line(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        def full(*_: Any, **__: Any) -> Any:
+    def test_no_memory_is_one_line(self, tmp_path, monkeypatch, capsys):
+        def full(*_, **__):
             raise MemoryError
 
         path = place(tmp_path, "run.csv", csv(COLUMNS))
@@ -263,12 +255,12 @@ class TestSize:
         with pytest.raises(DataError, match="takes more memory than there is"):
             read_record(path)
 
-    def test_numbers_beyond_all_floats(self, tmp_path: Path) -> None:
+    def test_numbers_beyond_all_floats(self, tmp_path):
         text = json.dumps({"time [s]": [0, 1], "x [m]": [1, 10**400], "F [N]": [1, 2]})
         with pytest.raises(DataError, match="is not a number"):
             read_record(place(tmp_path, "run.json", text))
 
-    def test_waveforms_of_nothing(self) -> None:
+    def test_waveforms_of_nothing(self):
         t = np.arange(400) / 100.0
         x = 1e-203 * np.sin(9.0 * t)
         with pytest.raises(ValidationError, match="no sample of displacement is above 1e-203"):
@@ -276,7 +268,7 @@ class TestSize:
 
 
 class TestDoubts:
-    def named(self, folder: Path, columns: Any, message: str) -> None:
+    def named(self, folder, columns, message):
         with pytest.warns(DataWarning, match=message):
             record = read_record(place(folder, "run.csv", csv(columns)))
         assert re.search(message, (record.provenance or {})["warnings"][0])
@@ -286,20 +278,20 @@ class TestDoubts:
         ([2], "the force repeats one value while the motion goes on, from line 32"),
         ([1, 2], "motion and force are 0 for a while, from line 32"),
     ])  # fmt: skip
-    def test_holes(self, rows: list[int], message: str, tmp_path: Path) -> None:
+    def test_holes(self, rows, message, tmp_path):
         columns = COLUMNS.copy()
         columns[rows, 30:45] = 0.0
         self.named(tmp_path, columns, message)
 
     @pytest.mark.parametrize("places", [slice(30, 45), slice(None)])
-    def test_a_motion_that_sticks(self, places: slice, tmp_path: Path) -> None:
+    def test_a_motion_that_sticks(self, places, tmp_path):
         columns = COLUMNS.copy()
         columns[1, places] = columns[1, 30]
         self.named(tmp_path, columns, "the motion repeats one value while the force goes on")
 
     @pytest.mark.parametrize("row", [0, 1, 2])
     @pytest.mark.parametrize("factor", [1e3, 1e-3])
-    def test_a_unit_that_switches(self, row: int, factor: float, tmp_path: Path) -> None:
+    def test_a_unit_that_switches(self, row, factor, tmp_path):
         columns = COLUMNS.copy()
         columns[row, 30:] *= factor
         if row == 0:
@@ -308,7 +300,7 @@ class TestDoubts:
 
     @pytest.mark.parametrize("row", [1, 2])
     @pytest.mark.parametrize("factor", [1e3, 1e-3])
-    def test_a_unit_that_switches_anywhere(self, row: int, factor: float, tmp_path: Path) -> None:
+    def test_a_unit_that_switches_anywhere(self, row, factor, tmp_path):
         t = np.arange(200) / 200.0
         x = 1e-3 * (0.7 + t) * np.sin(6 * np.pi * t + 0.1)
         columns = np.array([t, x, DAHL.force(x)])
@@ -323,7 +315,7 @@ class TestDoubts:
             named += any("1000 times larger or smaller" in str(w.message) for w in said)
         assert named >= 42  # of 60; where a signal passes zero it is too small to tell
 
-    def test_good_records_raise_none(self, tmp_path: Path) -> None:
+    def test_good_records_raise_none(self, tmp_path):
         t = np.arange(4000) / 100.0
         level = np.repeat([1e-5, 1e-2, 2e-3, 0.0], 1000)
         x = level * np.sin(2.0 * np.pi * t)
@@ -332,7 +324,7 @@ class TestDoubts:
                 force = law.force(x) + noise * np.random.default_rng(0).standard_normal(t.size)
                 assert read_record(place(tmp_path, "run.csv", csv([t, x, force]))).n == t.size
 
-    def test_channels_that_start_apart(self, tmp_path: Path) -> None:
+    def test_channels_that_start_apart(self, tmp_path):
         nptdms: Any = importlib.import_module("nptdms")
         start = np.datetime64("2026-03-01T12:00:00")
         channels = [
@@ -353,7 +345,7 @@ class TestDoubts:
         ):
             read_record(path)
 
-    def test_channels_that_start_together(self, tmp_path: Path) -> None:
+    def test_channels_that_start_together(self, tmp_path):
         nptdms: Any = importlib.import_module("nptdms")
         start = np.datetime64("2026-03-01T12:00:00")
         channels = [
@@ -368,13 +360,13 @@ class TestDoubts:
             writer.write_segment(channels)
         assert read_record(tmp_path / "run.tdms").n == TIME.size
 
-    def test_times_and_the_header_that_disagree(self, tmp_path: Path) -> None:
+    def test_times_and_the_header_that_disagree(self, tmp_path):
         text = reader_fuzz.written("lvm", COLUMNS).decode()
         text = text.replace("Channels\t2", "Channels\t2\nX0\t0\t0\nDelta_X\t0.001\t0.001")
         with pytest.warns(DataWarning, match=r"steps of 0.0078125, and .* Delta_X = 0.001"):
             read_record(place(tmp_path, "run.lvm", text))
 
-    def test_a_member_twice(self, tmp_path: Path) -> None:
+    def test_a_member_twice(self, tmp_path):
         path = place(tmp_path, "run.npz", reader_fuzz.written("npz", COLUMNS))
         buffer = io.BytesIO()
         np.save(buffer, 2.0 * X)
@@ -386,11 +378,11 @@ class TestDoubts:
 
 
 class TestUnderstood:
-    def is_the_record(self, record: di.Record) -> None:
+    def is_the_record(self, record):
         for found, good in ((record.time, TIME), (record.displacement, X), (record.force, F)):
             np.testing.assert_allclose(np.asarray(found), good)
 
-    def test_json_of_rows(self, tmp_path: Path) -> None:
+    def test_json_of_rows(self, tmp_path):
         rows = COLUMNS.T.tolist()
         path = place(tmp_path, "run.json", json.dumps(rows))
         self.is_the_record(read_record(path, **NAMED))
@@ -401,7 +393,7 @@ class TestUnderstood:
         path = place(tmp_path, "run.json", json.dumps({"data": labelled} | units))
         self.is_the_record(read_record(path))
 
-    def test_lvm_with_one_header(self, tmp_path: Path) -> None:
+    def test_lvm_with_one_header(self, tmp_path):
         text = reader_fuzz.written("lvm", COLUMNS).decode()
         text = text.replace("Separator\tTab", "Separator\tTab\nMulti_Headings\tNo")
         text = text.replace("Samples\t64\t64", "Samples\t16\t16")
@@ -411,7 +403,7 @@ class TestUnderstood:
             read_record(place(tmp_path, "run.lvm", cut))
 
     @pytest.mark.parametrize("rate", [300.0, 800.0])
-    def test_rounded_times_are_even(self, rate: float, tmp_path: Path) -> None:
+    def test_rounded_times_are_even(self, rate, tmp_path):
         t = np.arange(600) / rate
         columns = [np.round(t, 3), np.sin(20.0 * t), np.cos(20.0 * t)]
         record = read_record(place(tmp_path, "run.csv", csv(columns)))
@@ -425,7 +417,7 @@ class TestUnderstood:
         text = "time,x [m],F [N]\n" + "".join(f"{a},{b!r},{c!r}\n" for a, b, c in rows)
         assert read_record(place(tmp_path, "run.csv", text)).uniform
 
-    def test_of_two_motions_the_displacement(self, tmp_path: Path) -> None:
+    def test_of_two_motions_the_displacement(self, tmp_path):
         columns = [*COLUMNS, np.gradient(X, TIME)]
         path = place(tmp_path, "run.csv", csv(columns, "time [s],x [m],F [N],velocity [m/s]"))
         record = read_record(path)
@@ -433,15 +425,13 @@ class TestUnderstood:
         assert "displacement is used, and not velocity" in (record.provenance or {})["notes"]
         assert read_record(path, velocity="velocity").motion_channel == "velocity"
 
-    def test_the_friction_of_a_tribometer(self, tmp_path: Path) -> None:
+    def test_the_friction_of_a_tribometer(self, tmp_path):
         columns = [TIME, X, 0.0 * F + 10.0, F]
         text = csv(columns, "Time [s],Stroke [m],Normal Force [N],Friction Force [N]")
         found = inspect(place(tmp_path, "run.csv", text)).column_map
         assert '[force]\ncolumn = "Friction Force"' in found
 
-    def test_two_columns_without_a_header(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_two_columns_without_a_header(self, tmp_path, capsys):
         path = place(tmp_path, "run.csv", csv(COLUMNS[1:]).partition("\n")[2])
         words = ("--displacement", "column 1 [m]", "--force", "column 2 [N]", "--sample-rate", 128)
         code, out, _ = told(capsys, "fit", path, "--record", "--alpha", "1", *words)
@@ -451,7 +441,7 @@ class TestUnderstood:
         assert code == 1
         assert "--displacement is given without --record" in why
 
-    def test_uneven_records_are_cut_and_resampled(self, tmp_path: Path) -> None:
+    def test_uneven_records_are_cut_and_resampled(self, tmp_path):
         t = np.arange(600) / 100.0
         x = 1e-2 * np.sin(2.0 * np.pi * t) * (1.0 + t) / 7.0
         force = di.Dahl(0.1, 30.0, alpha=1.0).force(x) + 2.0 * np.gradient(x, t)
@@ -472,9 +462,7 @@ class TestUnderstood:
         assert [part.n for part in parts] == [99, 458]
         assert di.fit(record, di.Spring(), throw=False).data[0].n == kept.size
 
-    def test_a_table_without_a_frequency(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_a_table_without_a_frequency(self, tmp_path, capsys):
         A = np.geomspace(1e-4, 4e-3, 8)
         N = np.array([complex(DAHL.describing_function(a)) for a in A])
         columns = [A, np.abs(N), np.degrees(np.angle(N))]
@@ -493,7 +481,7 @@ class TestUnderstood:
         with pytest.raises(DataError, match="holds the frequency too"):
             read_frequency_response(tmp_path / "saved.csv", frequency=1.0)
 
-    def test_rotation_stays_rotation(self, tmp_path: Path) -> None:
+    def test_rotation_stays_rotation(self, tmp_path):
         path = place(tmp_path, "run.csv", csv(COLUMNS, "time [s],angle [rad],torque [N m]"))
         record = read_record(path, displacement="angle")
         fit = di.fit(record, di.Dahl(alpha=1.0))
@@ -521,7 +509,7 @@ class TestUnderstood:
             di.fit([record, translation], di.Dahl())
 
     @pytest.mark.parametrize("version", [True, 1.0, "1", 0])
-    def test_versions_of_saved_fits_are_whole_numbers(self, version: Any) -> None:
+    def test_versions_of_saved_fits_are_whole_numbers(self, version):
         record = di.fit(di.Record(TIME, displacement=X, force=F), di.Dahl(alpha=1.0))
         table = di.fit(di.load_dataset("noisy"), di.Dahl(alpha=1.0))
         for fit in (record, table):

@@ -1,31 +1,27 @@
 """Text tables: dialects, headers, units, and every way in which they can be wrong."""
 
-from __future__ import annotations
-
 import bz2
 import contextlib
 import gzip
 import hashlib
 import lzma
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from dahl_ident.data import FrequencyResponse, Record, inspect, read_frequency_response, read_record
+from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, UnitError
 
 TIME, X, F = [0.0, 0.5, 1.0], [1e-3, 2.5e-3, -3e-3], [1000.0, 2000.0, 3500.0]
 
 
-def written(tmp_path: Path, text: str | bytes, name: str = "run.csv") -> Path:
+def written(tmp_path, text, name="run.csv"):
     path = tmp_path / name
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return path
 
 
-def assert_the_run(record: Record) -> None:
+def assert_the_run(record):
     np.testing.assert_allclose(record.time, TIME, rtol=1e-15)
     np.testing.assert_allclose(record.displacement, X, rtol=1e-15)
     np.testing.assert_allclose(record.force, F, rtol=1e-15)
@@ -74,15 +70,15 @@ class TestDialects:
             "time [s],x [mm],F [kN]\n0,1.0e0,1\n.5,+2.5E+0,2.\n1,-3,35e-1\n",
         ],
     )
-    def test_every_dialect_reads_alike(self, tmp_path: Path, text: str) -> None:
+    def test_every_dialect_reads_alike(self, tmp_path, text):
         assert_the_run(read_record(written(tmp_path, text)))
 
-    def test_channels_called_by_numbers(self, tmp_path: Path) -> None:
+    def test_channels_called_by_numbers(self, tmp_path):
         path = written(tmp_path, "x-axis,1,2\nsecond,Volt,Volt\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n")
         assert_the_run(read_record(path, time="x-axis", displacement="1 [mm]", force="2 [kN]"))
 
     @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-    def test_encodings(self, tmp_path: Path, encoding: str) -> None:
+    def test_encodings(self, tmp_path, encoding):
         text = PLAIN.replace("mm", "µm").replace("1,-3", "1,-3")
         record = read_record(written(tmp_path, text.encode(encoding)))
         np.testing.assert_allclose(record.displacement, np.array(X) * 1e-3)
@@ -91,15 +87,15 @@ class TestDialects:
         ("ending", "pack"),
         [(".gz", gzip.compress), (".bz2", bz2.compress), (".xz", lzma.compress)],
     )
-    def test_packed(self, tmp_path: Path, ending: str, pack: Any) -> None:
+    def test_packed(self, tmp_path, ending, pack):
         assert_the_run(read_record(written(tmp_path, pack(PLAIN.encode()), f"run.csv{ending}")))
 
-    def test_standard_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_standard_input(self, tmp_path, monkeypatch):
         with written(tmp_path, PLAIN).open() as stream:
             monkeypatch.setattr("sys.stdin", stream)
             assert_the_run(read_record("-"))
 
-    def test_numbers_are_read_to_the_last_digit(self, tmp_path: Path) -> None:
+    def test_numbers_are_read_to_the_last_digit(self, tmp_path):
         rng = np.random.default_rng(11)
         numbers = np.exp(rng.uniform(-200, 200, (2000, 2))) * rng.choice([-1.0, 1.0], (2000, 2))
         lines = [f"{i},{x!r},{f!r}" for i, (x, f) in enumerate(numbers.tolist())]
@@ -108,7 +104,7 @@ class TestDialects:
         np.testing.assert_array_equal(record.displacement, numbers[:, 0])
         np.testing.assert_array_equal(record.force, numbers[:, 1])
 
-    def test_a_late_word_in_a_long_table(self, tmp_path: Path) -> None:
+    def test_a_late_word_in_a_long_table(self, tmp_path):
         """Parsers that read in parts guess types anew in each."""
         lines = [f"{i},{i % 7},{i % 5}" for i in range(150_000)]
         lines[140_000] = "140000,oops,1"
@@ -118,7 +114,7 @@ class TestDialects:
 
 
 class TestColumns:
-    def test_names_units_signs_and_factors(self, tmp_path: Path) -> None:
+    def test_names_units_signs_and_factors(self, tmp_path):
         path = written(tmp_path, "t,LVDT 2,cell,amp\n0,1,1,1\n0.5,2.5,2,2\n1,-3,3.5,3\n")
         columns = tmp_path / "lab.toml"
         columns.write_text(
@@ -135,27 +131,27 @@ class TestColumns:
         assert (record.drive_unit, record.drive_factor) == ("V", 12.5)
         assert record.drive_factor_uncertainty == 0.01
 
-    def test_keywords_name_columns_with_their_units(self, tmp_path: Path) -> None:
+    def test_keywords_name_columns_with_their_units(self, tmp_path):
         path = written(tmp_path, "a,b,c\n0,1,1\n0.5,2.5,2\n1,-3,3.5\n")
         assert_the_run(read_record(path, time="a [s]", displacement="b [mm]", force="c [kN]"))
 
-    def test_keywords_override_the_map(self, tmp_path: Path) -> None:
+    def test_keywords_override_the_map(self, tmp_path):
         path = written(tmp_path, "t [s],x [mm],y [mm],F [kN]\n0,9,1,1\n0.5,9,2.5,2\n1,9,-3,3.5\n")
         assert_the_run(read_record(path, columns={"displacement": "x"}, displacement="y"))
 
-    def test_headerless_table_with_a_map(self, tmp_path: Path) -> None:
+    def test_headerless_table_with_a_map(self, tmp_path):
         path = written(tmp_path, "0,1,1\n0.5,2.5,2\n1,-3,3.5\n")
         columns = {"time": "column 1 [s]", "displacement": "column 2 [mm]"}
         assert_the_run(read_record(path, columns=columns, force="column 3 [kN]"))
 
-    def test_sample_rate_instead_of_time(self, tmp_path: Path) -> None:
+    def test_sample_rate_instead_of_time(self, tmp_path):
         record = read_record(
             written(tmp_path, "x [mm],F [kN]\n1,1\n2.5,2\n-3,3.5\n"), sample_rate=2.0
         )
         assert_the_run(record)
         assert record.provenance["notes"] == ["time counted from the sample rate of 2 Hz"]
 
-    def test_provenance(self, tmp_path: Path) -> None:
+    def test_provenance(self, tmp_path):
         path = written(tmp_path, PLAIN)
         provenance = read_record(path).provenance
         assert provenance == {
@@ -166,7 +162,7 @@ class TestColumns:
         provenance = read_record(path, displacement="x", columns={"force": "F"}).provenance
         assert provenance["options"] == {"columns": {"force": "F"}, "displacement": "x"}
 
-    def test_rotation(self, tmp_path: Path) -> None:
+    def test_rotation(self, tmp_path):
         record = read_record(
             written(tmp_path, "t [s],position [deg],torque [lbf-in]\n0,90,1\n1,180,2\n")
         )
@@ -177,11 +173,11 @@ class TestColumns:
         ("header", "channel", "factor"),
         [("vel [mm/s]", "velocity", 1e-3), ("acc [g]", "acceleration", 9.80665)],
     )
-    def test_other_motions(self, tmp_path: Path, header: str, channel: str, factor: float) -> None:
+    def test_other_motions(self, tmp_path, header, channel, factor):
         record = read_record(written(tmp_path, f"t [s],{header},F [N]\n0,1,1\n1,2,2\n"))
         np.testing.assert_allclose(getattr(record, channel), [factor, 2 * factor])
 
-    def test_missing_samples_become_gaps_on_request(self, tmp_path: Path) -> None:
+    def test_missing_samples_become_gaps_on_request(self, tmp_path):
         text = "t [s],x [mm],F [N]\n0,1,1\n1,,2\n2,3,3\n3,4,nan\n4,5,5\n5,6,6\n"
         with pytest.raises(
             DataError, match=r"line 3, column 'x': the cell is empty or NaN \(1 such"
@@ -191,21 +187,21 @@ class TestColumns:
         assert record.time.tolist() == [0.0, 2.0, 4.0, 5.0]
         assert "2 samples with missing values left out" in record.provenance["notes"]
 
-    def test_missing_samples_keep_their_place_in_counted_time(self, tmp_path: Path) -> None:
+    def test_missing_samples_keep_their_place_in_counted_time(self, tmp_path):
         path = written(tmp_path, "x [mm],F [N]\n1,1\n,2\n3,3\n4,4\n")
         record = read_record(path, sample_rate=10.0, missing="drop")
         np.testing.assert_allclose(record.time, [0.0, 0.2, 0.3])
 
 
 class TestUnusualTables:
-    def test_what_ends_in_two_delimiters(self, tmp_path: Path) -> None:
+    def test_what_ends_in_two_delimiters(self, tmp_path):
         text = PLAIN.replace("\n0", ",,\n0").replace(",1\n", ",1,,\n").replace("2\n", "2,,\n")
         assert_the_run(read_record(written(tmp_path, text.replace("3.5\n", "3.5,,\n"))))
 
-    def test_colons_between_fields(self, tmp_path: Path) -> None:
+    def test_colons_between_fields(self, tmp_path):
         assert_the_run(read_record(written(tmp_path, PLAIN.replace(",", ":"), "run.txt")))
 
-    def test_more_columns_than_one_looks_at(self, tmp_path: Path) -> None:
+    def test_more_columns_than_one_looks_at(self, tmp_path):
         rng = np.random.default_rng(1)
         noise = rng.normal(size=(30, 2000))
         lines = ["time [s],x [mm],F [kN]," + ",".join(f"c{i}" for i in range(2000))]
@@ -224,11 +220,11 @@ class TestUnusualTables:
             ("time [s];x [mm];F [N]\n0;1;1,234\n1;2;2,345\n", [1.234, 2.345]),  # as ever
         ],
     )
-    def test_marks_of_thousands(self, tmp_path: Path, text: str, force: list[float]) -> None:
+    def test_marks_of_thousands(self, tmp_path, text, force):
         found = read_record(written(tmp_path, text)).force_samples
         np.testing.assert_allclose(found, force)
 
-    def test_marks_of_thousands_at_the_wrong_place(self, tmp_path: Path) -> None:
+    def test_marks_of_thousands_at_the_wrong_place(self, tmp_path):
         text = "time [s];x [mm];F [N]\n0;1;1,234.5\n1;2;23,45\n"
         with pytest.raises(DataError, match=r"column 'F': .* is not a number"):
             read_record(written(tmp_path, text))
@@ -237,7 +233,7 @@ class TestUnusualTables:
         "stamp", ["2024-03-31T12:00:{:06.3f}", "2024-03-31 12:00:{:06.3f}Z", "12:00:{:06.3f}",
                   "2024-03-31T12:00:{:06.3f}+0200"]
     )  # fmt: skip
-    def test_time_stamps(self, tmp_path: Path, stamp: str) -> None:
+    def test_time_stamps(self, tmp_path, stamp):
         rows = [f"{stamp.format(t)},{i},{i}" for i, t in enumerate((58.5, 59.0, 59.75))]
         record = read_record(written(tmp_path, "\n".join(["time,x [mm],F [N]", *rows])))
         np.testing.assert_allclose(record.time, [0.0, 0.5, 1.25], atol=1e-9)
@@ -245,7 +241,7 @@ class TestUnusualTables:
         proposal = written(tmp_path, inspect(tmp_path / "run.csv").column_map, "columns.toml")
         assert read_record(tmp_path / "run.csv", columns=proposal).n == 3
 
-    def test_time_stamps_that_are_none(self, tmp_path: Path) -> None:
+    def test_time_stamps_that_are_none(self, tmp_path):
         text = "time,x [mm],F [N]\n12:00:01,1,1\n12:00:61,1,1\n"
         with pytest.raises(
             DataError, match="line 3, column 'time': '12:00:61' is not a time stamp"
@@ -266,12 +262,12 @@ class TestUnusualTables:
             "Checked by: A. Hill",
         ],
     )
-    def test_lines_below_the_table(self, tmp_path: Path, footer: str) -> None:
+    def test_lines_below_the_table(self, tmp_path, footer):
         record = read_record(written(tmp_path, PLAIN + footer))
         assert_the_run(record)
         assert "left out below the table" in repr(record)
 
-    def test_a_repeated_header_begins_a_run(self, tmp_path: Path) -> None:
+    def test_a_repeated_header_begins_a_run(self, tmp_path):
         day = "frequency_hz,amplitude [m],real [N/m],imag [N/m]\n1,1,2,1\n1,2,2,1\n"
         table = written(tmp_path, day + day + day.replace("1,2,2,1\n", ""))
         with pytest.warns(DataWarning, match="the header is repeated in the file: read as 3 runs"):
@@ -282,11 +278,11 @@ class TestUnusualTables:
         with pytest.warns(DataWarning, match="read as 2 runs"):
             assert read_frequency_response(written(tmp_path, units + units)).runs == ["1", "2"]
 
-    def test_a_converter_that_sticks(self, tmp_path: Path) -> None:
+    def test_a_converter_that_sticks(self, tmp_path):
         t = np.arange(400) / 100.0
         x, force = np.sin(2 * np.pi * t), np.cos(2 * np.pi * t)
 
-        def text(values: Any) -> str:
+        def text(values):
             rows = (f"{a!r},{b!r},{c!r}" for a, b, c in np.column_stack([t, x, values]).tolist())
             return "time [s],x [mm],F [N]\n" + "\n".join(rows) + "\n"
 
@@ -302,25 +298,25 @@ class TestUnusualTables:
         with pytest.warns(DataWarning, match=r"goes on, from line 112 \(3 such places\)"):
             read_record(written(tmp_path, text(noisy)))
 
-    def test_a_line_of_brackets_ends(self, tmp_path: Path) -> None:
+    def test_a_line_of_brackets_ends(self, tmp_path):
         for text in ("[" * 200_000, "(" * 200_000, "x" + " " * 200_000 + "["):
             for table in (f"{text}\n0 1\n1 2\n", f"{text},b\n0,1\n1,2\n"):
                 with pytest.raises(DataError):
                     read_record(written(tmp_path, table))
 
-    def test_damaged_comments_of_this_package(self, tmp_path: Path) -> None:
+    def test_damaged_comments_of_this_package(self, tmp_path):
         for comment in ("[" * 100_000, '{"quality": 3}', '{"text": [1]}', '{"drive_factor": "x"}',
                         '{"unknown": 1}', '{"provenance": {"warnings": 5}}',
                         '{"provenance": {"parts": [{"notes": [1]}]}}'):  # fmt: skip
             with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:'"):
                 read_record(written(tmp_path, f"# dahl_ident: {comment}\n{PLAIN}"))
 
-    def test_unpacked_sizes_are_limited(self, tmp_path: Path) -> None:
+    def test_unpacked_sizes_are_limited(self, tmp_path):
         path = written(tmp_path, gzip.compress(b"1,2\n" * 75_000_000, 1), "run.csv.gz")
         with pytest.raises(DataError, match=r"content would take 134 MB.*at most 134 MB are read"):
             read_record(path)
 
-    def test_damaged_compression(self, tmp_path: Path) -> None:
+    def test_damaged_compression(self, tmp_path):
         packed = bytearray(gzip.compress(PLAIN.encode() * 50))
         for place in range(10, len(packed), 7):
             damaged = bytes(packed[:place]) + b"\xff\x07" + bytes(packed[place + 2 :])
@@ -388,32 +384,30 @@ class TestRefusal:
             ("time [s],x [mm],F [kN]\n0,1,1\n", "time: expected at least two samples"),
         ],
     )
-    def test_bad_tables(self, tmp_path: Path, text: str, message: str) -> None:
+    def test_bad_tables(self, tmp_path, text, message):
         with pytest.raises((DataError, UnitError), match=message):
             read_record(written(tmp_path, text))
 
     @pytest.mark.parametrize("odd", ["1.024", "OVERLOAD"])
-    def test_a_decimal_comma_leaves_points_to_nobody(self, tmp_path: Path, odd: str) -> None:
+    def test_a_decimal_comma_leaves_points_to_nobody(self, tmp_path, odd):
         text = PLAIN.replace(",", ";").replace(".", ",").replace("2,5", odd)
         with pytest.raises(DataError, match=f"line 3, column 'x': '{odd}' is not a number with a"):
             read_record(written(tmp_path, text))
 
     @pytest.mark.parametrize(("lost", "found"), [(1, 3), (3, 1), (5, 0)])
-    def test_a_last_number_without_its_last_digits(
-        self, tmp_path: Path, lost: int, found: int
-    ) -> None:
+    def test_a_last_number_without_its_last_digits(self, tmp_path, lost, found):
         text = PLAIN + "".join(f"{i},{i}.5,12.0{i:03}\n" for i in range(2, 102))
         text = text.replace("\n0,1,1\n0.5,2.5,2\n1,-3,3.5", "")
         assert read_record(written(tmp_path, text.rstrip())).time.size == 100
         with pytest.raises(DataError, match=f"has {found} decimals and no line end, where all ab"):
             read_record(written(tmp_path, text[: -1 - lost]))
 
-    def test_line_numbers_count_preamble_comments_and_blanks(self, tmp_path: Path) -> None:
+    def test_line_numbers_count_preamble_comments_and_blanks(self, tmp_path):
         text = "rig 5\n\n# c\n" + PLAIN.replace("0.5", "\n# pause\n0.5").replace("2.5", "two")
         with pytest.raises(DataError, match="line 8, column 'x'"):
             read_record(written(tmp_path, text))
 
-    def test_units(self, tmp_path: Path) -> None:
+    def test_units(self, tmp_path):
         with pytest.raises(UnitError, match=r"'x' has no unit; .*'x \[um\]'.*'unit': 'um'"):
             read_record(written(tmp_path, PLAIN.replace("x [mm]", "x")))
         with pytest.raises(UnitError, match=r"the force has the unit \[mm\]; expected"):
@@ -424,20 +418,20 @@ class TestRefusal:
         with pytest.raises(UnitError, match=r"units disagree: .*translation, drive is rot"):
             read_record(path, drive="M", force="F")
 
-    def test_binary_behind_a_text_extension(self, tmp_path: Path) -> None:
+    def test_binary_behind_a_text_extension(self, tmp_path):
         with pytest.raises(DataError, match=r"the file is binary \(byte 5 is 0\)"):
             read_record(written(tmp_path, b"hello\0world"))
 
-    def test_damaged_packing(self, tmp_path: Path) -> None:
+    def test_damaged_packing(self, tmp_path):
         packed = gzip.compress(PLAIN.encode())[:-9]
         with pytest.raises(DataError, match="the compressed file is damaged"):
             read_record(written(tmp_path, packed, "run.csv.gz"))
 
-    def test_absent_file(self, tmp_path: Path) -> None:
+    def test_absent_file(self, tmp_path):
         with pytest.raises(DataError, match="cannot be read: No such file"):
             read_record(tmp_path / "absent.csv")
 
-    def test_edited_metadata(self, tmp_path: Path) -> None:
+    def test_edited_metadata(self, tmp_path):
         with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:' is not what"):
             read_record(written(tmp_path, "# dahl_ident: {oops\n" + PLAIN))
 
@@ -459,7 +453,7 @@ class TestRefusal:
             ({"controlled": 5}, "controlled is 5; expected 'displacement' or 'force'"),
         ],
     )
-    def test_bad_column_maps(self, tmp_path: Path, columns: Any, message: str | None) -> None:
+    def test_bad_column_maps(self, tmp_path, columns, message):
         path = written(tmp_path, PLAIN)
         if message is None:
             with pytest.raises(UnitError, match="the force has the unit"):
@@ -468,7 +462,7 @@ class TestRefusal:
         with pytest.raises(DataError, match=message):
             read_record(path, columns=columns)
 
-    def test_bad_column_map_files(self, tmp_path: Path) -> None:
+    def test_bad_column_map_files(self, tmp_path):
         path = written(tmp_path, PLAIN)
         with pytest.raises(DataError, match="the column map cannot be read: No such file"):
             read_record(path, columns=tmp_path / "absent.toml")
@@ -478,7 +472,7 @@ class TestRefusal:
 
 
 class TestReadsAgain:
-    def test_text_quality_survives_look_alikes(self, tmp_path: Path) -> None:
+    def test_text_quality_survives_look_alikes(self, tmp_path):
         data = FrequencyResponse(
             [1.0, 2.0], [1j, 2j], [1e-3, 1e-3], quality={"note": ["007", "1e5"]}, level=["", "nan"]
         )
@@ -487,7 +481,7 @@ class TestReadsAgain:
         assert back.levels == ["", "nan"]
 
 
-def test_small_and_large_tables_are_read_alike(tmp_path: Path) -> None:
+def test_small_and_large_tables_are_read_alike(tmp_path):
     """Small ones are parsed without pandas, to the last digit and with the same kinds."""
     rng = np.random.default_rng(1)
     rows = [

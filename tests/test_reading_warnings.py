@@ -1,15 +1,9 @@
 """What a reader warns of stays with the data: verdict and every form of report repeat it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataWarning
 
 FRICTION = di.Dahl(f_max=0.1, sigma=30.0)
@@ -18,7 +12,7 @@ N = np.array([complex(FRICTION.describing_function(a)) for a in A])
 N = N * np.exp(1e-3 * np.random.default_rng(0).standard_normal(A.size))
 
 
-def table(folder: Path, phase_deg: FloatArray, *, drive: FloatArray | None = None) -> Path:
+def table(folder, phase_deg, *, drive=None):
     """Write a table of one frequency."""
     drive = A * np.abs(N) if drive is None else drive
     lines = ["frequency_hz,amplitude [m],drive [N],gain [N/m],phase_deg"]
@@ -31,28 +25,28 @@ def table(folder: Path, phase_deg: FloatArray, *, drive: FloatArray | None = Non
     return path
 
 
-def radians(folder: Path) -> di.FrequencyResponse:
+def radians(folder):
     return di.read_frequency_response(table(folder, 0.3 * np.angle(N)))
 
 
-def one_sign(folder: Path) -> di.FrequencyResponse:
+def one_sign(folder):
     phase = np.degrees(np.angle(N))
     phase[3] *= -1.0
     return di.read_frequency_response(table(folder, phase))
 
 
-def rms_drive(folder: Path) -> di.FrequencyResponse:
+def rms_drive(folder):
     drive = A * np.abs(N) / np.sqrt(2.0)
     return di.read_frequency_response(table(folder, np.degrees(np.angle(N)), drive=drive))
 
 
-def two_days(folder: Path) -> di.FrequencyResponse:
+def two_days(folder):
     path = table(folder, np.degrees(np.angle(N)))
     path.write_text(path.read_text() * 2)
     return di.read_frequency_response(path)
 
 
-def record(folder: Path, change: Callable[[FloatArray], None]) -> Path:
+def record(folder, change):
     """Write a record of four levels."""
     t = np.arange(6000) / 100.0
     x = np.repeat([2e-2, 8e-3, 3e-3, 1e-3], 1500) * np.sin(2.0 * np.pi * t)
@@ -64,16 +58,16 @@ def record(folder: Path, change: Callable[[FloatArray], None]) -> Path:
     return path
 
 
-def stuck(folder: Path) -> di.FrequencyResponse:
-    def change(force: FloatArray) -> None:
+def stuck(folder):
+    def change(force):
         for start in (720, 2220, 3720, 5220):
             force[start : start + 25] = force[start]
 
     return di.extract(record(folder, change), harmonics=[1])
 
 
-def marks(folder: Path) -> di.FrequencyResponse:
-    def change(force: FloatArray) -> None:
+def marks(folder):
+    def change(force):
         force[[100, 101, 3000]] = -9999.0
 
     return di.extract(di.read_record(record(folder, change), missing="drop"), harmonics=[1])
@@ -90,9 +84,7 @@ def marks(folder: Path) -> di.FrequencyResponse:
         (marks, "3 samples left out: column 'F' is -9999 in them, a mark of a missing value"),
     ],
 )
-def test_warnings_on_reading_reach_verdict_and_report(
-    read: Callable[[Path], di.FrequencyResponse], message: str, tmp_path: Path
-) -> None:
+def test_warnings_on_reading_reach_verdict_and_report(read, message, tmp_path):
     with pytest.warns(DataWarning) as said:
         data = read(tmp_path)
     assert sum(message in str(warning.message) for warning in said) == 1
@@ -103,7 +95,7 @@ def test_warnings_on_reading_reach_verdict_and_report(
     assert message in di.FitResult.from_json(fit.to_json()).verdict
 
 
-def test_warnings_on_reading_reach_every_report(tmp_path: Path) -> None:
+def test_warnings_on_reading_reach_every_report(tmp_path):
     message = "the phase's sign creates energy: line 5"
     with pytest.warns(DataWarning, match=message):
         one_sign(tmp_path).save(tmp_path / "saved.csv")
@@ -115,8 +107,8 @@ def test_warnings_on_reading_reach_every_report(tmp_path: Path) -> None:
         assert message in (tmp_path / name).read_text().replace("&#39;", "'"), name
 
 
-def test_a_fit_to_the_record_itself_repeats_them(tmp_path: Path) -> None:
-    def change(force: FloatArray) -> None:
+def test_a_fit_to_the_record_itself_repeats_them(tmp_path):
+    def change(force):
         force[[100, 101, 3000]] = -9999.0
 
     path = record(tmp_path, change)

@@ -1,13 +1,9 @@
 """The README: its commands and links exist. What its code prints: ``test_docs``."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
 import pytest
-
-from tests.command_line import Runner
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -15,18 +11,18 @@ COMMANDS = sorted(set(re.findall(r"^dahl-ident (\w+)(.*?)(?:#|$)", README, re.MU
 
 
 @pytest.mark.parametrize(("command", "rest"), COMMANDS)
-def test_commands_have_the_options_that_are_shown(command: str, rest: str, run: Runner) -> None:
+def test_commands_have_the_options_that_are_shown(command, rest, run):
     helped = run(command, "--help").out
     for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest):
         assert option in helped
 
 
-def test_make_targets_exist() -> None:
+def test_make_targets_exist():
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert set(re.findall(r"(?:`|^)make ([a-z][a-z-]+)", README, re.MULTILINE)) <= targets
 
 
-def test_links_lead_to_files() -> None:
+def test_links_lead_to_files():
     links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
     assert "docs/images/overview.png" in links
     assert [link for link in links if not (ROOT / link).exists()] == []

@@ -1,11 +1,7 @@
 """Record: sampling checks, channels, tables and files."""
 
-from __future__ import annotations
-
 import copy
 import pickle
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +14,12 @@ from dahl_ident.errors import ValidationError
 TIME = np.arange(200) / 50.0
 
 
-def sine(**changes: Any) -> Record:
+def sine(**changes):
     arguments = {"displacement": np.sin(TIME), "force": np.cos(TIME)}
     return Record(TIME, **{**arguments, **changes})
 
 
-def assert_same(one: Record, other: Record) -> None:
+def assert_same(one, other):
     for name in ("time", "displacement", "velocity", "acceleration", "force", "drive"):
         a, b = getattr(one, name), getattr(other, name)
         if a is None:
@@ -35,7 +31,7 @@ def assert_same(one: Record, other: Record) -> None:
 
 
 class TestSampling:
-    def test_even(self) -> None:
+    def test_even(self):
         record = sine()
         assert record.n == len(record) == 200
         assert record.sample_rate == pytest.approx(50.0, rel=1e-13)
@@ -43,13 +39,13 @@ class TestSampling:
         assert record.uniform
         assert record.gaps.shape == (0, 2)
 
-    def test_time_stamps_rounded_to_ten_digits_are_even(self) -> None:
+    def test_time_stamps_rounded_to_ten_digits_are_even(self):
         time = np.round(np.arange(5000) / 1024, 9)
         record = Record(time, velocity=np.zeros(5000), force=np.zeros(5000))
         assert record.uniform
         assert record.sample_rate == pytest.approx(1024, rel=1e-9)
 
-    def test_gaps_do_not_count_into_the_rate(self) -> None:
+    def test_gaps_do_not_count_into_the_rate(self):
         kept = np.r_[0:50, 60:150, 152:200]
         record = Record(TIME[kept], displacement=np.zeros(kept.size), force=np.zeros(kept.size))
         np.testing.assert_allclose(record.gaps, TIME[[[49, 60], [149, 152]]])
@@ -57,7 +53,7 @@ class TestSampling:
         assert not record.uniform
 
     @given(st.integers(0, 2**32 - 1))
-    def test_jitter(self, seed: int) -> None:
+    def test_jitter(self, seed):
         time = TIME + np.random.default_rng(seed).uniform(-0.2, 0.2, TIME.size) / 50.0
         record = Record(time, displacement=time, force=time)
         assert not record.uniform
@@ -84,38 +80,38 @@ class TestValidation:
             ({"motion": "both"}, "motion is 'both'"),
         ],
     )
-    def test_impossible_fields_are_refused(self, arguments: Any, message: str) -> None:
+    def test_impossible_fields_are_refused(self, arguments, message):
         good = {"time": TIME, "displacement": np.sin(TIME), "force": np.cos(TIME)}
         with pytest.raises(ValidationError, match=message):
             Record(**{**good, **arguments})
 
-    def test_read_only(self) -> None:
+    def test_read_only(self):
         record = sine()
         with pytest.raises(ValueError, match="read-only"):
             record.time[0] = 1.0
 
-    def test_survives_pickle_and_copy(self) -> None:
+    def test_survives_pickle_and_copy(self):
         record = sine(provenance={"file": "a.csv"})
         assert_same(record, pickle.loads(pickle.dumps(record)))
         assert_same(record, copy.deepcopy(record))
 
 
 class TestChannels:
-    def test_force_of_a_drive_in_volts(self) -> None:
+    def test_force_of_a_drive_in_volts(self):
         record = Record(TIME, acceleration=TIME, drive=2 * np.ones(200), drive_factor=12.5)
         assert record.motion_channel == "acceleration"
         np.testing.assert_array_equal(record.motion_samples, TIME)
         np.testing.assert_array_equal(record.force_samples, 25.0)
 
-    def test_a_measured_force_comes_first(self) -> None:
+    def test_a_measured_force_comes_first(self):
         record = sine(drive=TIME, drive_factor=3.0)
         np.testing.assert_array_equal(record.force_samples, np.cos(TIME))
 
-    def test_a_drive_in_newtons_needs_no_factor(self) -> None:
+    def test_a_drive_in_newtons_needs_no_factor(self):
         record = Record(TIME, velocity=TIME, drive=TIME, drive_unit="N")
         np.testing.assert_array_equal(record.force_samples, TIME)
 
-    def test_a_drive_in_amperes_without_factor_is_no_force(self) -> None:
+    def test_a_drive_in_amperes_without_factor_is_no_force(self):
         record = Record(TIME, velocity=TIME, drive=TIME, drive_unit="A")
         with pytest.raises(ValidationError, match=r"drive is in A and has no factor; .* N/A"):
             record.force_samples  # noqa: B018
@@ -133,11 +129,11 @@ class TestTables:
             sine(displacement=None, acceleration=TIME / 9),
         ],
     )
-    def test_files_lose_nothing(self, tmp_path: Path, record: Record, ending: str) -> None:
+    def test_files_lose_nothing(self, tmp_path, record, ending):
         back = read_record(record.save(tmp_path / f"run{ending}"))
         assert_same(record, back)
 
-    def test_repr_shows_sampling_ranges_units(self) -> None:
+    def test_repr_shows_sampling_ranges_units(self):
         text = repr(
             Record(
                 np.r_[TIME[:9], TIME[12:]],

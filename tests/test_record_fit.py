@@ -1,7 +1,5 @@
 """Fits to records of any motion: recovery, error bars, verdicts, prediction, storage, refusals."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os
@@ -15,8 +13,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
-from dahl_ident.elements import Element, Model
+from dahl_ident.elements import Model
 from dahl_ident.engine import differentiated
 from dahl_ident.errors import DataError, FitError, FitInterrupted, ModelError, ValidationError
 from dahl_ident.problem import RecordProblem
@@ -30,7 +27,7 @@ DAHL = di.Dahl(f_max=0.1, sigma=30.0)
 BOUC_WEN = di.BoucWen(sigma=30.0, q=200.0, p=500.0)
 
 
-def trajectory(kind: str, samples: int, seed: int = 0) -> FloatArray:
+def trajectory(kind, samples, seed=0):
     """Return a displacement of about 10 mm, sampled at 500 Hz."""
     rng = np.random.default_rng(seed)
     t = np.arange(samples) / RATE
@@ -44,7 +41,7 @@ def trajectory(kind: str, samples: int, seed: int = 0) -> FloatArray:
     return np.asarray(8e-3 * np.interp(t * RATE / 100.0, np.arange(lengths.size), lengths))
 
 
-def recorded(model: Element, kind: str, samples: int, noise: float, seed: int = 0) -> di.Record:
+def recorded(model, kind, samples, noise, seed=0):
     """Return a record of the displacement and its noisy force."""
     x = trajectory(kind, samples, seed)
     v, _ = differentiated(x, 1.0 / RATE)
@@ -57,9 +54,7 @@ def recorded(model: Element, kind: str, samples: int, noise: float, seed: int = 
     return di.Record(time, displacement=x, force=force + noise * rng.standard_normal(samples))
 
 
-def driven(
-    seed: int, noise: float, samples: int = 2048, channel: str = "displacement"
-) -> di.Record:
+def driven(seed, noise, samples=2048, channel="displacement"):
     """Return a record of a plant with Dahl friction under a multisine force."""
     rng = np.random.default_rng(seed)
     t = np.arange(samples) / RATE
@@ -75,7 +70,7 @@ def driven(
 
 @pytest.mark.parametrize("kind", ["random", "trapezoid"])
 @pytest.mark.versions
-def test_force_from_displacement(kind: str) -> None:
+def test_force_from_displacement(kind):
     truth = DAHL + di.Spring(5.0) + di.Damper(0.3)
     fit = di.fit(recorded(truth, kind, 1500, 1e-3), di.Dahl() + di.Spring() + di.Damper())
     assert fit.trusted, fit.verdict
@@ -86,7 +81,7 @@ def test_force_from_displacement(kind: str) -> None:
             assert found.stderr < 0.2 * found.value
 
 
-def test_exact_where_there_is_no_noise() -> None:
+def test_exact_where_there_is_no_noise():
     fit = di.fit(recorded(BOUC_WEN, "random", 1500, 0.0), di.BoucWen())
     assert fit.params["q"].value == pytest.approx(200.0, rel=1e-7)
     assert fit.params["initial_force"].value == pytest.approx(0.02, rel=1e-6)
@@ -94,7 +89,7 @@ def test_exact_where_there_is_no_noise() -> None:
 
 @pytest.mark.parametrize("channel", ["displacement", "velocity", "acceleration"])
 @pytest.mark.versions
-def test_motion_from_force(channel: str) -> None:
+def test_motion_from_force(channel):
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
     truth = {"f_max": 0.1, "sigma": 300.0, "mass": 0.3, "damping": 0.5, "stiffness": 50.0}
     fit = di.fit(driven(1, 0.01, channel=channel), model)
@@ -105,7 +100,7 @@ def test_motion_from_force(channel: str) -> None:
         assert found.stderr < 0.2 * value
 
 
-def test_runs_are_fitted_together() -> None:
+def test_runs_are_fitted_together():
     runs = [recorded(DAHL, "random", 600, 1e-3, seed) for seed in (1, 2, 3)]
     fit = di.fit(runs, di.Dahl())
     single = di.fit(runs[0], di.Dahl())
@@ -117,7 +112,7 @@ def test_runs_are_fitted_together() -> None:
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.9])
-def test_error_bars_cover(pole: float) -> None:
+def test_error_bars_cover(pole):
     runs, inside = 24, 0
     clean = recorded(DAHL, "random", 400, 0.0)
     model = di.Dahl()
@@ -133,7 +128,7 @@ def test_error_bars_cover(pole: float) -> None:
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-5])
-def test_noise_of_the_displacement_does_not_count_as_travel(noise: float) -> None:
+def test_noise_of_the_displacement_does_not_count_as_travel(noise):
     # an encoder's noise at rest moves the model's friction by 7 standard uncertainties and more
     runs, inside, t = 10, 0, np.arange(1500) / 100.0
     for seed in range(runs):
@@ -157,7 +152,7 @@ def test_noise_of_the_displacement_does_not_count_as_travel(noise: float) -> Non
     assert di.fit(still, di.Dahl()).problem.displacement_noise == 0.0
 
 
-def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
+def test_noise_in_the_drive_does_not_pass_for_stiffness():
     # a plant that nearly floats: slow noise in the measured force moves the model, not the plant
     rng = np.random.default_rng(3)
     samples = 4000
@@ -182,7 +177,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness() -> None:
     assert {"noise", "noise in the drive"} <= {r.source for r in fit.budget()["mass"].rows}
 
 
-def test_noise_in_the_displacement_counts_by_its_mean_square() -> None:
+def test_noise_in_the_displacement_counts_by_its_mean_square():
     # a single draw may by chance move the estimate by a tenth of what noise moves it
     found, noise = [], 5e-6
     for seed in range(6):
@@ -198,7 +193,7 @@ def test_noise_in_the_displacement_counts_by_its_mean_square() -> None:
     assert max(found) / min(found) < 3.0
 
 
-def turning_row(step: float, seed: int) -> float:
+def turning_row(step, seed):
     """Return the uncertainty of sigma by turning points, the displacement wrong by one pole."""
     t = np.arange(2400) / RATE
     x = 3e-3 * (np.sin(9.0 * t) + np.sin(23.3 * t))
@@ -212,12 +207,12 @@ def turning_row(step: float, seed: int) -> float:
     return rows.get("displacement at turning points", 0.0) / rows["noise"]
 
 
-def test_correlated_errors_of_the_displacement_show_at_turning_points() -> None:
+def test_correlated_errors_of_the_displacement_show_at_turning_points():
     assert max(turning_row(0.0, seed) for seed in range(4)) == 0.0
     assert min(turning_row(1e-5, seed) for seed in range(4)) > 0.25
 
 
-def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
+def test_what_is_not_determined_is_said_with_the_motion_that_would():
     small = recorded(di.Dahl(0.1, 30.0), "random", 800, 1e-4)
     x = small.displacement * 0.01  # far below x_c
     noise = 3e-4 * np.random.default_rng(0).standard_normal(800)
@@ -228,7 +223,7 @@ def test_what_is_not_determined_is_said_with_the_motion_that_would() -> None:
     assert "move farther" in fit.verdict
 
 
-def test_a_displacement_that_is_constant_determines_nothing(tmp_path: Path) -> None:
+def test_a_displacement_that_is_constant_determines_nothing(tmp_path):
     t = np.arange(400) / 100.0
     force = 1e-3 * np.random.default_rng(0).standard_normal(400)
     fit = di.fit(di.Record(t, displacement=0.0 * t, force=force), di.Dahl(), throw=False)
@@ -240,14 +235,14 @@ def test_a_displacement_that_is_constant_determines_nothing(tmp_path: Path) -> N
     assert not np.isnan([d.stderr for d in fit.derived([1e-3], 1.0)]).any()
 
 
-def test_records_that_differ_are_the_reason_why_a_parameter_is_not_determined() -> None:
+def test_records_that_differ_are_the_reason_why_a_parameter_is_not_determined():
     runs = [recorded(di.Dahl(f_max, 30.0), "random", 800, 1e-5) for f_max in (0.03, 0.1)]
     fit = di.fit(runs, di.Dahl(alpha=1.0), throw=False)
     assert fit.budget()["f_max"].rows[0].source == "scatter between runs"
     assert "because the records ask for different values" in fit.verdict
 
 
-def test_ratios_alone_are_refused() -> None:
+def test_ratios_alone_are_refused():
     t = np.arange(200) / 100.0
     decay = di.Record(t, displacement=np.exp(-t) * np.cos(9.0 * t), force=0.0 * t)
     with pytest.raises(DataError, match="the force is zero, so that the motion determines only"):
@@ -257,7 +252,7 @@ def test_ratios_alone_are_refused() -> None:
         di.fit(base, di.Dahl() + di.Mass() + di.Spring(), excitation="base")
 
 
-def test_what_the_model_misses_from_place_to_place_is_in_the_budget() -> None:
+def test_what_the_model_misses_from_place_to_place_is_in_the_budget():
     # friction whose level wanders by 10 % from one twentieth of the record to the next
     samples = 4000
     clean = recorded(DAHL, "random", samples, 0.0)
@@ -277,17 +272,15 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget() -> None:
     assert steady.trusted
 
 
-def test_a_fit_that_is_stopped_keeps_what_it_found(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fit_that_is_stopped_keeps_what_it_found(monkeypatch, capsys):
     record = recorded(DAHL, "random", 500, 1e-3)
     own, calls = RecordProblem.predict, []
 
-    def predict(self: RecordProblem, *given: object, **how: object) -> object:
+    def predict(self, *given, **how):
         calls.append(given)
         if len(calls) == 9:
             raise KeyboardInterrupt
-        return own(self, *given, **how)  # type: ignore[arg-type]
+        return own(self, *given, **how)
 
     monkeypatch.setattr(RecordProblem, "predict", predict)
     monkeypatch.setattr("dahl_ident.progress.PATIENCE", 0.0)
@@ -302,7 +295,7 @@ def test_a_fit_that_is_stopped_keeps_what_it_found(
     assert capsys.readouterr().out == ""
 
 
-def test_parts_that_are_left_out_are_predicted() -> None:
+def test_parts_that_are_left_out_are_predicted():
     record = recorded(DAHL, "random", 900, 1e-3)
     check = di.fit(record, di.Dahl()).hold_out(3)
     assert [part.samples for part in check.parts] == [300, 300, 300]
@@ -317,12 +310,12 @@ def test_parts_that_are_left_out_are_predicted() -> None:
         di.fit(record, di.Dahl()).hold_out(1)
 
 
-def test_a_wrong_model_is_not_trusted() -> None:
+def test_a_wrong_model_is_not_trusted():
     fit = di.fit(recorded(di.Spring(10.0) + DAHL, "random", 800, 1e-4), di.Dahl(), throw=False)
     assert not fit.trusted
 
 
-def test_stored_and_read_again(tmp_path: Path) -> None:
+def test_stored_and_read_again(tmp_path):
     fit = di.fit(recorded(BOUC_WEN, "random", 500, 1e-3), di.BoucWen())
     again = FitResult.load(fit.save(tmp_path / "fit.json"))
     assert {n: str(p) for n, p in again.params.items()} == {
@@ -350,7 +343,7 @@ def test_stored_and_read_again(tmp_path: Path) -> None:
         assert fit.plot(kind).get_ylabel()
 
 
-def test_prediction_of_another_record() -> None:
+def test_prediction_of_another_record():
     model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
     fit = di.fit(driven(1, 0.001), model)
     band = fit.predict(driven(2, 0.0))
@@ -360,7 +353,7 @@ def test_prediction_of_another_record() -> None:
     assert fit.simulate(driven(2, 0.0)).shape == (2048,)
 
 
-def test_refusals() -> None:
+def test_refusals():
     record = recorded(DAHL, "random", 100, 1e-3)
     t = np.arange(100.0)
     with pytest.raises(DataError, match="no displacement"):
@@ -380,7 +373,7 @@ def test_refusals() -> None:
 
 
 @needs_measured
-def test_earthquake_on_friction_isolators() -> None:
+def test_earthquake_on_friction_isolators():
     place = Path(str(MEASURED)) / "base_isolation"
     floors = [np.loadtxt(place / f"ICA100_a{i}.txt") for i in range(1, 7)]
     x = np.loadtxt(place / "ICA100_d1.txt")
@@ -392,9 +385,7 @@ def test_earthquake_on_friction_isolators() -> None:
     assert fit.status.value == "approximate"
 
 
-def test_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_line(tmp_path, capsys, monkeypatch):
     from dahl_ident.cli import main
 
     place = tmp_path / "run.csv"
@@ -428,7 +419,7 @@ def test_command_line(
 
 
 @pytest.mark.parametrize("ending", ["json", "html"])
-def test_report(tmp_path: Path, ending: str) -> None:
+def test_report(tmp_path, ending):
     fit = di.fit(recorded(BOUC_WEN, "random", 500, 1e-3), di.BoucWen())
     place = di.report(fit, tmp_path / f"report.{ending}", metadata={"specimen": "joint 7"})
     text = place.read_text("utf-8")
@@ -447,7 +438,7 @@ def test_report(tmp_path: Path, ending: str) -> None:
         di.report([fit, *tables], tmp_path / "other.html")
 
 
-def test_what_records_cannot_do_is_refused_by_name() -> None:
+def test_what_records_cannot_do_is_refused_by_name():
     fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
     with pytest.raises(ValidationError, match=r"likelihood is given with records: .*robust"):
         di.posterior(fit.data[0], di.Dahl(), likelihood="student_t")
@@ -461,7 +452,7 @@ def test_what_records_cannot_do_is_refused_by_name() -> None:
         di.posterior(fit, priors={"drift": (0.0, 1.0)})
 
 
-def test_derived_quantities_follow_from_the_estimate() -> None:
+def test_derived_quantities_follow_from_the_estimate():
     fit = di.fit(recorded(DAHL, "random", 500, 1e-3), di.Dahl())
     f_max, sigma = fit.params["f_max"].value, fit.params["sigma"].value
     x_c, energy, stiffness, damping = fit.derived([2e-3], 5.0)
@@ -475,7 +466,7 @@ def test_derived_quantities_follow_from_the_estimate() -> None:
     assert damping.value == pytest.approx(N.imag / (10.0 * np.pi))
 
 
-def test_results_of_records_are_copied_and_pickled() -> None:
+def test_results_of_records_are_copied_and_pickled():
     record = recorded(DAHL, "random", 400, 1e-3)
     plant = di.Dahl() + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
     results = [

@@ -1,15 +1,10 @@
 """Every law is recovered from records of a multisine, a trapezoidal motion and a ring-down."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 import dahl_ident as di
-from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Model
 from dahl_ident.engine import differentiated
 from tests.motions import Driven
@@ -40,7 +35,7 @@ PLANTS: list[tuple[str, Element, Element]] = [
 ]
 
 
-def displacement(kind: str, samples: int) -> FloatArray:
+def displacement(kind, samples):
     """Return a displacement of about 10 mm."""
     if kind == "ring-down":
         t = np.arange(samples) / RATE
@@ -48,7 +43,7 @@ def displacement(kind: str, samples: int) -> FloatArray:
     return trajectory(kind, samples)
 
 
-def drive(kind: str, samples: int) -> FloatArray:
+def drive(kind, samples):
     """Return a force of about 1 N; none for a ring-down."""
     t = np.arange(samples) / RATE
     if kind == "trapezoid":
@@ -61,7 +56,7 @@ def drive(kind: str, samples: int) -> FloatArray:
     return np.asarray(0.03 * np.sum([np.sin(2 * np.pi * (f * t + p)) for f, p in lines], axis=0))
 
 
-def assert_recovered(fit: di.FitResult, truth: Element) -> None:
+def assert_recovered(fit, truth):
     """Check every free parameter against its uncertainty, which must say something."""
     assert fit.trusted, fit.verdict
     for parameter in truth.parameters:
@@ -75,7 +70,7 @@ def assert_recovered(fit: di.FitResult, truth: Element) -> None:
 @pytest.mark.parametrize(
     ("truth", "model", "kind"), [(*law, MOTIONS[i % 3]) for i, law in enumerate(LAWS)]
 )
-def test_force_from_displacement(truth: Element, model: Element, kind: str) -> None:
+def test_force_from_displacement(truth, model, kind):
     samples = 600
     x = displacement(kind, samples)
     v, _ = differentiated(x, 1.0 / RATE)
@@ -86,7 +81,7 @@ def test_force_from_displacement(truth: Element, model: Element, kind: str) -> N
     assert_recovered(di.fit(record, model, throw=False), truth)
 
 
-def driven(kind: str, whole: Model, samples: int, noise: float) -> di.Record:
+def driven(kind, whole, samples, noise):
     """Return a record of a plant's displacement, noise in shares of its standard deviation."""
     wave = drive(kind, samples)
     plant = Driven(whole, wave, RATE)
@@ -98,7 +93,7 @@ def driven(kind: str, whole: Model, samples: int, noise: float) -> di.Record:
 
 
 @pytest.mark.parametrize(("kind", "truth", "model"), PLANTS)
-def test_motion_from_force(kind: str, truth: Element, model: Element) -> None:
+def test_motion_from_force(kind, truth, model):
     known = kind == "ring-down"  # no force is measured, so the mass has to be known
     whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
     record = driven(kind, whole, 384, 1e-3)
@@ -118,7 +113,7 @@ def test_motion_from_force(kind: str, truth: Element, model: Element) -> None:
         ),
     ],
 )
-def test_trapezoids_that_are_hard_to_search(truth: Element, model: Element, noise: float) -> None:
+def test_trapezoids_that_are_hard_to_search(truth, model, noise):
     whole = Model(truth + di.Mass(0.3) + di.Spring(50.0))
     no_delay = di.Sensors(delay=norm(0.0, 1e-9))  # which such a motion does not tell from sigma
     record = driven("trapezoid", whole, 512, noise)
@@ -131,7 +126,7 @@ def test_trapezoids_that_are_hard_to_search(truth: Element, model: Element, nois
             assert error < 4.5 * float(found.stderr or 0.0), found
 
 
-def damped_record(damper: Callable[[FloatArray], FloatArray]) -> di.Record:
+def damped_record(damper):
     """Return a record of Dahl friction and a force of the speed."""
     t = np.arange(1500) / 200.0
     phase = 2.0 * np.sin(0.9 * t) + 5.1 * t
@@ -141,14 +136,14 @@ def damped_record(damper: Callable[[FloatArray], FloatArray]) -> di.Record:
     return di.Record(t, displacement=x, force=force + noise)
 
 
-def test_exponent_of_a_damper_stays_between_its_bounds() -> None:
+def test_exponent_of_a_damper_stays_between_its_bounds():
     record = damped_record(lambda v: 5e5 * v**3 * np.abs(v))
     fit = di.fit(record, di.Dahl() + di.PowerDamper(), throw=False)
     assert 2.9 < fit.params["exponent"].value <= 3.0
     np.testing.assert_allclose(fit.params["f_max"].value, 0.1, rtol=0.05)
 
 
-def test_damper_that_vanishes_does_not_stop_the_search() -> None:
+def test_damper_that_vanishes_does_not_stop_the_search():
     record = damped_record(lambda v: -0.2 * v)  # no coefficient above zero helps
     no_delay = di.Sensors(delay=norm(0.0, 1e-9))  # which would stand for the damper
     law = di.Dahl(alpha=1.0)

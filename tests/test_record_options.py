@@ -1,9 +1,5 @@
 """Options of a fit that tables and records share, on records."""
 
-from __future__ import annotations
-
-from typing import Any, Literal
-
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -18,24 +14,24 @@ NOISE = 1e-3 * RNG.standard_normal(2000)
 MODEL = di.Dahl(alpha=1.0)
 
 
-def record(force: np.ndarray) -> di.Record:
+def record(force):
     return di.Record(np.arange(2000) / 100.0, displacement=X, force=force)
 
 
 @pytest.fixture(scope="module")
-def fit() -> di.FitResult:
+def fit():
     return di.fit(record(TRUE + NOISE), MODEL)
 
 
 @pytest.mark.parametrize("label", ["offset", "drift", "initial_force"])
-def test_a_parameter_called_as_one_of_the_records_is_refused(label: str) -> None:
+def test_a_parameter_called_as_one_of_the_records_is_refused(label):
     class Own(di.Friction):
         parameters = (
             di.Parameter("sigma", "N/m", "stiffness", lower=0.0, transform="log"),
             di.Parameter(label, "N", "friction limit", lower=0.0, transform="log"),
         )
 
-        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        def slope(self, force, direction, velocity, values):
             return values[0] * (1.0 - direction * force / values[1])
 
     for model in (Own(), Own(30.0), Own(None, 0.1) + di.Spring()):
@@ -43,14 +39,14 @@ def test_a_parameter_called_as_one_of_the_records_is_refused(label: str) -> None
             di.fit(record(TRUE + NOISE), model)
 
 
-def test_unknowns_of_two_elements_have_names_of_their_own() -> None:
+def test_unknowns_of_two_elements_have_names_of_their_own():
     class Own(di.Friction):
         parameters = (
             di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
             di.Parameter("limit", "N", "friction limit", lower=0.0, transform="log"),
         )
 
-        def slope(self, force: Any, direction: Any, velocity: Any, values: Any) -> Any:
+        def slope(self, force, direction, velocity, values):
             return values[0] * (1.0 - direction * force / values[1])
 
     with pytest.raises(ModelError, match="unknown of several elements initial_force; give each a"):
@@ -60,7 +56,7 @@ def test_unknowns_of_two_elements_have_names_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("method", ["scipy", "ipopt"])
-def test_every_method_finds_the_same_optimum(method: str, fit: di.FitResult) -> None:
+def test_every_method_finds_the_same_optimum(method, fit):
     other = di.fit(record(TRUE + NOISE), MODEL, method=method)
     assert other.method == method
     np.testing.assert_allclose(other.optimum.values[:2], fit.optimum.values[:2], rtol=1e-5)
@@ -68,7 +64,7 @@ def test_every_method_finds_the_same_optimum(method: str, fit: di.FitResult) -> 
 
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
 @pytest.mark.parametrize("method", ["lm", "scipy"])
-def test_robust_losses_ignore_outliers(loss: str, method: str, fit: di.FitResult) -> None:
+def test_robust_losses_ignore_outliers(loss, method, fit):
     hit = TRUE + NOISE
     hit[::50] += 0.2
     robust = di.fit(record(hit), MODEL, loss=loss, method=method)
@@ -82,9 +78,7 @@ def test_robust_losses_ignore_outliers(loss: str, method: str, fit: di.FitResult
 
 
 @pytest.mark.parametrize("method", ["profile", "bootstrap"])
-def test_intervals_by_noise_agree_where_the_problem_is_linear(
-    method: Literal["profile", "bootstrap"], fit: di.FitResult
-) -> None:
+def test_intervals_by_noise_agree_where_the_problem_is_linear(method, fit):
     comparison = fit.compare_intervals(("wald", method), levels=0.9545)
     for ours, theirs in zip(
         *(one.at(0.9545).items() for one in comparison.intervals), strict=False
@@ -95,7 +89,7 @@ def test_intervals_by_noise_agree_where_the_problem_is_linear(
         assert abs(ours[1].upper - theirs[1].upper) < 0.35 * half
 
 
-def test_likelihood_and_criteria(fit: di.FitResult) -> None:
+def test_likelihood_and_criteria(fit):
     (predicted,) = fit.best_fit
     left = TRUE + NOISE - predicted
     density = norm(0.0, np.sqrt(np.mean(left**2))).logpdf(left).sum()
@@ -105,7 +99,7 @@ def test_likelihood_and_criteria(fit: di.FitResult) -> None:
     assert fit.bic == pytest.approx(np.log(2000.0) * counted - 2.0 * density)
 
 
-def test_profile_counts_correlated_noise() -> None:
+def test_profile_counts_correlated_noise():
     slow = np.convolve(RNG.standard_normal(2100), np.ones(30), "valid")[:2000] * 3e-4
     fit = di.fit(record(TRUE + slow), MODEL)
     (wald,) = (fit.conf_interval("wald", 0.9545)[name][0] for name in ("f_max",))
@@ -115,7 +109,7 @@ def test_profile_counts_correlated_noise() -> None:
     assert profile.upper - profile.lower > 1.5 * white
 
 
-def test_a_posterior_by_points_has_the_covariance_of_the_fit() -> None:
+def test_a_posterior_by_points_has_the_covariance_of_the_fit():
     part = slice(300)
     short = di.Record(np.arange(300) / 100.0, displacement=X[part], force=(TRUE + NOISE)[part])
     fit = di.fit(short, MODEL)
@@ -130,11 +124,11 @@ def test_a_posterior_by_points_has_the_covariance_of_the_fit() -> None:
     assert "log_evidence" not in posterior.to_dict()
 
 
-def test_constraints() -> None:
+def test_constraints():
     measured = record(TRUE + NOISE)
 
-    def tied(ratio: float) -> di.FitResult:
-        def constraints(p: Any) -> list[Any]:
+    def tied(ratio):
+        def constraints(p):
             return [p["sigma"] == ratio * p["f_max"]]
 
         return di.fit(measured, MODEL, method="ipopt", constraints=constraints)
@@ -162,12 +156,12 @@ def test_constraints() -> None:
         (di.load_dataset("noisy"), {"excitation": "base"}),
     ],
 )
-def test_options_of_the_other_kind_are_refused(data: Any, option: dict[str, Any]) -> None:
+def test_options_of_the_other_kind_are_refused(data, option):
     with pytest.raises(ValidationError, match=r"is given with (records|a table): .*leave it out"):
         di.fit(data, MODEL, **option)
 
 
-def test_a_table_and_a_record_answer_the_same_questions(fit: di.FitResult) -> None:
+def test_a_table_and_a_record_answer_the_same_questions(fit):
     table = di.fit(di.load_dataset("noisy"), MODEL)
     for one in (fit, table):
         report = one.fit_report()
@@ -181,7 +175,7 @@ def test_a_table_and_a_record_answer_the_same_questions(fit: di.FitResult) -> No
             one.plot("spiral")
 
 
-def test_what_one_kind_alone_has_is_refused_in_one_way(fit: di.FitResult) -> None:
+def test_what_one_kind_alone_has_is_refused_in_one_way(fit):
     table = di.fit(di.load_dataset("noisy"), MODEL)
     with pytest.raises(ValidationError, match="a fit of a table has no prediction of a record"):
         table.predict(record(TRUE))
@@ -191,7 +185,7 @@ def test_what_one_kind_alone_has_is_refused_in_one_way(fit: di.FitResult) -> Non
         fit.backbone(1e-3)
 
 
-def test_a_fit_of_records_predicts_responses_to_sines(fit: di.FitResult) -> None:
+def test_a_fit_of_records_predicts_responses_to_sines(fit):
     A = np.array([1e-3, 4e-3])
     band, truth = fit.describing_function(A), di.Dahl(0.1, 30.0).describing_function(A)
     np.testing.assert_allclose(band.response, fit.model.dynamic_stiffness(A, 1.0), rtol=1e-9)
@@ -206,7 +200,7 @@ def test_a_fit_of_records_predicts_responses_to_sines(fit: di.FitResult) -> None
     np.testing.assert_allclose(drawn.draws.real.std(axis=0), band.real_std, rtol=0.2)
 
 
-def test_a_fit_of_a_driven_record_has_a_backbone() -> None:
+def test_a_fit_of_a_driven_record_has_a_backbone():
     mass, stiffness, friction = 0.5, 200.0, di.Dahl(0.1, 30.0, alpha=1.0)
     t, tones = np.arange(1500)[:, None] / 200.0, np.array([4.0, 9.1, 15.7])
     waves = 8e-3 * np.sin(tones * t)

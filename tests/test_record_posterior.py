@@ -1,10 +1,7 @@
 """Posteriors of records: their width, their priors, what they predict, and their chains on disk."""
 
-from __future__ import annotations
-
 import json
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ import dahl_ident as di
 from tests.test_record_fit import DAHL, driven, recorded
 
 
-def slow_noise(seed: int = 0) -> di.Record:
+def slow_noise(seed=0):
     """Return a record whose noise has a correlation of 0.95 from sample to sample."""
     clean = recorded(DAHL, "random", 500, 0.0)
     white = np.random.default_rng(seed).standard_normal(800)
@@ -23,7 +20,7 @@ def slow_noise(seed: int = 0) -> di.Record:
     return di.Record(clean.time, displacement=clean.displacement, force=clean.force_samples + noise)
 
 
-def test_as_wide_as_the_error_bars_of_the_fit_where_residuals_are_correlated() -> None:
+def test_as_wide_as_the_error_bars_of_the_fit_where_residuals_are_correlated():
     fit = di.fit(slow_noise(), di.Dahl())
     found = di.posterior(fit, seed=1, steps=120, walkers=64)
     assert found.names == ("f_max", "sigma")
@@ -35,7 +32,7 @@ def test_as_wide_as_the_error_bars_of_the_fit_where_residuals_are_correlated() -
         assert abs(found.params[name].value - fit.params[name].value) < 0.3 * other
 
 
-def _counted_as_independent(fit: di.FitResult, name: str) -> float:
+def _counted_as_independent(fit, name):
     """Return the standard error if every sample counted."""
     number = fit.var_names.index(name)
     J = fit.problem.predict(fit.optimum.values, 0).by
@@ -43,7 +40,7 @@ def _counted_as_independent(fit: di.FitResult, name: str) -> float:
     return float(covariance[number, number] ** 0.5)
 
 
-def test_a_posterior_counts_noise_alone_or_the_stated_calibration() -> None:
+def test_a_posterior_counts_noise_alone_or_the_stated_calibration():
     """By importance points, of which the width is that of the fit's covariance."""
     record, model = recorded(DAHL, "random", 300, 1e-3), di.Dahl(alpha=1.0)
     gain = di.Sensors(force_gain=norm(1.0, 0.05))
@@ -61,7 +58,7 @@ def test_a_posterior_counts_noise_alone_or_the_stated_calibration() -> None:
     assert "Noise alone is counted" in both["noise"].verdict
 
 
-def test_priors_and_prediction() -> None:
+def test_priors_and_prediction():
     fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
     sigma = fit.params["sigma"]
     at = float(sigma.value) + 3.0 * float(sigma.stderr or 0.0)
@@ -80,7 +77,7 @@ def test_priors_and_prediction() -> None:
     assert x_c.value == pytest.approx(np.mean(narrow.values[:, 0] / narrow.values[:, 1]), rel=1e-4)
 
 
-def test_a_stopped_chain_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+def test_a_stopped_chain_goes_on_as_if_it_had_not_been(tmp_path):
     fit = di.fit(recorded(DAHL, "random", 200, 1e-3), di.Dahl())
     place = tmp_path / "chain.h5"
     di.posterior(fit, seed=3, steps=60, walkers=32, resume=place)
@@ -92,9 +89,7 @@ def test_a_stopped_chain_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
         di.posterior(other, seed=3, steps=120, walkers=32, resume=place)
 
 
-def test_command_line_and_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_line_and_report(tmp_path, monkeypatch, capsys):
     from dahl_ident.cli import main
 
     place, told = tmp_path / "run.csv", tmp_path / "run.json"
@@ -118,7 +113,7 @@ def test_command_line_and_report(
     assert "--likelihood is given with records" in capsys.readouterr().err
 
 
-def test_data_that_the_model_misses_are_said() -> None:
+def test_data_that_the_model_misses_are_said():
     with_spring = recorded(DAHL + di.Spring(20.0), "random", 300, 1e-4)
     found = di.posterior(with_spring, di.Dahl(), seed=1, steps=200, walkers=32)
     assert found.status.value != "trusted"
@@ -126,7 +121,7 @@ def test_data_that_the_model_misses_are_said() -> None:
     assert "Counted: noise" in str(found)
 
 
-def test_importance_points_of_a_plant_take_few_motions() -> None:
+def test_importance_points_of_a_plant_take_few_motions():
     """A record determines its parameters to first order nearly: the posterior is Student's t."""
     model = di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Damper() + di.Spring(50.0)
     fit = di.fit(driven(1, 0.01, 400), model)

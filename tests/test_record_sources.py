@@ -1,7 +1,5 @@
 """What the uncertainty of a fit to records counts, and what its verdict says of doubtful values."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +15,11 @@ from dahl_ident.synthetic import Acquisition, Experiment, FrequencySweep, simula
 from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
 
 
-def sources(fit: di.FitResult, name: str) -> dict[str, float]:
+def sources(fit, name):
     return {row.source: row.u for row in fit.budget()[name].rows}
 
 
-def test_an_assumed_exponent_counts_as_if_it_were_estimated() -> None:
+def test_an_assumed_exponent_counts_as_if_it_were_estimated():
     record = recorded(DAHL, "random", 1500, 1e-3)
     assumed, free = di.fit(record, di.Dahl()), di.fit(record, di.Dahl(alpha=None))
     assert assumed.trusted
@@ -38,7 +36,7 @@ def test_an_assumed_exponent_counts_as_if_it_were_estimated() -> None:
     assert assumed.params["alpha"].stderr == pytest.approx(free.params["alpha"].stderr, rel=0.1)
 
 
-def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says() -> None:
+def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says():
     """It moves the plant most near resonance, where damping and friction are determined."""
     plant = di.Dahl(0.1, 30.0, 1.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
     sweep = FrequencySweep((0.2, 1.0), 0.4, 5.0, 20.0)
@@ -69,9 +67,7 @@ def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says() -> None:
         ("delay", "delay between the channels"),
     ],
 )  # fmt: skip
-def test_calibrations_count_as_they_move_the_estimate(
-    output: str, channel: str, source: str
-) -> None:
+def test_calibrations_count_as_they_move_the_estimate(output, channel, source):
     """Against a fit of the record with that channel wrong by a standard uncertainty."""
     if output == "force":
         record, model = (
@@ -105,7 +101,7 @@ def test_calibrations_count_as_they_move_the_estimate(
     )
 
 
-def test_a_record_takes_priors_of_its_channels_alone() -> None:
+def test_a_record_takes_priors_of_its_channels_alone():
     record = recorded(DAHL, "random", 300, 1e-3)
     for sensors in (di.Sensors(force_gain=None), di.Sensors(force_gain=1.02)):
         with pytest.raises(ValidationError, match="a fit of records expects a prior about 1"):
@@ -113,7 +109,7 @@ def test_a_record_takes_priors_of_its_channels_alone() -> None:
 
 
 @pytest.mark.parametrize("alpha", [0.5, 0.8, 1.3, 2.0])
-def test_an_exponent_that_nobody_stated_is_estimated(alpha: float) -> None:
+def test_an_exponent_that_nobody_stated_is_estimated(alpha):
     record = recorded(di.Dahl(0.1, 30.0, alpha=alpha), "random", 1500, 1e-3)
     fit, free = di.fit(record, di.Dahl(), throw=False), di.fit(record, di.Dahl(alpha=None))
     assert fit.trusted
@@ -125,7 +121,7 @@ def test_an_exponent_that_nobody_stated_is_estimated(alpha: float) -> None:
     assert low <= 0.1 <= high
 
 
-def test_an_exponent_beyond_its_range_is_named() -> None:
+def test_an_exponent_beyond_its_range_is_named():
     record = recorded(di.Dahl(0.1, 30.0, alpha=3.0), "random", 1500, 1e-3)
     fit = di.fit(record, di.Dahl(), throw=False)
     assert not fit.trusted
@@ -133,7 +129,7 @@ def test_an_exponent_beyond_its_range_is_named() -> None:
     assert "beyond the range that is assumed" in fit.verdict
 
 
-def test_an_assumed_exponent_of_a_driven_motion() -> None:
+def test_an_assumed_exponent_of_a_driven_motion():
     plant = di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
     start = {"f_max": 0.1, "sigma": 300.0}
     record = driven(2, 0.01, 1024)
@@ -146,7 +142,7 @@ def test_an_assumed_exponent_of_a_driven_motion() -> None:
     assert one.stderr == pytest.approx(other.stderr, rel=0.1)
 
 
-def test_scatter_between_runs_is_in_the_budget() -> None:
+def test_scatter_between_runs_is_in_the_budget():
     count = 6
     levels = np.random.default_rng(3).standard_normal(count)
     levels = 1.0 + 0.1 * (levels - levels.mean()) / levels.std(ddof=1)
@@ -170,7 +166,7 @@ def test_scatter_between_runs_is_in_the_budget() -> None:
     assert "a single run" in di.fit(runs[0], di.Dahl()).verdict
 
 
-def test_a_negative_damper_is_said_in_the_verdict_with_what_to_do() -> None:
+def test_a_negative_damper_is_said_in_the_verdict_with_what_to_do():
     record = recorded(DAHL + di.Damper(-0.3), "multisine", 1500, 1e-3)
     fit = di.fit(record, di.Dahl() + di.Damper())
     assert fit.status.value == "approximate"
@@ -180,7 +176,7 @@ def test_a_negative_damper_is_said_in_the_verdict_with_what_to_do() -> None:
     assert "negative" not in given.verdict
 
 
-def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted() -> None:
+def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted():
     x: FloatArray = trajectory("multisine", 3000)
     law = di.MaxwellSlip(slips=[5e-4, 2e-3, 4e-3], stiffnesses=[20.0, 10.0, 5.0])
     noise = 1e-3 * np.random.default_rng(1).standard_normal(x.size)
@@ -193,7 +189,7 @@ def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted() -> None:
     assert "less than the model misses" not in right.verdict
 
 
-def test_the_posterior_of_an_approximate_fit_is_approximate() -> None:
+def test_the_posterior_of_an_approximate_fit_is_approximate():
     clean = recorded(DAHL, "random", 1000, 0.0)
     level = np.repeat(1.0 + 0.05 * np.random.default_rng(3).standard_normal(20), 50)
     noise = 1e-3 * np.random.default_rng(0).standard_normal(1000)
@@ -207,7 +203,7 @@ def test_the_posterior_of_an_approximate_fit_is_approximate() -> None:
     assert "alpha between 0.5 and 2" in found.verdict
 
 
-def moving(seed: int, size: float = 8e-3, samples: int = 1500) -> tuple[FloatArray, FloatArray]:
+def moving(seed, size=8e-3, samples=1500):
     """Return times ten times as close as samples at 500 Hz, and a multisine of a dozen lines."""
     rng = np.random.default_rng(seed)
     t = np.arange(-2000, 10 * samples) / (10.0 * RATE)
@@ -215,15 +211,7 @@ def moving(seed: int, size: float = 8e-3, samples: int = 1500) -> tuple[FloatArr
     return t, np.asarray(size / 12**0.5 * np.sin(2.0 * np.pi * lines).sum(axis=0))
 
 
-def held(
-    law: di.Dahl,
-    seed: int,
-    *,
-    delay: float = 0.0,
-    power: float = 0.0,
-    size: float = 8e-3,
-    noise: float = 5e-4,
-) -> di.Record:
+def held(law, seed, *, delay=0.0, power=0.0, size=8e-3, noise=5e-4):
     """Return a record with noise, by default 0.5 %, whose motion lags the force by some samples.
 
     The friction rises with a power of the speed.
@@ -237,7 +225,7 @@ def held(
 
 
 @pytest.mark.parametrize("delay", [-0.5, 0.05, 0.5])
-def test_a_delay_that_nobody_stated_is_estimated(delay: float) -> None:
+def test_a_delay_that_nobody_stated_is_estimated(delay):
     for seed in range(3):
         fit = di.fit(held(DAHL, seed, delay=delay), di.Dahl())
         assert fit.trusted, fit.verdict
@@ -251,7 +239,7 @@ def test_a_delay_that_nobody_stated_is_estimated(delay: float) -> None:
     assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
 
 
-def test_outliers_that_a_loss_sets_aside_are_no_error_of_the_displacement() -> None:
+def test_outliers_that_a_loss_sets_aside_are_no_error_of_the_displacement():
     """The motion is exact, so that what it adds is as small as without outliers."""
     rng, t = np.random.default_rng(1), np.arange(2000) / 200.0
     x = 0.01 * np.sin(2.0 * np.pi * t) * np.sin(0.26 * np.pi * t)
@@ -264,7 +252,7 @@ def test_outliers_that_a_loss_sets_aside_are_no_error_of_the_displacement() -> N
         assert robust.params[name].stderr == pytest.approx(plain.params[name].stderr, rel=0.3)
 
 
-def test_motions_that_turn_between_samples_are_covered() -> None:
+def test_motions_that_turn_between_samples_are_covered():
     """At 0.1 % noise, what the samples miss of the turning points moves f_max by two of its u."""
     away = []
     for seed in range(8):
@@ -278,7 +266,7 @@ def test_motions_that_turn_between_samples_are_covered() -> None:
     assert np.abs(away).max() < 3.0
 
 
-def test_a_delay_of_a_driven_motion_is_estimated() -> None:
+def test_a_delay_of_a_driven_motion_is_estimated():
     clean = driven(3, 1e-3, 1024)
     x = np.asarray(clean.displacement)
     late = CubicSpline(clean.time, x)(clean.time - 0.5 / RATE)
@@ -289,7 +277,7 @@ def test_a_delay_of_a_driven_motion_is_estimated() -> None:
 
 
 @pytest.mark.parametrize("power", [0.02, 0.1])
-def test_friction_that_rises_a_little_with_speed_is_covered(power: float) -> None:
+def test_friction_that_rises_a_little_with_speed_is_covered(power):
     fit = di.fit(held(DAHL, 1, power=power), di.Dahl())
     assert fit.status.usable
     assert fit.trusted == (power == 0.02)
@@ -298,7 +286,7 @@ def test_friction_that_rises_a_little_with_speed_is_covered(power: float) -> Non
 
 
 @pytest.mark.parametrize("alpha", [0.8, 1.3])
-def test_an_exponent_stated_wrongly_is_not_described(alpha: float) -> None:
+def test_an_exponent_stated_wrongly_is_not_described(alpha):
     fit = di.fit(held(di.Dahl(0.1, 30.0, alpha=alpha), 1), di.Dahl(alpha=1.0))
     assert fit.status == "not described"
     assert "The records contradict alpha = 1, which was stated" in fit.verdict
@@ -307,7 +295,7 @@ def test_an_exponent_stated_wrongly_is_not_described(alpha: float) -> None:
 
 
 @pytest.mark.parametrize(("alpha", "seed"), [(0.9, 0), (0.7, 1)])
-def test_misfit_of_a_stated_exponent_does_not_pass_as_noise(alpha: float, seed: int) -> None:
+def test_misfit_of_a_stated_exponent_does_not_pass_as_noise(alpha, seed):
     """A motion of twelve tones, both channels noisy."""
     rng, t = np.random.default_rng(seed), np.arange(4000) / 500.0
     tones = np.array([0.3, 0.5, 0.8, 1.1, 1.7, 2.3, 2.9, 3.7, 4.4, 5.3, 6.1, 7.3])
@@ -322,7 +310,7 @@ def test_misfit_of_a_stated_exponent_does_not_pass_as_noise(alpha: float, seed: 
     assert right.trusted, right.verdict
 
 
-def test_the_window_of_differentiation_is_in_the_budget() -> None:
+def test_the_window_of_differentiation_is_in_the_budget():
     """A mass that moves in jerks, of which the filter of the acceleration takes a part away."""
     t, x = moving(4)
     x = x + 5e-6 * np.sin(2.0 * np.pi * 40.0 * t)
@@ -338,7 +326,7 @@ def test_the_window_of_differentiation_is_in_the_budget() -> None:
     assert abs(mass.value - 0.1) < 2.0 * (mass.stderr or 0.0)
 
 
-def test_bands_grow_with_the_level_where_the_model_misses() -> None:
+def test_bands_grow_with_the_level_where_the_model_misses():
     fit = di.fit(held(DAHL, 1, power=0.1), di.Dahl())
     for size in (4e-3, 8e-3, 16e-3):
         band = fit.predict(held(DAHL, 7, power=0.1, size=size))
@@ -346,7 +334,7 @@ def test_bands_grow_with_the_level_where_the_model_misses() -> None:
         assert inside > 0.88
 
 
-def test_few_effective_samples_are_not_trusted() -> None:
+def test_few_effective_samples_are_not_trusted():
     record = held(DAHL, 2)
     slow = np.cumsum(np.random.default_rng(3).standard_normal(len(record)))
     drifting = record.force_samples + 1e-2 * (slow - slow.mean()) / slow.std()

@@ -1,13 +1,10 @@
 """Reports: what they say, in every format, and how the page behaves in a browser."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,15 +14,14 @@ from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.reporting.document import Cell, Document, Section, TextTable
 from dahl_ident.reporting.pdf import pdf
-from dahl_ident.results import Posterior
-from tests.browser import CHROMIUM, Page, chromium
+from tests.browser import CHROMIUM, chromium
 
 NASTY = "<img src=x onerror=alert(1)>&\"'|*_`[x](y)#.csv"
 WIDTHS = (400, 1400)
 
 
 @pytest.fixture(scope="module")
-def fit() -> di.FitResult:
+def fit():
     amplitude = np.geomspace(3e-4, 3e-2, 20)
     random = np.random.default_rng(1)
     noise = 0.01 * (random.standard_normal(20) + 1j * random.standard_normal(20))
@@ -36,21 +32,19 @@ def fit() -> di.FitResult:
 
 
 @pytest.fixture(scope="module")
-def posterior(fit: di.FitResult) -> Posterior:
+def posterior(fit):
     return di.posterior(fit, seed=3, ess=500.0, uncertainty="noise")
 
 
 @pytest.fixture(scope="module")
-def page_file(
-    fit: di.FitResult, posterior: Posterior, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def page_file(fit, posterior, tmp_path_factory):
     return report([fit, posterior], tmp_path_factory.mktemp("report") / "report.html")
 
 
 class Outline(HTMLParser):
     """Headings, pictures and links to elsewhere, as a reader program meets them."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.headings: list[int] = []
         self.alts: list[str] = []
@@ -58,7 +52,7 @@ class Outline(HTMLParser):
         self.scripts = 0
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         given = dict(attrs)
         if re.fullmatch("h[1-6]", tag):
             self.headings.append(int(tag[1]))
@@ -70,7 +64,7 @@ class Outline(HTMLParser):
 
 
 @pytest.mark.versions
-def test_html_is_one_file_with_headings_in_order_and_alt_texts(page_file: Path) -> None:
+def test_html_is_one_file_with_headings_in_order_and_alt_texts(page_file):
     outline = Outline(page_file.read_text(encoding="utf-8"))
     assert outline.outside == []
     assert outline.headings[0] == 1
@@ -81,14 +75,14 @@ def test_html_is_one_file_with_headings_in_order_and_alt_texts(page_file: Path) 
     assert [p.name for p in page_file.parent.iterdir()] == ["report.html"]
 
 
-def test_text_from_files_is_escaped(page_file: Path) -> None:
+def test_text_from_files_is_escaped(page_file):
     text = page_file.read_text(encoding="utf-8")
     assert "<img src=x" not in text
     assert "&lt;img src=x onerror=alert(1)&gt;" in text
     assert Outline(text).scripts == 1
 
 
-def test_html_tells_the_numbers_side_by_side(page_file: Path, fit: di.FitResult) -> None:
+def test_html_tells_the_numbers_side_by_side(page_file, fit):
     text = page_file.read_text(encoding="utf-8")
     for method in ("Wald 95.45 %", "profile 95.45 %", "posterior 95.45 %"):
         assert method in text
@@ -104,14 +98,14 @@ def test_html_tells_the_numbers_side_by_side(page_file: Path, fit: di.FitResult)
 
 
 @pytest.mark.pictures
-def test_the_same_result_gives_the_same_pictures(fit: di.FitResult, tmp_path: Path) -> None:
+def test_the_same_result_gives_the_same_pictures(fit, tmp_path):
     one, two = (report(fit, tmp_path / name) for name in ("a.html", "b.html"))
     pictures = [re.findall(r'src="data:image[^"]*"', p.read_text()) for p in (one, two)]
     assert pictures[0] == pictures[1]
 
 
 @pytest.mark.versions
-def test_json_holds_the_numbers(fit: di.FitResult, posterior: Posterior, tmp_path: Path) -> None:
+def test_json_holds_the_numbers(fit, posterior, tmp_path):
     told = json.loads(report([fit, posterior], tmp_path / "report.json").read_text())
     f_max = told["fits"][0]["parameters"]["f_max"]
     assert f_max["value"] == fit.params["f_max"].value
@@ -122,7 +116,7 @@ def test_json_holds_the_numbers(fit: di.FitResult, posterior: Posterior, tmp_pat
 
 
 @pytest.mark.versions
-def test_markdown_links_pictures_that_exist(fit: di.FitResult, tmp_path: Path) -> None:
+def test_markdown_links_pictures_that_exist(fit, tmp_path):
     place = report(fit, tmp_path / "my report.md")
     text = place.read_text(encoding="utf-8")
     links = re.findall(r"!\[[^\n]*\]\(<([^>]*)>\)", text)
@@ -135,7 +129,7 @@ def test_markdown_links_pictures_that_exist(fit: di.FitResult, tmp_path: Path) -
 
 @pytest.mark.pictures
 @pytest.mark.versions
-def test_pdf_has_text_pictures_and_outline(fit: di.FitResult, tmp_path: Path) -> None:
+def test_pdf_has_text_pictures_and_outline(fit, tmp_path):
     pypdf = pytest.importorskip("pypdf")
     reader = pypdf.PdfReader(report(fit, tmp_path / "report.pdf"))
     text = "".join("".join(page.extract_text().split()) for page in reader.pages)
@@ -148,7 +142,7 @@ def test_pdf_has_text_pictures_and_outline(fit: di.FitResult, tmp_path: Path) ->
     }
 
 
-def test_headings_and_captions_in_pdf_stay_with_what_they_head() -> None:
+def test_headings_and_captions_in_pdf_stay_with_what_they_head():
     pypdf = pytest.importorskip("pypdf")
     sections = tuple(
         Section(
@@ -170,14 +164,14 @@ def test_headings_and_captions_in_pdf_stay_with_what_they_head() -> None:
         assert f"row {i}.0." in page
 
 
-def test_the_verdict_is_told_once(fit: di.FitResult, tmp_path: Path) -> None:
+def test_the_verdict_is_told_once(fit, tmp_path):
     text = report(fit, tmp_path / "once.md").read_text(encoding="utf-8")
     told = [line for line in text.splitlines() if not line.startswith("![")]  # alt texts tell more
     assert sum("The residuals are consistent with noise" in line for line in told) == 1
     assert f"| rms misfit | {100.0 * fit.goodness.rms_misfit:.2g} % |" in text
 
 
-def test_a_fit_that_ran_away_is_not_trusted(tmp_path: Path) -> None:
+def test_a_fit_that_ran_away_is_not_trusted(tmp_path):
     amplitude = np.geomspace(1e-6, 1e-5, 8)
     response = 30.0 * np.exp(1j * 1e-3 * ((-1.0) ** np.arange(8) - 0.5))
     fit = di.fit(di.FrequencyResponse(np.ones(8), response, amplitude), di.Dahl(), throw=False)
@@ -188,7 +182,7 @@ def test_a_fit_that_ran_away_is_not_trusted(tmp_path: Path) -> None:
 
 
 @pytest.mark.pictures
-def test_a_plant_over_frequency_is_reported(tmp_path: Path) -> None:
+def test_a_plant_over_frequency_is_reported(tmp_path):
     frequency, drive = (
         g.ravel() for g in np.meshgrid(np.geomspace(0.1, 3.0, 9), [0.05, 0.15, 1.0])
     )
@@ -206,7 +200,7 @@ def test_a_plant_over_frequency_is_reported(tmp_path: Path) -> None:
     assert "equivalent damping [N s/m]" in text
 
 
-def test_what_cannot_be_written_is_refused(fit: di.FitResult, tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused(fit, tmp_path):
     with pytest.raises(ValidationError, match=r"written as \.html, \.pdf, \.md, \.json"):
         report(fit, tmp_path / "report.docx")
     with pytest.raises(ValidationError, match="there is no result to report on"):
@@ -218,7 +212,7 @@ def test_what_cannot_be_written_is_refused(fit: di.FitResult, tmp_path: Path) ->
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-def test_the_page_in_chromium(page_file: Path, tmp_path: Path) -> None:
+def test_the_page_in_chromium(page_file, tmp_path):
     with chromium(tmp_path / "profile") as page:
         for width in WIDTHS:
             page.open(page_file, width)
@@ -234,7 +228,7 @@ def test_the_page_in_chromium(page_file: Path, tmp_path: Path) -> None:
         assert [url for url in page.requests if not url.startswith(("file:", "data:"))] == []
 
 
-def _check_sorting(page: Page) -> None:
+def _check_sorting(page):
     page.value("window.data = [...document.querySelectorAll('table')].find(t => "
                "t.ariaLabel.endsWith('The points as they were fitted')); 1")  # fmt: skip
     gains = "[...data.tBodies[0].rows].map(r => Number(r.cells[2].dataset.value))"
@@ -245,7 +239,7 @@ def _check_sorting(page: Page) -> None:
     assert page.value("data.tHead.rows[0].cells[2].getAttribute('aria-sort')") == "descending"
 
 
-def _check_copying(page: Page) -> None:
+def _check_copying(page):
     page.value("navigator.clipboard.writeText = async (t) => { window.copied = t; }; 1")
     page.value("document.querySelector('.table .copy').click()")
     rows = page.value("copied").split("\n")
@@ -254,7 +248,7 @@ def _check_copying(page: Page) -> None:
     assert len(rows[1].split("\t")[1]) > 10, "every digit is copied"
 
 
-def _check_contrast(page: Page) -> None:
+def _check_contrast(page):
     """All text stands out from its ground by 4.5 to 1 (WCAG 2), in light and dark."""
     script = """
     (() => {
@@ -286,7 +280,7 @@ def _check_contrast(page: Page) -> None:
         assert page.value(script) >= 4.5, scheme
 
 
-def test_provenance_of_several_files_is_listed(fit: di.FitResult, tmp_path: Path) -> None:
+def test_provenance_of_several_files_is_listed(fit, tmp_path):
     parts = [{"file": f"run{i}.csv", "sha256": str(i) * 64} for i in range(2)]
     data = replace(fit.data, provenance={"parts": parts})
     told = json.loads(report(di.fit(data, di.Dahl()), tmp_path / "r.json").read_text())
@@ -297,7 +291,7 @@ def test_provenance_of_several_files_is_listed(fit: di.FitResult, tmp_path: Path
 
 
 @pytest.mark.pictures
-def test_measured_loops_and_settling_are_shown(tmp_path: Path) -> None:
+def test_measured_loops_and_settling_are_shown(tmp_path):
     friction = di.Dahl(0.1, 30.0)
     t = np.arange(6000) / 200.0
     x = 0.008 * np.sin(2.0 * np.pi * 1.25 * t)
@@ -318,14 +312,14 @@ def test_measured_loops_and_settling_are_shown(tmp_path: Path) -> None:
         report(di.fit(plain_table(), di.Dahl()), tmp_path / "other.html", record=record)
 
 
-def plain_table() -> di.FrequencyResponse:
+def plain_table():
     amplitude = np.geomspace(3e-4, 3e-2, 12)
     noise = 0.01 * np.random.default_rng(1).standard_normal((2, 12))
     response = di.Dahl(0.1, 30.0).describing_function(amplitude) * np.exp(noise[0] + 1j * noise[1])
     return di.FrequencyResponse(np.ones(12), response, amplitude)
 
 
-def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path: Path) -> None:
+def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path):
     fit = di.fit(plain_table(), di.Dahl())
     before = report(fit, tmp_path / "a.md").read_text(encoding="utf-8")
     assert "bootstrap" not in before
@@ -334,7 +328,7 @@ def test_the_bootstrap_stands_next_to_the_others_once_it_was_run(tmp_path: Path)
     assert "| bootstrap 95.45 % |" in after
 
 
-def test_pdf_shows_characters_that_its_font_lacks(fit: di.FitResult, tmp_path: Path) -> None:
+def test_pdf_shows_characters_that_its_font_lacks(fit, tmp_path):
     pypdf = pytest.importorskip("pypdf")
     place = report(fit, tmp_path / "r.pdf", title="pivot \u65e5 \u03a9")
     assert pypdf.PdfReader(place).pages[0].extract_text().startswith("pivot <U+65E5> \u03a9")
@@ -345,9 +339,7 @@ def test_pdf_shows_characters_that_its_font_lacks(fit: di.FitResult, tmp_path: P
     [("a\ud800b\x00\n c", "a?b c"), ("W" * 5000, "W" * 200 + "..."), ("word " * 1000, "word word")],
     ids=["half a character", "long", "many words"],
 )
-def test_titles_that_no_page_has_room_for(
-    fit: di.FitResult, tmp_path: Path, title: str, printed: str
-) -> None:
+def test_titles_that_no_page_has_room_for(fit, tmp_path, title, printed):
     pypdf = pytest.importorskip("pypdf")
     place = report(fit, tmp_path / "r.json", title=title)
     found = json.loads(place.read_text(encoding="utf-8"))["title"]
@@ -359,7 +351,7 @@ def test_titles_that_no_page_has_room_for(
     assert page.endswith("Page 1 of 1")
 
 
-def test_files_and_the_files_that_those_were_made_from_are_listed(tmp_path: Path) -> None:
+def test_files_and_the_files_that_those_were_made_from_are_listed(tmp_path):
     origin = {"file": "raw.csv", "sha256": "1" * 64, "extraction": {"mode": "steps"}}
     data = replace(
         plain_table(), provenance={"file": "levels.csv", "sha256": "2" * 64, "origin": origin}
@@ -374,7 +366,7 @@ def test_files_and_the_files_that_those_were_made_from_are_listed(tmp_path: Path
         assert row in text
 
 
-def test_a_report_is_replaced_on_request_only(fit: di.FitResult, tmp_path: Path) -> None:
+def test_a_report_is_replaced_on_request_only(fit, tmp_path):
     place = tmp_path / "r.md"
     (tmp_path / "r_pictures").mkdir()
     mine = tmp_path / "r_pictures" / "residuals.png"
@@ -388,9 +380,7 @@ def test_a_report_is_replaced_on_request_only(fit: di.FitResult, tmp_path: Path)
         report(fit, place)
 
 
-def test_a_fit_is_saved_as_json_and_replaced_on_request_only(
-    fit: di.FitResult, tmp_path: Path
-) -> None:
+def test_a_fit_is_saved_as_json_and_replaced_on_request_only(fit, tmp_path):
     place = fit.save(tmp_path / "fit.json")
     assert di.FitResult.load(place).params == fit.params
     with pytest.raises(DataError, match="the file exists already"):
@@ -400,7 +390,7 @@ def test_a_fit_is_saved_as_json_and_replaced_on_request_only(
         fit.save(tmp_path / "fit.txt")
 
 
-def test_of_several_fits_each_verdict_names_its_model(fit: di.FitResult, tmp_path: Path) -> None:
+def test_of_several_fits_each_verdict_names_its_model(fit, tmp_path):
     with_spring = di.fit(fit.data, di.Dahl() + di.Spring(), throw=False)
     path = report([fit, with_spring], tmp_path / "report.md")
     head = path.read_text().split("\n## ")[0]
@@ -409,7 +399,7 @@ def test_of_several_fits_each_verdict_names_its_model(fit: di.FitResult, tmp_pat
         assert f"{one.problem.model!r}: {trust}" in head.replace("\\", "")
 
 
-def test_a_fit_with_constraints_is_reported(tmp_path: Path) -> None:
+def test_a_fit_with_constraints_is_reported(tmp_path):
     """Without profiles, which would not keep them."""
     fit = di.fit(
         di.load_dataset("noisy"),

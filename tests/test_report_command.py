@@ -1,7 +1,5 @@
 """The command in a report repeats its result: it is run, and the numbers are compared."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -12,33 +10,31 @@ import pytest
 from scipy import stats
 
 import dahl_ident as di
-from dahl_ident.results import Posterior
-from tests.command_line import Runner
 
 SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
 A = np.geomspace(3e-4, 3e-2, 12)
 NOISE = 0.01 * np.random.default_rng(3).standard_normal((2, 12))
 
 
-def table(friction: di.Dahl) -> di.FrequencyResponse:
+def table(friction):
     response = friction.describing_function(A) * np.exp(NOISE[0] + 1j * NOISE[1])
     return di.FrequencyResponse(np.full(12, 2.0), response, A)
 
 
-def shipped(name: str) -> di.FrequencyResponse:
+def shipped(name):
     data = di.load_dataset(name)
     assert isinstance(data, di.FrequencyResponse)
     return data
 
 
-def command_of(result: di.FitResult | Posterior) -> str | None:
+def command_of(result):
     """Return the command that a report prints."""
     place = di.report(result, "command.json", overwrite=True)
     command: str | None = json.loads(place.read_text(encoding="utf-8"))["command"]
     return command
 
 
-def check_repeated(run: Runner, fit: di.FitResult) -> str:
+def check_repeated(run, fit):
     command = command_of(fit)
     told: dict[str, Any] = json.loads(run.line(command, "--json").out)["params"]
     assert set(told) == set(fit.params)
@@ -50,7 +46,7 @@ def check_repeated(run: Runner, fit: di.FitResult) -> str:
     return command
 
 
-def test_of_files_with_options(run: Runner) -> None:
+def test_of_files_with_options(run):
     text = "frequency_hz,gain [N/m],phase_deg\n"
     for level in ("my 1.csv", "2.csv"):
         rows = table(di.Dahl(0.1, 30.0))
@@ -66,7 +62,7 @@ def test_of_files_with_options(run: Runner) -> None:
     assert "'my 1.csv' 2.csv --amplitude '2 mm rms'" in command
 
 
-def test_of_sensors_priors_and_solver(run: Runner) -> None:
+def test_of_sensors_priors_and_solver(run):
     table(di.Dahl(0.1, 30.0, 1.3)).save("t.csv")
     sensors = di.Sensors(force_gain=stats.norm(1.0, scale=0.02), delay=-1e-3)
     fit = di.fit(
@@ -79,7 +75,7 @@ def test_of_sensors_priors_and_solver(run: Runner) -> None:
     assert "--alpha 1.3 --noise relative --method ipopt" in check_repeated(run, fit)
 
 
-def test_of_a_shipped_table(run: Runner) -> None:
+def test_of_a_shipped_table(run):
     command = check_repeated(run, di.fit(shipped("noisy"), di.Dahl()))
     assert command.startswith("dahl-ident datasets noisy -o - | dahl-ident fit - ")
 
@@ -92,12 +88,12 @@ def test_of_a_shipped_table(run: Runner) -> None:
         (di.Dahl(alpha=None, asymmetry=0.1) + di.Mass(), "'dahl(alpha=free, asymmetry=0.1)'"),
     ],
 )
-def test_of_any_law(run: Runner, model: di.Element, told: str) -> None:
+def test_of_any_law(run, model, told):
     fit = di.fit(shipped("noisy"), model, throw=False)
     assert told in check_repeated(run, fit)
 
 
-def test_of_waveforms(run: Runner) -> None:
+def test_of_waveforms(run):
     record = di.read_record(SETS / "plant_recording.csv.gz")
     data = di.extract(record, controlled="force", harmonics=[1], num_periods=8)
     data = data.select(rows=data.quality["verdict"] == "good")
@@ -106,7 +102,7 @@ def test_of_waveforms(run: Runner) -> None:
     assert "--num-periods 8" in command
 
 
-def test_of_a_posterior(run: Runner) -> None:
+def test_of_a_posterior(run):
     table(di.Dahl(0.1, 30.0)).save("t.csv")
     data = di.read_frequency_response("t.csv")
     priors: dict[str, Any] = {"f_max": stats.lognorm(s=0.5, scale=0.1), "sigma": (1.0, 100.0)}
@@ -116,7 +112,7 @@ def test_of_a_posterior(run: Runner) -> None:
     assert told["summary"]["sigma"]["mean"] == posterior.summary().loc["sigma", "mean"]
 
 
-def test_of_what_the_command_line_wrote(run: Runner) -> None:
+def test_of_what_the_command_line_wrote(run):
     table(di.Dahl(0.1, 30.0)).save("t.csv")
     run("report", "t.csv", "--stiffness", "free", "-o", "r.html", "-o", "one.json")
     page = Path("r.html").read_text(encoding="utf-8")
@@ -127,9 +123,7 @@ def test_of_what_the_command_line_wrote(run: Runner) -> None:
     assert one == two
 
 
-def test_what_no_command_describes_is_said_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_no_command_describes_is_said_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     data = table(di.Dahl(0.1, 30.0))
     fit = di.fit(data, di.Dahl())
@@ -140,7 +134,7 @@ def test_what_no_command_describes_is_said_so(
     assert "in Python; no command describes this model and these data" in text
 
 
-def test_of_an_exponent_that_was_given(run: Runner) -> None:
+def test_of_an_exponent_that_was_given(run):
     table(di.Dahl(0.1, 30.0)).save("t.csv")
     data = di.read_frequency_response("t.csv")
     for model, option in ((di.Dahl(), False), (di.Dahl(alpha=1.0), True)):

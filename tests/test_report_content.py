@@ -1,7 +1,5 @@
 """Reports as a laboratory signs them: header, order, what is crossed out, comparison, schema."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -20,8 +18,7 @@ from scipy.integrate import trapezoid
 import dahl_ident as di
 from dahl_ident import report
 from dahl_ident.errors import DataError, ValidationError
-from tests.browser import CHROMIUM, Page, chromium
-from tests.command_line import Runner
+from tests.browser import CHROMIUM, chromium
 
 METADATA: dict[str, Any] = {
     "specimen": "Flex pivot 12",
@@ -37,42 +34,38 @@ METADATA: dict[str, Any] = {
 SCHEMA = json.loads((files("dahl_ident.reporting") / "report.schema.json").read_text("utf-8"))
 
 
-def measured(
-    f_max: float, seed: int, *, amplitudes: tuple[float, float] = (3e-4, 3e-2), file: str = ""
-) -> di.FrequencyResponse:
-    A = np.geomspace(*amplitudes, 20)
+def measured(f_max, seed, *, amplitudes=(3e-4, 3e-2), file=""):
+    A = np.geomspace(amplitudes[0], amplitudes[1], 20)
     scatter = 0.01 * np.random.default_rng(seed).standard_normal((2, 20))
     response = di.Dahl(f_max, 30.0).describing_function(A) * np.exp(scatter[0] + 1j * scatter[1])
     provenance = {"file": file, "sha256": "ab" * 32} if file else None
     return di.FrequencyResponse(np.ones(20), response, A, provenance=provenance)
 
 
-def text_of(*results: di.FitResult, metadata: Any = None) -> str:
+def text_of(*results, metadata=None):
     """Return a report as text without escapes."""
     with TemporaryDirectory() as folder:
         place = report(list(results), Path(folder) / "r.md", metadata=metadata)
         return place.read_text("utf-8").replace("\\", "")
 
 
-def change_of(name: str, fits: list[di.FitResult], place: Path) -> dict[str, Any]:
+def change_of(name, fits, place):
     """Return what a report says of the change of one parameter."""
     facts = json.loads(report(fits, place, overwrite=True).read_text("utf-8"))
     return next(change for change in facts["changes"] if change["parameter"] == name)
 
 
 @pytest.fixture(scope="module")
-def fit() -> di.FitResult:
+def fit():
     return di.fit(measured(0.1, 1, file="pivot.csv"), di.Dahl())
 
 
 @pytest.fixture(scope="module")
-def microslip() -> di.FitResult:
+def microslip():
     return di.fit(measured(0.1, 1, amplitudes=(1e-7, 1e-6)), di.Dahl(), throw=False)
 
 
-def test_the_header_states_what_was_measured_and_with_what(
-    fit: di.FitResult,
-) -> None:
+def test_the_header_states_what_was_measured_and_with_what(fit):
     text = text_of(fit, metadata=METADATA)
     head = text.split("\n## ")[0]
     for row in (
@@ -89,7 +82,7 @@ def test_the_header_states_what_was_measured_and_with_what(
     assert "____" not in head
 
 
-def test_what_nobody_stated_is_a_line_to_fill_in(fit: di.FitResult, tmp_path: Path) -> None:
+def test_what_nobody_stated_is_a_line_to_fill_in(fit, tmp_path):
     head = text_of(fit).split("\n## ")[0]
     blank = re.findall(r"^\| ([\w ]+) \| _+ \|$", head, re.MULTILINE)
     assert blank == [
@@ -99,7 +92,7 @@ def test_what_nobody_stated_is_a_line_to_fill_in(fit: di.FitResult, tmp_path: Pa
     assert page.count('class="blank"') == len(blank) + 3, "and date, name, signature"
 
 
-def test_metadata_from_a_file(fit: di.FitResult, tmp_path: Path) -> None:
+def test_metadata_from_a_file(fit, tmp_path):
     place = tmp_path / "lab.toml"
     place.write_text('specimen = "S 1"\nmeasured = 2026-11-20\n[ambient]\nhumidity = "41 %"\n')
     facts = json.loads(report(fit, tmp_path / "r.json", metadata=place).read_text("utf-8"))
@@ -125,14 +118,12 @@ def test_metadata_from_a_file(fit: di.FitResult, tmp_path: Path) -> None:
         ({"instruments": [{"nmae": "x"}]}, r"instruments\[0\] has the field 'nmae'"),
     ],
 )
-def test_metadata_of_another_kind_is_refused(
-    fit: di.FitResult, tmp_path: Path, given: dict[str, Any], message: str
-) -> None:
+def test_metadata_of_another_kind_is_refused(fit, tmp_path, given, message):
     with pytest.raises(ValidationError, match=message):
         report(fit, tmp_path / "r.json", metadata=given)
 
 
-def test_the_hash_is_that_of_the_file_that_was_read(tmp_path: Path, run: Runner) -> None:
+def test_the_hash_is_that_of_the_file_that_was_read(tmp_path, run):
     """Also where the file is a copy that carries the hash of what it was made from."""
     place = tmp_path / "noisy.csv"
     assert run("datasets", "noisy", "-o", str(place)).status == 0
@@ -144,7 +135,7 @@ def test_the_hash_is_that_of_the_file_that_was_read(tmp_path: Path, run: Runner)
     assert len(facts["files"]) == 2, "the shipped file it was made from stands after it"
 
 
-def test_the_order_is_answer_assumed_signature_details(fit: di.FitResult, tmp_path: Path) -> None:
+def test_the_order_is_answer_assumed_signature_details(fit, tmp_path):
     text = text_of(fit)
     sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
     assert sections[:7] == [
@@ -170,9 +161,7 @@ def test_the_order_is_answer_assumed_signature_details(fit: di.FitResult, tmp_pa
         assert numbers == list(range(1, len(numbers) + 1))
 
 
-def test_what_must_not_be_used_is_crossed_out_with_its_reason(
-    fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
-) -> None:
+def test_what_must_not_be_used_is_crossed_out_with_its_reason(fit, microslip, tmp_path):
     rows = _result_rows(text_of(microslip))
     assert rows["f_max"][1].startswith("~~")
     assert "not determined, because no amplitude" in rows["f_max"][-1]
@@ -196,13 +185,13 @@ def test_what_must_not_be_used_is_crossed_out_with_its_reason(
     assert re.search(r"<s>[0-9.e+-]+</s>", page)
 
 
-def _result_rows(text: str) -> dict[str, list[str]]:
+def _result_rows(text):
     table = text.split("## Result")[1].split("\n## ")[0]
     rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")]
     return {row[0]: row for row in rows[2:]}
 
 
-def runs(f_max: float, seed: int, scatter: float, count: int) -> di.FitResult:
+def runs(f_max, seed, scatter, count):
     """Return a fit of some runs between which the friction scatters, exactly by its share."""
     rng = np.random.default_rng(seed)
     shares = 1.0 + scatter * stats.zscore(rng.standard_normal(count), ddof=1)
@@ -214,7 +203,7 @@ def runs(f_max: float, seed: int, scatter: float, count: int) -> di.FitResult:
     return di.fit(di.FrequencyResponse.concatenate(tables), di.Dahl(alpha=1.0))
 
 
-def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path: Path) -> None:
+def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path):
     fit, later = runs(0.1, 1, 0.01, 4), runs(0.15, 2, 0.01, 4)
     facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
     found = {change["parameter"]: change for change in facts["changes"]}
@@ -231,9 +220,7 @@ def test_two_devices_are_overlaid_and_their_changes_judged(tmp_path: Path) -> No
     assert (tmp_path / "r_pictures" / "overlay.png").exists()
 
 
-def test_scatter_between_runs_counts_in_the_change_of_a_single_run(
-    fit: di.FitResult, tmp_path: Path
-) -> None:
+def test_scatter_between_runs_counts_in_the_change_of_a_single_run(fit, tmp_path):
     """A single day compared with four: its own scatter is that of the four."""
     several = runs(0.103, 3, 0.02, 4)
     change = change_of("f_max", [fit, several], tmp_path / "r.json")
@@ -244,9 +231,7 @@ def test_scatter_between_runs_counts_in_the_change_of_a_single_run(
     assert not change_of("f_max", [fit, later], tmp_path / "r.json")["runs_known"]
 
 
-def test_two_single_runs_leave_open_whether_the_device_changed(
-    fit: di.FitResult, tmp_path: Path
-) -> None:
+def test_two_single_runs_leave_open_whether_the_device_changed(fit, tmp_path):
     later = di.fit(measured(0.11, 2, file="later.csv"), di.Dahl())
     facts = json.loads(report([fit, later], tmp_path / "r.json").read_text("utf-8"))
     assert [file["file"] for file in facts["files"]] == ["pivot.csv", "later.csv"]
@@ -255,16 +240,14 @@ def test_two_single_runs_leave_open_whether_the_device_changed(
     assert any("scatter between runs" in line for line in facts["verdict"])
 
 
-def test_a_change_of_what_is_not_determined_is_not_judged(
-    fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
-) -> None:
+def test_a_change_of_what_is_not_determined_is_not_judged(fit, microslip, tmp_path):
     facts = json.loads(report([fit, microslip], tmp_path / "r.json").read_text("utf-8"))
     found = {change["parameter"]: change for change in facts["changes"]}
     assert (found["f_max"]["p"], found["f_max"]["significant"]) == (None, False)
     assert found["sigma"]["p"] is not None
 
 
-def test_two_saved_fits_say_what_changed(run: Runner, fit: di.FitResult) -> None:
+def test_two_saved_fits_say_what_changed(run, fit):
     fit.save("monday.json")
     di.fit(measured(0.11, 2), di.Dahl()).save("friday.json")
     told = run("fit", "monday.json", "friday.json", "--report", "change.html")
@@ -283,7 +266,7 @@ def test_two_saved_fits_say_what_changed(run: Runner, fit: di.FitResult) -> None
     )
 
 
-def test_equal_devices_seldom_change_significantly(tmp_path: Path) -> None:
+def test_equal_devices_seldom_change_significantly(tmp_path):
     """At 5 %, 2 parameters of 30 pairs: more than 9 significant ones have probability 0.1 %."""
     fits = [di.fit(measured(0.1, seed), di.Dahl()) for seed in range(60)]
     found = [
@@ -295,9 +278,7 @@ def test_equal_devices_seldom_change_significantly(tmp_path: Path) -> None:
     assert stats.binom.sf(sum(found) - 1, 60, 0.05) > 1e-3
 
 
-def test_json_follows_the_published_schema(
-    fit: di.FitResult, microslip: di.FitResult, tmp_path: Path
-) -> None:
+def test_json_follows_the_published_schema(fit, microslip, tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     chain = di.posterior(fit.data, di.Dahl(alpha=1.0), seed=1, steps=60)
     cases: tuple[list[Any], ...] = ([fit], [microslip], [fit, chain], [chain], [fit, microslip])
@@ -309,13 +290,13 @@ def test_json_follows_the_published_schema(
         jsonschema.validate(facts, SCHEMA)
 
 
-def _computed(page: Page, selector: str, property_name: str) -> set[str]:
+def _computed(page, selector, property_name):
     every = f"[...document.querySelectorAll('{selector}')]"
     return set(page.value(f"{every}.map(e => getComputedStyle(e).{property_name})"))
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-def test_the_page_on_a4(fit: di.FitResult, microslip: di.FitResult, tmp_path: Path) -> None:
+def test_the_page_on_a4(fit, microslip, tmp_path):
     """At most two pages before the details; tables keep headings, nothing is split or lost."""
     pypdf = pytest.importorskip("pypdf")
     with chromium(tmp_path / "profile") as page:
@@ -347,7 +328,7 @@ def test_the_page_on_a4(fit: di.FitResult, microslip: di.FitResult, tmp_path: Pa
             assert all("frequency [Hz]" in printed[i] for i in rows), "the heading is repeated"
 
 
-def test_pdf_marks_its_headings_for_reading_aloud(fit: di.FitResult, tmp_path: Path) -> None:
+def test_pdf_marks_its_headings_for_reading_aloud(fit, tmp_path):
     pypdf = pytest.importorskip("pypdf")
     reader = pypdf.PdfReader(report(fit, tmp_path / "r.pdf"))
     tree = reader.trailer["/Root"]["/StructTreeRoot"]["/K"][0].get_object()["/K"]
@@ -383,7 +364,7 @@ CERTIFIED = {
 }
 
 
-def test_the_instruments_calibrations_are_the_priors_of_the_sensors() -> None:
+def test_the_instruments_calibrations_are_the_priors_of_the_sensors():
     sensors = di.Sensors.from_metadata(CERTIFIED)
     assert sensors.priors["force_gain"].mean() == 1.0
     assert sensors.priors["force_gain"].std() == pytest.approx(np.hypot(0.005, 0.003))
@@ -392,9 +373,7 @@ def test_the_instruments_calibrations_are_the_priors_of_the_sensors() -> None:
     assert sensors.displacement_gain == 1.0
 
 
-def test_a_report_refuses_a_fit_that_did_not_count_its_instruments(
-    fit: di.FitResult, tmp_path: Path
-) -> None:
+def test_a_report_refuses_a_fit_that_did_not_count_its_instruments(fit, tmp_path):
     with pytest.raises(ValidationError, match=r"0\.00583 for force_gain, but the fit takes it as"):
         report(fit, tmp_path / "r.html", metadata=CERTIFIED)
     counted = di.fit(fit.data, di.Dahl(), sensors=di.Sensors.from_metadata(CERTIFIED))
@@ -415,14 +394,12 @@ def test_a_report_refuses_a_fit_that_did_not_count_its_instruments(
         ({"channel": "force", "uncertainty": "1 %", "k": "two"}, "k 'two'"),
     ],
 )
-def test_an_uncertainty_without_its_meaning_is_refused(
-    instrument: dict[str, Any], message: str
-) -> None:
+def test_an_uncertainty_without_its_meaning_is_refused(instrument, message):
     with pytest.raises(ValidationError, match=message):
         di.Sensors.from_metadata({"instruments": [instrument]})
 
 
-def test_number_title_hash_and_page_stand_on_every_page(tmp_path: Path) -> None:
+def test_number_title_hash_and_page_stand_on_every_page(tmp_path):
     pypdf = pytest.importorskip("pypdf")
     counted = di.fit(
         measured(0.1, 1, file="pivot.csv"), di.Dahl(), sensors=di.Sensors.from_metadata(CERTIFIED)
@@ -436,7 +413,7 @@ def test_number_title_hash_and_page_stand_on_every_page(tmp_path: Path) -> None:
     assert "The results relate only to the item that was measured." in pages[0]
 
 
-def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit: di.FitResult) -> None:
+def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit):
     """The loop of Dahl's law from its differential equation, integrated over its displacement."""
     found = re.search(
         r"A cycle loses \S+ ± \S+ J at \S+ m and (\S+) ± (\S+) J at (\S+) m", text_of(fit)
@@ -448,7 +425,7 @@ def test_the_energy_of_a_cycle_has_the_uncertainty_of_the_budget(fit: di.FitResu
 
 
 @pytest.mark.parametrize("f_max", [0.1, 0.07])
-def test_a_table_and_waveforms_of_one_test_are_compared(f_max: float, tmp_path: Path) -> None:
+def test_a_table_and_waveforms_of_one_test_are_compared(f_max, tmp_path):
     time = np.arange(400) / 100.0
     x = 5e-3 * np.sin(2.0 * time) * (0.2 + 0.8 * np.sin(0.6 * time) ** 2)
     noise = 5e-4 * np.random.default_rng(2).standard_normal(400)
@@ -474,7 +451,7 @@ def test_a_table_and_waveforms_of_one_test_are_compared(f_max: float, tmp_path: 
     assert text.count("## Result") == 2
 
 
-def test_pictures_of_two_fits_are_files_of_their_own(fit: di.FitResult, tmp_path: Path) -> None:
+def test_pictures_of_two_fits_are_files_of_their_own(fit, tmp_path):
     other = di.fit(fit.data, di.BoucWen())
     text = report([fit, other], tmp_path / "both.md").read_text("utf-8")
     named = re.findall(r"<(both_pictures/\S+)>", text)

@@ -1,19 +1,14 @@
 """What users hold: names, reports, files and pictures of fits."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from scipy import optimize, stats
 
 from dahl_ident import (
@@ -31,7 +26,6 @@ from dahl_ident import (
     load_dataset,
     posterior,
 )
-from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status
 from dahl_ident.problem import TableProblem
@@ -39,22 +33,22 @@ from tests.friction_tables import FRICTION, amplitudes, plant_table, table
 
 
 @pytest.fixture(scope="module")
-def result() -> FitResult:
+def result():
     return fit(table(), Dahl())
 
 
 @pytest.fixture(scope="module")
-def plant() -> FitResult:
+def plant():
     return fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
 
 
 @pytest.fixture(scope="module")
-def microslip() -> FitResult:
+def microslip():
     return fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
 
 
 class TestFit:
-    def test_names_of_lmfit(self, result: FitResult) -> None:
+    def test_names_of_lmfit(self, result):
         f_max = result.params["f_max"]
         optimum = result.optimum
         assert optimum.values[0] == pytest.approx(0.09976, rel=1e-4)
@@ -86,7 +80,7 @@ class TestFit:
         np.testing.assert_allclose(combined, stated.dynamic_stiffness(A), rtol=1e-12)
         np.testing.assert_allclose(combined, result.model.dynamic_stiffness(A), rtol=1e-12)
 
-    def test_residuals_and_their_squares(self, result: FitResult) -> None:
+    def test_residuals_and_their_squares(self, result):
         alpha = result.params["alpha"].value
         friction = Dahl(result.params["f_max"].value, result.params["sigma"].value, alpha)
         y = np.log(result.data.response / friction.describing_function(result.data.amplitude))
@@ -100,7 +94,7 @@ class TestFit:
 
     @pytest.mark.parametrize("alpha", [0.8, 1.0])
     @pytest.mark.parametrize("stated", [0.002, 0.01, None])
-    def test_everything_describes_one_point(self, alpha: float, stated: float | None) -> None:
+    def test_everything_describes_one_point(self, alpha, stated):
         """Also where the misfit moves the estimate from the optimum, and harmonics are fitted."""
         data = table(model=Dahl(0.1, 30.0, alpha=alpha) + Spring(0.2))
         if stated is not None:
@@ -124,7 +118,7 @@ class TestFit:
                 assert limits.lower < p.value < limits.upper
         assert found.covar[0, 0] ** 0.5 == pytest.approx(found.params["f_max"].stderr)
 
-    def test_criteria_from_the_density(self, result: FitResult) -> None:
+    def test_criteria_from_the_density(self, result):
         """ln gain and phase are normal; a density by Re and Im has the Jacobian 1/|R|^2."""
         searched = result.problem.predict(result.optimum.theta)
         y = np.log(result.data.response / searched).view(np.float64)
@@ -134,7 +128,7 @@ class TestFit:
         assert result.aic == pytest.approx(-2.0 * density + 2.0 * 3.0)
         assert result.bic == pytest.approx(-2.0 * density + 3.0 * np.log(60.0))
 
-    def test_criteria_of_a_robust_fit_are_those_of_its_density(self) -> None:
+    def test_criteria_of_a_robust_fit_are_those_of_its_density(self):
         """Student's t with 4 degrees of freedom in (ln gain, phase), by scipy."""
         data = table(n=12)
         result = fit(data, Dahl(), loss="student_t")
@@ -142,7 +136,7 @@ class TestFit:
         y = np.log(data.response / searched)
         pairs = np.column_stack([y.real, y.imag])
 
-        def deviance(ln_scale: float) -> float:
+        def deviance(ln_scale):
             shape = np.exp(2.0 * ln_scale) * np.eye(2)
             density = stats.multivariate_t(shape=shape, df=4).logpdf(pairs)
             return -2.0 * float(np.sum(density - 2.0 * np.log(np.abs(data.response))))
@@ -150,7 +144,7 @@ class TestFit:
         least = optimize.minimize_scalar(deviance, (-6.0, -4.0)).fun
         assert result.aic == pytest.approx(least + 6.0, abs=1e-6)
 
-    def test_rotation_has_its_units_everywhere(self) -> None:
+    def test_rotation_has_its_units_everywhere(self):
         data = table()
         turned = FrequencyResponse(
             data.frequency_hz, data.response, data.amplitude, motion="rotation"
@@ -165,7 +159,7 @@ class TestFit:
         assert grid.units[:2] == ("N m", "N m/rad")
         assert " N m (from" in grid.priors["f_max"]
 
-    def test_free_fixed_and_start(self) -> None:
+    def test_free_fixed_and_start(self):
         data = table()
         freed = fit(data, Dahl(0.1, 30.0), free=["f_max"], fixed={"sigma": 29.0})
         assert freed.var_names == ["f_max"]
@@ -176,7 +170,7 @@ class TestFit:
             fit(data, Dahl()).params["f_max"].value
         )
 
-    def test_no_optimum_is_raised_with_what_was_found(self) -> None:
+    def test_no_optimum_is_raised_with_what_was_found(self):
         tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(10))
         data = next(d for d in tables if not fit(d, Dahl(), throw=False).success)
         with pytest.raises(FitError, match="f_max grows without bound at constant sigma") as caught:
@@ -184,14 +178,14 @@ class TestFit:
         assert caught.value.result.optimum.status is Status.NO_LOSS
         assert caught.value.result.combinations[0].expression == "sigma"
 
-    def test_ipopt_finds_the_same(self, result: FitResult) -> None:
+    def test_ipopt_finds_the_same(self, result):
         other = fit(result.data, Dahl(), method="ipopt")
         assert other.method == "ipopt"
         for name in result.var_names:
             assert other.params[name].value == pytest.approx(result.params[name].value, rel=1e-7)
 
-    def test_constraints_leave_first_order_intervals(self) -> None:
-        def tie(p: Mapping[str, Any]) -> list[Any]:
+    def test_constraints_leave_first_order_intervals(self):
+        def tie(p):
             return [p["sigma"] == 290.0 * p["f_max"]]
 
         tied = fit(table(), Dahl(), method="ipopt", constraints=tie)
@@ -219,17 +213,17 @@ class TestFit:
             ({"noise": "white"}, "noise is 'white'"),
         ],
     )
-    def test_unknown_options(self, options: dict[str, Any], message: str) -> None:
+    def test_unknown_options(self, options, message):
         with pytest.raises(ValidationError, match=message):
             fit(table(), Dahl(), **options)
 
-    def test_nothing_free(self) -> None:
+    def test_nothing_free(self):
         with pytest.raises(ModelError, match="no free parameter"):
             fit(table(), FRICTION)
 
 
 class TestMany:
-    def test_is_each_fit(self) -> None:
+    def test_is_each_fit(self):
         tables = [table(seed=s) for s in range(4)] + [table(beta=(1e-4, 1e-3), seed=5)]
         many = fit_many(tables, Dahl())
         assert len(many) == 5
@@ -243,7 +237,7 @@ class TestMany:
         assert many[0].data is tables[0]
         assert [r.data for r in many[1:3]] == tables[1:3]
 
-    def test_frame_and_text(self) -> None:
+    def test_frame_and_text(self):
         many = fit_many([table(seed=s) for s in range(3)], Dahl())
         frame = many.to_frame()
         columns = "f_max f_max_stderr_noise sigma sigma_stderr_noise scale status"
@@ -258,13 +252,13 @@ class TestMany:
         )
         assert repr(many) == "<FitBatch: 3 tables, free f_max, sigma; 3 converged>"
 
-    def test_tables_must_agree(self) -> None:
+    def test_tables_must_agree(self):
         with pytest.raises(DataError, match="table 1 has 8 rows"):
             fit_many([table(), table(n=8)], Dahl())
 
 
 class TestReport:
-    def test_verdict_comes_first(self, result: FitResult) -> None:
+    def test_verdict_comes_first(self, result):
         text = result.fit_report()
         assert text.splitlines()[0] == "Verdict"
         assert "Trusted. Every parameter is identified." in text.splitlines()[1]
@@ -279,35 +273,35 @@ class TestReport:
         assert "estimated with 58 degrees of freedom" in text
         assert "constant variance of (ln gain, phase)" in text
 
-    def test_other_intervals(self, result: FitResult) -> None:
+    def test_other_intervals(self, result):
         assert "90 % (wald)" in result.fit_report("wald", 0.9)
         assert "95.45 % (bootstrap)" in result.fit_report("bootstrap")
 
-    def test_one_level_needs_no_sequence(self, result: FitResult) -> None:
+    def test_one_level_needs_no_sequence(self, result):
         upper = result.conf_interval(levels=0.95)["f_max"][0].upper
         assert upper == result.conf_interval(levels=(0.95,))["f_max"][0].upper
 
-    def test_what_is_not_to_be_trusted_says_why(self, microslip: FitResult) -> None:
+    def test_what_is_not_to_be_trusted_says_why(self, microslip):
         assert not microslip.trusted
         assert microslip.verdict.startswith("Not determined.")
         assert "Only sigma is determined; not f_max." in microslip.verdict
         assert "drive above that" in microslip.verdict
         assert "at least" in microslip.fit_report()
 
-    def test_a_wrong_model_is_compared_with_others(self) -> None:
+    def test_a_wrong_model_is_compared_with_others(self):
         wrong = fit(table(model=FRICTION + Spring(1.0)), Dahl())
         assert not wrong.trusted
         text = wrong.fit_report()
         assert "Other models, for comparison" in text
         assert "spring added would be better" in text
 
-    def test_correlations_of_a_plant(self, plant: FitResult) -> None:
+    def test_correlations_of_a_plant(self, plant):
         text = plant.fit_report()
         assert "sigma, mass: +0." in text
         assert "the describing function would be up to" in text
         assert plant.trusted
 
-    def test_priors_losses_and_units_are_told(self) -> None:
+    def test_priors_losses_and_units_are_told(self):
         sensors = Sensors(force_gain=stats.norm(1.0, 0.005))
         told = fit(table(), Dahl(), sensors=sensors).fit_report()
         assert "prior of force_gain: 1 ± 0.005" in told
@@ -320,17 +314,17 @@ class TestReport:
         )
         assert "N m/rad" in fit(turned, Dahl()).fit_report()
 
-    def test_html_is_escaped_and_has_the_same_words(self, result: FitResult) -> None:
+    def test_html_is_escaped_and_has_the_same_words(self, result):
         page = result._repr_html_()
         assert page.startswith("<div><h4>Verdict</h4><pre>Trusted.")
         assert page.count("<h4>") == page.count("</h4>") == page.count("<pre>")
 
-    def test_repr_is_one_line(self, result: FitResult) -> None:
+    def test_repr_is_one_line(self, result):
         assert repr(result) == (
             "<FitResult: f_max = 0.09957 ± 0.00039 N, sigma = 30.016 ± 0.063 N/m; converged>"
         )
 
-    def test_frame(self, result: FitResult) -> None:
+    def test_frame(self, result):
         frame = result.summary()
         assert list(frame.index) == ["f_max", "sigma", "alpha"]
         assert frame.loc["sigma", "value"] == result.params["sigma"].value
@@ -339,7 +333,7 @@ class TestReport:
 
 
 class TestStorage:
-    def check_same(self, one: FitResult, other: FitResult) -> None:
+    def check_same(self, one, other):
         np.testing.assert_array_equal(one.optimum.theta, other.optimum.theta)
         np.testing.assert_array_equal(one.optimum.values, other.optimum.values)
         np.testing.assert_array_equal(one.optimum.covariance, other.optimum.covariance)
@@ -348,11 +342,11 @@ class TestStorage:
         assert one.to_json() == other.to_json()
         assert one.fit_report() == other.fit_report()
 
-    def test_round_trip(self, result: FitResult, plant: FitResult, microslip: FitResult) -> None:
+    def test_round_trip(self, result, plant, microslip):
         for one in (result, plant, microslip):
             self.check_same(one, FitResult.from_json(one.to_json()))
 
-    def test_everything_a_table_can_hold(self, tmp_path: Path) -> None:
+    def test_everything_a_table_can_hold(self, tmp_path):
         data = table(n=9)
         A = amplitudes(data)
         C = (0.01 * data.gain)[:, None, None] ** 2 * np.array([[1.0, 0.2], [0.2, 1.0]])
@@ -378,7 +372,7 @@ class TestStorage:
         np.testing.assert_array_equal(back.dof, full.dof)
         assert back.levels == ["low"]
 
-    def test_is_strict_json_with_a_schema(self, microslip: FitResult) -> None:
+    def test_is_strict_json_with_a_schema(self, microslip):
         content = json.loads(microslip.to_json(), parse_constant=lambda name: pytest.fail(name))
         assert (content["schema"], content["schema_version"]) == ("dahl_ident.fit_result", 4)
         assert content["model"][0] == {
@@ -388,7 +382,7 @@ class TestStorage:
             "alpha": {"assumed": 1.0},
         }
 
-    def test_what_is_no_fit(self, result: FitResult, tmp_path: Path) -> None:
+    def test_what_is_no_fit(self, result, tmp_path):
         content = json.loads(result.to_json())
         with pytest.raises(DataError, match="is not JSON"):
             FitResult.from_json("{")
@@ -422,9 +416,7 @@ class TestStorage:
             lambda c: c.pop("digest"),
         ],
     )
-    def test_what_was_edited_is_refused(
-        self, result: FitResult, tmp_path: Path, change: Callable[[dict[str, Any]], Any]
-    ) -> None:
+    def test_what_was_edited_is_refused(self, result, tmp_path, change):
         content = json.loads(result.to_json())
         assert FitResult.from_json(json.dumps(content, indent=4, sort_keys=True)).trusted
         change(content)
@@ -432,7 +424,7 @@ class TestStorage:
         with pytest.raises(DataError, match=r"edited.json was changed after the fit was saved"):
             FitResult.load(tmp_path / "edited.json")
 
-    def test_priors_that_no_file_can_hold(self) -> None:
+    def test_priors_that_no_file_can_hold(self):
         result = fit(table(), Dahl())
         sensors = Sensors(force_gain=stats.uniform(0.9, 0.2))
         odd = replace(result.optimum, problem=TableProblem(table(), Dahl(), sensors=sensors))
@@ -440,23 +432,23 @@ class TestStorage:
             FitResult(odd).to_json()
 
 
-def xy(line: Line2D) -> FloatArray:
+def xy(line):
     """Return what a line shows, shape (2, n)."""
     return np.array([line.get_xdata(), line.get_ydata()], dtype=np.float64)
 
 
-def lines(axis: Axes, points: int) -> list[Line2D]:
+def lines(axis, points):
     """Return the lines of so many points."""
     return [line for line in axis.lines if xy(line).shape[1] == points]
 
 
 class TestPictures:
     @pytest.fixture(autouse=True)
-    def _close(self) -> Iterator[None]:
+    def _close(self):
         yield
         plt.close("all")
 
-    def test_over_amplitude_with_a_band(self, result: FitResult) -> None:
+    def test_over_amplitude_with_a_band(self, result):
         top, bottom = result.plot_fit()
         (line,) = lines(top, 200)
         band = result.predict(1.0, amplitude=xy(line)[0])
@@ -464,7 +456,7 @@ class TestPictures:
         assert len(top.collections) >= 2  # the band, and the error bars
         assert bottom.get_ylabel() == "phase [degrees]"
 
-    def test_over_frequency_by_levels(self, plant: FitResult) -> None:
+    def test_over_frequency_by_levels(self, plant):
         top, _ = plant.plot_fit()
         points = [line for line in lines(top, 12) if line.get_marker() not in ("", "None", "_")]
         curves = lines(top, 200)
@@ -476,19 +468,19 @@ class TestPictures:
         predicted = np.abs(plant.predict(f, drive=drive).response[24:36])[[0, -1]]
         np.testing.assert_allclose(ends, predicted, rtol=1e-9)
 
-    def test_residuals_in_standard_deviations(self, result: FitResult) -> None:
+    def test_residuals_in_standard_deviations(self, result):
         axis = result.plot_residuals()
         (gain,) = (x for x in axis.lines if x.get_label() == "ln gain")
         np.testing.assert_allclose(xy(gain)[1], result.residual[:60:2] / result.scale)
 
-    def test_draw_where_they_are_told(self, result: FitResult) -> None:
+    def test_draw_where_they_are_told(self, result):
         figure, axes = plt.subplots(3)
         assert result.plot_fit(axes[:2])[0] is axes[0]
         drawn = result.plot_residuals(axes[2])
         assert isinstance(drawn, Axes)
         assert drawn.figure is figure
 
-    def test_suspicious_points_are_ringed(self) -> None:
+    def test_suspicious_points_are_ringed(self):
         data = table()
         R = data.response.copy()
         R[7] *= 1.2
@@ -496,7 +488,7 @@ class TestPictures:
         rings = [x for x in axis.lines if x.get_markerfacecolor() == "none"]
         assert len(rings) == 2
 
-    def test_measured_errors_become_error_bars(self) -> None:
+    def test_measured_errors_become_error_bars(self):
         data = table()
         C = (0.02 * data.gain)[:, None, None] ** 2 * np.eye(2)
         top, _ = fit(replace(data, covariance=C), Dahl()).plot_fit()
@@ -505,7 +497,7 @@ class TestPictures:
         np.testing.assert_allclose(heights, 0.04 * data.gain, rtol=1e-6)
 
 
-def test_a_pandas_table_is_fitted_as_it_is_read() -> None:
+def test_a_pandas_table_is_fitted_as_it_is_read():
     data = load_dataset("noisy")
     frame = data.to_frame()
     assert fit(frame, Dahl()).params["f_max"].value == pytest.approx(
@@ -513,7 +505,7 @@ def test_a_pandas_table_is_fitted_as_it_is_read() -> None:
     )
 
 
-def test_a_list_of_fits_is_sent_to_the_report() -> None:
+def test_a_list_of_fits_is_sent_to_the_report():
     found = fit(load_dataset("noisy"), Dahl())
     with pytest.raises(
         ValidationError, match=r"got several fits; .* di\.report\(\[fit, \.\.\.\]\)"
@@ -522,7 +514,7 @@ def test_a_list_of_fits_is_sent_to_the_report() -> None:
 
 
 @pytest.mark.parametrize("ln_f_max", [441.0, -441.0])
-def test_values_beyond_any_parameter_stand_for_infinity_and_zero(ln_f_max: float) -> None:
+def test_values_beyond_any_parameter_stand_for_infinity_and_zero(ln_f_max):
     """Where a gap swallows the motion, a search may end at a force limit of 1e191."""
     A = np.geomspace(2e-5, 4.5e-4, 10)
     noise = 0.01 * np.random.default_rng(0).standard_normal(10)

@@ -1,7 +1,5 @@
 """Sensors: what a gain error and a delay do to every quantity, amplitude and harmonic."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,7 +14,7 @@ OMEGA = 2.0 * np.pi * FREQUENCY
 PLANT = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
 
 
-def test_parameters_are_fixed_free_or_have_a_prior() -> None:
+def test_parameters_are_fixed_free_or_have_a_prior():
     prior = stats.norm(0.0, 20e-6)
     sensors = Sensors(force_gain=None, delay=prior)
     assert [p.name for p in sensors.parameters if p.free] == ["force_gain", "delay"]
@@ -34,7 +32,7 @@ def test_parameters_are_fixed_free_or_have_a_prior() -> None:
         ({"force_gain": stats.norm(-1.0, 0.1)}, "force_gain is -1.0; expected a number > 0"),
     ],
 )
-def test_impossible_values_are_refused(arguments: dict[str, float], message: str) -> None:
+def test_impossible_values_are_refused(arguments, message):
     with pytest.raises(ValidationError, match=message):
         Sensors(**arguments)
 
@@ -51,9 +49,7 @@ def test_impossible_values_are_refused(arguments: dict[str, float], message: str
         ("apparent_mass", -2, False),
     ],
 )
-def test_each_quantity_sees_gains_and_delay(
-    quantity: str, power: int, inverted: bool, controlled: str
-) -> None:
+def test_each_quantity_sees_gains_and_delay(quantity, power, inverted, controlled):
     force_gain, displacement_gain, delay = 1.3, 0.8, 2e-3
     F = PLANT.dynamic_stiffness(A, OMEGA) * A  # the true phasors, X = A
     measured_force = force_gain * F
@@ -66,7 +62,7 @@ def test_each_quantity_sees_gains_and_delay(
         amplitude=np.abs(measured_displacement),
         drive=np.abs(measured_force),
         controlled=controlled,
-        quantity=quantity,  # type: ignore[arg-type]  # the table above holds all six
+        quantity=quantity,  # the table above holds all six
     )
     sensors = Sensors(force_gain=None, displacement_gain=None, delay=None)
     problem = TableProblem(data, PLANT, sensors=sensors, steady="describing function")
@@ -74,7 +70,7 @@ def test_each_quantity_sees_gains_and_delay(
     np.testing.assert_allclose(problem.predict(theta), response, rtol=1e-10)
 
 
-def test_a_harmonic_sees_the_delay_k_times() -> None:
+def test_a_harmonic_sees_the_delay_k_times():
     pivot, delay, period = Dahl(0.1, 30.0), 0.02, 1.0
     t = np.arange(4096) / 4096 * period
     phase = 2.0 * np.pi * t / period
@@ -90,7 +86,7 @@ def test_a_harmonic_sees_the_delay_k_times() -> None:
     np.testing.assert_allclose(problem.predict([delay]), measured, rtol=2e-5)
 
 
-def test_an_unknown_gain_leaves_one_friction_parameter() -> None:
+def test_an_unknown_gain_leaves_one_friction_parameter():
     N = Dahl(0.1, 30.0).describing_function(A)
     data = FrequencyResponse(np.ones(7), N, A)
     by_force = TableProblem(data, Dahl(), sensors=Sensors(force_gain=None))
@@ -103,7 +99,7 @@ def test_an_unknown_gain_leaves_one_friction_parameter() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-8])
-def test_a_calibration_counts_however_small_the_noise(noise: float) -> None:
+def test_a_calibration_counts_however_small_the_noise(noise):
     A = np.geomspace(1e-4, 3e-2, 30)
     error = 1.0 + noise * np.random.default_rng(0).standard_normal(30)
     table = FrequencyResponse(np.ones(30), Dahl(0.1, 30.0).describing_function(A) * error, A)

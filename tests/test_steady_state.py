@@ -1,9 +1,6 @@
 """The describing function's steady response: accuracy, uniqueness, several amplitudes, none."""
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -13,18 +10,17 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import i1e
 
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Dahl, Damper, Element, Mass, Model, Spring
 from dahl_ident.errors import ModelError, MultipleSolutionsWarning, ValidationError
-from dahl_ident.steady_state import SteadyResponse, solve
 from dahl_ident.steady_state import response as any_response
+from dahl_ident.steady_state import solve
 
 FIG_7 = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
 response = partial(any_response, steady="describing function")
 WIDE = np.geomspace(1e-12, 1e12, 97)[:, None]
 
 
-def worst_residual(plant: Model, result: SteadyResponse) -> float:
+def worst_residual(plant, result):
     """Return abs(X Z/u_0 - 1) over its bound max(1, kappa/4), the largest one found."""
     A, omega = result.amplitude, 2.0 * np.pi * result.frequency_hz
     found = np.isfinite(A)
@@ -36,7 +32,7 @@ def worst_residual(plant: Model, result: SteadyResponse) -> float:
     return float(np.max(residual[found]))
 
 
-def some_plants(count: int, alphas: Sequence[float]) -> list[Model]:
+def some_plants(count, alphas):
     rng = np.random.default_rng(7)
     plants = []
     for i in range(count):
@@ -51,7 +47,7 @@ def some_plants(count: int, alphas: Sequence[float]) -> list[Model]:
 
 
 @pytest.mark.parametrize("plant", some_plants(30, [1.0]), ids=repr)
-def test_drives_over_24_decades(plant: Model) -> None:
+def test_drives_over_24_decades(plant):
     f_max = float(plant.parameters[0].value or 0.0)
     result = response(plant, np.geomspace(1e-3, 1e3, 61), f_max * WIDE)
     assert result.amplitude.shape == (97, 61)
@@ -61,14 +57,14 @@ def test_drives_over_24_decades(plant: Model) -> None:
 
 
 @pytest.mark.parametrize("plant", some_plants(8, [0.25, 0.7, 2.0, 4.0]), ids=repr)
-def test_drives_over_24_decades_with_other_exponents(plant: Model) -> None:
+def test_drives_over_24_decades_with_other_exponents(plant):
     f_max = float(plant.parameters[0].value or 0.0)
     result = response(plant, np.geomspace(1e-2, 1e2, 9), f_max * WIDE[::4])
     assert result.found.all()
     assert worst_residual(plant, result) < 1e-12
 
 
-def test_several_friction_elements_side_by_side() -> None:
+def test_several_friction_elements_side_by_side():
     plant = (
         Dahl(1.0, 10.0, name="a")
         + Dahl(0.01, 1e4, name="b")
@@ -82,7 +78,7 @@ def test_several_friction_elements_side_by_side() -> None:
 
 
 @pytest.mark.parametrize("levels", [1, 3, 40])
-def test_the_phasor_is_as_accurate_as_the_amplitude_however_few_the_points(levels: int) -> None:
+def test_the_phasor_is_as_accurate_as_the_amplitude_however_few_the_points(levels):
     rng = np.random.default_rng(4)
     for plant in some_plants(40, [1.0, 0.5, 2.0]):
         f_max = float(plant.parameters[0].value or 0.0)
@@ -91,7 +87,7 @@ def test_the_phasor_is_as_accurate_as_the_amplitude_however_few_the_points(level
 
 
 @pytest.mark.parametrize("exponent", [(30, 30), (30, -30), (-30, 30), (-30, -30)])
-def test_extreme_units_pass_without_warning(exponent: tuple[int, int]) -> None:
+def test_extreme_units_pass_without_warning(exponent):
     f_max, sigma = 10.0 ** exponent[0], 10.0 ** exponent[1]
     plant = Dahl(f_max, sigma) + Mass(sigma) + Spring(0.1 * sigma)
     result = response(plant, [0.0, 0.1, 1.0], f_max * WIDE)
@@ -99,7 +95,7 @@ def test_extreme_units_pass_without_warning(exponent: tuple[int, int]) -> None:
     assert worst_residual(plant, result) < 1e-12
 
 
-def closed_form(A: float, omega: float) -> float:
+def closed_form(A, omega):
     """Return A abs(Z) of Fig. 7 from scipy's Bessel function."""
     beta = 30.0 * A / 0.1
     tanh = np.tanh(beta)
@@ -108,7 +104,7 @@ def closed_form(A: float, omega: float) -> float:
     return float(A * abs(0.3 - 0.3 * omega**2 + 0.24j * omega + N))
 
 
-def test_amplitude_is_that_of_brentq_on_the_closed_form() -> None:
+def test_amplitude_is_that_of_brentq_on_the_closed_form():
     frequency = np.array([0.01, 0.16, 0.5, 1.58, 3.0])
     drive = np.array([1e-3, 0.05, 0.1, 0.13, 0.2, 5.0])
     ours = response(FIG_7, frequency, drive[:, None]).amplitude
@@ -118,7 +114,7 @@ def test_amplitude_is_that_of_brentq_on_the_closed_form() -> None:
             assert ours[i, j] == pytest.approx(peer, rel=1e-10)
 
 
-def test_few_and_many_points_agree() -> None:
+def test_few_and_many_points_agree():
     frequency = np.geomspace(0.01, 30.0, 400)
     drive = np.geomspace(1e-4, 10.0, 51)[:, None]
     many = response(FIG_7, frequency, drive).amplitude
@@ -130,7 +126,7 @@ def test_few_and_many_points_agree() -> None:
 
 
 @st.composite
-def passive_parts(draw: st.DrawFn) -> ComplexArray:
+def passive_parts(draw):
     """Return linear parts L/sigma with Im L >= 0, from microscopic to huge."""
     size = st.floats(-8.0, 8.0)
     angle = st.one_of(st.floats(0.0, np.pi), st.sampled_from([0.0, np.pi / 2.0, np.pi]))
@@ -139,9 +135,7 @@ def passive_parts(draw: st.DrawFn) -> ComplexArray:
 
 
 @given(passive_parts(), st.sampled_from([0.25, 0.5, 1.0, 1.0, 1.7, 4.0]), st.booleans())
-def test_passive_plants_have_one_amplitude(
-    linear: ComplexArray, alpha: float, several: bool
-) -> None:
+def test_passive_plants_have_one_amplitude(linear, alpha, several):
     friction: Element = Dahl(1.0, 1.0, alpha, name="a")
     if several:
         friction = friction + Dahl(10.0, 0.3, 1.0, name="b") + Dahl(0.01, 0.7, 2.0, name="c")
@@ -153,7 +147,7 @@ def test_passive_plants_have_one_amplitude(
     assert np.all(np.diff(drive) > -rounding[:, 1:])
 
 
-def test_an_active_plant_breaks_that_property() -> None:
+def test_an_active_plant_breaks_that_property():
     A = np.geomspace(1e-6, 1e6, 241)
     force = A * Dahl(1.0, 1.0).dynamic_stiffness(A)
     assert np.any(np.diff(np.abs(A * (-0.5 - 0.3j) + force)) < -1e-3)
@@ -165,7 +159,7 @@ def test_an_active_plant_breaks_that_property() -> None:
 ACTIVE = Dahl(0.1, 30.0) + Mass(0.3) + Damper(-0.24) + Spring(0.3)
 
 
-def brute_force(plant: Element, frequency_hz: float, drive: float) -> FloatArray:
+def brute_force(plant, frequency_hz, drive):
     """Return where A abs(Z) crosses the drive on a very fine grid."""
     A = np.geomspace(1e-7, 1e4, 2_000_001)
     above = A * np.abs(plant.dynamic_stiffness(A, 2.0 * np.pi * frequency_hz)) > drive
@@ -174,7 +168,7 @@ def brute_force(plant: Element, frequency_hz: float, drive: float) -> FloatArray
 
 
 @pytest.mark.parametrize("damping", [-0.01, -0.24, -2.0])
-def test_all_amplitudes_of_an_active_plant(damping: float) -> None:
+def test_all_amplitudes_of_an_active_plant(damping):
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(damping) + Spring(0.3)
     frequency = np.array([0.1, 0.4, 0.8, 1.2, 1.5, 1.59, 2.0])
     drive = np.geomspace(1e-3, 0.5, 12)[:, None]
@@ -188,7 +182,7 @@ def test_all_amplitudes_of_an_active_plant(damping: float) -> None:
         assert len(expected) == result.number_of_solutions[i, j]
 
 
-def test_the_default_warns_and_returns_the_smallest() -> None:
+def test_the_default_warns_and_returns_the_smallest():
     frequency, drive = np.linspace(0.05, 3.0, 60), np.geomspace(1e-3, 1.0, 20)[:, None]
     every = response(ACTIVE, frequency, drive, all_roots=True)
     count = int(np.sum(every.number_of_solutions > 1))
@@ -202,7 +196,7 @@ def test_the_default_warns_and_returns_the_smallest() -> None:
     assert "several" in every.message
 
 
-def limit_cycle() -> tuple[Model, float, float]:
+def limit_cycle():
     """Return a plant with Z = 0 at amplitude 1 and omega 10, with both numbers."""
     friction = Dahl(1.0, 2.0)
     N = complex(friction.describing_function(1.0))
@@ -210,9 +204,7 @@ def limit_cycle() -> tuple[Model, float, float]:
 
 
 @pytest.mark.parametrize("drive", [1e-9, 1e-14, 1e-17, 1e-20, 1e-30])
-def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_near_the_small_one(
-    drive: float,
-) -> None:
+def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_near_the_small_one(drive):
     plant, amplitude, omega = limit_cycle()
     result = response(plant, omega / (2.0 * np.pi), drive, all_roots=True)
     small, *pair = result.amplitude  # that only rounding parts where the drive is less than it
@@ -221,7 +213,7 @@ def test_a_weakly_driven_limit_cycle_has_two_close_amplitudes_near_the_small_one
     np.testing.assert_allclose(pair, amplitude, rtol=10.0 * drive + 1e-13)
 
 
-def test_start_chooses_among_several() -> None:
+def test_start_chooses_among_several():
     plant, _, omega = limit_cycle()
     values = plant.known_values()
     every = response(plant, omega / (2.0 * np.pi), 0.01, all_roots=True).amplitude
@@ -238,7 +230,7 @@ def test_start_chooses_among_several() -> None:
 RESONANT = Dahl(1.0, 1.0) + Mass(1.0) + Spring(1.0)
 
 
-def test_undamped_resonance_has_no_amplitude_above_the_friction_limit() -> None:
+def test_undamped_resonance_has_no_amplitude_above_the_friction_limit():
     drive = np.array([0.5, 1.27, 4.0 / np.pi, 2.0])
     result = response(RESONANT, 0.5 / np.pi, drive)
     assert result.found.tolist() == [True, True, False, False]
@@ -252,7 +244,7 @@ def test_undamped_resonance_has_no_amplitude_above_the_friction_limit() -> None:
     np.testing.assert_allclose(force, drive[:2], rtol=1e-12)
 
 
-def test_resonance_that_rounding_hides_has_no_amplitude_either() -> None:
+def test_resonance_that_rounding_hides_has_no_amplitude_either():
     plant = Dahl(1.0, 1.0) + Mass(0.3) + Spring(0.1)
     omega = np.sqrt(0.1 / 0.3)
     assert 0.1 - 0.3 * omega**2 != 0.0
@@ -260,20 +252,20 @@ def test_resonance_that_rounding_hides_has_no_amplitude_either() -> None:
     assert response(plant, 1.0000001 * omega / (2.0 * np.pi), 2.0).found
 
 
-def test_a_point_without_amplitude_has_no_stiffness_and_no_warning() -> None:
+def test_a_point_without_amplitude_has_no_stiffness_and_no_warning():
     result = response(RESONANT, [0.5 / np.pi, 1.0], 2.0)
     for part in (result.dynamic_stiffness, result.receptance, result.phase):
         assert np.isfinite(part).tolist() == [False, True]
 
 
-def test_linear_plant_alone() -> None:
+def test_linear_plant_alone():
     plant = Mass(2.0) + Spring(8.0)
     result = response(plant, np.array([0.0, 1.0]) / np.pi, 4.0)
     assert result.amplitude[0] == pytest.approx(0.5)
     assert not result.found[1]
 
 
-def test_many_parameter_vectors_at_once_are_each_alone() -> None:
+def test_many_parameter_vectors_at_once_are_each_alone():
     rng = np.random.default_rng(3)
     omega, drive = 2.0 * np.pi * np.geomspace(0.05, 3.0, 11), np.geomspace(0.01, 1.0, 11)
     vectors = np.array([float(v) for v in FIG_7.known_values()]) * rng.uniform(0.5, 2.0, (17, 6))
@@ -291,9 +283,7 @@ TWO = Dahl(1.0, 5.0, name="a") + Dahl(0.2, 9.0, name="b") + Mass(0.1) + Damper(0
 @pytest.mark.parametrize("plant", [FIG_7, TWO], ids=["one", "two"])
 @pytest.mark.parametrize("index", range(6))
 @pytest.mark.parametrize("overflow", [np.inf, np.nan])
-def test_a_search_that_overflows_gets_no_amplitude(
-    plant: Model, index: int, overflow: float
-) -> None:
+def test_a_search_that_overflows_gets_no_amplitude(plant, index, overflow):
     vectors = np.tile([float(v) for v in plant.known_values()], (3, 1))
     vectors[1, index] = overflow
     columns = list(vectors.T[:, :, None])
@@ -306,7 +296,7 @@ def test_a_search_that_overflows_gets_no_amplitude(
 # arguments and results
 
 
-def test_shapes_broadcast_and_scalars_stay_scalars() -> None:
+def test_shapes_broadcast_and_scalars_stay_scalars():
     one = response(FIG_7, 1.0, 0.1)
     assert np.shape(one.amplitude) == ()
     assert isinstance(one.amplitude, float)
@@ -320,7 +310,7 @@ def test_shapes_broadcast_and_scalars_stay_scalars() -> None:
     assert response(FIG_7, 1.0, [0.1], all_roots=True).dynamic_stiffness.shape == (1, 1)
 
 
-def test_results_are_read_only() -> None:
+def test_results_are_read_only():
     result = response(FIG_7, [1.0, 2.0], 0.1)
     with pytest.raises(ValueError, match="read-only"):
         result.amplitude[0] = 1.0
@@ -339,7 +329,7 @@ def test_results_are_read_only() -> None:
         ([1.0, 2.0], [0.1, 0.2, 0.3], r"frequency_hz \(2,\), drive \(3,\)"),
     ],
 )
-def test_bad_arguments_are_named(frequency: FloatArray, drive: FloatArray, text: str) -> None:
+def test_bad_arguments_are_named(frequency, drive, text):
     with pytest.raises(ValidationError, match=text):
         response(FIG_7, frequency, drive)
 
@@ -349,9 +339,7 @@ def test_bad_arguments_are_named(frequency: FloatArray, drive: FloatArray, text:
     st.sampled_from([1.0, 0.5, 2.0]),
     st.sampled_from([1.0, -1.0, 0.0]),
 )
-def test_whatever_is_accepted_is_right_or_refused(
-    exponents: list[float], alpha: float, sign: float
-) -> None:
+def test_whatever_is_accepted_is_right_or_refused(exponents, alpha, sign):
     f_max, sigma, mass, damping, stiffness, frequency, drive = (10.0**e for e in exponents)
     plant = Dahl(f_max, sigma, alpha) + Mass(mass) + Damper(sign * damping) + Spring(stiffness)
     try:
@@ -372,20 +360,18 @@ def test_whatever_is_accepted_is_right_or_refused(
         (Dahl(1e-90, 1e-90) + Mass(1e90), 1e80, 1.0),
     ],
 )
-def test_what_numbers_cannot_hold_is_refused(
-    plant: Element, frequency: float, drive: float
-) -> None:
+def test_what_numbers_cannot_hold_is_refused(plant, frequency, drive):
     text = r"^point 0 \(1 such points\) has an amplitude of about .* outside the range of numbers"
     with pytest.raises(ValidationError, match=text):
         response(plant, frequency, drive)
 
 
-def test_a_plant_without_a_value_says_which() -> None:
+def test_a_plant_without_a_value_says_which():
     with pytest.raises(ModelError, match="has no value for sigma, damping"):
         response(Dahl(0.1) + Damper(), 1.0, 0.1)
 
 
-def test_a_motion_that_is_not_a_sine_is_named() -> None:
+def test_a_motion_that_is_not_a_sine_is_named():
     stick, slip = response(FIG_7, 0.158, 0.1), response(FIG_7, 1.0, 5.0)
     assert "the third harmonic is about 13 % at 0.158 Hz, drive 0.1" in stick.message
     assert slip.message == ""
@@ -394,12 +380,12 @@ def test_a_motion_that_is_not_a_sine_is_named() -> None:
     assert exact.message == ""
 
 
-def test_no_warning_where_one_amplitude_exists() -> None:
+def test_no_warning_where_one_amplitude_exists():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         response(FIG_7, [0.0, 1.0], [[1e-6], [1e6]])
 
 
-def test_what_is_no_plant_is_named() -> None:
+def test_what_is_no_plant_is_named():
     with pytest.raises(ModelError, match=r"expected a model such as Dahl\(\) .*, got str"):
         response("plant", 1.0, 1.0)  # type: ignore[arg-type]  # the point of the test

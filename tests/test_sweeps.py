@@ -1,9 +1,6 @@
 """Sweeps and stepped sines of a driven plant as waveforms: fitted at once, levels as one run."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,13 +14,13 @@ MODEL = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
 SENSORS = Acquisition(32.0, displacement=Channel(noise_std=1e-4), force=Channel(noise_std=5e-5))
 
 
-def sweep(level: float, seed: int) -> di.Record:
+def sweep(level, seed):
     data = di.simulate(Experiment(PLANT, FrequencySweep(level, 0.4, 5.0, 60.0), SENSORS), seed=seed)
     assert isinstance(data, di.Record)
     return data
 
 
-def assert_true(fit: di.FitResult | di.FitResult) -> None:
+def assert_true(fit):
     truth = {"f_max": 0.1, "sigma": 30.0, "mass": 0.3, "damping": 0.24, "stiffness": 0.3}
     assert fit.trusted, fit.verdict
     for name, value in truth.items():
@@ -31,11 +28,11 @@ def assert_true(fit: di.FitResult | di.FitResult) -> None:
         assert abs(found.value - value) < 4.0 * found.stderr, fit
 
 
-def test_the_shipped_sweeps_are_fitted_as_waveforms() -> None:
+def test_the_shipped_sweeps_are_fitted_as_waveforms():
     assert_true(di.fit(di.load_dataset("sweep_plant"), MODEL))
 
 
-def test_a_sweep_says_how_far_its_points_are_from_settled() -> None:
+def test_a_sweep_says_how_far_its_points_are_from_settled():
     data = di.load_dataset("sweep_plant")
     assert isinstance(data, di.Record)
     points = di.extract(data, controlled="force")
@@ -48,9 +45,7 @@ def test_a_sweep_says_how_far_its_points_are_from_settled() -> None:
     assert np.median(bias / error) < 5.0  # a bound that says something
 
 
-def test_sweeps_of_one_level_each_are_one_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sweeps_of_one_level_each_are_one_run(tmp_path, monkeypatch, capsys):
     sweeps = [sweep(level, seed) for seed, level in enumerate((0.05, 0.2, 1.0))]
     for record, level in zip(sweeps, (50, 200, 1000), strict=True):
         record.save(tmp_path / f"sweep{level}mN.csv")
@@ -66,8 +61,8 @@ def test_sweeps_of_one_level_each_are_one_run(
 
 
 def test_extraction_of_a_sweep_says_its_bias_and_the_command_for_waveforms(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     sweep(0.3, 1).save(tmp_path / "sweep.csv")
     words = ["extract", str(tmp_path / "sweep.csv"), "--controlled", "force"]
     monkeypatch.setattr("sys.argv", ["dahl-ident", *words])
@@ -81,7 +76,7 @@ def test_extraction_of_a_sweep_says_its_bias_and_the_command_for_waveforms(
     assert f"dahl-ident fit --record {tmp_path / 'sweep.csv'} --mass free" in text
 
 
-def test_a_table_of_stepped_sines_and_their_waveforms_agree() -> None:
+def test_a_table_of_stepped_sines_and_their_waveforms_agree():
     steps = SteppedSine(
         (0.08, 0.3, 1.0), (1.2, 2.0, 3.5), controlled="force", settling_periods=12,
         num_periods=12, ramp_periods=8.0,

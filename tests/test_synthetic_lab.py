@@ -1,10 +1,7 @@
 """Experiments: their description, their sensors, their tables, and that a seed fixes them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import FrozenInstanceError, replace
-from pathlib import Path
 
 import control
 import numpy as np
@@ -13,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, LinearSystem, Mass, Record, Spring, response
-from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 from dahl_ident.synthetic import (
@@ -32,19 +28,19 @@ PLANT = FRICTION + Mass(0.3) + Damper(0.24) + Spring(0.3)
 STEPS = SteppedSine((1e-3, 1e-2), (2.0,), settling_periods=2, num_periods=2)
 
 
-def record(experiment: Experiment, seed: int = 1) -> Record:
+def record(experiment, seed=1):
     data = simulate(experiment, seed=seed)
     assert isinstance(data, Record)
     return data
 
 
-def table(experiment: Experiment, seed: int = 1) -> FrequencyResponse:
+def table(experiment, seed=1):
     data = simulate(experiment, seed=seed)
     assert isinstance(data, FrequencyResponse)
     return data
 
 
-def displacement(channel: Channel, rate: float = 1000.0, seed: int = 1) -> FloatArray:
+def displacement(channel, rate=1000.0, seed=1):
     """Return what one displacement channel adds to or takes from the true motion."""
     run = Experiment(FRICTION, STEPS, Acquisition(rate, displacement=channel))
     measured = record(run, seed)
@@ -75,7 +71,7 @@ EXPERIMENTS = [
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS, ids=range(len(EXPERIMENTS)))
-def test_a_description_survives_json_toml_and_files(experiment: Experiment, tmp_path: Path) -> None:
+def test_a_description_survives_json_toml_and_files(experiment, tmp_path):
     assert Experiment.from_dict(experiment.to_dict()) == experiment
     assert Experiment.from_json(experiment.to_json()) == experiment
     assert Experiment.from_toml(str(experiment)) == experiment
@@ -85,18 +81,18 @@ def test_a_description_survives_json_toml_and_files(experiment: Experiment, tmp_
         assert Experiment.read(tmp_path / name) == experiment
 
 
-def test_experiments_differ_where_a_number_does() -> None:
+def test_experiments_differ_where_a_number_does():
     assert len(set(EXPERIMENTS)) == len(EXPERIMENTS)
     assert Experiment(Dahl(0.1, 30.0), STEPS) != Experiment(Dahl(0.1, 30.000001), STEPS)
     assert Experiment(FRICTION, STEPS) != "an experiment"
 
 
-def test_a_description_is_frozen() -> None:
+def test_a_description_is_frozen():
     with pytest.raises(FrozenInstanceError):
         EXPERIMENTS[0].motion = "rotation"  # type: ignore[misc]
 
 
-def test_what_a_file_leaves_out_has_its_default() -> None:
+def test_what_a_file_leaves_out_has_its_default():
     text = """
     [[plant]]
     kind = "dahl"
@@ -113,7 +109,7 @@ def test_what_a_file_leaves_out_has_its_default() -> None:
     assert Experiment.from_toml(text) == EXPERIMENTS[0]
 
 
-def description(**changes: object) -> dict[str, object]:
+def description(**changes):
     return EXPERIMENTS[0].to_dict() | changes
 
 
@@ -132,12 +128,12 @@ def description(**changes: object) -> dict[str, object]:
         (description(table={"std": 0.1}), "table has the unknown std; expected displacement_std"),
     ],
 )
-def test_a_bad_description_names_the_key(data: dict[str, object], message: str) -> None:
+def test_a_bad_description_names_the_key(data, message):
     with pytest.raises(DataError, match=message):
         Experiment.from_dict(data)
 
 
-def test_unreadable_files_are_named(tmp_path: Path) -> None:
+def test_unreadable_files_are_named(tmp_path):
     with pytest.raises(DataError, match=r"none\.toml: the file cannot be read: No such file"):
         Experiment.read(tmp_path / "none.toml")
     with pytest.raises(DataError, match=r"run\.yaml: expected an experiment in \.toml or \.json"):
@@ -153,7 +149,7 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
         Experiment.read(tmp_path / "b.json")
 
 
-def test_impossible_experiments_are_refused() -> None:
+def test_impossible_experiments_are_refused():
     with pytest.raises(ModelError, match="no value for sigma"):
         Experiment(Dahl(0.1), STEPS)
     with pytest.raises(ValidationError, match="a table was requested of a FrequencySweep"):
@@ -181,7 +177,7 @@ def test_impossible_experiments_are_refused() -> None:
     [("gain", 0.0), ("noise_std", -1.0), ("resolution", -1.0), ("antialias_hz", 0.0),
      ("limit", -1.0), ("delay", np.inf), ("hum_amplitude", np.nan)],
 )  # fmt: skip
-def test_bad_channels_are_refused_by_name(name: str, value: float) -> None:
+def test_bad_channels_are_refused_by_name(name, value):
     with pytest.raises(ValidationError, match=f"{name} is"):
         Channel(**{name: value})
 
@@ -190,12 +186,12 @@ def test_bad_channels_are_refused_by_name(name: str, value: float) -> None:
     "arguments",
     [{"force_std": -1.0}, {"harmonics": ()}, {"harmonics": (0,)}, {"outlier_fraction": 1.5}],
 )
-def test_bad_tables_are_refused_by_name(arguments: dict[str, object]) -> None:
+def test_bad_tables_are_refused_by_name(arguments):
     with pytest.raises(ValidationError, match=next(iter(arguments))):
-        Table(**arguments)  # type: ignore[arg-type]
+        Table(**arguments)
 
 
-def test_bad_recorders_are_refused_by_name() -> None:
+def test_bad_recorders_are_refused_by_name():
     with pytest.raises(ValidationError, match=r"dropped_fraction is 0\.95"):
         Acquisition(dropped_fraction=0.95)
     with pytest.raises(ValidationError, match="sample_rate_hz is 0"):
@@ -206,27 +202,27 @@ def test_bad_recorders_are_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS, ids=range(len(EXPERIMENTS)))
-def test_a_seed_fixes_the_data(experiment: Experiment) -> None:
+def test_a_seed_fixes_the_data(experiment):
     first, second = (simulate(experiment, seed=3) for _ in range(2))
     for name in ("time", "displacement", "force", "response", "amplitude"):
         if hasattr(first, name):
             assert np.array_equal(getattr(first, name), getattr(second, name))
 
 
-def test_another_seed_gives_other_noise_and_nothing_else() -> None:
+def test_another_seed_gives_other_noise_and_nothing_else():
     run = Experiment(FRICTION, STEPS, Acquisition(100.0, force=Channel(noise_std=1e-3)))
     a, b = record(run, 1), record(run, 2)
     assert np.array_equal(a.motion_samples, b.motion_samples)
     assert not np.array_equal(a.force_samples, b.force_samples)
 
 
-def test_adding_one_fault_leaves_the_others_as_they_were() -> None:
+def test_adding_one_fault_leaves_the_others_as_they_were():
     noise = displacement(Channel(noise_std=1e-3))
     both = displacement(Channel(noise_std=1e-3, hum_amplitude=1e-4))
     assert both - noise == pytest.approx(displacement(Channel(hum_amplitude=1e-4)), abs=1e-15)
 
 
-def test_provenance_tells_how_it_was_made() -> None:
+def test_provenance_tells_how_it_was_made():
     run = Experiment(
         PLANT, replace(STEPS, controlled="force"), Acquisition(force=Channel(gain=1.1, delay=1e-3))
     )
@@ -243,24 +239,24 @@ def test_provenance_tells_how_it_was_made() -> None:
 # --- sensors
 
 
-def test_an_ideal_sensor_shows_the_motion_itself() -> None:
+def test_an_ideal_sensor_shows_the_motion_itself():
     assert np.array_equal(displacement(Channel()), np.zeros(6_001))
 
 
-def test_white_noise() -> None:
+def test_white_noise():
     noise = displacement(Channel(noise_std=1e-3))
     assert np.std(noise) == pytest.approx(1e-3, rel=0.03)
     neighbours = np.mean(noise[1:] * noise[:-1]) / 1e-6
     assert neighbours == pytest.approx(0.0, abs=0.04)
 
 
-def test_flicker_noise_is_slow() -> None:
+def test_flicker_noise_is_slow():
     noise = displacement(Channel(flicker_std=1e-3))
     assert np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2) > 0.5
     assert np.std(noise) == pytest.approx(1e-3, rel=0.3)
 
 
-def test_offset_drift_and_gain() -> None:
+def test_offset_drift_and_gain():
     time = np.arange(6_001) / 1000.0
     added = displacement(Channel(offset=1e-3, drift=2e-3))
     assert added == pytest.approx(1e-3 + 2e-3 * time, abs=1e-15)
@@ -268,21 +264,21 @@ def test_offset_drift_and_gain() -> None:
     assert displacement(Channel(gain=1.25)) == pytest.approx(0.25 * true, abs=1e-15)
 
 
-def test_hum_is_a_sine_at_the_mains_frequency() -> None:
+def test_hum_is_a_sine_at_the_mains_frequency():
     hum = displacement(Channel(hum_amplitude=1e-3, hum_hz=60.0))[:-1]
     spectrum = 2.0 * np.abs(np.fft.rfft(hum)) / hum.size
     assert spectrum[360] == pytest.approx(1e-3, rel=1e-9)
     assert np.sum(np.delete(spectrum, 360)) < 1e-12
 
 
-def test_a_delay_shows_what_was() -> None:
+def test_a_delay_shows_what_was():
     time = np.arange(6_001) / 1000.0
     true = STEPS.waveform(0)
     late = displacement(Channel(delay=0.0123)) + true.value(time)
     assert late == pytest.approx(true.value(time - 0.0123), abs=1e-15)
 
 
-def test_quantisation_rounds_to_steps() -> None:
+def test_quantisation_rounds_to_steps():
     error = displacement(Channel(resolution=5e-4))
     shown = (error + STEPS.waveform(0).value(np.arange(6_001) / 1000.0)) / 5e-4
     assert shown == pytest.approx(np.round(shown), abs=1e-9)
@@ -290,7 +286,7 @@ def test_quantisation_rounds_to_steps() -> None:
     assert np.max(np.abs(error)) > 2.4e-4
 
 
-def test_clipping_holds_the_limit() -> None:
+def test_clipping_holds_the_limit():
     time = np.arange(6_001) / 1000.0
     true = STEPS.waveform(0).value(time)
     shown = displacement(Channel(limit=4e-3)) + true
@@ -298,7 +294,7 @@ def test_clipping_holds_the_limit() -> None:
     assert np.mean(np.abs(shown) == 4e-3) > 0.1
 
 
-def test_the_anti_alias_filter_is_of_first_order() -> None:
+def test_the_anti_alias_filter_is_of_first_order():
     steps = SteppedSine((1.0,), (2.0,), settling_periods=20)
     run = Experiment(Spring(1.0), steps, Acquisition(256.0, Channel(antialias_hz=3.0)))
     measured = record(run)
@@ -310,12 +306,12 @@ def test_the_anti_alias_filter_is_of_first_order() -> None:
     assert ratio == pytest.approx(1.0 / (1.0 + 2.0j / 3.0), rel=1e-5)
 
 
-def test_the_filter_starts_at_rest_with_its_signal() -> None:
+def test_the_filter_starts_at_rest_with_its_signal():
     shown = displacement(Channel(antialias_hz=3.0))
     assert shown[0] == pytest.approx(0.0, abs=1e-18)
 
 
-def test_jitter_moves_both_channels_alike() -> None:
+def test_jitter_moves_both_channels_alike():
     steps = SteppedSine((1.0,), (2.0,))
     run = Experiment(Spring(3.0), steps, Acquisition(1000.0, jitter_std=1e-4))
     measured = record(run)
@@ -328,7 +324,7 @@ def test_jitter_moves_both_channels_alike() -> None:
     assert np.diff(measured.time) == pytest.approx(1e-3)
 
 
-def test_dropped_samples_leave_gaps() -> None:
+def test_dropped_samples_leave_gaps():
     whole = record(Experiment(FRICTION, STEPS, Acquisition(1000.0)))
     holed = record(Experiment(FRICTION, STEPS, Acquisition(1000.0, dropped_fraction=0.1)))
     assert holed.n / whole.n == pytest.approx(0.9, abs=0.01)
@@ -337,7 +333,7 @@ def test_dropped_samples_leave_gaps() -> None:
     assert np.array_equal(whole.force_samples[kept], holed.force_samples)
 
 
-def test_a_forced_record_holds_the_drive_and_the_motion() -> None:
+def test_a_forced_record_holds_the_drive_and_the_motion():
     run = Experiment(
         PLANT,
         SteppedSine((0.2,), (2.0,), controlled="force", settling_periods=30),
@@ -357,7 +353,7 @@ def test_a_forced_record_holds_the_drive_and_the_motion() -> None:
 # --- tables
 
 
-def test_a_table_without_errors_is_the_describing_function() -> None:
+def test_a_table_without_errors_is_the_describing_function():
     steps = SteppedSine((1e-3, 1e-2), (1.0, 5.0))
     data = table(Experiment(PLANT, steps, table=Table(harmonics=(1, 3))))
     assert data.n == 8
@@ -369,7 +365,7 @@ def test_a_table_without_errors_is_the_describing_function() -> None:
         assert data.response[row] == pytest.approx(complex(expected), rel=1e-14)
 
 
-def test_a_forced_table_is_the_steady_response() -> None:
+def test_a_forced_table_is_the_steady_response():
     steps = SteppedSine((0.05, 0.5), (1.0, 5.0), controlled="force")
     data = table(Experiment(PLANT, steps, table=Table(), motion="rotation"))
     assert data.quantity == "receptance"
@@ -381,7 +377,7 @@ def test_a_forced_table_is_the_steady_response() -> None:
     assert data.drive == pytest.approx([0.05, 0.5, 0.05, 0.5])
 
 
-def test_a_tables_sensors_are_those_of_the_problem() -> None:
+def test_a_tables_sensors_are_those_of_the_problem():
     acquisition = Acquisition(
         displacement=Channel(gain=0.9, delay=3e-3), force=Channel(gain=1.2, delay=1e-3)
     )
@@ -399,7 +395,7 @@ def test_a_tables_sensors_are_those_of_the_problem() -> None:
     ) == Sensors(force_gain=1.2, displacement_gain=0.9, delay=2e-3)
 
 
-def test_a_table_sees_the_anti_alias_filter() -> None:
+def test_a_table_sees_the_anti_alias_filter():
     acquisition = Acquisition(displacement=Channel(antialias_hz=5.0))
     steps = SteppedSine((1e-3,), (5.0,))
     plain = table(Experiment(FRICTION, steps, table=Table())).response
@@ -409,11 +405,9 @@ def test_a_table_sees_the_anti_alias_filter() -> None:
 
 
 @pytest.mark.parametrize(("controlled", "harmonics"), [("displacement", (1, 3)), ("force", (1,))])
-def test_covariances_are_those_of_repeated_tables(
-    controlled: str, harmonics: tuple[int, ...]
-) -> None:
+def test_covariances_are_those_of_repeated_tables(controlled, harmonics):
     level = 5e-3 if controlled == "displacement" else 0.1
-    steps = SteppedSine((level,) * 5000, (1.0,), controlled=controlled)  # type: ignore[arg-type]
+    steps = SteppedSine((level,) * 5000, (1.0,), controlled=controlled)
     errors = Table(0.004, 0.006, harmonics, steady="describing function")
     data = table(Experiment(PLANT, steps, table=errors))
     for k in harmonics:
@@ -430,7 +424,7 @@ def test_covariances_are_those_of_repeated_tables(
         assert np.all(np.isinf(data.dof[rows]))
 
 
-def test_outliers_are_few_large_and_known() -> None:
+def test_outliers_are_few_large_and_known():
     steps = SteppedSine(tuple(np.geomspace(1e-4, 1e-1, 40)))
     plain = table(Experiment(FRICTION, steps, table=Table(force_std=0.01)))
     spoiled = table(Experiment(FRICTION, steps, table=Table(force_std=0.01, outlier_fraction=0.1)))
@@ -441,8 +435,8 @@ def test_outliers_are_few_large_and_known() -> None:
 
 
 @given(seed=st.integers(0, 2**64), f_max=st.floats(1e-6, 1e6), x_c=st.floats(1e-9, 1e3))
-def test_tables_scale_with_their_units(seed: int, f_max: float, x_c: float) -> None:
-    def made(f: float, x: float) -> FrequencyResponse:
+def test_tables_scale_with_their_units(seed, f_max, x_c):
+    def made(f, x):
         steps = SteppedSine((0.1 * x, 3.0 * x), order="random")
         return table(Experiment(Dahl(f, f / x), steps, table=Table(0.01, 0.01)), seed)
 
@@ -452,6 +446,6 @@ def test_tables_scale_with_their_units(seed: int, f_max: float, x_c: float) -> N
 
 
 @pytest.mark.parametrize("excitation", [AmplitudeRamp(1e-3, 1e-2, 2.0, 3.0), STEPS])
-def test_a_record_lasts_as_long_as_its_excitation(excitation: AmplitudeRamp | SteppedSine) -> None:
+def test_a_record_lasts_as_long_as_its_excitation(excitation):
     measured = record(Experiment(FRICTION, excitation, Acquisition(100.0)))
     assert measured.time[-1] == pytest.approx(excitation.waveform(0).duration, abs=0.01)

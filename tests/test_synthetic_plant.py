@@ -1,17 +1,13 @@
 """Plants in the time domain: against an ODE solver, each other, and the describing function."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest
 
 from dahl_ident import BoucWen, Dahl, Damper, LinearSystem, Mass, Model, Spring, response
-from dahl_ident.arrays import ComplexArray
-from dahl_ident.elements import Element
 from dahl_ident.errors import ModelError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
-from dahl_ident.synthetic.mechanism import Mechanism, Signal
+from dahl_ident.synthetic.mechanism import Mechanism
 
 FRICTION = (0.1, 30.0)
 LINEAR = Mass(0.3) + Damper(0.24) + Spring(0.3)
@@ -19,7 +15,7 @@ PLANT = Dahl(*FRICTION) + LINEAR
 
 
 @pytest.mark.parametrize("levels", [(0.02, 0.2), (0.5, 0.05)])
-def test_motion_of_a_law_without_closed_form(levels: tuple[float, ...]) -> None:
+def test_motion_of_a_law_without_closed_form(levels):
     """Bouc-Wen's law with q = p = sigma/f_max is Dahl's."""
     steps = SteppedSine(levels, (0.7,), controlled="force", settling_periods=1, num_periods=1)
     force = steps.waveform(seed=0)
@@ -29,7 +25,7 @@ def test_motion_of_a_law_without_closed_form(levels: tuple[float, ...]) -> None:
     assert np.max(np.abs(motion - exact)) < 1e-5 * np.max(np.abs(exact))
 
 
-def phasor(signal: Signal, frequency_hz: float, start: float, periods: int, k: int = 1) -> complex:
+def phasor(signal, frequency_hz, start, periods, k=1):
     """Return the k-th harmonic over whole periods, from 512 points in each."""
     time = start + np.arange(512 * periods) / (512.0 * frequency_hz)
     return complex(2.0 * np.mean(signal(time) * np.exp(-2j * np.pi * k * frequency_hz * time)))
@@ -48,7 +44,7 @@ def phasor(signal: Signal, frequency_hz: float, start: float, periods: int, k: i
     ids=["damper", "spring", "spring and damper", "mass", "alpha 1/4", "alpha 3"],
 )
 @pytest.mark.parametrize("level", [0.05, 0.5])
-def test_forces_balance_at_every_instant(plant: Element, level: float) -> None:
+def test_forces_balance_at_every_instant(plant, level):
     force = AmplitudeRamp(0.3 * level, level, 1.0, 3.0, controlled="force").waveform(seed=0)
     motion = Mechanism.of(plant).displacement_under(force)
     time = np.linspace(0.0, force.duration, 20_001)
@@ -64,7 +60,7 @@ def test_forces_balance_at_every_instant(plant: Element, level: float) -> None:
 
 @pytest.mark.parametrize("plant", [Spring(3.0), Spring(3.0) + Damper(0.1)])
 @pytest.mark.parametrize("law", [Dahl(*FRICTION), BoucWen(30.0, 200.0, 100.0)])
-def test_a_plant_without_mass_follows_a_jump_of_the_force(law: Element, plant: Element) -> None:
+def test_a_plant_without_mass_follows_a_jump_of_the_force(law, plant):
     sweep = FrequencySweep((0.05, 0.3), 1.0, 1.37, 2.3, ramp_periods=0.0)
     force = sweep.waveform(seed=0)
     time = np.linspace(0.0, force.duration, 20_001)
@@ -86,13 +82,11 @@ def test_a_plant_without_mass_follows_a_jump_of_the_force(law: Element, plant: E
         (control.tf([0.3, 0.24, 0.3], [1.0, 0.0, 0.0]), "apparent_mass"),
     ],
 )
-def test_a_linear_system_moves_as_its_elements_do(
-    system: object, quantity: str, controlled: str
-) -> None:
-    steps = SteppedSine((0.05,), controlled=controlled, settling_periods=1, num_periods=1)  # type: ignore[arg-type]
+def test_a_linear_system_moves_as_its_elements_do(system, quantity, controlled):
+    steps = SteppedSine((0.05,), controlled=controlled, settling_periods=1, num_periods=1)
     wave = steps.waveform(seed=0)
     time = np.linspace(0.0, wave.duration, 500)
-    plants = [PLANT, Dahl(*FRICTION) + LinearSystem(system, quantity=quantity)]  # type: ignore[arg-type]
+    plants = [PLANT, Dahl(*FRICTION) + LinearSystem(system, quantity=quantity)]
     elements, lumped = (
         (m.displacement_under if controlled == "force" else m.force_under)(wave)(time)
         for m in map(Mechanism.of, plants)
@@ -100,7 +94,7 @@ def test_a_linear_system_moves_as_its_elements_do(
     assert lumped == pytest.approx(elements, abs=1e-10 * np.max(np.abs(elements)))
 
 
-def test_a_linear_system_with_poles_of_its_own_is_followed_under_either_control() -> None:
+def test_a_linear_system_with_poles_of_its_own_is_followed_under_either_control():
     # a tuned absorber in parallel with the plant: Z has a pole pair that no lumped element has
     absorber = LinearSystem(
         control.tf([0.05 * 1.0, 0.05 * 25.0, 0.0, 0.0], [1.0, 1.0, 25.0]),
@@ -123,9 +117,7 @@ def test_a_linear_system_with_poles_of_its_own_is_followed_under_either_control(
 
 @pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("amplitude", [1e-4, 1e-2, 1.0])
-def test_friction_under_a_held_displacement_is_the_exact_force(
-    alpha: float, amplitude: float
-) -> None:
+def test_friction_under_a_held_displacement_is_the_exact_force(alpha, amplitude):
     friction = Dahl(*FRICTION, alpha)
     wave = SteppedSine(
         (amplitude, 0.4 * amplitude), (2.0,), settling_periods=1, num_periods=2, rest=0.3
@@ -138,7 +130,7 @@ def test_friction_under_a_held_displacement_is_the_exact_force(
     assert force == pytest.approx(expected, abs=1e-13 * 0.1)
 
 
-def steady(level: float, f: float) -> tuple[ComplexArray, Signal, float]:
+def steady(level, f):
     """Return harmonics 0 to 7 of the displacement, the motion, and the start of a period."""
     wave = SteppedSine((level,), (f,), controlled="force", settling_periods=60).waveform(seed=0)
     motion = Mechanism.of(PLANT).displacement_under(wave)
@@ -147,7 +139,7 @@ def steady(level: float, f: float) -> tuple[ComplexArray, Signal, float]:
 
 
 @pytest.mark.parametrize(("f", "level"), [(0.8, 0.02), (1.0, 0.12), (1.3, 0.06), (2.0, 0.12)])
-def test_the_describing_function_errs_as_the_third_harmonic_says(f: float, level: float) -> None:
+def test_the_describing_function_errs_as_the_third_harmonic_says(f, level):
     harmonics, _, start = steady(level, f)
     drive = level * np.exp(2j * np.pi * f * -start) / 1j  # a sine from the window's start
     predicted = response(PLANT, f, level, steady="describing function").receptance
@@ -159,7 +151,7 @@ def test_the_describing_function_errs_as_the_third_harmonic_says(f: float, level
     theta = np.linspace(0.0, 40.0 * np.pi, 40 * 2048 + 1)
     last = slice(-2048, None)
 
-    def left_over(*kept: int) -> float:
+    def left_over(*kept):
         """Return the imbalance of the fundamental, friction moved by some harmonics alone."""
         x = sum(np.real(harmonics[k] * np.exp(1j * k * (theta + omega * start))) for k in kept)
         force = Dahl(*FRICTION).force(np.asarray(x))[last]
@@ -172,7 +164,7 @@ def test_the_describing_function_errs_as_the_third_harmonic_says(f: float, level
     assert left_over(1, 3, 5, 7) < 0.05 * left_over(1)
 
 
-def test_time_can_be_scaled() -> None:
+def test_time_can_be_scaled():
     slow, fast = (
         Mechanism.of(Dahl(*FRICTION) + Mass(0.3 * s**2) + Damper(0.24 * s) + Spring(0.3))
         for s in (1.0, 1e-4)
@@ -184,7 +176,7 @@ def test_time_can_be_scaled() -> None:
     assert y == pytest.approx(x, abs=1e-9 * np.max(np.abs(x)))
 
 
-def test_progress_rises_to_one() -> None:
+def test_progress_rises_to_one():
     seen: list[float] = []
     wave = SteppedSine((0.1, 0.2), controlled="force", settling_periods=1).waveform(seed=0)
     Mechanism.of(PLANT).displacement_under(wave, seen.append)
@@ -212,19 +204,19 @@ def test_progress_rises_to_one() -> None:
     ],
     ids=["no linear part", "no value", "frequency response data", "improper"],
 )  # fmt: skip
-def test_a_plant_without_motion_says_why(plant: Element, message: str) -> None:
+def test_a_plant_without_motion_says_why(plant, message):
     wave = SteppedSine((0.1,), controlled="force").waveform(seed=0)
     with pytest.raises(ModelError, match=message):
         Mechanism.of(plant).displacement_under(wave)
 
 
-def test_an_unstable_plant_says_so() -> None:
+def test_an_unstable_plant_says_so():
     wave = SteppedSine((0.1,), controlled="force", settling_periods=2000).waveform(seed=0)
     with pytest.raises(ModelError, match="the motion grows beyond all bounds"):
         Mechanism.of(Dahl(*FRICTION) + Mass(0.3) + Damper(-5.0)).displacement_under(wave)
 
 
-def test_a_stiffness_beyond_a_mass_has_no_force_under_a_held_displacement() -> None:
+def test_a_stiffness_beyond_a_mass_has_no_force_under_a_held_displacement():
     jerk = LinearSystem(control.tf([1.0], [1.0, 0.0, 0.0, 0.0]), quantity="receptance")
     wave = SteppedSine((0.1,)).waveform(seed=0)
     with pytest.raises(ModelError, match=r"grows as s\^3; under a prescribed displacement"):

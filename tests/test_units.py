@@ -1,7 +1,5 @@
 """Units as laboratories write them, against factors worked out by hand or defined by law."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import subprocess
@@ -79,7 +77,7 @@ POUND_FORCE = 0.45359237 * 9.80665  # international avoirdupois pound, standard 
     ],
 )
 @pytest.mark.versions
-def test_factors(text: str, factor: float) -> None:
+def test_factors(text, factor):
     assert parse_unit(text).factor == pytest.approx(factor, rel=1e-14)
 
 
@@ -104,7 +102,7 @@ def test_factors(text: str, factor: float) -> None:
         ("mm 0p", "zero to peak", 1.0),
     ],
 )
-def test_amplitude_markers(text: str, marker: str | None, to_peak: float) -> None:
+def test_amplitude_markers(text, marker, to_peak):
     unit = parse_unit(text)
     assert (unit.marker, unit.to_peak) == (marker, to_peak)
 
@@ -112,7 +110,7 @@ def test_amplitude_markers(text: str, marker: str | None, to_peak: float) -> Non
 @pytest.mark.parametrize(
     "text", ["dB re 1 N/m", "dB re N/m", "dB N/m", "db re. 1 N/m", "dB re 1N/m"]
 )
-def test_decibels_keep_their_reference(text: str) -> None:
+def test_decibels_keep_their_reference(text):
     unit = parse_unit(text)
     assert unit.decibel
     assert kind_of(unit, QUANTITIES, "gain")[0] == "dynamic_stiffness"
@@ -137,13 +135,13 @@ def test_decibels_keep_their_reference(text: str) -> None:
         ("grad/s", "ambiguous"),
     ],
 )
-def test_what_is_no_unit(text: str, message: str) -> None:
+def test_what_is_no_unit(text, message):
     with pytest.raises(UnitError, match=message):
         parse_unit(text)
 
 
 @given(st.text(max_size=70))
-def test_any_text_is_a_unit_or_a_unit_error(text: str) -> None:
+def test_any_text_is_a_unit_or_a_unit_error(text):
     try:
         unit = parse_unit(text)
     except UnitError:
@@ -160,17 +158,17 @@ def test_any_text_is_a_unit_or_a_unit_error(text: str) -> None:
         max_size=12,
     )
 )
-def test_any_combination_of_symbols_ends(parts: list[str]) -> None:
+def test_any_combination_of_symbols_ends(parts):
     with contextlib.suppress(UnitError):
         assert isinstance(parse_unit("".join(parts)), Unit)
 
 
-def test_a_mil_is_a_length_and_no_angle() -> None:
+def test_a_mil_is_a_length_and_no_angle():
     assert kind_of(parse_unit("mils pp"), ("displacement",), "x")[1] == "translation"
 
 
 @pytest.mark.parametrize("kind", SI_UNITS)
-def test_si_units_are_their_own_kind(kind: str) -> None:
+def test_si_units_are_their_own_kind(kind):
     for motion, text in zip(("translation", "rotation"), SI_UNITS[kind], strict=True):
         found = kind_of(parse_unit(text), (kind,), "it")
         assert found[0] == kind
@@ -180,7 +178,7 @@ def test_si_units_are_their_own_kind(kind: str) -> None:
             assert si_unit(kind, found[1]) == text
 
 
-def test_the_six_quantities_are_told_by_their_units() -> None:
+def test_the_six_quantities_are_told_by_their_units():
     """No two of the twelve units have the same dimension."""
     for kind in QUANTITIES:
         for text in SI_UNITS[kind]:
@@ -204,13 +202,13 @@ def test_the_six_quantities_are_told_by_their_units() -> None:
         ("Hz", ("frequency", "angular_frequency"), ("frequency", "translation", 1.0)),
     ],
 )
-def test_kinds(text: str, kinds: tuple[str, ...], expected: tuple[str, str, float]) -> None:
+def test_kinds(text, kinds, expected):
     kind, motion, factor = kind_of(parse_unit(text), kinds, "it")
     assert (kind, motion) == expected[:2]
     assert factor == pytest.approx(expected[2], rel=1e-14)
 
 
-def test_misfits_name_what_was_expected() -> None:
+def test_misfits_name_what_was_expected():
     with pytest.raises(
         UnitError, match=r"force has the unit \[lb\].* N or N m \(pound-force is lbf"
     ):
@@ -221,7 +219,7 @@ def test_misfits_name_what_was_expected() -> None:
         factor_to(parse_unit("m"), "(N/m)^2", "variance")
 
 
-def test_quantities_in_words() -> None:
+def test_quantities_in_words():
     assert parse_quantity("0.2 N", DRIVE_KINDS, "drive") == (0.2, "force", "translation")
     value, kind, motion = parse_quantity("-3e1um rms", MOTION_KINDS, "amplitude")
     assert value == pytest.approx(-3e-5 * math.sqrt(2))
@@ -244,9 +242,7 @@ REGISTRY: Any = pint.UnitRegistry()
     st.booleans(),
 )
 @pytest.mark.versions
-def test_common_units_are_read_as_pint_reads_them(
-    parts: list[tuple[str, str, int]], bracket: bool
-) -> None:
+def test_common_units_are_read_as_pint_reads_them(parts, bracket):
     text = "".join(f"{sign}{name}{f'^{p}' if p not in (0, 1) else ''}" for sign, name, p in parts)
     text = f"m/({text[1:]})" if bracket else text[1:]
     expected = REGISTRY.Quantity(1.0, REGISTRY.parse_units(text)).to_base_units()
@@ -255,7 +251,7 @@ def test_common_units_are_read_as_pint_reads_them(
     assert dict(found.dimension) == {k: float(v) for k, v in expected.unit_items()}
 
 
-def test_common_units_are_read_without_loading_pint() -> None:
+def test_common_units_are_read_without_loading_pint():
     code = (
         "import sys; from dahl_ident.units import *; kind_of(parse_unit('mm'), MOTION_KINDS, '');"
         "kind_of(parse_unit('kN/mm'), QUANTITIES, ''); print('pint' in sys.modules)"

@@ -1,25 +1,17 @@
 """What a fit says: whether to trust it, in the fewest words that hold."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from dahl_ident import (
     Backlash,
     BoucWen,
     Dahl,
-    Element,
-    FitResult,
     FrequencyResponse,
-    Friction,
     MaxwellSlip,
     Sensors,
     Spring,
@@ -28,12 +20,11 @@ from dahl_ident import (
     load_dataset,
     report,
 )
-from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
 
-def stiffened(rise: float, noise: float = 0.01, seed: int = 1) -> FrequencyResponse:
+def stiffened(rise, noise=0.01, seed=1):
     """Return microslip on a spring whose stiffness rises by a share over the upper half."""
     A = np.geomspace(1e-3, 1e-1, 48) * X_C
     N = FRICTION.describing_function(A)
@@ -43,39 +34,39 @@ def stiffened(rise: float, noise: float = 0.01, seed: int = 1) -> FrequencyRespo
     )
 
 
-def rise(data: FrequencyResponse, model: Element | None = None) -> Any:
+def rise(data, model=None):
     """Return the rise of stiffness with the amplitude that a fit's goodness holds, or None."""
     return fit(data, model or Dahl(alpha=1.0) + Spring(), throw=False).goodness.stiffening
 
 
 class TestStiffening:
-    def test_size_and_place_of_a_rise(self) -> None:
+    def test_size_and_place_of_a_rise(self):
         found = rise(stiffened(0.2))
         assert found.rise == pytest.approx(0.17, abs=0.02)
         assert found.low < 0.02 * X_C < 0.06 * X_C < found.high
         assert found.p_value < 1e-9
 
-    def test_the_verdict_says_so(self) -> None:
+    def test_the_verdict_says_so(self):
         result = fit(stiffened(0.2), Dahl() + Spring(), throw=False)
         assert "stiffness rises with amplitude, by" in result.verdict
         assert "which this law cannot describe" in result.verdict
 
-    def test_noise_alone_seldom_looks_so(self) -> None:
+    def test_noise_alone_seldom_looks_so(self):
         made = [rise(stiffened(0.0, noise=0.05, seed=seed)) for seed in range(30)]
         p = np.array([1.0 if one is None else one.p_value for one in made])
         assert np.mean(p < 0.05) < 0.1
 
-    def test_other_exponents_do_not_look_so(self) -> None:
+    def test_other_exponents_do_not_look_so(self):
         for alpha in (0.3, 1.0, 2.0):
             found = rise(table(model=Dahl(0.1, 30.0, alpha=alpha)), Dahl(alpha=1.0))
             assert found is None or found.p_value > 0.01
 
-    def test_it_needs_friction_and_points(self) -> None:
+    def test_it_needs_friction_and_points(self):
         assert rise(stiffened(0.2), Spring()) is None
         assert rise(table(n=4), Dahl(alpha=1.0)) is None
 
 
-def test_microslip_with_a_free_exponent_determines_the_loss_alone() -> None:
+def test_microslip_with_a_free_exponent_determines_the_loss_alone():
     """Where exponent and limit grow together, their ratio stays, and with it the loss."""
     data = table(model=FRICTION + Spring(20.0), beta=(3e-3, 3e-2), n=12, noise=1e-3)
     found = fit(data, Dahl(alpha=1.0) + Spring(), free=["alpha"], throw=False).identifiability
@@ -86,20 +77,20 @@ def test_microslip_with_a_free_exponent_determines_the_loss_alone() -> None:
 
 
 class TestTrust:
-    def test_two_points_leave_noise_and_model_alike(self) -> None:
+    def test_two_points_leave_noise_and_model_alike(self):
         result = fit(table(n=2, noise=0.03), Dahl())
         assert result.identifiability.complete
         assert not result.trusted
         assert "With 2 degrees of freedom a wrong model cannot be distinguished" in result.verdict
         assert "measure more points, or repeat them" in result.verdict
 
-    def test_two_points_of_known_noise_are_judged_by_it(self) -> None:
+    def test_two_points_of_known_noise_are_judged_by_it(self):
         data = table(n=2, noise=0.01, seed=3)
         C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
         known = FrequencyResponse(data.frequency_hz, data.response, data.amplitude, covariance=C)
         assert fit(known, Dahl()).goodness.judged
 
-    def test_one_amplitude_does_not_test_the_model(self) -> None:
+    def test_one_amplitude_does_not_test_the_model(self):
         """A spring and a damper without any friction, which two parameters meet all the same."""
         f, A = np.ones(12), np.full(12, 1e-3)
         damped = FrequencyResponse(f, (20.0 + 5.0j) * relative_noise(12, 0.01, 1), A)
@@ -114,12 +105,12 @@ class TestTrust:
         assert "does not describe these data" in tested.verdict
 
     @pytest.mark.parametrize("noise", ["relative", "absolute"])
-    def test_a_scatter_that_no_sensor_has(self, noise: str) -> None:
+    def test_a_scatter_that_no_sensor_has(self, noise):
         result = fit(table(n=12), Spring(), noise=noise)
         assert not result.trusted
         assert "% of the response, more than any sensor's noise" in result.verdict
 
-    def test_much_noise_is_borne(self) -> None:
+    def test_much_noise_is_borne(self):
         result = fit(table(n=60, noise=0.1), Dahl())
         assert result.trusted
         assert result.goodness.noise_share == pytest.approx(0.1, rel=0.2)
@@ -127,35 +118,35 @@ class TestTrust:
 
 class TestWords:
     @staticmethod
-    def unlimited() -> FitResult:
+    def unlimited():
         return fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
 
-    def test_an_optimum_at_infinity_is_said_once(self) -> None:
+    def test_an_optimum_at_infinity_is_said_once(self):
         result = self.unlimited()
         assert result.fit_report().count("No finite optimum: ") == 1
         assert result.verdict.count("sigma + stiffness =") == 1
         assert "Here:" not in result.verdict
         assert "Here: f_max without bound" in result.message
 
-    def test_what_is_determined_comes_first_with_its_number(self) -> None:
+    def test_what_is_determined_comes_first_with_its_number(self):
         first, second, *_ = self.unlimited().statements
         assert first.startswith("Not determined. Only ")
         assert second.startswith("Determined: ")
         assert "sigma + stiffness = 30." in second
 
-    def test_each_statement_has_its_line(self) -> None:
+    def test_each_statement_has_its_line(self):
         result = self.unlimited()
         lines = result.fit_report().splitlines()
         assert tuple(line.strip() for line in lines[1 : 1 + len(result.statements)]) == (
             result.statements
         )
 
-    def test_parameters_without_any_limit_give_way_to_those_with_one(self) -> None:
+    def test_parameters_without_any_limit_give_way_to_those_with_one(self):
         known = self.unlimited().identifiability
         assert len(known.open) < len(known.parameters)
         assert all("anything" not in parameter.reason for parameter in known.open)
 
-    def test_one_chi_square(self, tmp_path: Path) -> None:
+    def test_one_chi_square(self, tmp_path):
         data = table(n=12)
         C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)
         rough = FrequencyResponse(
@@ -175,25 +166,25 @@ class TestWords:
 
 
 class TestComparison:
-    def test_chance_does_not_make_another_model_the_best(self) -> None:
+    def test_chance_does_not_make_another_model_the_best(self):
         for seed in range(6):
             found = compare_models(fit(table(seed=seed), Dahl()))
             assert found.best is found.models[0]
 
-    def test_an_element_without_a_number_is_named(self) -> None:
+    def test_an_element_without_a_number_is_named(self):
         found = compare_models(fit(table(noise=0.0), Dahl()))
         (two,) = (m for m in found.models if m.name == "two Dahl elements")
         assert "not determined" in two.estimates
         assert "?" not in two.estimates
 
-    def test_a_better_model_that_is_absurd_is_said_to_be(self) -> None:
+    def test_a_better_model_that_is_absurd_is_said_to_be(self):
         maker = FRICTION + Spring(-3.0)
         found = compare_models(fit(table(model=maker), Dahl()))
         assert found.best.name == "spring added"
         assert "There stiffness is negative" in found.headline
 
 
-def _scattered(seed: int, off: float = 1.0) -> FrequencyResponse:
+def _scattered(seed, off=1.0):
     """Return 16 rows with 1 % of noise, two of them off by a factor."""
     A = np.geomspace(1e-4, 1e-2, 16)
     rng = np.random.default_rng(seed)
@@ -203,7 +194,7 @@ def _scattered(seed: int, off: float = 1.0) -> FrequencyResponse:
     return FrequencyResponse(np.ones(16), R, A)
 
 
-def test_a_robust_fit_that_moves_an_estimate_is_said_without_suspicious_rows() -> None:
+def test_a_robust_fit_that_moves_an_estimate_is_said_without_suspicious_rows():
     fitted = fit(_scattered(22, 1.1), Dahl())
     assert not fitted.goodness.suspicious
     assert "A robust fit moves sigma by more than one standard uncertainty" in fitted.verdict
@@ -211,7 +202,7 @@ def test_a_robust_fit_that_moves_an_estimate_is_said_without_suspicious_rows() -
     assert fit(_scattered(22), Dahl()).trusted
 
 
-def test_what_only_a_prior_determines_is_not_called_identified() -> None:
+def test_what_only_a_prior_determines_is_not_called_identified():
     tight = fit(_scattered(3), Dahl(), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
     known = tight.identifiability
     assert known.headline == "f_max and sigma are identified; force_gain is known from its prior."
@@ -225,7 +216,7 @@ def test_what_only_a_prior_determines_is_not_called_identified() -> None:
     assert seen.identifiability.headline == "Every parameter is identified."
 
 
-def test_a_prior_that_the_data_contradict_is_named() -> None:
+def test_a_prior_that_the_data_contradict_is_named():
     data = _scattered(3)
     data = replace(data, response=1.1 * data.response)
     against = fit(data, Dahl(f_max=0.1), sensors=Sensors(force_gain=stats.norm(1.0, 0.01)))
@@ -233,7 +224,7 @@ def test_a_prior_that_the_data_contradict_is_named() -> None:
     assert not against.trusted
 
 
-def test_a_free_delay_states_the_gain_that_it_assumes() -> None:
+def test_a_free_delay_states_the_gain_that_it_assumes():
     data = load_dataset("delayed")
     assert isinstance(data, FrequencyResponse)
     delayed = fit(data, Dahl(), sensors=Sensors(delay=None), throw=False)
@@ -243,7 +234,7 @@ def test_a_free_delay_states_the_gain_that_it_assumes() -> None:
 class TestNamed:
     """What makes a result doubtful has a sentence, and is in the status."""
 
-    def test_a_force_that_friction_cannot_carry(self) -> None:
+    def test_a_force_that_friction_cannot_carry(self):
         """A sinusoidal force above the limit, with nothing else to carry it."""
         A = np.geomspace(0.1, 20.0, 14) * X_C
         N = FRICTION.describing_function(A) * relative_noise(14, 0.01, 1)
@@ -258,7 +249,7 @@ class TestNamed:
             if named:
                 assert not found.trusted
 
-    def test_points_that_were_all_flagged(self) -> None:
+    def test_points_that_were_all_flagged(self):
         flawed = np.array(["not settled"] * 30)
         every = fit(replace(table(), quality={"verdict": flawed}), Dahl())
         assert str(every.status) == "not determined"
@@ -269,7 +260,7 @@ class TestNamed:
         assert "The extraction flagged 3 of the points fitted (" in some.verdict
 
     @pytest.mark.parametrize("column", ["level", "run", "tension"])
-    def test_devices_in_one_table(self, column: str) -> None:
+    def test_devices_in_one_table(self, column):
         tensions = [20, 40, 60]
         A = np.geomspace(0.3, 10.0, 10) * X_C
         R = np.outer(tensions, FRICTION.describing_function(A)).ravel() / 40.0
@@ -289,9 +280,7 @@ class TestNamed:
         ("order", "seen"),
         [(np.arange(12), False), (np.arange(12)[::-1], False), (np.arange(12) * 5 % 12, True)],
     )
-    def test_a_drift_that_cannot_be_told_from_the_amplitude_is_named(
-        self, order: NDArray[np.intp], seen: bool
-    ) -> None:
+    def test_a_drift_that_cannot_be_told_from_the_amplitude_is_named(self, order, seen):
         A = (np.geomspace(0.1, 10.0, 12) * X_C)[order]
         N = FRICTION.describing_function(A) * relative_noise(12, 0.01, 3)
         (assumed,) = (t for t in fit(FrequencyResponse(np.ones(12), N, A), Dahl()).verdict.split(
@@ -299,14 +288,14 @@ class TestNamed:
         assert assumed.endswith("a single run." if seen else "a single run without drift.")
         assert len(assumed.split()) <= 25
 
-    def test_gains_and_phases_that_were_held_out(self) -> None:
+    def test_gains_and_phases_that_were_held_out(self):
         found = fit(_scattered(22, 1.1), Dahl())
         check = found.cross_validation
         assert check.rows == 16
         text = f"{check.gains} of 16 held-out gains and {check.phases} of 16 phases of fundamentals"
         assert text in found.fit_report()
 
-    def test_the_verdict_is_five_sentences_and_the_rest_stands_below(self) -> None:
+    def test_the_verdict_is_five_sentences_and_the_rest_stands_below(self):
         """Runs that differ, rows that were flagged or are suspicious, and a wrong law."""
         law = MaxwellSlip([0.3 * X_C, 3.0 * X_C], [25.0, 8.0])
         A = np.tile(np.geomspace(0.3, 10.0, 12) * X_C, 2)
@@ -330,7 +319,7 @@ class TestNamed:
         BoucWen(30.0, 300.0, 300.0, exponent=2.0),
         Backlash(FRICTION, 0.5 * X_C),
     ])  # fmt: skip
-    def test_another_law_is_not_described_however_many_its_harmonics(self, law: Element) -> None:
+    def test_another_law_is_not_described_however_many_its_harmonics(self, law):
         """Or the limit of its force is within the interval: Bouc-Wen's loop is near to Dahl's."""
         rng = np.random.default_rng(3)
         A = np.geomspace(0.3, 10.0, 12) * X_C
@@ -349,14 +338,14 @@ class TestNamed:
 
 
 class TestFindings:
-    def test_the_status_is_the_worst_severity(self) -> None:
+    def test_the_status_is_the_worst_severity(self):
         for data in (table(), table(n=2, noise=0.03), stiffened(0.2), table(beta=(1e-3, 1e-2))):
             result = fit(data, Dahl(), throw=False)
             assert result.status == max(
                 (finding.severity for finding in result.findings), key=lambda status: status.rank
             )
 
-    def test_they_are_data_and_their_text_is_the_verdict(self) -> None:
+    def test_they_are_data_and_their_text_is_the_verdict(self):
         wrong = fit(load_dataset("alpha_2"), Dahl(alpha=1.0), throw=False)
         (misfit,) = (finding for finding in wrong.findings if finding.code == "misfit")
         assert misfit.question.value == "described"
@@ -366,7 +355,7 @@ class TestFindings:
         assert record["severity"] == "not described"
         assert record["text"] == str(misfit)
 
-    def test_an_unusable_result_does_not_list_what_is_assumed(self) -> None:
+    def test_an_unusable_result_does_not_list_what_is_assumed(self):
         wrong = fit(load_dataset("alpha_2"), Dahl(alpha=1.0), throw=False)
         assert any(finding.code == "assumed" for finding in wrong.findings)
         assert "Assumed:" not in wrong.verdict
@@ -377,9 +366,7 @@ class TestDescribed:
     """The status of laws and devices that one Dahl element is not; never better without noise."""
 
     @staticmethod
-    def status(
-        N: ComplexArray, A: FloatArray, *, stated: bool, run: ArrayLike | None = None
-    ) -> FitResult:
+    def status(N, A, *, stated, run=None):
         noisy = N * relative_noise(len(A), 0.01, 4)
         C = (0.01 * np.abs(noisy))[:, None, None] ** 2 * np.eye(2) if stated else None
         return fit(
@@ -397,7 +384,7 @@ class TestDescribed:
             Dahl(0.1, 30.0, alpha=0.265),
         ],
     )
-    def test_another_law_is_not_trusted(self, law: Friction, *, stated: bool) -> None:
+    def test_another_law_is_not_trusted(self, law, *, stated):
         """Unless twelve rows of unknown noise look like the law, and its numbers are right."""
         A = X_C * np.geomspace(0.1, 10.0, 12)
         found = self.status(law.describing_function(A), A, stated=stated)
@@ -409,7 +396,7 @@ class TestDescribed:
         assert not found.trusted or (not stated and right)
 
     @pytest.mark.parametrize("stated", [True, False])
-    def test_several_devices_are_not_one(self, *, stated: bool) -> None:
+    def test_several_devices_are_not_one(self, *, stated):
         limits, A = 0.1 * np.geomspace(0.4, 1.7, 6), X_C * np.geomspace(0.2, 8.0, 8)
         N = np.concatenate([Dahl(f, 300.0 * f).describing_function(A) for f in limits])
         run = np.repeat([f"band {i}" for i in range(6)], 8)
@@ -417,7 +404,7 @@ class TestDescribed:
         assert result.status == "not described"
         assert "the runs differ (gain by" in result.verdict
 
-    def test_harmonics_of_another_law_do_not_move_the_estimate(self) -> None:
+    def test_harmonics_of_another_law_do_not_move_the_estimate(self):
         A, law = X_C * np.geomspace(0.1, 10.0, 12), MaxwellSlip([2e-3, 5e-3], [20.0, 12.0])
         own = [np.asarray(p.value) for p in law.parameters]
         exact = np.concatenate([law.stiffness(own, A, np.zeros(()), k) for k in (1, 3, 5)])
