@@ -7,7 +7,7 @@ what the result depends on and the data cannot test.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,8 +16,6 @@ from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import in_order_of_level
-from dahl_ident.diagnostics.goodness import Goodness
-from dahl_ident.diagnostics.held_out import CrossValidation
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
@@ -26,11 +24,12 @@ from dahl_ident.diagnostics.physics import (
     slight,
     steady_findings,
 )
-from dahl_ident.diagnostics.verdicts import Identifiability
-from dahl_ident.elements import Element, Model
+from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import LOSSES
-from dahl_ident.fitting.optimum import ConstraintCost
+
+if TYPE_CHECKING:
+    from dahl_ident.diagnostics.assessment import Assessment, TableAssessment
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
@@ -45,58 +44,7 @@ _DETERMINED, _DESCRIBED, _ASSUMED = Question
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 
 
-class Judged(Protocol):
-    """The input of a verdict."""
-
-    @property
-    def optimum(self) -> Optimum:
-        """The solver's result."""
-
-    @property
-    def model(self) -> Model:
-        """The model with the estimates put in."""
-
-    @property
-    def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
-        """Estimates and combined standard uncertainties by name."""
-
-    @property
-    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        """Where the data come from."""
-
-    @property
-    def constraint_cost(self) -> ConstraintCost | None:
-        """What constraints cost."""
-
-    def assumptions(self) -> Iterable[Finding]:
-        """Return what the result depends on."""
-
-
-class JudgedTable(Judged, Protocol):
-    """The input of the verdict on a fit of a table."""
-
-    @property
-    def goodness(self) -> Goodness:
-        """Tests of the residuals."""
-
-    @property
-    def identifiability(self) -> Identifiability:
-        """What the data determine."""
-
-    @property
-    def errors(self) -> ErrorModel | None:
-        """The sources of error."""
-
-    @property
-    def cross_validation(self) -> CrossValidation | None:
-        """The check of the bands."""
-
-    @property
-    def with_less(self) -> JudgedTable | None:
-        """The fit without harmonics, or without a covariance; None where there is neither."""
-
-
-def judgement(fit: JudgedTable) -> Judgement:
+def judgement(fit: TableAssessment) -> Judgement:
     """Return the findings of every check, and with them the status.
 
     Neither harmonics nor a covariance hide what the fundamentals show without them.
@@ -114,7 +62,7 @@ def judgement(fit: JudgedTable) -> Judgement:
 # Determined?
 
 
-def _parameters(fit: JudgedTable) -> Iterator[Finding]:
+def _parameters(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
         return  # what the numbers leave undetermined says nothing of the mechanism
@@ -146,13 +94,13 @@ def _parameters(fit: JudgedTable) -> Iterator[Finding]:
 # Described?
 
 
-def _is_determined(fit: JudgedTable) -> bool:
+def _is_determined(fit: TableAssessment) -> bool:
     optimum, goodness = fit.optimum, fit.goodness
     determined = optimum.success and optimum.dof > 0 and goodness.judged and not goodness.sign
     return determined and fit.identifiability.complete
 
 
-def _residuals(fit: JudgedTable) -> Iterator[Finding]:
+def _residuals(fit: TableAssessment) -> Iterator[Finding]:
     """Yield the size and kind of the misfit."""
     goodness = fit.goodness
     lost = (
@@ -169,7 +117,7 @@ def _residuals(fit: JudgedTable) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, severity, "large_misfit", {"rms": goodness.rms_misfit})
 
 
-def _stated_exponent_is_wrong(fit: JudgedTable) -> bool:
+def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
     """Return whether the data contradict an exponent that the user gave."""
     exponent = fit.goodness.exponent
     if exponent is None or exponent.p_value > fit.goodness.level:
@@ -178,7 +126,7 @@ def _stated_exponent_is_wrong(fit: JudgedTable) -> bool:
     return not given[exponent.name].assumed
 
 
-def _bands(fit: JudgedTable) -> Iterator[Finding]:
+def _bands(fit: TableAssessment) -> Iterator[Finding]:
     """Yield whether the bands hold for what was held out, where anything speaks against the fit."""
     goodness = fit.goodness
     speaks_against = (goodness.objections, goodness.flagged, *_reservations(fit))
@@ -209,7 +157,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     return min(rms_misfit_of(errors.problem, each) for each in fitted)
 
 
-def _reservations(fit: JudgedTable) -> Iterator[Finding]:
+def _reservations(fit: TableAssessment) -> Iterator[Finding]:
     """Yield what keeps a fit from being trusted although its residuals may look like noise."""
     yield from _beyond_limit(fit)
     yield from negative(fit)
@@ -218,7 +166,7 @@ def _reservations(fit: JudgedTable) -> Iterator[Finding]:
     yield from _moved_by_outliers(fit)
 
 
-def _beyond_limit(fit: JudgedTable) -> Iterator[Finding]:
+def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
     """Yield where a force exceeds what friction can carry; not rows that a loss sets aside."""
     errors, differ = fit.errors, fit.goodness.runs_differ
     scatter = 0.0 if differ is None else sum(differ.scatter.values())
@@ -227,12 +175,12 @@ def _beyond_limit(fit: JudgedTable) -> Iterator[Finding]:
     yield from beyond_friction_limit(optimum, scatter, aside)
 
 
-def negative(fit: Judged) -> Iterator[Finding]:
+def negative(fit: Assessment) -> Iterator[Finding]:
     """Yield a finding for every mass, damping or stiffness clearly below zero."""
     yield from below_zero(fit.optimum.problem, *fit.known)
 
 
-def _slight(fit: JudgedTable) -> Iterator[Finding]:
+def _slight(fit: TableAssessment) -> Iterator[Finding]:
     """Yield a finding for every mass, damper or spring of less force than the model misses."""
     view = fit.optimum.problem.stiffness_data
     rows = view.harmonic == 1
@@ -249,7 +197,7 @@ def _slight(fit: JudgedTable) -> Iterator[Finding]:
     yield from slight(fit.optimum.problem, *fit.known, share_of, within, misfit)
 
 
-def constraints(fit: Judged) -> Iterator[Finding]:
+def constraints(fit: Assessment) -> Iterator[Finding]:
     """Yield the constraints that the data contradict: their cost is not due to chance."""
     cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
@@ -262,7 +210,7 @@ def constraints(fit: Judged) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "constraint", values)
 
 
-def _contradicted_priors(fit: JudgedTable) -> Iterator[Finding]:
+def _contradicted_priors(fit: TableAssessment) -> Iterator[Finding]:
     """Yield every prior that the data contradict."""
     optimum = fit.optimum
     estimates = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
@@ -277,7 +225,7 @@ def _contradicted_priors(fit: JudgedTable) -> Iterator[Finding]:
             yield Finding(_DESCRIBED, _APPROXIMATE, "prior", values)
 
 
-def _beyond_range(fit: JudgedTable) -> Iterator[Finding]:
+def _beyond_range(fit: TableAssessment) -> Iterator[Finding]:
     """Yield every assumed exponent that the data put outside its range."""
     errors = fit.errors
     if errors is None:
@@ -291,7 +239,7 @@ def _beyond_range(fit: JudgedTable) -> Iterator[Finding]:
             yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_range", values)
 
 
-def _moved_by_outliers(fit: JudgedTable) -> Iterator[Finding]:
+def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters a robust fit moves by more than one uncertainty."""
     optimum, errors = fit.optimum, fit.errors
     if optimum.loss != "linear" or errors is None:
@@ -346,7 +294,7 @@ def robust_values(
     )
 
 
-def _steady(fit: JudgedTable) -> Iterator[Finding]:
+def _steady(fit: TableAssessment) -> Iterator[Finding]:
     """Yield how rows of held force were predicted."""
     yield from steady_findings(fit.optimum, fit.model)
 
@@ -354,9 +302,9 @@ def _steady(fit: JudgedTable) -> Iterator[Finding]:
 # Assumed?
 
 
-def reading(fit: Judged) -> Iterator[Finding]:
+def reading(fit: Assessment) -> Iterator[Finding]:
     """Yield the warnings on reading the data."""
-    yield from doubted(*fit.provenances)
+    yield from doubted(*fit.problem.provenances)
 
 
 def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
@@ -369,9 +317,9 @@ def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, _TRUSTED, "more_warnings", values)
 
 
-def assumed(fit: Judged) -> Iterable[Finding]:
-    """Return the assumptions of a fit."""
-    return fit.assumptions()
+def assumed(fit: Assessment) -> Iterator[Finding]:
+    """Yield the assumptions of a fit."""
+    yield from fit.assumptions()
 
 
 def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding]:
@@ -410,7 +358,7 @@ def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding
         yield Finding(_ASSUMED, _TRUSTED, "assumed", values)
 
 
-CHECKS: tuple[Callable[[JudgedTable], Iterable[Finding]], ...] = (
+CHECKS: tuple[Callable[[TableAssessment], Iterable[Finding]], ...] = (
     constraints,
     _parameters,
     _residuals,

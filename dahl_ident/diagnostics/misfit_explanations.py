@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
@@ -26,6 +26,9 @@ from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.fitting.global_start import own_starts
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import percent
+
+if TYPE_CHECKING:
+    from dahl_ident.diagnostics.goodness import Goodness
 
 _LEVEL = 0.01  # false-alarm rate, of the worst of all points
 _SHARE = 0.1  # of the rows: if more stand out, model or noise is wrong, not single rows
@@ -213,19 +216,7 @@ def rms_misfit_of(problem: TableProblem, fitted: ComplexArray) -> float:
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 
-class Tested(Protocol):
-    """Tests of a fit's residuals."""
-
-    @property
-    def rms_misfit(self) -> float:
-        """Of the fundamentals."""
-
-    @property
-    def objections(self) -> tuple[str, ...]:
-        """What speaks against the model."""
-
-
-def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum], Tested]) -> str:
+def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum], Goodness]) -> str:
     """Return which sign of the response explains data that the fit does not; "" where none.
 
     `before` is the misfit of the estimate, and `tested` tests that of another optimum: a missing

@@ -8,22 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.checks import Judged, assumed, constraints, negative, reading
+from dahl_ident.diagnostics.checks import assumed, constraints, negative, reading
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.physics import is_single, slight
-from dahl_ident.diagnostics.record_errors import MODEL, NOISE, RecordErrors
+from dahl_ident.diagnostics.record_errors import MODEL, NOISE
 from dahl_ident.elements import Element
 from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.units import Motion, percent, shown_unit, si_unit
+
+if TYPE_CHECKING:
+    from dahl_ident.diagnostics.record_assessment import RecordAssessment
 
 _SEGMENTS = 50  # the worst one is 2 % of a record
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
@@ -141,35 +144,19 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     )
 
 
-class JudgedRecords(Judged, Protocol):
-    """The input of the verdict on a fit to records."""
-
-    @property
-    def problem(self) -> RecordProblem:
-        """Records and model as they were fitted."""
-
-    @property
-    def errors(self) -> RecordErrors:
-        """The sources of error."""
-
-    @property
-    def goodness(self) -> RecordGoodness:
-        """Statistics of the residuals."""
-
-
-def record_judgement(fit: JudgedRecords) -> Judgement:
+def record_judgement(fit: RecordAssessment) -> Judgement:
     """Return the findings of every check, and with them the status."""
     return Judgement(finding for check in CHECKS for finding in check(fit))
 
 
-def misses(fit: JudgedRecords) -> bool:
+def misses(fit: RecordAssessment) -> bool:
     """Return whether the model misses more than noise."""
     goodness = fit.goodness
     structured = goodness.correlation > _STRUCTURED and goodness.share_in_band > _WELL
     return structured or MODEL in fit.errors.contributions
 
 
-def undetermined(fit: JudgedRecords) -> Iterator[Finding]:
+def undetermined(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield the parameters that the records do not determine, the reasons, and a motion that would.
 
     Those of which the uncertainty is a third of their size.
@@ -223,7 +210,7 @@ def _motion_that_lacks(
     return ""
 
 
-def _reason(fit: JudgedRecords, place: int) -> str:
+def _reason(fit: RecordAssessment, place: int) -> str:
     """Return why a parameter is not determined: the largest source, or one that is like it."""
     covariance = fit.errors.covariance
     for source, C in fit.errors.contributions.items():
@@ -238,7 +225,7 @@ def _reason(fit: JudgedRecords, place: int) -> str:
     return ": its effect is small compared with the residuals; fix it, or leave the element out"
 
 
-def _misfit(fit: JudgedRecords) -> Iterator[Finding]:
+def _misfit(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield whether the model describes the records."""
     far, converged = fit.goodness.share_in_band > _FAIRLY, fit.optimum.converged
     if far:
@@ -256,7 +243,7 @@ def _misfit(fit: JudgedRecords) -> Iterator[Finding]:
         yield Finding(_DESCRIBED, _APPROXIMATE, "few_effective_samples", few)
 
 
-def _physics(fit: JudgedRecords) -> Iterator[Finding]:
+def _physics(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield what speaks against a law's estimates physically, or against an exponent."""
     for element in fit.model.elements:
         if not is_single(element):
@@ -272,7 +259,7 @@ def _physics(fit: JudgedRecords) -> Iterator[Finding]:
                 yield Finding(_DESCRIBED, _NOT_DESCRIBED, "stated_exponent", stated)
 
 
-def _slight(fit: JudgedRecords) -> Iterator[Finding]:
+def _slight(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield what carries less force than the misfit, and may stand for a part of it."""
     problem = fit.problem
     if problem.output == "motion" or not misses(fit):
@@ -289,7 +276,7 @@ def _slight(fit: JudgedRecords) -> Iterator[Finding]:
     yield from slight(problem, *fit.known, share_of, misfit, misfit)
 
 
-def _notes(fit: JudgedRecords) -> Iterator[Finding]:
+def _notes(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield the size of the residuals, and what was done with the records."""
     problem, goodness = fit.problem, fit.goodness
     size = {
@@ -315,7 +302,7 @@ def _notes(fit: JudgedRecords) -> Iterator[Finding]:
     yield Finding(_DESCRIBED, _TRUSTED, "effective_samples", size)
 
 
-CHECKS: tuple[Callable[[JudgedRecords], Iterable[Finding]], ...] = (
+CHECKS: tuple[Callable[[RecordAssessment], Iterable[Finding]], ...] = (
     constraints,
     _misfit,
     undetermined,

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,14 +71,6 @@ class Verdict(Enum):
     def known(self) -> bool:
         """Whether the estimate can be used."""
         return self in (Verdict.IDENTIFIED, Verdict.BY_PRIOR)
-
-
-class JudgedFit(Protocol):
-    """A fit that knows what its data determine."""
-
-    @property
-    def identifiability(self) -> Identifiability:
-        """Which parameters, or which combinations of them, the data determine."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +205,7 @@ class Identifiability:
         return "\n".join(lines)
 
 
-def identifiability(fit: JudgedFit) -> Identifiability:
+def identifiability(fit: Any) -> Identifiability:
     """Say which parameters, or which combinations of them, the data determine.
 
     Parameters
@@ -243,7 +235,8 @@ def identifiability(fit: JudgedFit) -> Identifiability:
     >>> print(identifiability(result).headline)
     Every parameter is identified.
     """
-    return fit.identifiability
+    judged: Identifiability = fit.identifiability
+    return judged
 
 
 def judged(

@@ -14,7 +14,14 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.storage import read_text
-from dahl_ident.diagnostics.bands import DerivedQuantity, ResponseBand
+from dahl_ident.diagnostics.assessment import TableAssessment
+from dahl_ident.diagnostics.bands import (
+    DerivedQuantity,
+    ResponseBand,
+    describing_function_band,
+    predicted_backbone,
+    response_band,
+)
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.confidence_levels import LEVELS
 from dahl_ident.diagnostics.intervals import (
@@ -24,14 +31,13 @@ from dahl_ident.diagnostics.intervals import (
     compare,
 )
 from dahl_ident.diagnostics.judgement import Judgement
+from dahl_ident.diagnostics.record_assessment import RecordAssessment
 from dahl_ident.diagnostics.verdicts import Identifiability, Verdict
 from dahl_ident.elements import Model
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.optimum import DeterminedCombination, Optimum
 from dahl_ident.results import fit_report, fit_storage
-from dahl_ident.results.record_assessment import RecordAssessment
 from dahl_ident.results.result import Parameters, Result, part
-from dahl_ident.results.table_assessment import TableAssessment
 from dahl_ident.units import Quantity
 
 if TYPE_CHECKING:
@@ -375,7 +381,8 @@ class FitResult(Result):
         """
         if isinstance(at, Record):
             return self.assessment.predict_record(at, initial)
-        return self.assessment.predict_response(at, amplitude, drive, quantity, noise=noise)
+        optimum, _, errors = self.assessment.device
+        return response_band(optimum, at, amplitude, drive, quantity, errors, of_a_test=noise)
 
     def simulate(self, record: Record) -> FloatArray:
         """Return the output for a record's input, from rest; its measured output is not used."""
@@ -424,7 +431,8 @@ class FitResult(Result):
         ModelError
             If the model has no mass, or no natural frequency at an amplitude.
         """
-        return self.assessment.backbone(amplitude)
+        optimum, errors, _ = self.assessment.device
+        return predicted_backbone(optimum, self.model, amplitude, errors)
 
     def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
         """Return N(A) of the friction alone, with bands that hold the device's.
@@ -443,7 +451,8 @@ class FitResult(Result):
         ModelError
             If the model has no friction law.
         """
-        return self.assessment.describing_function(amplitude)
+        optimum, errors, _ = self.assessment.device
+        return describing_function_band(optimum, amplitude, errors)
 
     def derived(
         self, amplitudes: Sequence[float] = (), frequency_hz: float | None = None
@@ -461,7 +470,7 @@ class FitResult(Result):
         -------
         tuple of DerivedQuantity
         """
-        return self.assessment.derived(amplitudes, frequency_hz)
+        return tuple(self.assessment.derived(amplitudes, frequency_hz))
 
     def fit_report(
         self, method: Method = "combined", level: float = LEVELS[1], *, details: bool = True

@@ -1,28 +1,21 @@
-"""What a fit of records of any motion states."""
+"""What a fit of records of any motion states, and how it predicts others."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
-from dahl_ident.diagnostics.bands import (
-    DerivedQuantity,
-    ResponseBand,
-    describing_function_band,
-    predicted_backbone,
-    quantities_and_slopes,
-    response_band,
-)
+from dahl_ident.diagnostics.assessment import Assessment
+from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
 from dahl_ident.diagnostics.budget import Budget, coverage_factor
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, LEVELS, checked_levels, level_text
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, checked_levels, level_text
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement
@@ -50,7 +43,6 @@ from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import ConstraintCost, Optimum
 from dahl_ident.fitting.record_search import hold_model
 from dahl_ident.problem import RecordProblem, TableProblem
-from dahl_ident.results.assessment import Assessment
 from dahl_ident.units import percent, shown_unit
 
 _LEAST = 1e-100  # of a positive value, or of a share of the response
@@ -98,11 +90,6 @@ class RecordAssessment(Assessment):
 
     problem: RecordProblem
     instead = "it has errors, residuals and hold_out() of the samples"
-
-    @property
-    def provenances(self) -> tuple[Mapping[str, object] | None, ...]:
-        """Where each record comes from."""
-        return self.problem.provenances
 
     @property
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
@@ -202,7 +189,7 @@ class RecordAssessment(Assessment):
     def identifiability(self) -> Identifiability:
         """Which parameters the records determine."""
         lost = {finding.values["name"]: str(finding) for finding in undetermined(self)}
-        limits = self.intervals("combined", LEVELS, None, 0)
+        limits = self.intervals("combined")
         verdicts: dict[str, ParameterVerdict] = {}
         for name, unit in zip(limits, limits.units, strict=True):
             verdict = Verdict.NOT_IDENTIFIED if name in lost else Verdict.IDENTIFIED
@@ -264,19 +251,17 @@ class RecordAssessment(Assessment):
 
     def derived(
         self, amplitudes: Sequence[float], frequency_hz: float | None
-    ) -> tuple[DerivedQuantity, ...]:
-        """Return x_c, energy per cycle, equivalent stiffness and damping."""
+    ) -> Iterator[DerivedQuantity]:
+        """Yield x_c, energy per cycle, equivalent stiffness and damping."""
         count = self.problem.n_reported
-        numbers = []
         for name, unit, A, value, slopes in quantities_and_slopes(
             self.problem, self.optimum.values[:count], amplitudes, frequency_hz
         ):
             (variance,) = variances(slopes[None], self.covar[:count, :count])
-            numbers.append(DerivedQuantity(name, unit, A, value, float(variance) ** 0.5))
-        return tuple(numbers)
+            yield DerivedQuantity(name, unit, A, value, float(variance) ** 0.5)
 
     @cached_property
-    def device(self) -> Optimum:
+    def device(self) -> tuple[Optimum, None, None]:
         """The estimate as that of a table of one row; its noise is what the model misses."""
         one = FrequencyResponse([1.0], [1.0], [1.0], motion=self.problem.motion)
         problem: TableProblem = self.problem.at(one).like(noise="relative")
@@ -290,31 +275,11 @@ class RecordAssessment(Assessment):
         unknown = ~np.isfinite(covariance)
         covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
         share = (0.5 * self.goodness.share_left) ** 0.5 if misses(self) else _LEAST
-        return replace(
+        optimum = replace(
             self.optimum, problem=problem, theta=theta, values=values, covariance=covariance,
             scale=share, dof=int(self.errors.dof),
         )  # fmt: skip
-
-    def predict_response(
-        self,
-        frequency_hz: ArrayLike,
-        amplitude: ArrayLike | None,
-        drive: ArrayLike | None,
-        quantity: Any,
-        *,
-        noise: bool,
-    ) -> ResponseBand:
-        """Return the response to a sine; of one more test, what the model misses included."""
-        at = frequency_hz, amplitude, drive, quantity
-        return response_band(self.device, *at, of_a_test=noise)
-
-    def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
-        """Return natural frequency and damping ratio of the estimate against amplitude."""
-        return predicted_backbone(self.device, self.model, amplitude)
-
-    def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
-        """Return N(A) of the friction alone."""
-        return describing_function_band(self.device, amplitude)
+        return optimum, None, None
 
     def predict_record(self, record: Record, initial: str) -> RecordBand:
         """Return what another record should show."""

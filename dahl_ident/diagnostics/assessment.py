@@ -1,49 +1,182 @@
-"""What a fit of a table states."""
+"""What a fit states of its data: errors, values, intervals, bands, judgement."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse
-from dahl_ident.diagnostics.bands import (
-    DerivedQuantity,
-    ResponseBand,
-    derived,
-    describing_function_band,
-    predicted_backbone,
-    response_band,
-)
+from dahl_ident.diagnostics.bands import DerivedQuantity, derived
+from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget, taken_as_exact
 from dahl_ident.diagnostics.checks import assumptions, judgement
-from dahl_ident.diagnostics.confidence_levels import LEVELS
+from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation
-from dahl_ident.diagnostics.intervals import ConfidenceIntervals, combined_intervals
+from dahl_ident.diagnostics.intervals import (
+    METHODS,
+    ConfidenceIntervals,
+    Method,
+    combined_intervals,
+    profile_intervals,
+    wald_intervals,
+)
 from dahl_ident.diagnostics.judgement import Finding, Judgement
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Model
-from dahl_ident.errors import DahlIdentError, FitError, ValidationError
+from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
 from dahl_ident.problem import TableProblem
-from dahl_ident.results.assessment import Assessment
+from dahl_ident.units import shown_unit
 
+_OF_ONE_KIND = {
+    "cross_validation": "held-out tests",
+    "errors_of_combinations": "errors of combinations",
+    "predict_record": "prediction of a record",
+    "record_at_draws": "prediction of a record",
+    "residuals": "residuals sample by sample",
+}
+"""What one kind of data alone has, in words."""
 _NOISE = {
     "measured": "measured: the data's covariance, scale known",
     "relative": "relative: constant variance of (ln gain, phase)",
     "absolute": "absolute: constant variance of (real, imaginary part)",
 }
+
+
+class Assessment(ABC):
+    """An optimum with what its data tell of it; a ``FitResult`` hands all of it on.
+
+    Attributes
+    ----------
+    optimum : Optimum
+        The solver's result.
+    first_order : bool
+        Whether errors are of first order alone: with constraints.
+    quick_methods : tuple of str
+        Of intervals: those that a report has time for, in addition to the combined ones.
+    instead : str
+        What to do where this kind of data has no answer.
+    """
+
+    problem: Any
+    quick_methods: tuple[Method, ...] = ("wald",)
+    instead: str
+
+    def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
+        self.optimum, self.first_order = optimum, first_order
+        self.problem = optimum.problem
+        self._intervals: dict[tuple[Any, ...], ConfidenceIntervals] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _OF_ONE_KIND:
+            raise ValidationError(
+                f"a fit of {self.problem.called} has no {_OF_ONE_KIND[name]}; {self.instead}"
+            )
+        raise AttributeError(name)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stated for machines, apart from parameters, verdict and budget."""
+        optimum = self.optimum
+        return {
+            "search": optimum.status.name.lower().replace("_", " "),
+            "scale": self.estimate.scale,
+            "scale_known": optimum.scale_known,
+            "rms_misfit": self.goodness.rms_misfit,
+            "aic": optimum.aic,
+            "bic": optimum.bic,
+        }
+
+    @property
+    def chi_square(self) -> tuple[float, int]:
+        """Sum of squared residuals, and its degrees of freedom."""
+        residuals = self.estimate.residuals
+        return float(residuals @ residuals), self.optimum.dof
+
+    @property
+    def redchi(self) -> float:
+        """Sum of squared residuals over degrees of freedom, NaN where there are none."""
+        value, dof = self.chi_square
+        return value / dof if dof > 0 else math.nan
+
+    @property
+    def constraint_cost(self) -> ConstraintCost | None:
+        """What constraints cost."""
+        return self.optimum.constraint_cost
+
+    @property
+    @abstractmethod
+    def goodness(self) -> Any:
+        """Statistics and tests of the residuals."""
+
+    @property
+    @abstractmethod
+    def estimate(self) -> Optimum:
+        """The estimate, as an optimum."""
+
+    @property
+    @abstractmethod
+    def by_noise(self) -> Optimum:
+        """The optimum with the covariance of noise alone."""
+
+    @abstractmethod
+    def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
+        """Return intervals that count every source of error."""
+
+    def intervals(
+        self,
+        method: Method,
+        levels: Sequence[float] | float = LEVELS,
+        replicates: int | None = None,
+        seed: int = 0,
+    ) -> ConfidenceIntervals:
+        """Return confidence intervals, each kind of them made once."""
+        if method not in METHODS:
+            raise ValidationError(
+                f"method is {method!r}; expected one of {choices(METHODS, method)}"
+            )
+        levels = tuple(checked_levels(levels).tolist())
+        key = (method, levels, replicates, seed)
+        if key not in self._intervals:
+            made, problem = self._new_intervals(method, levels, replicates, seed), self.problem
+            units = {p.name: shown_unit(p.unit, problem.motion) for p in problem.every_parameter}
+            self._intervals[key] = replace(made, units=tuple(units[n] for n in made.names))
+        return self._intervals[key]
+
+    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
+        """Return the intervals at a level of every method that has been asked for until now."""
+        matching = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
+        return list({one.method: one for one in matching}.values())
+
+    def _new_intervals(
+        self, method: Method, levels: Sequence[float], replicates: int | None, seed: int
+    ) -> ConfidenceIntervals:
+        if self.first_order:
+            if method in ("profile", "bootstrap"):
+                raise ValidationError(
+                    f"method is {method!r}, but the fit had constraints, which profiles and "
+                    "repetitions do not keep; use method='wald', whose covariance is that on the "
+                    "constraints"
+                )
+            note = "first order, noise alone: the fit had constraints"
+            return replace(wald_intervals(self.by_noise, levels), note=note)
+        if method == "combined":
+            return self.combined_intervals(levels)
+        if method == "bootstrap":
+            return bootstrap_intervals(self.by_noise, levels, replicates, seed)
+        quick = wald_intervals if method == "wald" else profile_intervals
+        return quick(self.by_noise, levels)
 
 
 class TableAssessment(Assessment):
@@ -64,6 +197,11 @@ class TableAssessment(Assessment):
         if self.first_order:
             return None
         return self.errors or error_model(self.optimum, of_combinations=True)
+
+    @property
+    def device(self) -> tuple[Optimum, ErrorModel | None, ErrorModel | None]:
+        """What predictions begin from: optimum, errors of its parameters and of combinations."""
+        return self.optimum, self.errors, self.errors_of_combinations
 
     @property
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
@@ -96,8 +234,7 @@ class TableAssessment(Assessment):
         if errors is None:
             return self.optimum.values_covariance
         free = [errors.names.index(name) for name in self.optimum.names]
-        slopes = errors.problem.value_slopes(errors.theta)
-        whole = propagated(errors.covariance, slopes)
+        whole = propagated(errors.covariance, errors.problem.value_slopes(errors.theta))
         return np.asarray(whole[np.ix_(free, free)])
 
     @property
@@ -113,16 +250,6 @@ class TableAssessment(Assessment):
         return self.optimum if errors is None else errors.by_noise
 
     @property
-    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        """Where the table comes from."""
-        return (self.problem.data.provenance,)
-
-    @property
-    def constraint_cost(self) -> ConstraintCost | None:
-        """What constraints cost."""
-        return self.optimum.constraint_cost
-
-    @property
     def success(self) -> bool:
         """Whether a finite optimum was found."""
         return self.optimum.success
@@ -130,40 +257,32 @@ class TableAssessment(Assessment):
     @cached_property
     def model(self) -> Model:
         """The model with the estimates put in; parameters stay free or fixed as they were."""
-        model = self.problem.model
-        known = {p.name: p for p in model.parameters}
-        values = self.problem.to_values(self.optimum.theta).tolist()
-        estimates = dict(zip(self.optimum.names, values, strict=True))
+        model, optimum = self.problem.model, self.optimum
+        values = self.problem.to_values(optimum.theta).tolist()
+        estimates = dict(zip(optimum.names, values, strict=True))
         if self.errors is not None:
             estimates = dict(self.errors.values)
-        return model.with_values(
-            {name: known[name].nearest(v) for name, v in estimates.items() if name in known}
-        )
+        known = (p for p in model.parameters if p.name in estimates)
+        return model.with_values({p.name: p.nearest(estimates[p.name]) for p in known})
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
-
-        def profile() -> ConfidenceIntervals:
-            return self.intervals("profile", levels, None, 0)
-
         errors = self.errors_of_combinations
         if errors is None:
-            return replace(profile(), method="combined")
-        return combined_intervals(self.optimum, errors, levels, profile)
+            return replace(self.intervals("profile", levels), method="combined")
+        return combined_intervals(
+            self.optimum, errors, levels, lambda: self.intervals("profile", levels)
+        )
 
     @cached_property
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
-
-        def profile() -> ConfidenceIntervals:
-            return self.intervals("profile", LEVELS, None, 0)
-
-        stated = self.intervals("combined", LEVELS, None, 0)
-        verdicts = judged(self.by_noise, None if self.first_order else profile, self.errors, stated)
+        profile = None if self.first_order else lambda: self.intervals("profile")
+        verdicts = judged(self.by_noise, profile, self.errors, self.intervals("combined"))
         try:
             sources: Mapping[str, ParameterBudget] = self.budget()
         except FitError:
-            sources = {}
+            return verdicts
         combinations = tuple(
             replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
             if c.expression in sources
@@ -245,34 +364,11 @@ class TableAssessment(Assessment):
         """Return the uncertainty budget."""
         return self._budget
 
-    def predict_response(
-        self,
-        frequency_hz: ArrayLike,
-        amplitude: ArrayLike | None,
-        drive: ArrayLike | None,
-        quantity: Any,
-        *,
-        noise: bool,
-    ) -> ResponseBand:
-        """Return the response at other operating points."""
-        errors = self.errors_of_combinations
-        return response_band(
-            self.optimum, frequency_hz, amplitude, drive, quantity, errors, of_a_test=noise
-        )
-
-    def backbone(self, amplitude: ArrayLike) -> FrequencyResponse:
-        """Return natural frequency and damping ratio of the estimate against amplitude."""
-        return predicted_backbone(self.optimum, self.model, amplitude, self.errors)
-
-    def describing_function(self, amplitude: ArrayLike) -> ResponseBand:
-        """Return N(A) of the friction alone."""
-        return describing_function_band(self.optimum, amplitude, self.errors)
-
     def derived(
         self, amplitudes: Sequence[float], frequency_hz: float | None
-    ) -> tuple[DerivedQuantity, ...]:
-        """Return x_c, energy per cycle, equivalent stiffness and damping."""
-        return tuple(derived(self.optimum, amplitudes, frequency_hz, self.errors))
+    ) -> Iterator[DerivedQuantity]:
+        """Yield x_c, energy per cycle, equivalent stiffness and damping."""
+        return derived(self.optimum, amplitudes, frequency_hz, self.errors)
 
     @property
     def facts(self) -> dict[str, Any]:
