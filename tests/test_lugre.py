@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid
+from scipy.integrate import solve_ivp, trapezoid
 
-from dahl_ident import Dahl, Damper, LuGre
+from dahl_ident import Dahl, Damper, Friction, LuGre
 from dahl_ident.errors import ModelError, ValidationError
 
 LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
@@ -60,3 +60,54 @@ def test_facts_and_refusals():
         LuGre(static_ratio=0.5)
     values = [np.asarray(v) for v in LAW.known_values()]
     assert [float(v) for v in LAW.force_limits(values)] == pytest.approx([1.6, 1.6])
+
+
+def moved(t):
+    """Return displacement, velocity and acceleration of two sines."""
+    parts = [(0.03, 2.0 * np.pi, 0.0), (0.02, 4.6 * np.pi, 1.0)]
+    x, v, a = (
+        sum(A * w**n * np.sin(w * t + phase + 0.5 * n * np.pi) for A, w, phase in parts)
+        for n in range(3)
+    )
+    return np.asarray(x), np.asarray(v), np.asarray(a)
+
+
+class Stribeck(Friction):
+    """A user's law that depends on the speed."""
+
+    rate_independent = False
+    parameters = LuGre.parameters[:4]
+
+    def slope(self, force, direction, velocity, values):
+        f_max, sigma, ratio, speed = values
+        limit = f_max * (1.0 + (ratio - 1.0) * np.exp(-((velocity / speed) ** 2)))
+        return sigma * (1.0 - direction * force / limit)
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_the_force_along_a_sampled_motion_is_that_of_the_motion(uneven):
+    """Of 10 ms sampling, against DOP853 on the motion itself; the speed is continuous."""
+    f_max, sigma, ratio, speed, micro, viscous = 1.0, 100.0, 1.5, 0.05, 0.5, 0.2
+    t = np.arange(0.0, 3.0, 0.01)
+    if uneven:
+        t = t + 0.004 * np.random.default_rng(0).uniform(-1.0, 1.0, t.size)
+    x, v, a = moved(t)
+
+    def slope(t, force):
+        v = moved(np.asarray(t))[1]
+        limit = f_max * (1.0 + (ratio - 1.0) * np.exp(-((v / speed) ** 2)))
+        return sigma * (v - np.abs(v) * force / limit)
+
+    bristles = solve_ivp(
+        slope, (t[0], t[-1]), [0.3], "DOP853", t, rtol=1e-11, atol=1e-12, max_step=2e-3
+    ).y[0]
+    own = Stribeck(f_max, sigma, ratio, speed)
+    assert np.abs(own.force(x, 0.3, velocity=v, time=t) - bristles).max() < 2e-5
+    law = LuGre(f_max, sigma, ratio, speed, micro, viscous)
+    rates = np.array([slope(*at) for at in zip(t, bristles, strict=True)])
+    whole = bristles + micro / sigma * rates + viscous * v
+    assert np.abs(law.force(x, 0.3, velocity=v, time=t) - whole).max() < 2e-5
+    exact = law.force(x, 0.3, velocity=v, acceleration=a, time=t)
+    assert np.abs(exact - whole).max() < (1e-7 if not uneven else 1e-6)
+    if not uneven:
+        assert np.abs(law.force(x, 0.3, velocity=v) - whole).max() < 2e-5

@@ -148,9 +148,10 @@ class Behaviour(ABC):
         state: float = 0.0,
         *,
         acceleration: FloatArray | None = None,
+        time: FloatArray | None = None,
     ) -> FloatArray:
         """Return the force at every sample of one history, unchecked; `state` is the first."""
-        path = Path(displacement, velocity, acceleration)
+        path = Path(displacement, velocity, acceleration, time)
         return self.history(values, path, state, slopes=False).value
 
     def force_history_gradient(
@@ -161,9 +162,10 @@ class Behaviour(ABC):
         state: float = 0.0,
         *,
         acceleration: FloatArray | None = None,
+        time: FloatArray | None = None,
     ) -> HistoryGradient:
         """Return the force at every sample with its derivatives, unchecked."""
-        path = Path(displacement, velocity, acceleration)
+        path = Path(displacement, velocity, acceleration, time)
         return self.history(values, path, state, slopes=True)
 
     def _differences(self, values: Sequence[Any], path: Path, state: float) -> HistoryGradient:
@@ -227,17 +229,13 @@ class Behaviour(ABC):
         """Return the unknown at the first sample with which a history starts with a force."""
         return force
 
-    def sampled(self, interval: float) -> Self:
-        """Return this element for histories of one sampling interval, s."""
-        return self
-
     def coarser(self) -> Self:
         """Return this element, or one whose motion under a force costs less and is nearly alike."""
         return self
 
-    def free_responses(self, samples: int) -> FloatArray:
+    def free_responses(self, time: FloatArray) -> FloatArray:
         """Return the force from each state of a linear element at the first sample, (n, states)."""
-        return np.zeros((samples, 0))
+        return np.zeros((time.size, 0))
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return what abs(N) and A abs(N) never exceed, over all amplitudes; inf where nothing."""

@@ -21,7 +21,6 @@ from dahl_ident.arrays import (
     real_array,
     whole_number,
 )
-from dahl_ident.data.record import is_even
 from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.elements.facts import (
     HistoryGradient,
@@ -203,13 +202,15 @@ class Element(Behaviour):
         Parameters
         ----------
         displacement : array_like, shape (n,)
-            m; between samples the motion is taken as monotone.
+            m; between samples the motion is taken as monotone or, by an element that depends on
+            the rate, as a polynomial with the velocity (and acceleration) of both.
         initial_force : float, default 0
             Force at the first sample, N; for an element with memory.
         velocity, acceleration : array_like, shape (n,), optional
             m/s and m/s^2; needed where the element depends on them.
         time : array_like, shape (n,), optional
             s; gives the velocity and acceleration that are left out, by central differences.
+            Without it samples are taken as even where displacement and velocity agree with that.
 
         Returns
         -------
@@ -242,17 +243,15 @@ class Element(Behaviour):
             None if given is None else np.atleast_1d(motion(given, name, x, self))
             for given, name in ((velocity, "velocity"), (acceleration, "acceleration"))
         )
-        element = self
+        t = None
         if time is not None and x.size > 1:
             t = motion(time, "time", x, self)
             if np.any(np.diff(t) <= 0.0):
                 raise ValidationError("time does not rise from sample to sample")
             v = np.gradient(x, t) if v is None else v
             a = np.gradient(v, t) if a is None else a
-            if is_even(t):
-                element = self.sampled(float(t[-1] - t[0]) / (x.size - 1))
         start = self.start_with(values, start)
-        force = element.force_history(values, np.atleast_1d(x), v, start, acceleration=a)
+        force = self.force_history(values, np.atleast_1d(x), v, start, acceleration=a, time=t)
         return force if x.ndim else force[0]
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
@@ -363,10 +362,6 @@ class Model(Element):
     def has_inertia(self) -> bool:
         """Whether a force determines the motion."""
         return any(element.has_inertia for element in self._elements)
-
-    def sampled(self, interval: float) -> Model:
-        """Return the model for histories of one sampling interval, s."""
-        return Model(*(element.sampled(interval) for element in self._elements))
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
         remember = [(e, own) for e, own in self.of(values) if e.has_memory]

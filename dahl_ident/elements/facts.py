@@ -58,11 +58,33 @@ class Sine(NamedTuple):
 
 
 class Path(NamedTuple):
-    """A history of displacement, with velocity and acceleration where they are known."""
+    """A history of displacement, with velocity, acceleration and rising times where known."""
 
     displacement: FloatArray
     velocity: FloatArray | None = None
     acceleration: FloatArray | None = None
+    time: FloatArray | None = None
+
+    def polynomials(self, intervals: FloatArray) -> FloatArray:
+        """Return x between samples, (4 or 6, n - 1), in powers of the share of each interval, s.
+
+        Hermite's: they have the velocities, and the accelerations where known, of both ends.
+        """
+        x, v, a = self.displacement, np.asarray(self.velocity), self.acceleration
+        start, end = intervals * v[:-1], intervals * v[1:]
+        if a is None:
+            place, speed = np.diff(x) - start, end - start
+            return np.stack([x[:-1], start, 3.0 * place - speed, speed - 2.0 * place])
+        two, last = (0.5 * intervals**2 * one for one in (a[:-1], a[1:]))
+        place, speed, bend = np.diff(x) - start - two, end - start - 2.0 * two, last - two
+        return np.stack(
+            [
+                x[:-1], start, two,
+                10.0 * place - 4.0 * speed + bend,
+                -15.0 * place + 7.0 * speed - 2.0 * bend,
+                6.0 * place - 3.0 * speed + bend,
+            ]
+        )  # fmt: skip
 
 
 class StiffnessGradient(NamedTuple):

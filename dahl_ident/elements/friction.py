@@ -218,15 +218,13 @@ class Friction(Element):
     ) -> HistoryGradient:
         """Return the force at every sample with its derivatives; 0 by parameters that are fixed.
 
-        A law that depends on the rate moves at the mean of two samples' velocities between them.
+        Between samples the displacement of a law that depends on the rate has the velocity, and the
+        acceleration where it is known, of both.
         """
-        if self.rate_independent:
-            free = [i for i, p in enumerate(self.parameters) if p.free]
-            return force_along(self, values, path, state, free if slopes else None)
-        motion(path.velocity, "velocity", path.displacement, self)
-        if slopes:
-            return self._differences(values, path, state)
-        return force_along(self, values, path, state)
+        if not self.rate_independent:
+            motion(path.velocity, "velocity", path.displacement, self)
+        free = [i for i, p in enumerate(self.parameters) if p.free]
+        return force_along(self, values, path, state, free if slopes else None)
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf if there is none."""

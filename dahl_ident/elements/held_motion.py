@@ -2,7 +2,7 @@
 
 Laws are compiled once, and moved along a history in one integration, with exact derivatives. A law
 that does not depend on the rate is moved at unit speed: time is then the path, and a step may be as
-long as the way between two turning points.
+long as the way between two turning points. One that does moves along polynomials in time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SYSTEMS: dict[Hashable, System] = {}
 _FIRST: dict[Hashable, FirstState] = {}
 """How first states follow from what is unknown there, by law."""
 
-_SLOWEST = 1e-6  # of the largest speed
+_EVEN = 0.1  # of a step: what even sampling may leave unexplained
 _FINER = 10.0  # than a driven motion, where a step is not that across a narrow gap
 
 
@@ -87,43 +87,68 @@ def force_along(
 ) -> HistoryGradient:
     """Return the force at every sample of a displacement, with the derivatives `chosen`, others 0.
 
-    Between samples the displacement is monotone, and its speed constant: the mean of the two
-    samples where the law depends on it. `state` is the unknown, or the unknowns, at the first.
+    `state` is the unknown, or the unknowns, at the first sample.
     """
     from dahl_ident.engine import march
 
     x, numbers = path.displacement, np.array([float(v) for v in values])
-    velocity = None if law.rate_independent else path.velocity
-    steps, speed = np.diff(x), np.ones(())
-    if velocity is not None:
-        speed = 0.5 * np.abs(velocity[1:] + velocity[:-1])
-        speed = np.maximum(speed, _SLOWEST * speed.max(initial=0.0))
-    with np.errstate(all="ignore"):
-        times = np.append(0.0, np.cumsum(np.where(steps == 0.0, 0.0, np.abs(steps) / speed)))
-    corners = moves = np.flatnonzero(steps)
     if law.rate_independent:
-        heading = np.sign(steps[moves])
-        corners = np.append(0, moves[1:][heading[1:] != heading[:-1]])
-    corners = np.append(corners, x.size - 1)
-    starts = np.append([x[0], 0.0], state)
-    first, by_start, by_value = _first_of(law)(starts, numbers)
+        times, knots, coefficients = _at_unit_speed(x)
+    else:
+        times, knots, coefficients = _in_time(path)
+    first, by_start, by_value = _first_of(law)(np.append([x[0], 0.0], state), numbers)
     by, by_first = np.zeros((len(values), x.size)), np.zeros((x.size, first.size))
-    if not moves.size:
-        part = law.mechanics(values, x[0], 0.0, 1.0, first[2:].tolist())
-        force = np.full(x.shape, first[2] if velocity is not None else part.force)
+    if not coefficients.size:
+        speed = 0.0 if law.rate_independent else float(np.asarray(path.velocity)[0])
+        heading = -1.0 if speed < 0.0 else 1.0
+        part = law.mechanics(values, x[0], speed, heading, first[2:].tolist())
+        force = np.full(x.shape, part.force)
     else:
         samples, rows = np.unique(times, return_inverse=True)
         motion = march(
-            system_of(law, values, chosen or ()), times[corners],
-            np.stack([x[corners[:-1]], np.diff(x[corners])]), samples,
-            np.append([x[corners[0]], 0.0], first[2:]), numbers, chosen=chosen or (),
+            system_of(law, values, chosen or ()), knots, coefficients, samples,
+            np.append([coefficients[0, 0], 0.0], first[2:]), numbers, chosen=chosen or (),
             derivatives=chosen is not None, finer=_FINER if law.n_states == 1 else 1.0,
         )  # fmt: skip
-        force = (motion.output if velocity is None else motion.states[:, 2])[rows]
+        force = motion.output[rows]
         if chosen is not None:
             by_first, by[list(chosen)] = motion.by_first[rows], motion.by_parameter[rows].T
             by[list(chosen)] += (by_first @ by_value[:, list(chosen)]).T
-    if velocity is not None:
-        slopes = law.slope(force, np.where(velocity < 0.0, -1.0, 1.0), velocity, values)
-        force = np.asarray(law.output(force, slopes, velocity, values)) + 0.0 * force
     return HistoryGradient(force, (by_first @ by_start[:, 2:]).squeeze(), tuple(by))
+
+
+def _at_unit_speed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the path at every sample, and at every turning point; straight lines between these."""
+    steps = np.diff(x)
+    path = np.append(0.0, np.cumsum(np.abs(steps)))
+    moves = np.flatnonzero(steps)
+    heading = np.sign(steps[moves])
+    turns = moves[1:][heading[1:] != heading[:-1]]
+    corners = np.concatenate([[0], turns, [x.size - 1]]) if moves.size else moves
+    return path, path[corners], np.stack([x[corners[:-1]], np.diff(x[corners])])
+
+
+def _in_time(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the times of the samples, twice, and the polynomials of displacement between them.
+
+    Where the times are not known they follow from displacement and velocity, for even sampling or,
+    where that does not fit, for a constant acceleration between samples.
+    """
+    x, v = path.displacement, np.asarray(path.velocity)
+    if path.time is not None or x.size < 2:
+        times = np.zeros(x.size) if path.time is None else path.time
+        return times, times, path.polynomials(np.diff(times))
+    from scipy.interpolate import CubicSpline
+
+    steps = np.diff(x)
+    way = np.diff(CubicSpline(np.arange(x.size), v).antiderivative()(np.arange(x.size)))
+    even = float(steps @ way) / (float(way @ way) or 1.0)
+    size = np.abs(even * way)
+    intervals = np.full(steps.shape, even)
+    if not (even > 0.0 and np.all(np.abs(steps - even * way) <= _EVEN * (size + 0.1 * size.max()))):
+        with np.errstate(all="ignore"):
+            intervals = np.asarray(2.0 * steps / (v[1:] + v[:-1]))
+        known = (intervals > 0.0) & (intervals < np.inf)
+        intervals[~known] = np.median(intervals[known]) if known.any() else 1.0
+    times = np.append(0.0, np.cumsum(intervals))
+    return times, times, path.polynomials(np.diff(times))

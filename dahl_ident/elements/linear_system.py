@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.quantities import DEFINITIONS, converted
+from dahl_ident.data.record import is_even
 from dahl_ident.elements.element import Element, motion, prefixed
 from dahl_ident.elements.facts import (
     STENCIL,
@@ -95,7 +96,6 @@ class LinearSystem(Element):
     equation = "F = Z(j omega) X"
     is_linear = True
     rate_independent = False
-    _interval: float | None = None  # between the samples of a history, s
 
     def __init__(
         self,
@@ -210,16 +210,11 @@ class LinearSystem(Element):
         """Return mass, the rest of the force, and the changes of the states, in metres."""
         return self._equation.mechanics(x, velocity, states)
 
-    def sampled(self, interval: float) -> Self:
-        """Return this element for histories of one sampling interval, s."""
-        copy = self.with_bound(self.parameters)
-        copy._interval = interval
-        return copy
-
-    def free_responses(self, samples: int) -> FloatArray:
+    def free_responses(self, time: FloatArray) -> FloatArray:
         """Return the force from each state at the first sample, (n, states)."""
         equation = self._equation
-        states = self._histories(equation, np.zeros((samples - 1, 6)), np.eye(equation.order))
+        rest = np.zeros((time.size - 1, 6))
+        states = self._histories(equation, self._step(time), rest, np.eye(equation.order))
         return np.asarray(states @ equation.output)
 
     def history(
@@ -245,33 +240,20 @@ class LinearSystem(Element):
                     f"under a prescribed displacement the force of {self!r} grows beyond all "
                     "bounds; give records in which a force drives a mass"
                 )
-            rest = np.zeros((equation.order, 1))
-            states = self._histories(equation, self._paths(x, v, a), rest)
+            rest, h = np.zeros((equation.order, 1)), self._step(path.time)
+            paths = Path(x, v, a).polynomials(np.full(x.size - 1, h)).T
+            states = self._histories(equation, h, paths, rest)
             force = np.asarray(force + states[:, 0] @ equation.output)
         zero = np.zeros(force.shape)
         return HistoryGradient(force, zero, (zero,) * len(self.parameters))
 
-    def _paths(self, x: FloatArray, v: FloatArray, a: FloatArray) -> FloatArray:
-        """Return the coefficients of x in the share of each interval, (n - 1, 6)."""
-        h = self._step
-        one, two = h * v, 0.5 * h**2 * a
-        place = np.diff(x) - one[:-1] - two[:-1]
-        speed = np.diff(one) - 2.0 * two[:-1]
-        bend = np.diff(two)
-        return np.column_stack(
-            [
-                x[:-1], one[:-1], two[:-1],
-                10.0 * place - 4.0 * speed + bend,
-                -15.0 * place + 7.0 * speed - 2.0 * bend,
-                6.0 * place - 3.0 * speed + bend,
-            ]
-        )  # fmt: skip
-
-    def _histories(self, equation: Equation, paths: FloatArray, first: FloatArray) -> FloatArray:
+    def _histories(
+        self, equation: Equation, h: float, paths: FloatArray, first: FloatArray
+    ) -> FloatArray:
         """Return the states, (n, c, order), driven by polynomials from `first`, (order, c)."""
         from scipy.linalg import expm
 
-        order, h = equation.order, self._step
+        order = equation.order
         chain = np.zeros((order + 6, order + 6))
         chain[:order, :order] = h * equation.matrix
         chain[:1, order] = h * equation.rate
@@ -282,13 +264,12 @@ class LinearSystem(Element):
         keep = np.broadcast_to(whole[:, :order], (len(paths), order, order))
         return matrix_recursion(keep, term, first).transpose(0, 2, 1)
 
-    @property
-    def _step(self) -> float:
-        if self._interval is None:
+    def _step(self, time: FloatArray | None) -> float:
+        if time is None or not is_even(time):
             raise ValidationError(
                 f"{self!r} needs evenly spaced times to give its force; pass time="
             )
-        return self._interval
+        return float(time[-1] - time[0]) / (time.size - 1)
 
     def describe(self) -> dict[str, Any]:
         """Return quantity and system as plain data; a function cannot be written to a file."""

@@ -15,11 +15,9 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import motion
-from dahl_ident.elements.facts import Asymptote, HistoryGradient, Path, Values
+from dahl_ident.elements.facts import Asymptote, Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.elements.recursion import linear_recursion
 
 _FAR = 1e12  # of the data's speeds: exp(-(v/stribeck_speed)^2) is 0 or 1 to every digit
 
@@ -95,24 +93,6 @@ class LuGre(Friction):
         """Return the whole force from that of the bristles and its slope."""
         _, sigma, *_, micro_damping, viscous = values
         return force + (micro_damping / sigma * slope + viscous) * velocity
-
-    def history(
-        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
-    ) -> HistoryGradient:
-        """Return the force at every sample; exact where the speed is constant between samples."""
-        if slopes:
-            return self._differences(values, path, state)
-        v = motion(path.velocity, "velocity", path.displacement, self)
-        f_max, sigma, ratio, speed, *_ = (float(p) for p in values)
-        step = np.diff(path.displacement)
-        middle = 0.5 * (v[1:] + v[:-1])
-        level = f_max * (1.0 + (ratio - 1.0) * np.exp(-((middle / speed) ** 2)))
-        keep = np.exp(-sigma * np.abs(step) / level)
-        terms = np.sign(step) * level * (1.0 - keep)
-        force = linear_recursion(keep, terms[:, None], np.array([state]))[:, 0]
-        slope = self.slope(force, np.sign(v), v, values)
-        force = np.asarray(self.output(force, slope, v, values))
-        return HistoryGradient(force, force, ())
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the static force, for both directions."""

@@ -178,9 +178,7 @@ class _Scan:
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
         return [
-            element.sampled(1.0 / record.sample_rate).force_history(
-                values, x, v, 0.0, acceleration=a
-            )
+            element.force_history(values, x, v, 0.0, acceleration=a, time=record.time)
             for record, (x, v, a, _) in zip(self.problem.records, self.histories, strict=True)
         ]
 

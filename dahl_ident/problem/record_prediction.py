@@ -51,15 +51,14 @@ def force_of(
     by = np.zeros((x.size, len(problem.parameters) if derivatives else 0))
     start, column = 0, 0
     first = len(problem.free) + number * problem.per_record
-    model = problem.model.sampled(1.0 / problem.rates[number])
-    for element, at in model.of(problem.full_values(values)):
+    for element, at in problem.model.of(problem.full_values(values)):
         stop = start + (len(element.starts) if element.has_memory else element.n_states)
         states, moved = of_record[start:stop], x
         state: Any = 0.0  # or several
         if isinstance(element, Friction):
             state, moved = states if states.size > 1 else float(states[0]), path
         if derivatives:
-            history = element.force_history_gradient(at, moved, v, state, acceleration=a)
+            history = element.force_history_gradient(at, moved, v, state, acceleration=a, time=time)
             total = total + history.value
             for parameter, slope in zip(element.parameters, history.by_parameter, strict=True):
                 if parameter.free:
@@ -68,9 +67,10 @@ def force_of(
             if element.has_memory:
                 by[:, first + start : first + stop] = history.by_state.reshape(x.size, -1)
         else:
-            total = total + element.force_history(at, moved, v, state, acceleration=a)
+            force = element.force_history(at, moved, v, state, acceleration=a, time=time)
+            total = total + force
         if element.n_states and not element.has_memory:
-            free = element.free_responses(x.size)
+            free = element.free_responses(time)
             total = total + free @ states
             if derivatives:
                 by[:, first + start : first + stop] = free
