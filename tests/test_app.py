@@ -128,7 +128,7 @@ def test_a_bad_file_is_refused_in_the_reader_s_words(server, content, message):
 def test_the_program_gives_what_the_page_shows(server, work, fitted):
     run = fitted
     page = unescape(server.page(run))
-    assert "Trusted." in page
+    assert '<p class="mark">Trusted</p>' in page
     assert "Pivot 12" in server.page(f"{run}/file/report.html")
     folder = server.folder / work[1:]
     stated = di.FitResult.load(folder / run.rpartition("/")[2] / "fit.json")

@@ -6,15 +6,39 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dahl_ident.elements import Damper, Mass, Spring
-from dahl_ident.elements.law_files import class_named
+import numpy as np
+
+from dahl_ident.elements import (
+    BoucWen,
+    Dahl,
+    Damper,
+    Friction,
+    Iwan,
+    LuGre,
+    Mass,
+    MaxwellSlip,
+    PowerDamper,
+    Spring,
+)
+from dahl_ident.elements.law_files import KINDS, class_named, load_laws
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.synthetic.experiment import toml_text
 from dahl_ident.units import SI_UNITS, parse_quantity
 
+_LAWS: tuple[tuple[str, str, Any], ...] = (
+    ("Dahl", "pivots, bearings, gears: stiffness, then slip", Dahl(0.7, 3.0, 1.0)),
+    ("Bouc-Wen", "hysteresis with a stiffness after slip", BoucWen(3.0, 4.0, 1.0)),
+    ("Maxwell slip", "several springs that slip one after the other",
+     MaxwellSlip([0.1, 0.3, 0.6], [1.0, 0.8, 0.5])),
+    ("Iwan", "bolted joints: microslip, then slip", Iwan(0.7, 3.0, -0.5, 0.7)),
+    ("LuGre", "friction that depends on the speed", LuGre(0.7, 3.0, 1.4, 0.2, 0.05, 0.05)),
+    ("power damper", "damping force as a power of the speed", PowerDamper(0.7, 0.3)),
+)  # fmt: skip
+"""Name and use of each law, and one whose loop is drawn over a displacement of amplitude 1."""
 LINEAR = {"mass": Mass, "damping": Damper, "stiffness": Spring}
 """The options of elements without friction, and their classes."""
 OF_TABLES = ("quantity", "amplitude", "frequency", "sweep", "level_from_name", "controlled")
@@ -27,8 +51,37 @@ ROLES = (
 )  # fmt: skip
 """What a channel can mean; "" is what its name says, or nothing."""
 _COLUMNS, _REPORT = "columns.toml", "report.toml"
-REPORTS = ("report.html", "report.pdf", "report.md")
-"""The last one for the page itself: its tables and pictures."""
+REPORTS = ("report.html", "report.pdf")
+
+
+def laws(files: Sequence[str]) -> list[dict[str, str]]:
+    """Return the laws that can be chosen, those of the user's files included."""
+    known = [{"kind": e.kind, "name": name, "use": use, "drawn": "yes"} for name, use, e in _LAWS]
+    for file in files:
+        load_laws(Path(file))
+    for cls in KINDS.values() if files else ():
+        if issubclass(cls, Friction) and not cls.__module__.startswith("dahl_ident."):
+            use = (cls.__doc__ or "").strip().partition("\n")[0]
+            known.append({"kind": cls.kind, "name": cls.__name__, "use": use, "drawn": ""})
+    return known
+
+
+@cache
+def loop_of(kind: str) -> str | None:
+    """Return a loop of a law as SVG, None where it has no picture."""
+    element = next((element for _, _, element in _LAWS if element.kind == kind), None)
+    if element is None:
+        return None
+    turns = 2.0 * np.pi * np.linspace(0.0, 2.25, 451)
+    values = [np.asarray(parameter.value) for parameter in element.parameters]
+    force = element.force_history(values, np.sin(turns), np.cos(turns))[100:]
+    x, y = 50.0 + 42.0 * np.sin(turns[100:]), 34.0 - 28.0 * force / np.abs(force).max()
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 68" width="100" height="68">'
+        '<path d="M50 2V66M4 34H96" stroke="#8a94a0" stroke-width=".7" fill="none"/>'
+        f'<polyline points="{points}" fill="none" stroke="#3b82c4" stroke-width="2"/></svg>'
+    )
 
 
 @dataclass(frozen=True)

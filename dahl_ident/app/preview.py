@@ -10,32 +10,34 @@ import json
 import sys
 import tomllib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.app.commands import OF_BOTH, OF_TABLES
-from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse, read_frequency_response, read_record
+from dahl_ident.data import read_frequency_response, read_record
 from dahl_ident.data.readers import open_source
 from dahl_ident.data.readers.inspection import contents
 from dahl_ident.data.response_table import WaveformsError
 from dahl_ident.errors import DahlIdentError
+from dahl_ident.reporting.document import Picture
 from dahl_ident.units import parse_quantity
 
 NOTHING_FOUND: Mapping[str, Any] = {
-    "channels": [], "notes": [], "curves": [],
+    "channels": [], "notes": [], "pictures": [],
     "error": "", "kind": "", "summary": "", "format": "", "sampling": "",
 }  # fmt: skip
-_SHOWN = 300  # points of a picture
+_SHOWN = 300  # points of a channel's picture
+_DRAWN = 6  # records
 
 
 def preview(state: dict[str, Any]) -> dict[str, Any]:
     """Return channels of the first file, what could be read, and what could not."""
-    shown: dict[str, Any] = dict(NOTHING_FOUND, channels=[], notes=[], curves=[])
+    shown: dict[str, Any] = dict(NOTHING_FOUND, channels=[], notes=[])
     files = [str(file["stored"]) for file in state["files"]]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -82,15 +84,17 @@ def _read(files: Sequence[str], reading: dict[str, str], shown: dict[str, Any]) 
             if kind == "table":
                 raise
         else:
-            shown |= {"kind": "table", "summary": repr(table), "curves": _points(table)}
+            shown |= {"kind": "table", "summary": repr(table), "pictures": [_drawn(table.plot)]}
             return
     if reading.get("sample_rate"):
         how["sample_rate"] = _hertz(reading["sample_rate"], "sample_rate")
     records = [read_record(file, **how) for file in files]
     shown |= {"kind": kind or "record", "summary": "\n".join(map(repr, records))}
-    for record in records:
-        x, y = record.motion_samples, record.force_samples
-        shown["curves"].append(_curve(x, y, record.motion_channel, "force or drive", line=True))
+    shown["pictures"] = [_drawn(partial(record.plot, "loops")) for record in records[:_DRAWN]]
+
+
+def _drawn(draw: Callable[[], Any]) -> str:
+    return Picture("", "", "", draw).address("png")
 
 
 def _hertz(text: str, what: str) -> float:
@@ -98,31 +102,6 @@ def _hertz(text: str, what: str) -> float:
         return float(text)
     except ValueError:
         return parse_quantity(text, ("frequency",), what)[0]
-
-
-def _points(table: FrequencyResponse) -> list[dict[str, Any]]:
-    first = table.harmonic == 1
-    gain = np.abs(table.response[first])
-    level = next(v for v in (table.amplitude, table.drive) if v is not None)[first]
-    varied = np.unique(level[np.isfinite(level)]).size > 2
-    curves = [_curve(level, gain, "level", f"|{table.quantity}|", logs=True)] if varied else []
-    if np.unique(table.frequency_hz).size > 2:
-        f = table.frequency_hz[first]
-        curves.append(_curve(f, gain, "frequency, Hz", f"|{table.quantity}|", logs=True))
-    return curves
-
-
-def _curve(
-    x: FloatArray, y: FloatArray, name: str, other: str, *, line: bool = False, logs: bool = False
-) -> dict[str, Any]:
-    """Return a curve in the unit square, with the ends of its axes."""
-    keep = np.isfinite(x) & np.isfinite(y) & ((x > 0.0) & (y > 0.0) if logs else True)
-    x, y = x[keep], y[keep]
-    step = max(1, x.size // (10 * _SHOWN))
-    x, y = x[::step], y[::step]
-    ends = [[f"{v.min():.3g}", f"{v.max():.3g}"] if v.size else ["", ""] for v in (x, y)]
-    points = np.column_stack([_unit(np.log(v) if logs else v) for v in (x, y)])
-    return {"x": name, "y": other, "ends": ends, "line": line, "points": points.round(4).tolist()}
 
 
 def _thumbnail(values: Any) -> list[list[float]]:
@@ -134,13 +113,9 @@ def _thumbnail(values: Any) -> list[list[float]]:
     if y.size > _SHOWN:
         parts = np.array_split(y, _SHOWN // 2)
         y = np.array([v for part in parts for v in (part.min(), part.max())])
-    points: list[list[float]] = np.column_stack([np.linspace(0.0, 1.0, y.size), _unit(y)]).tolist()
+    height = (y - y.min()) / (np.ptp(y) or 1.0)
+    points: list[list[float]] = np.column_stack([np.linspace(0.0, 1.0, y.size), height]).tolist()
     return points
-
-
-def _unit(values: FloatArray) -> FloatArray:
-    size = float(np.ptp(values)) if values.size else 0.0
-    return np.asarray((values - values.min()) / size if size > 0.0 else np.full(values.shape, 0.5))
 
 
 if __name__ == "__main__":

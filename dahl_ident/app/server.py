@@ -27,9 +27,8 @@ from starlette.staticfiles import StaticFiles
 
 from dahl_ident import reporting
 from dahl_ident.app import commands
-from dahl_ident.app.commands import JobStep
+from dahl_ident.app.commands import JobStep, laws, loop_of
 from dahl_ident.app.guard import Guard
-from dahl_ident.app.pages import blocks, laws, loop_of
 from dahl_ident.app.preview import NOTHING_FOUND
 from dahl_ident.app.work import Jobs, Work, output
 from dahl_ident.data.storage import save_frame
@@ -73,7 +72,7 @@ class App:
             get("/", self.start),
             post("/", self.upload),
             get("/laws/{kind}.svg", self.law),
-            get("/static/report.css", self.styles),
+            get("/static/page.{ending}", self.of_reports),
             Mount("/static", StaticFiles(directory=_HERE / "static")),
             get("/{work}", self.data),
             post("/{work}", self.save_data),
@@ -188,15 +187,16 @@ class App:
         """Show how a run goes, and its result."""
         work, folder = self._run(request)
         job = self.jobs.state(folder)
-        report = folder / "report.md"
-        found = blocks(work.in_users_words(report.read_text("utf-8"))) if report.exists() else []
+        page = folder / "report.html"
+        report = page.read_text("utf-8") if page.exists() else ""
         parts = []
         for part in sorted(folder.glob("*-[0-9]*"), key=lambda p: p.stat().st_mtime):
             one = self.jobs.state(part)
             text = work.in_users_words(output(part, len(one["steps"]) - 1))
             parts.append((part.name, one, text, self._files(part)))
         return self._page(
-            "run", work=work, state=work.state, folder=folder, job=job, blocks=found, parts=parts,
+            "run", work=work, state=work.state, folder=folder, job=job, parts=parts,
+            report=report.partition("<main>")[2].partition("</main>")[0],
             typed=_typed([JobStep(one["title"], tuple(one["words"])) for one in job["steps"]]),
             program=(folder / "program.py").read_text("utf-8"), files=self._files(folder),
             failed=work.in_users_words(job["error"]), exports=_EXPORTS,
@@ -275,9 +275,10 @@ class App:
         where = {"Content-Disposition": f'attachment; filename="friction_{to}.txt"'}
         return Response(made.stdout, headers=where, media_type="text/plain")
 
-    async def styles(self, request: Request) -> Response:
-        """Return the styles of reports, which the pages share."""
-        return FileResponse(Path(reporting.__file__).with_name("page.css"))
+    async def of_reports(self, request: Request) -> Response:
+        """Return the styles or the script of reports, which the pages share."""
+        name = f"page.{'js' if request.path_params['ending'] == 'js' else 'css'}"
+        return FileResponse(Path(reporting.__file__).with_name(name))
 
     async def law(self, request: Request) -> Response:
         """Return the picture of a law's loop."""

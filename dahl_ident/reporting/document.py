@@ -6,6 +6,7 @@ the same content.
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -94,6 +95,11 @@ class Picture:
             figure.savefig(buffer, format=kind, dpi=160, metadata=metadata)
             plt.close(figure)
         return buffer.getvalue()
+
+    def address(self, kind: str) -> str:
+        """Return the picture as an address that holds it, for an HTML page."""
+        media = {"svg": "image/svg+xml", "png": "image/png"}[kind]
+        return f"data:{media};base64,{base64.b64encode(self.rendered(kind)).decode()}"
 
 
 Block = Paragraph | Bullets | Listing | TextTable | Picture

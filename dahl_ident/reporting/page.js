@@ -1,7 +1,7 @@
 "use strict";
 // Click on a header sorts its table; numbers by their full value, text by language.
 const valueOf = (cell) => (cell.dataset.value === undefined ? NaN : Number(cell.dataset.value));
-for (const header of document.querySelectorAll("thead th")) {
+for (const header of document.querySelectorAll("thead th:has(button)")) {
   header.querySelector("button").addEventListener("click", () => {
     const body = header.closest("table").tBodies[0];
     const column = header.cellIndex;

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Iterator
 from importlib.resources import files
@@ -30,7 +29,6 @@ def html(document: Document) -> bytes:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
     )
-    environment.filters["svg"] = _as_uri
     page = environment.from_string((room / "page.html.j2").read_text(encoding="utf-8"))
     return page.render(
         document=document,
@@ -43,10 +41,6 @@ def html(document: Document) -> bytes:
 def _css_text(text: str) -> str:
     """Return a string of a style sheet that holds nothing but letters, digits and escapes."""
     return '"' + "".join(c if c.isalnum() else f"\\{ord(c):x} " for c in text) + '"'
-
-
-def _as_uri(picture: Picture) -> str:
-    return "data:image/svg+xml;base64," + base64.b64encode(picture.rendered("svg")).decode()
 
 
 def markdown(document: Document, folder: str) -> bytes:

@@ -10,12 +10,6 @@ for (const form of document.querySelectorAll("form.drop")) {
     input.files = e.dataTransfer.files;
   });
 }
-for (const button of document.querySelectorAll("button.copy")) {
-  button.addEventListener("click", async () => {
-    await navigator.clipboard.writeText(button.parentElement.querySelector("pre").textContent);
-    button.textContent = "Copied";
-  });
-}
 const progress = document.getElementById("progress");
 if (progress) {
   const look = async () => {
