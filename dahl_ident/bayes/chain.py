@@ -7,9 +7,9 @@ does not matter; convergence is checked after fixed numbers of steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,43 +26,22 @@ _ROUND = 50  # steps: checks are at round numbers
 _PIECE = 50  # steps between two calls of the listener, at least
 _PIECES = 20  # one piece adds at most this fraction of the chain
 
-RandomState = tuple[Any, ...]
-"""As numpy.random.RandomState.get_state returns it."""
+_PARTS = 8  # of the points of one call, distributed over a pool
 
-
-class Pool(Protocol):
-    """Anything with map: multiprocessing, concurrent.futures, mpi4py."""
-
-    def map(self, function: Callable[..., Any], items: Any) -> Any:
-        """Return the function's value for each of the items, in order."""
+Pool = Any
+"""Anything with map: multiprocessing, concurrent.futures, mpi4py."""
 
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """How a chain is run.
+    """How a chain is run."""
 
-    Attributes
-    ----------
-    walkers : int
-        Walkers in all ensembles together.
-    ensembles : int
-        Independent ensembles.
-    seed : int
-        Of the start and of every step.
-    steps : int or None
-        Total number of steps; None runs until convergence.
-    most_steps : int
-        Where to stop without convergence.
-    wanted : float
-        Effective draws of every parameter that are required of a chain.
-    """
-
-    walkers: int
-    ensembles: int
+    walkers: int  # in all ensembles together
+    ensembles: int  # independent ones
     seed: int
-    steps: int | None
-    most_steps: int
-    wanted: float
+    steps: int | None  # in total; None runs until convergence
+    most_steps: int  # where to stop without convergence
+    wanted: float  # effective draws of every parameter
 
     @classmethod
     def of(
@@ -88,44 +67,30 @@ class ChainSettings:
             )
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
-        return cls(
-            walkers,
-            ensembles,
-            whole_number(seed, "seed", 0),
-            None if steps is None else whole_number(steps, "steps", _LEAST_STEPS),
-            whole_number(max_steps, "max_steps", _LEAST_STEPS),
-            positive_number(ess, "ess"),
-        )
+        steps = None if steps is None else whole_number(steps, "steps", _LEAST_STEPS)
+        most_steps = whole_number(max_steps, "max_steps", _LEAST_STEPS)
+        seed = whole_number(seed, "seed", 0)
+        return cls(walkers, ensembles, seed, steps, most_steps, positive_number(ess, "ess"))
 
 
 @dataclass(frozen=True)
 class Chain:
-    """All steps so far, and the state needed to continue.
+    """All steps so far, and the state needed to continue."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (steps, walkers, D)
-        Coordinates after each step, walkers ordered by ensemble.
-    log_density : ndarray, shape (steps, walkers)
-        Log-posterior there.
-    start : ndarray, shape (walkers, D)
-        Positions of the walkers before the first step.
-    random_state : tuple
-        State of the random generator after the last step.
-    """
-
-    points: FloatArray
-    log_density: FloatArray
-    start: FloatArray
-    random_state: RandomState
+    seed: int
+    points: FloatArray  # (steps, walkers, D) coordinates, walkers ordered by ensemble
+    log_density: FloatArray  # (steps, walkers)
+    start: FloatArray  # (walkers, D) before the first step
+    random_state: tuple[Any, ...]  # after the last step, of numpy's RandomState
 
     @classmethod
     def at(cls, start: FloatArray, seed: int) -> Chain:
         """Return an empty chain."""
-        walkers, dims = start.shape
         bits = np.random.MT19937(np.random.SeedSequence(seed))
         state = np.random.RandomState(bits).get_state()
-        return cls(np.empty((0, walkers, dims)), np.empty((0, walkers)), start, tuple(state))
+        return cls(
+            seed, np.empty((0, *start.shape)), np.empty((0, len(start))), start, tuple(state)
+        )
 
     @property
     def steps(self) -> int:
@@ -141,19 +106,19 @@ def run(
     density: LogDensity,
     chain: Chain,
     settings: ChainSettings,
-    *,
+    listeners: Sequence[Listener],
     pool: Pool | None = None,
-    listener: Listener | None = None,
 ) -> tuple[Chain, Convergence]:
     """Return the chain, continued until it is long enough, and its convergence verdict."""
     verdict: Convergence | None = None
     sampler = _sampler(density, settings, pool)
     end = settings.most_steps if settings.steps is None else settings.steps
     while True:
-        check = next_check(chain.steps, end) if settings.steps is None else end
+        check = _next_check(chain.steps, end) if settings.steps is None else end
         while chain.steps < check:
-            chain = _continued(sampler, chain, min(_piece(chain), check - chain.steps))
-            if listener is not None:
+            piece = max(_PIECE, chain.steps // _PIECES)
+            chain = _continued(sampler, chain, min(piece, check - chain.steps))
+            for listener in listeners:
                 listener(chain, verdict)
         verdict = judge(chain.points, settings.ensembles, settings.wanted)
         if chain.steps >= end or verdict.reached:
@@ -162,11 +127,7 @@ def run(
         chain = _continued(sampler, chain, min(_PIECE, end - chain.steps))
 
 
-def _piece(chain: Chain) -> int:
-    return max(_PIECE, chain.steps // _PIECES)
-
-
-def next_check(steps: int, end: int) -> int:
+def _next_check(steps: int, end: int) -> int:
     """Return the first number of steps, at least `steps`, after which convergence is judged."""
     check = _FIRST_CHECK
     while check < steps:
@@ -177,13 +138,14 @@ def next_check(steps: int, end: int) -> int:
 def _sampler(density: LogDensity, settings: ChainSettings, pool: Pool | None) -> Any:
     from emcee import EnsembleSampler
 
-    function = density if pool is None else _Mapped(density, pool)
+    def mapped(x: FloatArray) -> FloatArray:
+        assert pool is not None
+        return np.concatenate(list(pool.map(density, np.array_split(x, _PARTS))))
+
+    function = density if pool is None else mapped
+    moves = moves_for(settings.ensembles, density.decorrelation)
     sampler: Any = EnsembleSampler(
-        settings.walkers,
-        len(density.names),
-        function,
-        moves=moves_for(settings.ensembles, density.decorrelation),
-        vectorize=True,
+        settings.walkers, len(density.names), function, moves=moves, vectorize=True
     )
     # emcee's wrapper prints points and traceback on standard output when a run is interrupted
     sampler.log_prob_fn = function
@@ -201,21 +163,6 @@ def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
         random_state=chain.random_state,
     )
     last = sampler.run_mcmc(state, steps, skip_initial_state_check=True)
-    return Chain(
-        np.concatenate([chain.points, sampler.get_chain()]),
-        np.concatenate([chain.log_density, sampler.get_log_prob()]),
-        chain.start,
-        last.random_state,
-    )
-
-
-@dataclass(frozen=True)
-class _Mapped:
-    """A density whose points are distributed over a pool."""
-
-    density: LogDensity
-    pool: Pool
-    parts: int = 8
-
-    def __call__(self, x: FloatArray) -> FloatArray:
-        return np.concatenate(list(self.pool.map(self.density, np.array_split(x, self.parts))))
+    points = np.concatenate([chain.points, sampler.get_chain()])
+    log_density = np.concatenate([chain.log_density, sampler.get_log_prob()])
+    return replace(chain, points=points, log_density=log_density, random_state=last.random_state)

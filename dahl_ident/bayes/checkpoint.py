@@ -18,36 +18,27 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dahl_ident.bayes.chain import Chain, RandomState
+from dahl_ident.bayes.chain import Chain, ChainSettings
 from dahl_ident.bayes.convergence import Convergence
 from dahl_ident.bayes.density import LogDensity
 from dahl_ident.data.storage import library, locked, plain_data, put_in_place
 from dahl_ident.elements.description import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
-FORMAT = "dahl_ident chain"
-VERSION = 1  # of the layout of the file; files of other layouts are refused
+_FORMAT = "dahl_ident chain", 1  # with the version of the layout; files of others are refused
+_ARRAYS = ("points", "log_density", "start", "random_key", "random_rest")
 _SHARE = 20.0  # ratio of the time spent sampling to the time spent writing
 
 Identity = Mapping[str, str]
 """Everything a chain depends on, part by part, as text or digest."""
 
 
-@dataclass(frozen=True)
-class StoredChain:
-    """A chain read from a file, with its seed."""
-
-    chain: Chain
-    seed: int
-
-
-def identity(density: LogDensity, walkers: int, ensembles: int) -> Identity:
+def identity(density: LogDensity, settings: ChainSettings) -> Identity:
     """Return everything a chain depends on except its seed, part by part."""
     elements = density.problem.model
     try:
@@ -63,42 +54,37 @@ def identity(density: LogDensity, walkers: int, ensembles: int) -> Identity:
         "model": model,
         "likelihood": density.likelihood,
         "parameters": ", ".join(density.names),
-        "walkers": f"{walkers} in {ensembles} ensembles",
+        "walkers": f"{settings.walkers} in {settings.ensembles} ensembles",
         **{f"prior of {name}": text for name, text in density.priors.items()},
     }
 
 
 class ChainFile:
-    """The file of one run; made by :func:`open_chain`, which holds the lock.
+    """The file of one run, for which :func:`open_chain` holds the lock.
 
     As a listener of :func:`dahl_ident.bayes.chain.run` it writes at intervals, to limit the cost.
     """
 
     def __init__(self, path: Path, identity: Identity) -> None:
         self.path, self._identity = path, identity
-        self._seed = 0
         self._written: Chain | None = None
         self._latest: Chain | None = None
         self._due = 0.0
 
-    def load(self) -> StoredChain | None:
+    def load(self) -> Chain | None:
         """Return the chain in the file, None where there is no file yet."""
         if not self.path.exists():
             return None
-        stored, stored_identity = _read(self.path)
-        differing = [k for k, v in self._identity.items() if stored_identity.get(k) != v]
+        chain, stored = _read(self.path)
+        differing = [k for k, v in self._identity.items() if stored.get(k) != v]
         if differing:
             raise SamplingError(
                 f"{self.path} holds a chain of another run: it differs in "
                 f"{', '.join(differing)}. Resume with the original settings, or give another "
                 "file; this one was not changed"
             )
-        self._written = self._latest = stored.chain
-        return stored
-
-    def begin(self, seed: int) -> None:
-        """Set the seed to be written."""
-        self._seed = seed
+        self._written = self._latest = chain
+        return chain
 
     def __call__(self, chain: Chain, verdict: Convergence | None) -> None:
         """Keep the chain, and write it if the last write is long enough ago."""
@@ -111,7 +97,7 @@ class ChainFile:
         if self._latest is None or self._latest is self._written:
             return
         began = time.monotonic()
-        _write(self.path, self._latest, self._seed, self._identity)
+        _write(self.path, self._latest, self._identity)
         self._written = self._latest
         ended = time.monotonic()
         self._due = ended + _SHARE * (ended - began)
@@ -133,19 +119,21 @@ def open_chain(path: str | os.PathLike[str], identity: Identity) -> Iterator[Cha
             chain_file.flush()
 
 
-def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
+def _write(path: Path, chain: Chain, identity: Identity) -> None:
     h5py = library("h5py")
-
-    text = json.dumps(dict(identity), sort_keys=True)
-    arrays = _arrays(chain)
+    _, key, *position = chain.random_state
+    values = (chain.points, chain.log_density, chain.start, key, np.array(position, dtype=float))
+    text, seed = json.dumps(dict(identity), sort_keys=True), str(chain.seed)
 
     def write(place: Path) -> None:
         with h5py.File(place, "w") as file:
-            for name, array in arrays.items():
+            for name, array in zip(_ARRAYS, values, strict=True):
                 file[name] = array
-            file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-            file.attrs["identity"], file.attrs["seed"] = text, str(seed)
-            file.attrs["digest"] = _digest(text, str(seed), *arrays.values())
+            digest = _digest(text, seed, *values)
+            format_, version = _FORMAT
+            file.attrs.update(
+                format=format_, version=version, identity=text, seed=seed, digest=digest
+            )
 
     try:
         put_in_place(path, write)
@@ -157,57 +145,36 @@ def _write(path: Path, chain: Chain, seed: int, identity: Identity) -> None:
         ) from exc
 
 
-def _read(path: Path) -> tuple[StoredChain, dict[str, str]]:
+def _read(path: Path) -> tuple[Chain, dict[str, str]]:
+    """Return the chain in a file, and what it belongs to."""
     h5py = library("h5py")
-
     try:
         with h5py.File(path, "r") as file:
             attributes = plain_data(dict(file.attrs))
-            _check_format(path, attributes)
-            arrays = {name: file[name][()] for name in _NAMES}
-    except SamplingError:
-        raise
+            stated = (attributes.get("format"), attributes.get("version"))
+            known = stated == _FORMAT and {"identity", "seed", "digest"} <= set(attributes)
+            values = [file[name][()] for name in _ARRAYS] if known else []
     except (OSError, KeyError, RuntimeError) as exc:
         raise SamplingError(
             f"{path} cannot be read as a chain ({exc}); it is damaged or something else. Give "
             "another file; this one is left as it is"
         ) from exc
-    digest = _digest(attributes["identity"], attributes["seed"], *arrays.values())
-    if digest != attributes["digest"]:
+    if not known:
+        raise SamplingError(
+            f"{path} is an HDF5 file, but not a chain that this version can resume: format and "
+            f"version are {stated}, expected {_FORMAT}. Give another file; this one is left as it "
+            "is"
+        )
+    text, seed = attributes["identity"], attributes["seed"]
+    if _digest(text, seed, *values) != attributes["digest"]:
         raise SamplingError(
             f"{path} is damaged: its content does not match the digest that was written with it. "
             "Give another file, or a copy that is whole; this one is left as it is"
         )
-    return _stored(arrays, int(attributes["seed"])), json.loads(attributes["identity"])
-
-
-def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:
-    stated = (attributes.get("format"), attributes.get("version"))
-    missing = {"identity", "seed", "digest"} - set(attributes)
-    if stated != (FORMAT, VERSION) or missing:
-        raise SamplingError(
-            f"{path} is an HDF5 file, but not a chain that this version can resume: format and "
-            f"version are {stated}, expected {(FORMAT, VERSION)}. Give another file; this one is "
-            "left as it is"
-        )
-
-
-_NAMES = ("points", "log_density", "start", "random_key", "random_rest")
-
-
-def _arrays(chain: Chain) -> dict[str, np.ndarray[Any, Any]]:
-    _, key, *rest = chain.random_state
-    values = (chain.points, chain.log_density, chain.start, key, np.array(rest, dtype=float))
-    return dict(zip(_NAMES, values, strict=True))
-
-
-def _stored(arrays: Mapping[str, Any], seed: int) -> StoredChain:
-    position, has_gauss, cached = arrays["random_rest"].tolist()
-    state: RandomState = (
-        "MT19937", arrays["random_key"], int(position), int(has_gauss), cached,
-    )  # fmt: skip
-    chain = Chain(arrays["points"], arrays["log_density"], arrays["start"], state)
-    return StoredChain(chain, seed)
+    points, log_density, start, key, position = values
+    place, has_gauss, cached = position.tolist()
+    state = ("MT19937", key, int(place), int(has_gauss), cached)
+    return Chain(int(seed), points, log_density, start, state), json.loads(text)
 
 
 def _digest(*parts: Any) -> str:

@@ -23,30 +23,15 @@ R_HAT = 1.01  # as Vehtari et al. (2021) recommend; the older 1.1 passes chains 
 
 @dataclass(frozen=True)
 class Convergence:
-    """The verdict on one chain.
+    """The verdict on one chain."""
 
-    Attributes
-    ----------
-    steps : int
-        All steps of the chain.
-    discard : int
-        Steps of warm-up.
-    tau : ndarray, shape (D,)
-        Integrated autocorrelation time after the warm-up, steps; NaN where nothing moved.
-    ess : ndarray, shape (D,)
-        Effective number of independent draws.
-    r_hat : ndarray, shape (D,)
-        Split R-hat across ensembles.
-    wanted : float
-        The number of draws asked for.
-    """
-
-    steps: int
-    discard: int
+    steps: int  # of the whole chain
+    discard: int  # steps of warm-up
+    # (D,) integrated autocorrelation time after the warm-up, steps; NaN where nothing moved
     tau: FloatArray
-    ess: FloatArray
-    r_hat: FloatArray
-    wanted: float
+    ess: FloatArray  # (D,) effective number of independent draws
+    r_hat: FloatArray  # (D,) split R-hat across ensembles
+    wanted: float  # number of draws asked for
 
     @property
     def usable(self) -> bool:

@@ -9,10 +9,22 @@ the prior 1/s of the scale being flat in ln s. Integrated over s, the same is
 
     ln p(theta) + ln Gamma(n) - n ln(pi S(theta)) - ln 2 + constants.
 
-Where rows share errors, :mod:`dahl_ident.bayes.row_errors` takes the place of S.
-
-For outliers a row may count as Student's t in two dimensions with nu = 4 instead, of density
+Where rows share errors, :mod:`dahl_ident.bayes.row_errors` takes the place of S. For outliers a row
+may count as Student's t in two dimensions with nu = 4 instead, of density
 (1 + |y|^2/(nu s^2))^-(nu/2 + 1) / (2 pi s^2).
+
+**Records.** States, offsets and drifts are linear in the output, nearly: the residuals e are
+projected off their derivatives, so that only the model's parameters theta are coordinates. With S
+the sum of squares that is left, nu the effective degrees of freedom of the residuals and P
+parameters, the unknown scale of the noise integrated out,
+
+    ln p(theta) + constants - (nu + P)/2 ln(1 + (S(theta*) - S(t))/(nu s^2)),    s^2 = S(t)/n.
+
+Residuals of neighbouring samples are correlated, so S counts too many samples, of some parameters
+more than of others. It is therefore taken at theta* = t + C (theta - t), t the least-squares
+estimate and C such that the curvature at t is the inverse of the estimate's covariance, in which
+the correlation is accounted for (curvature adjustment of a composite likelihood: Ribatet, Cooley
+and Davison, Statistica Sinica 22 (2012) 813-845).
 """
 
 from __future__ import annotations
@@ -31,21 +43,21 @@ from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.data.columns import one_of
-from dahl_ident.errors import SamplingError, ValidationError, argument
+from dahl_ident.errors import FitError, SamplingError, ValidationError, argument
 from dahl_ident.fitting import solve
 from dahl_ident.problem import TableProblem
+from dahl_ident.problem.record_problem import RecordProblem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
 TAIL_DOF = 4.0  # of Student's t: heavy tails for outliers, yet a finite variance
 _FARTHEST = 300.0  # of ln s
 Sums = Callable[[FloatArray], FloatArray]
-_COLUMNS = (
+_COLUMNS = (  # of a table: what its likelihood depends on
     "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
     "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance", "harmonic",
     "controlled",
 )  # fmt: skip
-"""Of a table: what its likelihood depends on."""
 
 
 class LogDensity(ABC):
@@ -53,11 +65,9 @@ class LogDensity(ABC):
 
     problem: Any
     prior: JointPrior
-    likelihood: str
-    counted: tuple[str, ...]
-    """The sources of error that the likelihood counts."""
-    normalised: bool = True
-    """Whether the density is that of the data, and not only up to a factor."""
+    likelihood: str = "gaussian"
+    counted: tuple[str, ...]  # the sources of error that the likelihood counts
+    normalised: bool = True  # whether it is the density of the data, and not only up to a factor
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
         """Return the log-prior of theta, (S, P); -inf outside its support."""
@@ -122,7 +132,7 @@ class LogDensity(ABC):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates' values, D of them."""
-        return (*(part.parameter.name for part in self.prior.priors), *[SCALE] * self.has_scale)
+        return (*self.prior.names, *[SCALE] * self.has_scale)
 
     @property
     def logarithmic(self) -> tuple[bool, ...]:
@@ -143,25 +153,30 @@ class LogDensity(ABC):
 
 @dataclass(frozen=True)
 class Density(LogDensity):
-    """Log-posterior of a problem; call it with points of shape (S, D).
+    """Log-posterior of the parameters of a table.
 
-    Attributes
-    ----------
-    problem : TableProblem
-        Data, model and noise.
-    prior : JointPrior
-        Of theta.
-    likelihood : {"gaussian", "student_t", "none"}
-        What the noise model says (Gaussian, or Student's t where covariances were estimated),
-        tails for outliers, or the prior alone.
-    errors : RowErrors, optional
-        Errors that rows share, with a Gaussian likelihood; left out, rows are independent.
+    Without `errors`, rows are independent; with them, the likelihood is Gaussian.
     """
 
     problem: TableProblem
     prior: JointPrior
     likelihood: str = "gaussian"
     errors: RowErrors | None = None
+
+    def __post_init__(self) -> None:
+        problem = self.problem
+        one_of(self.likelihood, "likelihood", LIKELIHOODS)
+        if self.likelihood == "student_t" and not problem.gaussian:
+            raise ValidationError(
+                f"{argument('likelihood', 'student_t')} is for Gaussian noise with outliers, but "
+                "the covariance of these data has few degrees of freedom, which gives Student's t "
+                "by itself; leave likelihood out"
+            )
+        if self.has_scale and problem.n_residuals <= len(problem.names):
+            raise SamplingError(
+                f"{problem.n_residuals} residuals cannot determine {len(problem.names)} parameters "
+                "and the scale of the noise; give the data a covariance, or fix parameters"
+            )
 
     @property
     def counted(self) -> tuple[str, ...]:  # type: ignore[override]  # others keep it
@@ -186,21 +201,6 @@ class Density(LogDensity):
         P = len(self.problem.names)
         return np.concatenate([self.problem.in_order(points[:, :P]), points[:, P:]], axis=1)
 
-    def __post_init__(self) -> None:
-        problem = self.problem
-        one_of(self.likelihood, "likelihood", LIKELIHOODS)
-        if self.likelihood == "student_t" and not problem.gaussian:
-            raise ValidationError(
-                f"{argument('likelihood', 'student_t')} is for Gaussian noise with outliers, but "
-                "the covariance of these data has few degrees of freedom, which gives Student's t "
-                "by itself; leave likelihood out"
-            )
-        if self.has_scale and problem.n_residuals <= len(problem.names):
-            raise SamplingError(
-                f"{problem.n_residuals} residuals cannot determine {len(problem.names)} parameters "
-                "and the scale of the noise; give the data a covariance, or fix parameters"
-            )
-
     @property
     def has_scale(self) -> bool:
         """Whether ln s is the last coordinate."""
@@ -222,34 +222,31 @@ class Density(LogDensity):
         result = self.log_prior(x[:, :P])
         if self.has_scale:  # where the scale would overflow, the likelihood is zero
             result[np.abs(x[:, P]) > _FARTHEST] = -np.inf
-        if self.likelihood == "none":
-            return result
         inside = result > -np.inf
-        if inside.all():
-            return result + self.log_likelihood(*self.split(x))
-        if inside.any():
+        if self.likelihood != "none" and inside.any():
             result[inside] += self.log_likelihood(*self.split(x[inside]))
         return result
 
     def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
         """Return the log-density of theta, (S, P), an unknown scale integrated out."""
-        if self.likelihood == "student_t" and self.has_scale:
+        if self.likelihood != "student_t":
+            return self.highest(theta, sums)
+        if self.has_scale:
             raise ValidationError(
                 f"{argument('likelihood', 'student_t')} with an unknown noise scale has no closed "
                 "integral over the scale; give the data a covariance, or use sampling"
             )
-        return self(theta) if self.likelihood == "student_t" else self.highest(theta, sums)
+        return self(theta)
 
     def highest(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
         """Return the Gaussian log-posterior of theta, (S, P), an unknown scale integrated out."""
         result = self.log_prior(theta)
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
-            squares, n = (sums or self.sums)(theta[inside]), 0.5 * self.problem.n_residuals
-            with np.errstate(divide="ignore"):
-                terms = -n * np.log(squares) if self.has_scale else -0.5 * squares
-            result[inside] += self._mean(terms) + self._constant
+            squares = (sums or self.sums)(theta[inside])
+            result[inside] += self._mean(self._exponents(squares)) + self._constant
             if self.has_scale:
+                n = 0.5 * self.problem.n_residuals
                 result[inside] += float(gammaln(n) + (n - 1.0) * np.log(2.0))
         return result
 
@@ -263,31 +260,23 @@ class Density(LogDensity):
 
     def log_likelihood(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
         """Return ln of the data's density at theta, (S, P), and s, (S,)."""
+        m = self.problem.n_residuals
         if self.errors is not None:
             terms = -0.5 * self.sums(theta) / scale[:, None] ** 2
-            rest = self._constant - self.problem.n_residuals * np.log(scale)
-            return self._mean(terms) + rest
+            return np.asarray(self._mean(terms) + self._constant - m * np.log(scale))
         if self.likelihood != "student_t":
             return self.quick.log_likelihood(theta, scale if self.has_scale else None)
-        z = self.squares(theta)
-        n = z.shape[-1]
-        tails = np.log1p(z / (TAIL_DOF * scale[:, None] ** 2)).sum(axis=-1)
-        result = self._constant - 2.0 * n * np.log(scale) - (0.5 * TAIL_DOF + 1.0) * tails
+        z = self.quick.squares(theta) / (TAIL_DOF * scale[:, None] ** 2)
+        tails = np.log1p(z).sum(axis=-1)
+        result = self._constant - m * np.log(scale) - (0.5 * TAIL_DOF + 1.0) * tails
         return np.where(np.isnan(result), -np.inf, result)
-
-    def squares(self, theta: FloatArray) -> FloatArray:
-        """Return |y|^2 of every row, (S, n), the scale taken as 1."""
-        y, _ = self.quick.whitened(theta, derivatives=False)
-        with np.errstate(over="ignore"):  # far off, a point has no chance
-            return np.asarray(y.real**2 + y.imag**2)
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Return the residuals of which the squares are added, (S, P) -> (S, K)."""
         if self.errors is None:
             y, _ = self.quick.whitened(theta, derivatives=False)
             return np.ascontiguousarray(y).view(np.float64)
-        held = self.errors.held(theta)
-        y, _ = self.quick.whitened(held, derivatives=False, tails=False)
+        y, _ = self.quick.whitened(self.errors.held(theta), derivatives=False, tails=False)
         parts = np.broadcast_to(y, (len(theta), y.shape[-1])).copy().view(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
             return self.errors.uncorrelated(parts + self.errors.moved(theta))
@@ -301,9 +290,7 @@ class Density(LogDensity):
         """Return how probable each size of shared errors is, (S, M), given sums of squares."""
         if self.errors is None:
             return np.ones(sums.shape)
-        n = 0.5 * self.problem.n_residuals
-        each = -n * np.log(sums) if self.has_scale else -0.5 * sums
-        each = each + self.errors.log_weights
+        each = self._exponents(sums) + self.errors.log_weights
         return np.asarray(np.exp(each - logsumexp(each, axis=1, keepdims=True)))
 
     def curvature(self, theta: FloatArray) -> tuple[float, FloatArray]:
@@ -315,8 +302,15 @@ class Density(LogDensity):
         y = y[..., :m] + errors.moved(at)
         by = np.where(np.isnan(errors.centre), by[..., :m, :], errors.slopes)
         with np.errstate(invalid="ignore", over="ignore"):
-            y, by = errors.independent(y, by)
-            return float(0.5 * np.sum(y**2)), by[0].T @ by[0]
+            y, by = errors.independent(y), errors.independent(by.swapaxes(-1, -2))[0]
+            return float(0.5 * np.sum(y**2)), by @ by.T
+
+    def _exponents(self, squares: FloatArray) -> FloatArray:
+        """Return ln of the likelihood but for constants, an unknown scale integrated out."""
+        if not self.has_scale:
+            return -0.5 * squares
+        with np.errstate(divide="ignore"):
+            return np.asarray(-0.5 * self.problem.n_residuals * np.log(squares))
 
     def _mean(self, terms: FloatArray) -> FloatArray:
         """Return ln of the mean likelihood over the sizes of shared errors, (S, M) -> (S,)."""
@@ -341,3 +335,113 @@ class Density(LogDensity):
     def _constant(self) -> float:
         """The Gaussian log-likelihood at s = 1 less its exponent."""
         return float(self.problem.log_area - 0.5 * self.problem.n_residuals * np.log(2.0 * np.pi))
+
+
+@dataclass(frozen=True)
+class RecordDensity(LogDensity):
+    """Log-posterior of the model's free parameters, given records."""
+
+    problem: RecordProblem
+    values: FloatArray  # the least-squares estimate: P parameters, then states and offsets
+    covariance: FloatArray  # (P, P) of the parameters, by the sources of error that are counted
+    dof: float  # effective degrees of freedom of the residuals
+    counted: tuple[str, ...]
+    prior: JointPrior
+    normalised = False
+
+    @cached_property
+    def centre(self) -> FloatArray:
+        """Coordinates of the estimate."""
+        return np.where(self.logarithmic, np.log(self._slopes), self.values[: len(self.names)])
+
+    @property
+    def _slopes(self) -> FloatArray:
+        """Derivatives of the values with respect to the coordinates."""
+        return np.where(self.logarithmic, self.values[: len(self.names)], 1.0)
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """A root of the covariance of the coordinates, (P, P)."""
+        covariance = self.covariance / np.outer(self._slopes, self._slopes)
+        size = np.sqrt(covariance.diagonal())
+        try:
+            return np.asarray(size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size)))
+        except np.linalg.LinAlgError as exc:
+            raise SamplingError(
+                "the records do not determine every parameter, so that their likelihood has no "
+                "curvature to begin with; fix what the fit's verdict names"
+            ) from exc
+
+    @property
+    def around(self) -> tuple[FloatArray, FloatArray]:
+        """The estimate's coordinates and their covariance."""
+        return self.centre, self.root @ self.root.T
+
+    @property
+    def facts(self) -> dict[str, str | Sequence[object]]:
+        """Samples and estimate."""
+        samples = [(r.time, r.motion_samples, r.force_samples) for r in self.problem.records]
+        return {"data": [part for one in samples for part in one], "estimate": [self.values]}
+
+    @cached_property
+    def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Orthonormal derivatives by states and offsets, and those by theta, of each record."""
+        count, per_record = len(self.names), self.problem.per_record
+        parts = []
+        for number in range(len(self.problem.records)):
+            by = self.problem.filtered(self.problem.predict(self.values, number).by)
+            columns = by[:, count + number * per_record :][:, :per_record]
+            basis = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
+            parts.append((basis, by[:, :count] * self._slopes))
+        return parts
+
+    @cached_property
+    def _least(self) -> float:
+        return float(np.sum(self._residuals(self.centre) ** 2))
+
+    @cached_property
+    def _bend(self) -> FloatArray:
+        """C, symmetric in coordinates in which the covariance is the unit matrix."""
+        hessian = np.zeros((len(self.names),) * 2)
+        for basis, by in self._nuisance:
+            rest = by - basis @ (basis.T @ by)
+            hessian += rest.T @ rest
+        noise = self._least / self.problem.n_residuals
+        values, vectors = np.linalg.eigh(self.root.T @ hessian @ self.root / noise)
+        shrunk = vectors @ np.diag(1.0 / np.sqrt(values)) @ vectors.T
+        return np.asarray(self.root @ shrunk @ np.linalg.inv(self.root))
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
+        return self.marginal(x)
+
+    def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
+        """Return the log-density of theta, (S, P); the noise's scale is not a coordinate."""
+        result = self.log_prior(theta)
+        noise = self._least / self.problem.n_residuals
+        inside = result > -np.inf
+        if inside.any():
+            squares = (sums or self.sums)(theta[inside])[:, 0]
+            excess = (squares - self._least) / (self.dof * noise)
+            power = 0.5 * (self.dof + len(self.names))
+            result[inside] -= power * np.log1p(np.maximum(excess, -0.5))
+        return result
+
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        """Return the residuals at theta*, (S, P) -> (S, n), states and offsets projected out."""
+        bent = self.centre + (theta - self.centre) @ self._bend.T
+        return np.array([self._residuals(one) for one in bent])
+
+    def _residuals(self, theta: FloatArray) -> FloatArray:
+        full = self.values.copy()
+        full[: theta.size] = self.to_values(theta)
+        parts = []
+        try:
+            for number, y in enumerate(self.problem.measured):
+                predicted = self.problem.predict(full, number, derivatives=False)
+                e = self.problem.filtered(y - predicted.output)
+                basis = self._nuisance[number][0]
+                parts.append(e - basis @ (basis.T @ e))
+        except FitError:  # the motion grows beyond all bounds
+            return np.full(self.problem.n_residuals, np.inf)
+        return np.concatenate(parts)

@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -39,42 +39,19 @@ _RESONANCE = 1e3  # factor by which the parts of a plant may exceed their sum
 _TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
 
 
-class Distribution(Protocol):
-    """The methods of a frozen scipy.stats distribution that a prior needs."""
-
-    def logpdf(self, x: Any) -> Any:
-        """Return the logarithm of the density at x."""
-
-    def cdf(self, x: Any) -> Any:
-        """Return the probability below x."""
-
-    def ppf(self, q: Any) -> Any:
-        """Return the quantile q."""
-
-
-PriorLike = Distribution | tuple[float, float]
+PriorLike = Any
+"""A frozen distribution of scipy.stats over the value, or the two ends of a range."""
 
 
 @dataclass(frozen=True)
 class ParameterPrior:
-    """The prior of one parameter.
-
-    Attributes
-    ----------
-    parameter : Parameter
-        Whose prior it is.
-    given : Distribution or tuple of float
-        A distribution of the value, or the ends of a log-uniform or uniform one.
-    source : {"given", "sensors", "assumed", "default"}
-        Its origin; a default is derived from the size of the data.
-    estimate : float
-        The least-squares value, not finite where unknown. `limits` reach beyond it, because data
-        can outweigh a prior even in its far tail.
-    """
+    """The prior of one parameter."""
 
     parameter: Parameter
-    given: PriorLike
-    source: str = "given"
+    given: PriorLike  # a distribution of the value, or the ends of a log-uniform or uniform one
+    source: str = "given"  # {"given", "sensors", "assumed", "default"}
+    # the least-squares value, not finite where unknown: `limits` reach beyond it, because data can
+    # outweigh a prior even in its far tail
     estimate: float = float("nan")
 
     @property
@@ -82,19 +59,19 @@ class ParameterPrior:
         """Whether the search coordinate theta is the logarithm of the value."""
         return self.parameter.positive
 
-    @cached_property
-    def distribution(self) -> Distribution | None:
-        """The distribution of the value; None where there are bounds."""
-        return None if isinstance(self.given, tuple) else self.given
+    @property
+    def bounded(self) -> bool:
+        """Whether the prior is the ends of a range."""
+        return isinstance(self.given, tuple)
 
     @cached_property
     def limits(self) -> tuple[float, float]:
         """Ends of theta beyond which the posterior probability is zero or negligible."""
-        if isinstance(self.given, tuple):
-            return self._theta(self.given[0]), self._theta(self.given[1])
         low, high = self.bulk
         at = self._theta(self.estimate)
-        if np.isfinite(at):  # as far beyond the estimate as that is from the prior
+        if not self.bounded and np.isfinite(
+            at
+        ):  # as far beyond the estimate as that is from the prior
             first, last = (self._theta(float(self.given.ppf(q))) for q in (0.0, 1.0))
             low = max(first, min(low, 2.0 * at - low))
             high = min(last, max(high, 2.0 * at - high))
@@ -103,9 +80,8 @@ class ParameterPrior:
     @cached_property
     def bulk(self) -> tuple[float, float]:
         """Ends of theta beyond which the prior probability is zero or negligible."""
-        if isinstance(self.given, tuple):
-            return self.limits
-        low, high = (self._theta(float(self.given.ppf(q))) for q in (_TAIL, 1.0 - _TAIL))
+        ends = self.given if self.bounded else self.given.ppf([_TAIL, 1.0 - _TAIL])
+        low, high = (self._theta(float(end)) for end in ends)
         return low, high
 
     def _theta(self, value: float) -> float:
@@ -121,36 +97,33 @@ class ParameterPrior:
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """Return the log-density over theta; -inf outside its support."""
-        low, high = self.limits
-        if self.distribution is None:
-            inside = (theta >= low) & (theta <= high)
-            return np.where(inside, -np.log(high - low), -np.inf)
+        if self.bounded:
+            low, high = self.limits
+            return np.where((theta >= low) & (theta <= high), -np.log(high - low), -np.inf)
         with np.errstate(over="ignore"):
             value = np.exp(theta) if self.logarithmic else theta
         allowed = (value >= self.parameter.lower) & (value <= self.parameter.upper)
-        density = np.where(allowed, _log_density(self.distribution, value), -np.inf)
+        density = np.where(allowed, _log_density(self.given, value), -np.inf)
         return density + theta if self.logarithmic else density
 
     def probability(self, theta: FloatArray) -> FloatArray:
         """Return the prior probability below theta."""
-        if self.distribution is None:
+        if self.bounded:
             low, high = self.limits
             return np.clip((theta - low) / (high - low), 0.0, 1.0)
-        return np.asarray(self.distribution.cdf(np.exp(theta) if self.logarithmic else theta))
+        return np.asarray(self.given.cdf(np.exp(theta) if self.logarithmic else theta))
 
     def quantile(self, q: FloatArray) -> FloatArray:
         """Return quantiles of theta."""
         low, high = self.limits
-        if self.distribution is None:
+        if self.bounded:
             return np.asarray(low + (high - low) * q)
-        value = np.asarray(self.distribution.ppf(q))
-        if not self.logarithmic:
-            return value
-        return np.asarray(np.log(np.maximum(value, np.exp(low))))
+        value = np.asarray(self.given.ppf(q))
+        return np.log(np.maximum(value, np.exp(low))) if self.logarithmic else value
 
     def __str__(self) -> str:
         unit = f" {self.parameter.unit}" if self.parameter.unit else ""
-        if isinstance(self.given, tuple):
+        if self.bounded:
             kind = "log-uniform" if self.logarithmic else "uniform"
             text = f"{kind} from {self.given[0]:.4g} to {self.given[1]:.4g}{unit}"
         else:
@@ -165,42 +138,21 @@ class JointPrior:
 
     priors: tuple[ParameterPrior, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(part.parameter.name for part in self.priors)
+
     @cached_property
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Ends of every theta, each of shape (P,)."""
         low, high = np.array([part.limits for part in self.priors]).T
         return low, high
 
-    @cached_property
-    def bulk(self) -> tuple[FloatArray, FloatArray]:
-        """Ends of every theta beyond which the prior probability is negligible."""
-        low, high = np.array([part.bulk for part in self.priors]).T
-        return low, high
-
-    @cached_property
-    def widths(self) -> FloatArray:
-        """Distance in theta between the quantiles 16 % and 84 %, shape (P,)."""
-        return np.array([part.width for part in self.priors])
-
     def log_density(self, theta: FloatArray) -> FloatArray:
         """Return the joint log-density over theta, (S, P) -> (S,)."""
-        total = self._bounded(theta)
-        for index, part in enumerate(self.priors):
-            if part.distribution is not None:
-                total = total + part.log_density(theta[:, index])
-        return total
-
-    def _bounded(self, theta: FloatArray) -> FloatArray:
-        low, high, constant = self._box
-        inside = ((theta >= low) & (theta <= high)).all(axis=-1)
-        return np.where(inside, constant, -np.inf)
-
-    @cached_property
-    def _box(self) -> tuple[FloatArray, FloatArray, float]:
-        bounded = np.array([part.distribution is None for part in self.priors])
-        low, high = self.limits
-        constant = -float(np.log((high - low)[bounded]).sum())
-        return np.where(bounded, low, -np.inf), np.where(bounded, high, np.inf), constant
+        each = (part.log_density(theta[:, i]) for i, part in enumerate(self.priors))
+        return np.asarray(sum(each, np.zeros(len(theta))))
 
     def draw(self, random: np.random.Generator, size: int) -> FloatArray:
         """Return independent draws of theta, shape (size, P)."""
@@ -251,8 +203,7 @@ def _checked_prior(parameter: Parameter, stated: Any) -> PriorLike:
     frozen = not hasattr(stated, "freeze")  # as those of scipy.stats without parameters have
     if frozen and all(hasattr(stated, name) for name in ("logpdf", "cdf", "ppf")):
         _check_support(parameter, stated)
-        prior: Distribution = stated
-        return prior
+        return stated
     if not isinstance(stated, Sequence) or len(stated) != 2:
         raise ValidationError(
             f"the prior of {parameter.name} is {stated!r}; expected a frozen, continuous "
@@ -274,7 +225,7 @@ def _checked_prior(parameter: Parameter, stated: Any) -> PriorLike:
     return low, high
 
 
-def _check_support(parameter: Parameter, dist: Distribution) -> None:
+def _check_support(parameter: Parameter, dist: Any) -> None:
     """Refuse a distribution with noticeable probability where the parameter cannot be."""
     with np.errstate(divide="ignore", invalid="ignore"):
         outside = float(dist.cdf(parameter.lower)) + 1.0 - float(dist.cdf(parameter.upper))
@@ -302,7 +253,11 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
     # the problem shows units of rotation where the data do; dimensions follow those declared
     parameter = next((p for p in problem.model.parameters if p.name == parameter.name), parameter)
     if parameter.prior is not None:
-        low, high = _widened(parameter, *parameter.prior)
+        low, high = parameter.prior  # of 95 % probability: bounds well beyond it
+        beyond = _BEYOND * (high - low)
+        low, high = (
+            (low / _BEYOND, high * _BEYOND) if parameter.positive else (low - beyond, high + beyond)
+        )
     elif not any(parameter.dimension):
         raise _without_default(parameter)
     elif parameter.positive:
@@ -322,13 +277,6 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
     return low, high
 
 
-def _widened(parameter: Parameter, low: float, high: float) -> tuple[float, float]:
-    """Return bounds well beyond a declared range of 95 % probability."""
-    if parameter.positive:
-        return low / _BEYOND, high * _BEYOND
-    return low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-
-
 def _without_default(parameter: Parameter) -> ValidationError:
     name = parameter.name
     return ValidationError(
@@ -338,7 +286,7 @@ def _without_default(parameter: Parameter) -> ValidationError:
     )
 
 
-def _log_density(distribution: Distribution, value: FloatArray) -> FloatArray:
+def _log_density(distribution: Any, value: FloatArray) -> FloatArray:
     """Return logpdf; of normal distributions directly, because scipy takes fifty times as long."""
     if _name(distribution) == "norm":
         mean, std = _moments(distribution)
@@ -356,7 +304,7 @@ def _moments(distribution: Any) -> tuple[float, float]:
     return float(distribution.mean()), float(distribution.std())
 
 
-def _described(distribution: Distribution) -> str:
+def _described(distribution: Any) -> str:
     mean, std = _moments(distribution)
     if np.isfinite(std):
         return f"{_name(distribution)}, mean {mean:.6g}, std {std:.4g}"

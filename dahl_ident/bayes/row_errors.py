@@ -32,48 +32,22 @@ _MANY = 200.0  # degrees of freedom with which Student's t is normal to 1 % at 9
 
 @dataclass(frozen=True)
 class RowErrors:
-    """Covariance of a table's residuals, and the sources that it counts.
-
-    Attributes
-    ----------
-    counted : tuple of str
-        Names of the sources.
-    turn : ndarray, shape (k, m)
-        W: takes m residuals to coordinates in which they are independent.
-    shared : ndarray, shape (k,)
-        mu: variance of what rows share there; that of noise is 1.
-    log_volume : float
-        ln of the determinant of W.
-    factors : ndarray, shape (n, 2, 2)
-        What takes each row's residuals to those with a noise of unit variance.
-    dof, share : float
-        nu and p.
-    jacobian : ndarray, shape (m, P)
-        Derivatives of weighted residuals with respect to what the data determine.
-    residuals : ndarray, shape (m,)
-        Weighted residuals at the estimate.
-    scale_known : bool
-        Whether s is 1.
-    centre : ndarray, shape (P,)
-        Estimates of parameters that differ from run to run, search coordinates; NaN for others.
-    slopes : ndarray, shape (m, P)
-        Derivatives of the residuals by them, 0 for others.
-    inside : ndarray, shape (m, k), or None
-        Orthonormal directions of residuals beyond which rows share nothing, where rows are many.
-    """
+    """Covariance of a table's m residuals, and the sources that it counts."""
 
     counted: tuple[str, ...]
-    turn: FloatArray
-    shared: FloatArray
-    log_volume: float
-    factors: FloatArray
-    dof: float
-    share: float
-    jacobian: FloatArray
-    residuals: FloatArray
-    scale_known: bool
+    turn: FloatArray  # (k, m) W: to k coordinates in which residuals are independent
+    shared: FloatArray  # (k,) mu: variance of what rows share there; that of noise is 1
+    log_volume: float  # ln of the determinant of W
+    factors: FloatArray  # (n, 2, 2): from a row's residuals to those with noise of unit variance
+    dof: float  # nu
+    share: float  # p
+    jacobian: FloatArray  # (m, P) of weighted residuals with respect to what the data determine
+    residuals: FloatArray  # (m,) weighted, at the estimate
+    scale_known: bool  # whether s is 1
+    # (P,) estimates of parameters that differ from run to run, search coordinates; NaN for others
     centre: FloatArray
-    slopes: FloatArray
+    slopes: FloatArray  # (m, P) derivatives of the residuals with respect to them, 0 for others
+    # (m, k) orthonormal directions beyond which rows share nothing, where rows are many
     inside: FloatArray | None = None
 
     @cached_property
@@ -102,7 +76,10 @@ class RowErrors:
         root = np.sqrt(variances)
         Q, R = np.linalg.qr(self.turn @ self.jacobian / root[:, None])
         z = self.turn @ self.residuals / root
-        left = float(z @ z - np.sum((Q.T @ z) ** 2)) + float(self._beyond(self.residuals))
+        left = float(z @ z - np.sum((Q.T @ z) ** 2))
+        if self.inside is not None:  # where rows share nothing
+            y = self.residuals
+            left += max(float(y @ y - np.sum((y @ self.inside) ** 2)), 0.0)
         size = -float(np.log(np.abs(np.diagonal(R))).sum())
         if self.scale_known:
             return size - 0.5 * left
@@ -117,12 +94,12 @@ class RowErrors:
         return np.asarray((theta - self.held(theta)) @ self.slopes.T)
 
     def uncorrelated(self, y: FloatArray) -> FloatArray:
-        """Return uncorrelated residuals, (S, m) -> (S, K), last those that rows do not share."""
-        y = self._weighted(y)
+        """Return uncorrelated residuals, (..., m) -> (..., K), the last not shared by rows."""
+        y = np.sum(y.reshape(*y.shape[:-1], -1, 1, 2) * self.factors, axis=-1).reshape(y.shape)
         turned = y @ self.turn.T
         if self.inside is None:
             return np.asarray(turned)
-        return np.concatenate([turned, y - (y @ self.inside) @ self.inside.T], axis=1)
+        return np.concatenate([turned, y - (y @ self.inside) @ self.inside.T], axis=-1)
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -130,31 +107,11 @@ class RowErrors:
         alone = 0 if self.inside is None else len(self.inside)
         return np.concatenate([1.0 / self._variances, np.ones((alone, len(self.sizes)))])
 
-    def _weighted(self, y: FloatArray) -> FloatArray:
-        """Return residuals (..., m) with their weights."""
-        pairs = y.reshape(*y.shape[:-1], -1, 1, 2)
-        return np.asarray(np.sum(pairs * self.factors, axis=-1).reshape(y.shape))
-
-    def _beyond(self, y: FloatArray) -> FloatArray:
-        """Return the sum of squares of residuals (..., m) where rows share nothing."""
-        if self.inside is None:
-            return np.zeros(y.shape[:-1])
-        rest = np.sum(y**2, axis=-1) - np.sum((y @ self.inside) ** 2, axis=-1)
-        return np.asarray(np.maximum(rest, 0.0))
-
-    def independent(self, y: FloatArray, by: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return independent residuals, (S, k), and derivatives, (S, k, P), of (S, m[, P]).
+    def independent(self, y: FloatArray) -> FloatArray:
+        """Return independent residuals, (..., m) -> (..., K), whose squares count alike.
 
         Their sum of squares is that of lambda = 1.
         """
-        y = self._weighted(y)
-        by = self._weighted(by.swapaxes(-1, -2)).swapaxes(-1, -2)
-        turn = self.turn / np.sqrt(1.0 + self.shared)[:, None]
-        turned = y @ turn.T, turn @ by
-        if self.inside is None:
-            return turned
-        rest = y - (y @ self.inside) @ self.inside.T, by - self.inside @ (self.inside.T @ by)
-        return (
-            np.concatenate([turned[0], rest[0]], axis=-1),
-            np.concatenate([turned[1], rest[1]], axis=-2),
-        )
+        y = self.uncorrelated(y)
+        y[..., : len(self.shared)] /= np.sqrt(1.0 + self.shared)
+        return y

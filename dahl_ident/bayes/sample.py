@@ -6,7 +6,6 @@ Both have coordinates theta with weights, whether they can be used, and why not.
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -37,36 +36,8 @@ Start = Callable[[int, np.random.Generator], FloatArray]
 """Returns as many points of finite density as there are walkers."""
 
 
-class Sample(ABC):
-    """Weighted draws from a posterior, and whether they can be used."""
-
-    @property
-    @abstractmethod
-    def draws(self) -> WeightedDraws:
-        """All draws that count, search coordinates."""
-
-    @property
-    @abstractmethod
-    def converged(self) -> bool:
-        """Whether the numbers can be used."""
-
-    @property
-    @abstractmethod
-    def message(self) -> str:
-        """Whether the numbers can be used, and what is missing if not."""
-
-    @property
-    @abstractmethod
-    def facts(self) -> Mapping[str, Any]:
-        """How the draws were made, as plain data."""
-
-    def columns(self, std: FloatArray) -> dict[str, FloatArray]:
-        """Return what a summary states of each parameter in addition to moments and quantiles."""
-        return {}
-
-
 @dataclass(frozen=True)
-class ChainSample(Sample):
+class ChainSample:
     """The draws of a Markov chain, without its warm-up."""
 
     chain: Chain
@@ -88,8 +59,8 @@ class ChainSample(Sample):
     def message(self) -> str:
         """Whether the chain has converged, and what is missing if not."""
         steps, warm_up = self.chain.steps, self.convergence.discard
-        kept = f"{steps - warm_up} steps of {self.settings.walkers} walkers"
         if self.converged:
+            kept = f"{steps - warm_up} steps of {self.settings.walkers} walkers"
             return f"Converged: {kept} after {warm_up} of warm-up."
         return (
             f"NOT CONVERGED after {steps} steps: {'; '.join(self.convergence.lacks)}. The "
@@ -99,11 +70,8 @@ class ChainSample(Sample):
     @property
     def facts(self) -> Mapping[str, Any]:
         """Seed and number of steps."""
-        return {
-            "seed": self.settings.seed,
-            "steps": self.chain.steps,
-            "warm_up": self.convergence.discard,
-        }
+        steps, warm_up = self.chain.steps, self.convergence.discard
+        return {"seed": self.chain.seed, "steps": steps, "warm_up": warm_up}
 
     def columns(self, std: FloatArray) -> dict[str, FloatArray]:
         """Return Monte Carlo errors, effective numbers of draws, and R-hat."""
@@ -112,9 +80,9 @@ class ChainSample(Sample):
 
     def check(self, names: Sequence[str], result: Any) -> None:
         """Raise where nothing can be said of the chain; the error carries the result."""
-        if self.convergence.usable:
-            return
         still = ~np.isfinite(self.convergence.tau)
+        if not still.any():
+            return
         stuck = [name for name, there in zip(names, still, strict=True) if there]
         raise SamplingError(
             f"some walkers never moved in {', '.join(stuck)} over {self.chain.steps} steps, so "
@@ -125,7 +93,7 @@ class ChainSample(Sample):
 
 
 @dataclass(frozen=True)
-class PointSample(Sample):
+class PointSample:
     """Importance points: the same at every call, with the error of every probability."""
 
     density: LogDensity
@@ -173,6 +141,14 @@ class PointSample(Sample):
         names = (*["log_evidence"] * self.density.normalised, "error", "evaluations")
         return {name: getattr(self.integral, name) for name in names}
 
+    def columns(self, std: FloatArray) -> dict[str, FloatArray]:
+        """Return nothing: the error is one number for all parameters."""
+        return {}
+
+
+Sample = ChainSample | PointSample
+"""Weighted draws from a posterior, and whether they can be used."""
+
 
 def sample_chain(
     density: LogDensity,
@@ -189,31 +165,19 @@ def sample_chain(
     The seed of a file is kept; a `seed` that differs from it is refused.
     """
     with ExitStack() as stack:
-        every, stored = [*listeners], None
+        stored = None
         if resume is not None:
-            of = identity(density, settings.walkers, settings.ensembles)
-            file = stack.enter_context(open_chain(resume, of))
+            file = stack.enter_context(open_chain(resume, identity(density, settings)))
             stored = file.load()
             if stored is not None and seed not in (None, stored.seed):
                 raise SamplingError(
                     f"{os.fspath(resume)} was begun with seed {stored.seed}, but seed is {seed}; "
                     "leave it out to resume, or give another file"
                 )
-            if stored is not None:
-                settings = replace(settings, seed=stored.seed)
-            file.begin(settings.seed)
-            every.append(file)
-        if stored is None:
-            random = np.random.default_rng(settings.seed)
-            chain = Chain.at(start(settings.walkers, random), settings.seed)
-        else:
-            chain = stored.chain
-
-        def tell(chain: Chain, verdict: Convergence | None) -> None:
-            for listener in every:
-                listener(chain, verdict)
-
-        chain, verdict = run(density, chain, settings, pool=pool, listener=tell)
+            listeners = [*listeners, file]
+        random = np.random.default_rng(settings.seed)
+        chain = stored or Chain.at(start(settings.walkers, random), settings.seed)
+        chain, verdict = run(density, chain, settings, listeners, pool)
     return ChainSample(chain, verdict, settings)
 
 
@@ -229,7 +193,7 @@ def sample_points(
     `begin` returns a centre and a covariance, (P,) and (P, P); `given` names the parameters that
     were left free by the user; `tell` takes the number of points so far.
     """
-    names = [part.parameter.name for part in density.prior.priors]
+    names = density.prior.names
     if len(names) > _MOST_AXES:
         assumed = [name for name in names if name not in given]
         instead = f"give {', '.join(assumed)} or " if assumed else ""
@@ -241,32 +205,24 @@ def sample_points(
     centre, covariance = begin()
     evaluations = 0
 
-    def counted(function: Function) -> Function:
-        def of_points(theta: FloatArray) -> FloatArray:
-            nonlocal evaluations
-            result = function(theta)
-            evaluations += len(theta)
-            if tell is not None:
-                tell(evaluations)
-            return result
+    def counted(function: Function, theta: FloatArray) -> FloatArray:
+        nonlocal evaluations
+        result = function(theta)
+        evaluations += len(theta)
+        if tell is not None:
+            tell(evaluations)
+        return result
 
-        return of_points
-
-    near, log_density, sums, error = None, counted(density.marginal), density.sums, 0.0
+    near, log_density, sums, error = None, partial(counted, density.marginal), density.sums, 0.0
     if density.likelihood == "gaussian":
-        near = interpolated(
-            density, counted(density.residuals), centre, covariance, 0.5 * tolerance
-        )
+        residuals_of = partial(counted, density.residuals)
+        near = interpolated(density, residuals_of, centre, covariance, 0.5 * tolerance)
     if near is not None:
         log_density, sums, error = partial(density.marginal, sums=near), near, near.error
     integral = integrate(
-        log_density,
-        density.prior,
-        centre,
-        covariance,
-        density.decorrelation,
+        log_density, density.prior, centre, covariance, density.decorrelation,
         tolerance=tolerance - error,
-    )
+    )  # fmt: skip
     integral = replace(integral, error=integral.error + error, evaluations=evaluations)
     return PointSample(density, integral, tolerance, sums)
 

@@ -80,13 +80,12 @@ def centre_and_covariance(
     if density.around is not None:
         return density.around
     assert isinstance(density, Density)
-    problem, prior = density.problem, density.prior
     theta = _inside(density, optimum, random)
-    precision = np.diag((2.0 / prior.widths) ** 2)
+    precision = np.diag([(2.0 / part.width) ** 2 for part in density.prior.priors])
     if density.likelihood != "none":
         scale = _scale(density, theta)
         if density.errors is None:
-            known = _with_normal_priors(problem).information(theta, scale)
+            known = _with_normal_priors(density.problem).information(theta, scale)
         else:
             known = density.curvature(theta)[1] / scale**2
         precision = precision + known
@@ -133,7 +132,7 @@ def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
     in microslip, for example, sigma and the spring have to follow an f_max that cannot be infinite.
     """
     problem = density.problem
-    low, high = _narrowed(*density.prior.bulk)
+    low, high = _narrowed(*np.transpose([part.bulk for part in density.prior.priors]))
     nearest = np.clip(optimum.theta, low, high)
     outside = np.flatnonzero(nearest != optimum.theta)
     if not outside.size:
@@ -163,7 +162,7 @@ def _scale(density: Density, theta: FloatArray) -> float:
     if not density.has_scale:
         return 1.0
     if density.errors is None:
-        squares = float(density.squares(theta[None]).sum())
+        squares = float(density.quick.squares(theta[None]).sum())
     else:
         squares = 2.0 * density.curvature(theta)[0]
     scale = float(np.sqrt(squares / density.problem.n_residuals))

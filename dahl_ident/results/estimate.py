@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.bayes.chain import ChainSettings, Pool
-from dahl_ident.bayes.density import Density, LogDensity
+from dahl_ident.bayes.density import Density, LogDensity, RecordDensity
 from dahl_ident.bayes.priors import PriorLike, joint_prior
-from dahl_ident.bayes.record_density import RecordDensity
 from dahl_ident.bayes.sample import ChainSample, Start, sample_chain, sample_points
 from dahl_ident.bayes.walker_start import (
     centre_and_covariance,

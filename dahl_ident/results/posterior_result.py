@@ -328,7 +328,7 @@ class Posterior(Result):
         return self.sample
 
     convergence: Convergence = part("chain.convergence", "The verdict on the chain's length.")
-    seed: int = part("chain.settings.seed", "With which the same chain comes out again.")
+    seed: int = part("chain.chain.seed", "With which the same chain comes out again.")
     steps: int = part("chain.chain.steps", "Total number of steps, warm-up included.")
     warm_up: int = part("convergence.discard", "Steps that numbers and pictures leave out.")
 
