@@ -93,11 +93,12 @@ class ParameterBudget:
         Its estimate.
     rows : tuple of BudgetRow
         One a source, the largest first.
-    limits : tuple of float, or None
-        The interval where it is not value ± U, as that of a factor either way.
     u, dof, k, U : float
         Combined standard uncertainty, its effective degrees of freedom, coverage factor for
         95.45 %, expanded uncertainty k u.
+    limits : tuple of float, or None
+        The interval where it is not value ± U, as that of a factor either way; no U is printed
+        then.
     """
 
     name: str
@@ -108,7 +109,6 @@ class ParameterBudget:
     dof: float
     k: float
     limits: tuple[float, float] | None = None
-    """The interval, where it is not value ± U; no U is printed then."""
 
     @property
     def U(self) -> float:
@@ -118,7 +118,7 @@ class ParameterBudget:
     @property
     def expanded(self) -> str:
         """U as it is printed, or the interval."""
-        return _u(self, self.U) if self.limits is None else interval(*self.limits, "")
+        return rounded(self.value, self.U)[1] if self.limits is None else interval(*self.limits, "")
 
 
 @dataclass(frozen=True)
@@ -149,11 +149,10 @@ class Budget(Mapping[str, ParameterBudget]):
     exact: tuple[str, ...]
 
     def __getitem__(self, name: str) -> ParameterBudget:
-        for parameter in self.parameters:
-            if parameter.name == name:
-                return parameter
-        known = ", ".join(p.name for p in self.parameters)
-        raise KeyError(f"{name} has no budget; there are {known}")
+        by_name = {parameter.name: parameter for parameter in self.parameters}
+        if name not in by_name:
+            raise KeyError(f"{name} has no budget; there are {', '.join(by_name)}")
+        return by_name[name]
 
     def __iter__(self) -> Iterator[str]:
         return (p.name for p in self.parameters)
@@ -177,11 +176,13 @@ class Budget(Mapping[str, ParameterBudget]):
     def _cells(self) -> Iterator[tuple[str, ...]]:
         """Yield name, value, then source, type, u, dof, share, k and U: the combined one first."""
         for p in self.parameters:
-            whole = ("combined", "", _u(p, p.u), _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded)
-            yield (p.name, rounded(p.value, p.u)[0], *whole)
+            value, u = rounded(p.value, p.u)
+            whole = ("combined", "", u, _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded)
+            yield (p.name, value, *whole)
             for r in p.rows:
                 share = f"{100.0 * r.share:.0f} %"
-                yield ("", "", r.source, r.kind, _u(p, r.u), _dof(r.dof), share, "", "")
+                u = rounded(p.value, r.u)[1]
+                yield ("", "", r.source, r.kind, u, _dof(r.dof), share, "", "")
 
     def __str__(self) -> str:
         lines: list[tuple[str, ...]] = [("", *_COLUMNS)]
@@ -208,17 +209,12 @@ class Budget(Mapping[str, ParameterBudget]):
         """Return a pandas table: one row a parameter and source, the combined one last."""
         import pandas as pd
 
-        return pd.DataFrame(
-            [
-                {"parameter": p.name, "unit": p.unit, **vars(row), "k": np.nan, "U": np.nan}
-                for p in self.parameters
-                for row in (*p.rows, BudgetRow("combined", "A", p.u, p.dof, 1.0))
-            ]
-        ).assign(
-            k=[v for p in self.parameters for v in (*[np.nan] * len(p.rows), p.k)],
-            U=[v for p in self.parameters for v in (*[np.nan] * len(p.rows), p.U)],
-            kind=[v for p in self.parameters for v in (*[r.kind for r in p.rows], "")],
-        )
+        rows = []
+        for p in self.parameters:
+            combined = vars(BudgetRow("combined", "A", p.u, p.dof, 1.0))
+            parts = (*map(vars, p.rows), combined | {"kind": "", "k": p.k, "U": p.U})
+            rows += [{"parameter": p.name, "unit": p.unit, **part} for part in parts]
+        return pd.DataFrame(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; infinite degrees of freedom are None."""
@@ -227,18 +223,13 @@ class Budget(Mapping[str, ParameterBudget]):
             "taken_as_exact": list(self.exact),
             "parameters": {
                 p.name: {
-                    "value": p.value,
-                    "unit": p.unit,
-                    "u": p.u,
-                    "dof": _finite(p.dof),
-                    "k": p.k,
-                    "U": p.U if p.limits is None else None,
-                    "interval": p.limits,
+                    "value": p.value, "unit": p.unit, "u": p.u, "dof": _finite(p.dof), "k": p.k,
+                    "U": p.U if p.limits is None else None, "interval": p.limits,
                     "sources": [{**vars(row), "dof": _finite(row.dof)} for row in p.rows],
                 }
                 for p in self.parameters
             },
-        }
+        }  # fmt: skip
 
     def numbers(self, library: Literal["uncertainties", "GTC"] = "uncertainties") -> dict[str, Any]:
         """Return the parameters as correlated numbers of a library for uncertain numbers.
@@ -378,10 +369,6 @@ def _parameter(
     dof = errors.dof(direction)
     dof = dof if dof < MANY else np.inf
     return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
-
-
-def _u(parameter: ParameterBudget, u: float) -> str:
-    return rounded(parameter.value, u)[1]
 
 
 def _dof(dof: float) -> str:

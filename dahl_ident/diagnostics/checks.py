@@ -16,7 +16,14 @@ from dahl_ident.data.tabular import doubts
 from dahl_ident.diagnostics.budget import taken_as_exact
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import in_order_of_level
-from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import (
+    Finding,
+    Judgement,
+    Question,
+    VerdictStatus,
+    described,
+    undetermined,
+)
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
     below_zero,
@@ -40,8 +47,7 @@ _OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 _PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
 
-_DETERMINED, _DESCRIBED, _ASSUMED = Question
-_TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
+_TRUSTED, _APPROXIMATE, _, _NOT_DESCRIBED = VerdictStatus
 
 
 def judgement(fit: TableAssessment) -> Judgement:
@@ -51,9 +57,9 @@ def judgement(fit: TableAssessment) -> Judgement:
     """
     found = [finding for check in CHECKS for finding in check(fit)]
     if fit.with_less is not None:
-        worst = max((f.severity.rank for f in found if f.question is _DESCRIBED), default=0)
+        worst = max((f.severity.rank for f in found if f.question is Question.DESCRIBED), default=0)
         every = judgement(fit.with_less).findings
-        hidden = [f for f in every if f.question is _DESCRIBED and f.severity.rank > worst]
+        hidden = [f for f in every if f.question is Question.DESCRIBED and f.severity.rank > worst]
         replaced = {"noise", *(f.code for f in hidden)} if hidden else set()
         found = [f for f in found if f.code not in replaced] + hidden
     return Judgement(found)
@@ -71,24 +77,19 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
     if can_tell or known.complete:
         yield known.finding
     if can_tell and not known.complete and known.combinations:
-        values: dict[str, Any] = {"combinations": tuple(map(str, known.combinations))}
-        yield Finding(_DETERMINED, _NOT_DETERMINED, "combinations", values)
+        yield undetermined("combinations", combinations=tuple(map(str, known.combinations)))
     if not optimum.success:
         message = optimum.status.value if optimum.status.at_infinity else optimum.message
-        yield Finding(_DETERMINED, _NOT_DETERMINED, "solver", {"message": message})
+        yield undetermined("solver", message=message)
     if optimum.dof <= 0:
-        values = {
-            "numbers": optimum.problem.n_residuals,
-            "parameters": len(optimum.names),
-            "scale_known": optimum.scale_known,
-        }
-        yield Finding(_DETERMINED, _NOT_DETERMINED, "no_degrees_of_freedom", values)
+        yield undetermined(
+            "no_degrees_of_freedom", numbers=optimum.problem.n_residuals,
+            parameters=len(optimum.names), scale_known=optimum.scale_known,
+        )  # fmt: skip
     if can_tell:
         for why in dict.fromkeys(parameter.why for parameter in known.open):
-            alike = [parameter for parameter in known.open if parameter.why == why]
-            shown = {parameter.name: parameter.known_as for parameter in alike}
-            values = {"shown": shown, "why": why}
-            yield Finding(_DETERMINED, _NOT_DETERMINED, "undetermined_parameters", values)
+            shown = {p.name: p.known_as for p in known.open if p.why == why}
+            yield undetermined("undetermined_parameters", shown=shown, why=why)
 
 
 # Described?
@@ -114,23 +115,21 @@ def _residuals(fit: TableAssessment) -> Iterator[Finding]:
     severity = _NOT_DESCRIBED if lost or large else _APPROXIMATE
     yield from goodness.findings(severity, counted=severity is _APPROXIMATE and _is_determined(fit))
     if large and not goodness.objections:
-        yield Finding(_DESCRIBED, severity, "large_misfit", {"rms": goodness.rms_misfit})
+        yield described("large_misfit", severity, rms=goodness.rms_misfit)
 
 
 def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
     """Return whether the data contradict an exponent that the user gave."""
-    exponent = fit.goodness.exponent
+    exponent, parameters = fit.goodness.exponent, fit.problem.model.parameters
     if exponent is None or exponent.p_value > fit.goodness.level:
         return False
-    given = {p.name: p for p in fit.optimum.problem.model.parameters}
-    return not given[exponent.name].assumed
+    return not any(p.assumed for p in parameters if p.name == exponent.name)
 
 
 def _bands(fit: TableAssessment) -> Iterator[Finding]:
     """Yield whether the bands hold for what was held out, where anything speaks against the fit."""
     goodness = fit.goodness
-    speaks_against = (goodness.objections, goodness.flagged, *_reservations(fit))
-    if goodness.sign or not any(speaks_against):
+    if goodness.sign or not (goodness.objections or goodness.flagged or any(_reservations(fit))):
         return
     check = fit.cross_validation
     if check is None:
@@ -139,8 +138,8 @@ def _bands(fit: TableAssessment) -> Iterator[Finding]:
     if enough and fit.errors is not None:
         misfit = min(_misfit_within_runs(fit.errors), goodness.rms_misfit)
         if check.width < misfit:  # misfits inside a band have an rms below its half width
-            values = {"width": check.width, "misfit": goodness.rms_misfit}
-            yield Finding(_DESCRIBED, _NOT_DESCRIBED, "narrow_bands", values)
+            width, rms = check.width, goodness.rms_misfit
+            yield described("narrow_bands", _NOT_DESCRIBED, width=width, misfit=rms)
             return
     outside = enough and check.inside < _FEWEST_INSIDE * check.count
     yield check.finding(_NOT_DESCRIBED if outside else _TRUSTED)
@@ -160,7 +159,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 def _reservations(fit: TableAssessment) -> Iterator[Finding]:
     """Yield what keeps a fit from being trusted although its residuals may look like noise."""
     yield from _beyond_limit(fit)
-    yield from negative(fit)
+    yield from below_zero(fit)
     yield from _contradicted_priors(fit)
     yield from _beyond_range(fit)
     yield from _moved_by_outliers(fit)
@@ -175,14 +174,9 @@ def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
     yield from beyond_friction_limit(optimum, scatter, aside)
 
 
-def negative(fit: Assessment) -> Iterator[Finding]:
-    """Yield a finding for every mass, damping or stiffness clearly below zero."""
-    yield from below_zero(fit.optimum.problem, *fit.known)
-
-
 def _slight(fit: TableAssessment) -> Iterator[Finding]:
     """Yield a finding for every mass, damper or spring of less force than the model misses."""
-    view = fit.optimum.problem.stiffness_data
+    view = fit.problem.stiffness_data
     rows = view.harmonic == 1
     if not (fit.goodness.objections and _is_determined(fit) and rows.any()):
         return
@@ -194,35 +188,26 @@ def _slight(fit: TableAssessment) -> Iterator[Finding]:
         part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
         return float(np.sqrt(np.mean(np.abs(part) ** 2)))
 
-    yield from slight(fit.optimum.problem, *fit.known, share_of, within, misfit)
+    yield from slight(fit, share_of, within, misfit)
 
 
 def constraints(fit: Assessment) -> Iterator[Finding]:
     """Yield the constraints that the data contradict: their cost is not due to chance."""
     cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
-        values = {
-            "texts": tuple(cost.texts),
-            "rise": cost.rise,
-            "noise_known": bool(np.isinf(cost.dof)),
-            "p_value": cost.p_value,
-        }
-        yield Finding(_DESCRIBED, _NOT_DESCRIBED, "constraint", values)
+        yield described(
+            "constraint", _NOT_DESCRIBED, texts=tuple(cost.texts), rise=cost.rise,
+            noise_known=bool(np.isinf(cost.dof)), p_value=cost.p_value,
+        )  # fmt: skip
 
 
 def _contradicted_priors(fit: TableAssessment) -> Iterator[Finding]:
     """Yield every prior that the data contradict."""
-    optimum = fit.optimum
-    estimates = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    for name, prior in optimum.problem.priors.items():
-        values = {
-            "name": name,
-            "value": estimates[name],
-            "mean": float(prior.mean()),
-            "std": float(prior.std()),
-        }
-        if abs(values["value"] - values["mean"]) > _CONTRADICTED * values["std"]:
-            yield Finding(_DESCRIBED, _APPROXIMATE, "prior", values)
+    estimates = dict(zip(fit.optimum.names, fit.optimum.values.tolist(), strict=True))
+    for name, prior in fit.problem.priors.items():
+        value, mean, std = estimates[name], float(prior.mean()), float(prior.std())
+        if abs(value - mean) > _CONTRADICTED * std:
+            yield described("prior", _APPROXIMATE, name=name, value=value, mean=mean, std=std)
 
 
 def _beyond_range(fit: TableAssessment) -> Iterator[Finding]:
@@ -230,13 +215,13 @@ def _beyond_range(fit: TableAssessment) -> Iterator[Finding]:
     errors = fit.errors
     if errors is None:
         return
-    ranged = {p.name: p for p in errors.problem.parameters}
+    ranged = {p.name: p.prior for p in errors.problem.parameters}
     for name in errors.problem.ranges:
-        low, high = ranged[name].prior or (0.0, np.inf)
+        low, high = ranged[name] or (0.0, np.inf)
         value, u = errors.values[name], errors.stderr[name]
         if max(low - value, value - high) > _OUTSIDE * u:
-            values = {"name": name, "value": value, "stderr": u, "low": low, "high": high}
-            yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_range", values)
+            ends = {"low": low, "high": high}
+            yield described("beyond_range", _APPROXIMATE, name=name, value=value, stderr=u, **ends)
 
 
 def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
@@ -250,7 +235,7 @@ def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
     )
     if moved:
         rows = tuple(point.name for point in fit.goodness.suspicious)
-        yield Finding(_DESCRIBED, _APPROXIMATE, "moved", {"names": moved, "rows": rows})
+        yield described("moved", _APPROXIMATE, names=moved, rows=rows)
 
 
 def robust_values(
@@ -286,17 +271,9 @@ def robust_values(
     theta[free] += move
     std[free] = np.sqrt(np.diagonal(known))
     std *= np.abs(problem.value_slopes(errors.theta))
-    values = problem.to_values(theta)
-    names = problem.names
-    return (
-        dict(zip(names, values.tolist(), strict=True)),
-        dict(zip(names, std.tolist(), strict=True)),
-    )
-
-
-def _steady(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield how rows of held force were predicted."""
-    yield from steady_findings(fit.optimum, fit.model)
+    both = (problem.to_values(theta), std)
+    robust, by_noise = (dict(zip(problem.names, one.tolist(), strict=True)) for one in both)
+    return robust, by_noise
 
 
 # Assumed?
@@ -310,11 +287,9 @@ def reading(fit: Assessment) -> Iterator[Finding]:
 def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
     """Yield the warnings that were shown when the data were read."""
     texts = list(dict.fromkeys(text for one in provenances for text in doubts(one)))
-    for text in texts[:_DOUBTS_SHOWN]:
-        yield Finding(_DESCRIBED, _TRUSTED, "warning", {"text": text})
+    yield from (described("warning", text=text) for text in texts[:_DOUBTS_SHOWN])
     if len(texts) > _DOUBTS_SHOWN:
-        values = {"count": len(texts) - _DOUBTS_SHOWN}
-        yield Finding(_DESCRIBED, _TRUSTED, "more_warnings", values)
+        yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)
 
 
 def assumed(fit: Assessment) -> Iterator[Finding]:
@@ -355,7 +330,7 @@ def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding
         "noise_alone": errors is None,
     }
     if any(values.values()):
-        yield Finding(_ASSUMED, _TRUSTED, "assumed", values)
+        yield Finding(Question.ASSUMED, _TRUSTED, "assumed", values)
 
 
 CHECKS: tuple[Callable[[TableAssessment], Iterable[Finding]], ...] = (
@@ -365,7 +340,7 @@ CHECKS: tuple[Callable[[TableAssessment], Iterable[Finding]], ...] = (
     _bands,
     _reservations,
     _slight,
-    _steady,
+    steady_findings,
     reading,
     assumed,
 )

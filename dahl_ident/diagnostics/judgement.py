@@ -79,6 +79,18 @@ class Finding:
         }
 
 
+def described(
+    code: str, severity: VerdictStatus = VerdictStatus.TRUSTED, /, **values: Any
+) -> Finding:
+    """Return a finding about how the model describes the data."""
+    return Finding(Question.DESCRIBED, severity, code, values)
+
+
+def undetermined(code: str, /, **values: Any) -> Finding:
+    """Return a finding about what the data do not determine."""
+    return Finding(Question.DETERMINED, VerdictStatus.NOT_DETERMINED, code, values)
+
+
 _MOST_TOLD = 5  # findings of a verdict; more are not read
 
 

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
-from dahl_ident.problem import Problem
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.steady_state import response
 from dahl_ident.units import engineering, percent, shown_unit
+
+if TYPE_CHECKING:
+    from dahl_ident.diagnostics.assessment import Assessment, TableAssessment
 
 _SEEN = 1e-3  # relative difference that is worth a place
 _DISTORTED = 0.05  # of a force: less changes the fundamental by well below 1 %
@@ -30,13 +33,14 @@ _OFF = 0.02  # relative error of a prediction: as large as a good measurement's
 _CLEARLY = 2.0  # standard uncertainties below zero
 _IMPOSSIBLE = 3.0  # standard errors of a limit that a force exceeds
 _WITH_HARMONICS = 4.0  # a mass at three times the frequency carries nine times as much of a third
-_DESCRIBED, _APPROXIMATE = Question.DESCRIBED, VerdictStatus.APPROXIMATE
+_APPROXIMATE = VerdictStatus.APPROXIMATE
 _FALLING = "fit a law whose force falls with speed (LuGre)"
 _INSTEAD = {
     (1, -1, 2): "a mass: leave it out, or give its value",
     (1, -1, 1): f"a damper: {_FALLING}, leave the damper out, or give its value",
     (1, -1, 0): "a spring, except a buckled one: leave it out, or give its value",
 }
+# Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.
 _TYPICAL = {"x_c": (1e-9, 0.1), "force limit": (1e-9, 1e8), "contact stiffness": (1e-2, 1e12)}
 _TYPICAL_ROTATION = {
     "x_c": (1e-7, 1.0), "force limit": (1e-10, 1e8), "contact stiffness": (1e-4, 1e12)
@@ -46,15 +50,15 @@ _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
 _ALIKE = 0.05  # relative difference from such a ratio, and spread
 
 
-def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
+def _steady_difference(optimum: Optimum) -> tuple[int, float]:
     """Return the row where exact and describing-function response differ most, and by how much.
 
-    Relative to the exact one; None where no row has both.
+    Relative to the exact one; zero where no row has both.
     """
     problem = optimum.problem
     forced = (problem.data.controlled == "force") & (problem.data.harmonic == 1)
     if problem.obstacle_to_exact or not np.isfinite(optimum.values).all():
-        return None
+        return 0, 0.0
     exact, sine = (
         problem.with_steady(steady).predict(optimum.theta)
         for steady in ("exact", "describing function")
@@ -65,35 +69,27 @@ def steady_difference(optimum: Optimum) -> tuple[int, float] | None:
     return row, float(apart[row])
 
 
-def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
-    """Yield how driven rows were predicted, what the other way would have been, and jumps.
-
-    `model` has the estimates put in.
-    """
-    problem = optimum.problem
-    forced = problem.data.controlled == "force"
-    if not forced.any():
+def steady_findings(fit: TableAssessment) -> Iterator[Finding]:
+    """Yield how driven rows were predicted, what the other way would have been, and jumps."""
+    optimum, problem = fit.optimum, fit.problem
+    if not (problem.data.controlled == "force").any():
         return
-    described, note = Question.DESCRIBED, VerdictStatus.TRUSTED
     if problem.is_exact:
-        worst = steady_difference(optimum)
-        values = {"difference": 0.0, "row": ""}
-        if worst is not None and worst[1] >= _SEEN:
-            (row,) = row_names(problem.data, [worst[0]])
-            values = {"difference": worst[1], "row": row}
-        yield Finding(described, note, "steady", values)
+        row, apart = _steady_difference(optimum)
+        (name,) = row_names(problem.data, [row])
+        seen = apart >= _SEEN
+        yield described("steady", difference=apart if seen else 0.0, row=name if seen else "")
         yield from _distorted(problem.data)
-        yield from _jumps(problem.data, model)
-        unstable = problem.unstable_rows(optimum.theta)
-        if unstable:
+        yield from _jumps(problem.data, fit.model)
+        if unstable := problem.unstable_rows(optimum.theta):
             names = tuple(row_names(problem.data, unstable))
-            yield Finding(described, VerdictStatus.APPROXIMATE, "unstable_rows", {"rows": names})
+            yield described("unstable_rows", _APPROXIMATE, rows=names)
         return
     why = problem.obstacle_to_exact
     if not why and not problem.takes_energy(optimum.theta):
-        yield Finding(described, note, "no_steady_motion")
+        yield described("no_steady_motion")
     if why and problem.steady == "exact" and any(not e.is_linear for e in problem.model.elements):
-        yield Finding(described, note, "describing_function", {"why": why})
+        yield described("describing_function", why=why)
 
 
 def _distorted(data: FrequencyResponse) -> Iterator[Finding]:
@@ -108,8 +104,7 @@ def _distorted(data: FrequencyResponse) -> Iterator[Finding]:
         provenance = data.provenance or {}
         parts = provenance.get("parts", (provenance,))
         files = tuple(dict.fromkeys(str(p["file"]) for p in parts if "file" in p))
-        values = {"row": name, "distortion": float(apart[row]), "files": files}
-        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "distorted_force", values)
+        yield described("distorted_force", row=name, distortion=float(apart[row]), files=files)
 
 
 def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
@@ -130,8 +125,7 @@ def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
             mean = float(np.median(drive[there]))
             places.append((mean, float(several.min()), float(several.max())))
     if places:
-        values = {"places": tuple(places), "unit": shown_unit("N", data.motion)}
-        yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "jump", values)
+        yield described("jump", places=tuple(places), unit=shown_unit("N", data.motion))
 
 
 def physical_warnings(optimum: Optimum) -> Iterator[str]:
@@ -140,7 +134,8 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
     if optimum.status is Status.AT_BOUND:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
     yield from _not_a_sine(optimum)
-    yield from implausible_units(optimum)
+    yield from _sizes(optimum)
+    yield from _levels(optimum)
 
 
 def _not_a_sine(optimum: Optimum) -> Iterator[str]:
@@ -148,12 +143,12 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
     problem = optimum.problem
     if problem.is_exact or not (problem.data.controlled == "force").any():
         return
-    found = steady_difference(optimum)
-    if found is not None and found[1] > _OFF:
-        (name,) = row_names(problem.data, [found[0]])
+    row, apart = _steady_difference(optimum)
+    if apart > _OFF:
+        (name,) = row_names(problem.data, [row])
         yield (
             "the describing function, which takes the motion for a sine, is "
-            f"{percent(found[1])} off at {name}: fit with {argument('steady', 'exact')}"
+            f"{percent(apart)} off at {name}: fit with {argument('steady', 'exact')}"
         )
 
 
@@ -197,40 +192,27 @@ def beyond_friction_limit(
     limit = 0.25 * np.pi * bound
     unit, view = shown_unit("N", problem.data.motion), problem.stiffness_data
     names = partial(row_names, problem.data)
-    force, error = friction_force(optimum)
-    error = np.hypot(error, scatter * bound)
+    friction, size = friction_stiffness(optimum), view.amplitude
+    seen = view.weights > 0.0
+    force = np.where((view.harmonic == 1) & seen, np.abs(friction) * size, np.nan)
+    noise = np.sqrt(2.0) * optimum.scale / np.where(seen, view.weights, np.nan) * size
+    error = np.hypot(noise, scatter * bound)
     force[aside] = np.nan
     excess = np.nan_to_num((force - bound) / error, nan=-np.inf)
     row, judged = int(np.argmax(excess)), max(np.isfinite(excess).sum(), 1)
     dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
     if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / judged):
         shown = {"force": with_unit(force[row], error[row], unit), "limit": f"{bound:.3g} {unit}"}
-        yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_slip", {"row": names([row])[0], **shown})
+        yield described("beyond_slip", _APPROXIMATE, row=names([row])[0], **shown)
     if problem.data.drive is None:
         return
     held = (problem.data.controlled == "force") & np.isfinite(force)
-    carried = np.abs(view.stiffness * _sensed(optimum) - friction_stiffness(optimum))
-    carried = _WITH_HARMONICS * carried * view.amplitude
+    carried = _WITH_HARMONICS * np.abs(view.stiffness * _sensed(optimum) - friction) * size
     beyond = np.where(held, problem.data.drive - carried - limit, -np.inf)
     row = int(np.argmax(beyond))
     if beyond[row] > _IMPOSSIBLE * np.hypot(u, scatter * limit):
         shown = {"carried": f"{carried[row]:.2g} {unit}", "limit": f"{limit:.3g} {unit}"}
-        yield Finding(_DESCRIBED, _APPROXIMATE, "beyond_limit", {"row": names([row])[0], **shown})
-
-
-def friction_force(optimum: Optimum) -> tuple[FloatArray, FloatArray]:
-    """Return the fundamental of the friction force of each row and its standard deviation.
-
-    The modelled linear part is subtracted from the measured dynamic stiffness. NaN in rows of
-    harmonics.
-    """
-    N, scale = friction_stiffness(optimum), optimum.scale
-    view = optimum.problem.stiffness_data
-    counted = (view.harmonic == 1) & (view.weights > 0.0)
-    weights = np.where(view.weights > 0.0, view.weights, np.nan)
-    error = np.sqrt(2.0) * scale / weights * view.amplitude
-    force = np.where(counted, np.abs(N) * view.amplitude, np.nan)
-    return force, error
+        yield described("beyond_limit", _APPROXIMATE, row=names([row])[0], **shown)
 
 
 def is_spring(element: Element) -> bool:
@@ -277,63 +259,36 @@ def is_single(element: Element) -> bool:
     )
 
 
-def _estimated_singles(problem: Problem) -> list[tuple[Element, Parameter]]:
-    """Return every mass, damper and spring that is estimated, with its parameter."""
-    singles = ((e, e.parameters[0]) for e in problem.model.elements if is_single(e))
-    return [(element, parameter) for element, parameter in singles if parameter.free]
+def _estimated_singles(fit: Assessment) -> Iterator[tuple[Element, Parameter, dict[str, Any]]]:
+    """Yield every mass, damper and spring that is estimated, with its parameter and estimate."""
+    values, stderr = fit.known
+    for element in fit.problem.model.elements:
+        if is_single(element) and element.parameters[0].free:
+            (parameter,) = element.parameters
+            name, unit = parameter.name, shown_unit(parameter.unit, fit.problem.motion)
+            estimate = {"value": values[name], "stderr": stderr[name], "unit": unit}
+            yield element, parameter, {"name": name, **estimate}
 
 
-def below_zero(
-    problem: Problem, values: Mapping[str, float], stderr: Mapping[str, float]
-) -> Iterator[Finding]:
+def below_zero(fit: Assessment) -> Iterator[Finding]:
     """Yield a finding for every mass, damping or stiffness clearly below zero, with what to do."""
-    for _, parameter in _estimated_singles(problem):
-        value, error = values[parameter.name], stderr[parameter.name]
-        if np.isfinite(value) and value < -_CLEARLY * error:
-            negative = {
-                "name": parameter.name,
-                "value": value,
-                "stderr": error,
-                "unit": shown_unit(parameter.unit, problem.motion),
-                "instead": _INSTEAD[parameter.dimension],
-            }
-            yield Finding(_DESCRIBED, _APPROXIMATE, "negative", negative)
+    for _, parameter, estimate in _estimated_singles(fit):
+        value, instead = estimate["value"], _INSTEAD[parameter.dimension]
+        if np.isfinite(value) and value < -_CLEARLY * estimate["stderr"]:
+            yield described("negative", _APPROXIMATE, **estimate, instead=instead)
 
 
 def slight(
-    problem: Problem,
-    values: Mapping[str, float],
-    stderr: Mapping[str, float],
-    share_of: Callable[[Element, float], float],
-    missed: float,
-    misfit: float,
+    fit: Assessment, share_of: Callable[[Element, float], float], missed: float, misfit: float
 ) -> Iterator[Finding]:
     """Yield a finding for every mass, damper or spring of less force than the model has `missed`.
 
     `share_of` returns the rms force of an element at its value over the whole; `misfit` is shown.
     """
-    for element, parameter in _estimated_singles(problem):
-        value, error = values[parameter.name], stderr[parameter.name]
-        share = share_of(element, value)
-        if share < missed and value >= -_CLEARLY * error:
-            shown = {
-                "name": parameter.name,
-                "value": value,
-                "stderr": error,
-                "unit": shown_unit(parameter.unit, problem.motion),
-                "share": share,
-                "misfit": misfit,
-            }
-            yield Finding(_DESCRIBED, VerdictStatus.TRUSTED, "slight", shown)
-
-
-# Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.
-
-
-def implausible_units(optimum: Optimum) -> Iterator[str]:
-    """Yield a sentence for every number that another unit would explain."""
-    yield from _sizes(optimum)
-    yield from _levels(optimum)
+    for element, _, estimate in _estimated_singles(fit):
+        share = share_of(element, estimate["value"])
+        if share < missed and estimate["value"] >= -_CLEARLY * estimate["stderr"]:
+            yield described("slight", **estimate, share=share, misfit=misfit)
 
 
 def _sizes(optimum: Optimum) -> Iterator[str]:

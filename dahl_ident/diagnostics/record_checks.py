@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.checks import assumed, constraints, negative, reading
+from dahl_ident.diagnostics.checks import assumed, constraints, reading
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
-from dahl_ident.diagnostics.physics import is_single, slight
+from dahl_ident.diagnostics.physics import below_zero, is_single, slight
 from dahl_ident.diagnostics.record_errors import MODEL, NOISE
 from dahl_ident.elements import Element
 from dahl_ident.elements.recursion import Stretches, stretches
@@ -273,7 +273,7 @@ def _slight(fit: RecordAssessment) -> Iterator[Finding]:
         return float(np.concatenate([f - f.mean() for f in force]).std() / size)
 
     misfit = fit.goodness.share_in_band**0.5
-    yield from slight(problem, *fit.known, share_of, misfit, misfit)
+    yield from slight(fit, share_of, misfit, misfit)
 
 
 def _notes(fit: RecordAssessment) -> Iterator[Finding]:
@@ -306,7 +306,7 @@ CHECKS: tuple[Callable[[RecordAssessment], Iterable[Finding]], ...] = (
     constraints,
     _misfit,
     undetermined,
-    negative,
+    below_zero,
     _physics,
     _slight,
     _notes,
