@@ -44,10 +44,9 @@ for any number of rows (the attenuation of errors-in-variables regression).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +59,6 @@ from dahl_ident.errors import DataError, argument
 Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 """A loss: z -> rho(z), rho'(z), rho''(z)."""
 
-NOISE_MODELS = ("measured", "relative", "absolute")
-
 ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
 _AMPLITUDE_STEPS = 40  # a limit for iterations that do not settle
@@ -69,47 +66,20 @@ _AMPLITUDE_TOLERANCE = 1e-7  # of its standard deviation; residuals err by less 
 _ROUNDED = 0.01  # likewise: a step below this and not shorter than the last is of rounding
 
 
-class Noise(ABC):
-    """The computation of residuals from the predicted response, for the rows of one table."""
-
-    name: str
-    scale_known: bool
-    log_area: FloatArray
-    """Sum over rows of ln |dy/dR|, the log of the whitening's determinant, plus constants."""
-
-    @property
-    @abstractmethod
-    def weights(self) -> FloatArray:
-        """One over the standard deviation of |R - R_model| at the data, up to the scale."""
-
-    @property
-    @abstractmethod
-    def rounding(self) -> FloatArray:
-        """Size of residuals that may be rounding errors alone, shape () or (S,)."""
-
-    @abstractmethod
-    def residual(self, predicted: ComplexArray) -> ComplexArray:
-        """Return the complex residual of every row."""
-
-    @abstractmethod
-    def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
-        """Return the residual's derivative where the prediction has the derivative `by`."""
-
-    @abstractmethod
-    def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
-        """Return the response that has the given residual."""
-
-
 @dataclass(frozen=True)
-class Relative(Noise):
+class Relative:
     """Constant unknown variance of (ln gain, phase)."""
 
     response: ComplexArray
     fundamental: FloatArray | None
     """|R_1| in rows of harmonics, 0 in rows of the fundamental; None without harmonics."""
     log_area: FloatArray
-    name: str = "relative"
-    scale_known: bool = False
+    """Sum over rows of ln |dy/dR|, the log of the whitening's determinant, plus constants."""
+    name: ClassVar = "relative"
+    scale_known: ClassVar = False
+    rounding: ClassVar = np.asarray(ROUNDING)  # of a logarithm
+    tail: ClassVar = None
+    amplitude: ClassVar = None
 
     @property
     def weights(self) -> FloatArray:
@@ -118,11 +88,6 @@ class Relative(Noise):
         if self.fundamental is not None:
             size = np.where(self.fundamental > 0.0, self.fundamental, size)
         return 1.0 / size
-
-    @property
-    def rounding(self) -> FloatArray:
-        """Rounding error of a logarithm."""
-        return np.asarray(ROUNDING)
 
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return ln(R/R_model), or the scaled difference in rows of harmonics."""
@@ -134,14 +99,13 @@ class Relative(Noise):
         return np.where(harmonic, (self.response - predicted) / size, _logarithm(ratio))
 
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
-        """Return the derivative of the residual."""
+        """Return the residual's derivative where the prediction has the derivative `by`."""
         if self.fundamental is None:
             return -by / predicted
-        harmonic = self.fundamental > 0.0
-        return -by / np.where(harmonic, self.fundamental, predicted)
+        return -by / np.where(self.fundamental > 0.0, self.fundamental, predicted)
 
     def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
-        """Return R_model exp(y), or R_model + |R_1| y in rows of harmonics."""
+        """Return the response that has the given residual."""
         fundamental = predicted * np.exp(residual)
         if self.fundamental is None:
             return np.asarray(fundamental)
@@ -150,49 +114,26 @@ class Relative(Noise):
 
 
 @dataclass(frozen=True)
-class Absolute(Noise):
-    """Constant unknown variance of (Re R, Im R)."""
+class Measured:
+    """Covariance of (Re R, Im R), and of ln A where `amplitude` is given.
 
-    response: ComplexArray
-    log_area: FloatArray
-    name: str = "absolute"
-    scale_known: bool = False
-
-    @property
-    def weights(self) -> FloatArray:
-        """1, in every row."""
-        return np.ones(self.response.shape)
-
-    @property
-    def rounding(self) -> FloatArray:
-        """Rounding error of the responses' root mean square."""
-        return np.asarray(ROUNDING * np.sqrt(np.mean(np.abs(self.response) ** 2, axis=-1)))
-
-    def residual(self, predicted: ComplexArray) -> ComplexArray:
-        """Return R - R_model."""
-        return self.response - predicted
-
-    def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
-        """Return the derivative of the residual."""
-        return -by
-
-    def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
-        """Return R_model + y."""
-        return predicted + residual
-
-
-@dataclass(frozen=True)
-class Measured(Noise):
-    """Known covariance of (Re R, Im R), and of ln A where `amplitude` is given."""
+    That of "absolute" noise, whose scale is unknown, is 1 in both parts.
+    """
 
     response: ComplexArray
     covariance: Covariance
     whitening: Whitening
     log_area: FloatArray
-    dof: FloatArray | None
-    amplitude: AmplitudeError | None
+    dof: FloatArray | None = None
+    amplitude: AmplitudeError | None = None
     name: str = "measured"
-    scale_known: bool = True
+    rounding: FloatArray = field(default_factory=lambda: np.zeros(()))
+    """Size of residuals that may be rounding errors alone, () or (S,); 0 where it is known."""
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether residuals have unit variance as they are."""
+        return self.name == "measured"
 
     @property
     def weights(self) -> FloatArray:
@@ -223,22 +164,20 @@ class Measured(Noise):
             amplitude = AmplitudeError(t * amplitude.variance, t * amplitude.cross)
         return Measured(self.response, covariance, whitening, area.sum(axis=-1), None, amplitude)
 
-    @property
-    def rounding(self) -> FloatArray:
-        """0: the scale is known, whatever the residuals are."""
-        return np.zeros(())
-
     def residual(self, predicted: ComplexArray) -> ComplexArray:
         """Return L^-1 (R - R_model)."""
         return self.whitening(self.response - predicted)
 
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
-        """Return the derivative of the residual."""
+        """Return the residual's derivative where the prediction has the derivative `by`."""
         return -self.whitening(by)
 
     def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
         """Return R_model + L y."""
         return predicted + self.whitening.inverse(residual)
+
+
+Noise = Relative | Measured
 
 
 class Covariance(NamedTuple):
@@ -315,25 +254,18 @@ def _logarithm(ratio: ComplexArray) -> ComplexArray:
     return result
 
 
-class Corrected(NamedTuple):
-    """Residuals at the best true amplitudes, and the prediction there."""
-
-    residual: ComplexArray
-    whitening: Whitening
-    error: FloatArray
-
-
 def correct_amplitude(
     noise: Measured,
-    error: AmplitudeError,
     predict: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]],
-) -> Corrected:
-    """Return residuals with every true amplitude at its best value.
+) -> tuple[ComplexArray, Whitening, FloatArray]:
+    """Return residuals with every true amplitude at its best value, their whitening, and ln errors.
 
     `predict` takes the error e of ln A, and returns the response and its derivative by ln A at
     the amplitude measured over exp(e). Each row is a fixed-point iteration of one variable, which
     secants of its last two steps shorten unless it hardly contracts.
     """
+    error = noise.amplitude
+    assert error is not None
     spread = np.sqrt(error.variance)
     found = last = step = np.zeros(noise.response.shape)
     size, longest = np.where(spread > 0.0, spread, np.inf), np.inf
@@ -350,7 +282,7 @@ def correct_amplitude(
         secant = (new - step) / (found - last)  # -1 where one plain step is enough
         stretch = np.where((-np.inf < secant) & (secant < -0.1), -1.0 / secant, 1.0)
         found, last, step = found + stretch * new, found, new
-    return Corrected(whitening(r), whitening, found)
+    return whitening(r), whitening, found
 
 
 @dataclass(frozen=True)
@@ -373,23 +305,6 @@ class Student:
         return size, -size / (self.dof + z)
 
 
-def bend(
-    y: ComplexArray,
-    changes: list[ComplexArray],
-    rho: Rho,
-) -> tuple[ComplexArray, list[ComplexArray]]:
-    """Return residuals of the same directions whose squares are rho(|y|^2), with derivatives."""
-    z = y.real**2 + y.imag**2
-    loss, slope, _ = rho(z)
-    flat = z <= 1e-12  # here rho(z) = rho'(0) z to rounding
-    safe = np.where(flat, 1.0, z)
-    factor = np.sqrt(np.where(flat, slope, loss / safe))
-    # d factor / dz, times 2
-    turn = np.where(flat, 0.0, (slope - loss / safe) / (safe * factor))
-    bent = [factor * d + y * turn * (y.real * d.real + y.imag * d.imag) for d in changes]
-    return factor * y, bent
-
-
 def noise_for(rows: Rows, kind: str | None) -> Noise:
     """Return the noise model `kind` for `rows`.
 
@@ -397,7 +312,7 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
     """
     if kind is None:
         kind = "relative" if rows.covariance is None else "measured"
-    one_of(kind, "noise", NOISE_MODELS)
+    one_of(kind, "noise", ("measured", "relative", "absolute"))
     if kind == "relative":
         return _relative(rows)
     if kind == "absolute":
@@ -405,7 +320,15 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
         if empty.any():
             table = f" of table {int(np.argmax(empty))}" if empty.ndim else ""
             raise DataError(f"every response{table} is 0; there is nothing to estimate from")
-        return Absolute(rows.response, np.zeros(rows.response.shape[:-1]))
+        one, none = np.ones(rows.response.shape), np.zeros(rows.response.shape)
+        return Measured(
+            rows.response,
+            Covariance(one, none, one),
+            Whitening(one, none, one),
+            none.sum(axis=-1),
+            name="absolute",
+            rounding=np.asarray(ROUNDING * np.sqrt(np.mean(np.abs(rows.response) ** 2, axis=-1))),
+        )
     return _measured(rows)
 
 
@@ -458,21 +381,17 @@ def _measured(rows: Rows) -> Measured:
         )
     dof = rows.dof if rows.dof is not None and np.isfinite(rows.dof).any() else None
     if dof is not None:
-        _check_dof(dof)
+        few = dof <= 2.0
+        if few.any():
+            raise DataError(
+                f"dof{_first(few)} is {dof[few][0]:g}; a covariance of two parts needs more than 2 "
+                "degrees of freedom to weigh a row: measure more cycles, or take "
+                f"{argument('noise', 'relative')}"
+            )
         dof = np.minimum(dof, _GAUSSIAN)
     return Measured(
         rows.response, covariance, whitening, log_area.sum(axis=-1), dof, _amplitude_error(rows)
     )
-
-
-def _check_dof(dof: FloatArray) -> None:
-    few = dof <= 2.0
-    if few.any():
-        raise DataError(
-            f"dof{_first(few)} is {dof[few][0]:g}; a covariance of two parts needs more than 2 "
-            "degrees of freedom to weigh a row: measure more cycles, or take "
-            f"{argument('noise', 'relative')}"
-        )
 
 
 def _amplitude_error(rows: Rows) -> AmplitudeError | None:
@@ -496,22 +415,35 @@ def _first(bad: NDArray[np.bool_]) -> str:
     return str([int(i) for i in np.argwhere(bad)[0]])
 
 
-def squares_of(residuals: FloatArray) -> FloatArray:
-    """Return the sum of squares of the two residuals of each row, (..., 2 n) -> (..., n)."""
-    return np.asarray(residuals[..., 0::2] ** 2 + residuals[..., 1::2] ** 2)
+def squares_of(residuals: FloatArray, parts: int = 2) -> FloatArray:
+    """Return the sum of squares of the residuals of each row, (..., parts n) -> (..., n)."""
+    return np.asarray((residuals.reshape(*residuals.shape[:-1], -1, parts) ** 2).sum(axis=-1))
 
 
-def weighted(rows: FloatArray, m: int, size: FloatArray, along: FloatArray) -> FloatArray:
-    """Return residuals times `size`, derivatives d of each pair y as size d + along y (y' d).
+def weighted(
+    rows: FloatArray, m: int, size: FloatArray, along: FloatArray, parts: int = 2
+) -> FloatArray:
+    """Return residuals times `size`, derivatives d of each row y as size d + along y (y' d).
 
     `rows` are residuals and, below them, their derivatives, (..., 1 + P, k); what stands after
     the first `m` residuals, those of priors, stays.
     """
-    first, second = rows[..., :1, 0:m:2], rows[..., :1, 1:m:2]
-    by_first, by_second = rows[..., 1:, 0:m:2], rows[..., 1:, 1:m:2]
-    lever = along[..., None, :] * (first * by_first + second * by_second)
+    y, by = rows[..., :1, :m], rows[..., 1:, :m]
+    lever = along[..., None, :] * sum(y[..., i::parts] * by[..., i::parts] for i in range(parts))
     result = rows.copy()
-    result[..., :m] *= np.repeat(size, 2, axis=-1)[..., None, :]
-    result[..., 1:, 0:m:2] += first * lever
-    result[..., 1:, 1:m:2] += second * lever
+    result[..., :m] *= np.repeat(size, parts, axis=-1)[..., None, :]
+    for i in range(parts):
+        result[..., 1:, i:m:parts] += y[..., i::parts] * lever
     return result
+
+
+def bend(rows: FloatArray, m: int, rho: Rho, parts: int = 2) -> FloatArray:
+    """Return rows as those of `weighted`, whose squares are rho(|y|^2) in the same directions."""
+    z = squares_of(rows[..., 0, :m], parts)
+    loss, slope, _ = rho(z)
+    flat = z <= 1e-12  # here rho(z) = rho'(0) z to rounding
+    safe = np.where(flat, 1.0, z)
+    factor = np.sqrt(np.where(flat, slope, loss / safe))
+    # d factor / dz, times 2
+    turn = np.where(flat, 0.0, (slope - loss / safe) / (safe * factor))
+    return weighted(rows, m, factor, turn, parts)

@@ -189,7 +189,7 @@ def test_harmonics_refer_to_the_measured_fundamental():
 def test_bend_keeps_direction_and_squares_to_the_loss():
     y = np.array([0.0, 1e-9, 0.5 + 1j, 30.0 - 40.0j])
     rho = Student(np.array(5.0))
-    bent, _ = bend(y, [], rho)
+    bent = bend(y.view(np.float64)[None], 2 * y.size, rho)[0].view(np.complex128)
     z = np.abs(y) ** 2
     np.testing.assert_allclose(np.abs(bent) ** 2, rho(z)[0], rtol=1e-12)
     np.testing.assert_allclose(np.angle(bent), np.angle(y), atol=1e-14)
@@ -252,8 +252,8 @@ def test_losses_have_their_own_derivatives():
     y: ComplexArray = np.array([0.3 - 0.2j, 3.0 + 4.0j])
     d: ComplexArray = np.array([1.0 + 2.0j, -0.5j])
     at: list[ComplexArray] = [y, np.add(y, h * d), np.subtract(y, h * d)]
-    (_, (bent,)), (up, _), (down, _) = (bend(one, [d], rho) for one in at)
-    np.testing.assert_allclose(bent, (up - down) / (2.0 * h), rtol=1e-7)
+    exact, up, down = (bend(np.array([one, d]).view(np.float64), 4, rho) for one in at)
+    np.testing.assert_allclose(exact[1], (up - down)[0] / (2.0 * h), rtol=1e-7)
 
 
 @pytest.mark.parametrize(

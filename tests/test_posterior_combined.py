@@ -39,7 +39,7 @@ def test_the_likelihood_is_that_of_the_covariance_by_source(rows):
     # f_max differs from day to day: residuals are linear in it
     move = theta - errors.theta
     other = fit.problem.residuals(errors.theta + move * [0.0, 1.0])
-    by = fit.problem.jacobian(errors.theta)[:, 0]
+    by = fit.problem.residuals_and_jacobian(errors.theta)[1][:, 0]
     y = other + move[:, :1] * by
     ratios = []
     for k in (0, len(found.sizes) // 2, len(found.sizes) - 1):

@@ -274,10 +274,9 @@ class Density(LogDensity):
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Return the residuals of which the squares are added, (S, P) -> (S, K)."""
         if self.errors is None:
-            y, _ = self.quick.whitened(theta, derivatives=False)
-            return np.ascontiguousarray(y).view(np.float64)
-        y, _ = self.quick.whitened(self.errors.held(theta), derivatives=False, tails=False)
-        parts = np.broadcast_to(y, (len(theta), y.shape[-1])).copy().view(np.float64)
+            return self.quick.whitened(theta)
+        y = self.quick.whitened(self.errors.held(theta), tails=False)
+        parts = np.broadcast_to(y, (len(theta), y.shape[-1]))
         with np.errstate(invalid="ignore", over="ignore"):
             return self.errors.uncorrelated(parts + self.errors.moved(theta))
 

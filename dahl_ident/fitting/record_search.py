@@ -362,7 +362,7 @@ class RecordSearch:
         theta = wider.to_search([known[name] for name in wider.names])
         for _ in range(_PRIORS):
             # with derivatives, which the search and what follows it need at the same place
-            residuals = [wider.rows(theta, i)[0] for i in range(len(wider.records))]
+            residuals = wider.split_residuals(wider.to_values(theta))
             noise = noise_power(float(end.cost[0]), problem.n_residuals, residuals) ** 0.5
             if last / _SAME_NOISE < noise < last * _SAME_NOISE:
                 break

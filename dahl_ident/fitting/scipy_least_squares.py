@@ -83,13 +83,10 @@ def _rows(
         if not np.isfinite(values).all() or (values[problem.space.positive] == 0.0).any():
             size = m + len(problem.priors)
             return np.full(size, np.nan), np.full((size, phi.size), np.nan)
-        r, J = problem.residuals_and_jacobian(at, scale, tails=loss is None)
+        both = problem.rows(at, scale, tails=loss is None)
         if loss is not None:
-            both = np.column_stack([r[:m], J[:m]]).T  # of two residuals a row, or of one
-            pairs = both[:, ::2] + 1j * both[:, 1::2] if problem.parts == 2 else both + 0j
-            y, changes = bend(pairs[0], list(pairs[1:]), loss)
-            bent = np.array([y, *changes]).view(np.float64)[:, :: 3 - problem.parts]
-            r[:m], J[:m] = bent[0], bent[1:].T
+            both = bend(both, m, loss, problem.parts)
+        r, J = both[0], both[1:].T
         if chart is not None:
             J = J @ chart.derivative(at)
         if not np.isfinite(J).all():

@@ -14,7 +14,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import ValidationError
-from dahl_ident.noise import Rho
+from dahl_ident.noise import Rho, squares_of, weighted
 from dahl_ident.problem.space import Space
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.units import Motion
@@ -35,66 +35,46 @@ class Quadratic(NamedTuple):
 
 
 class Problem(ABC):
-    """Residuals as functions of search coordinates, and what is known of their noise.
-
-    Attributes
-    ----------
-    model : Model
-        Free and fixed parameters put in.
-    sensors : Sensors
-        Gains and delay, where they are parameters.
-    space : Space
-        The search coordinates.
-    motion : {"translation", "rotation"}
-        Of the data.
-    parts : int
-        Residuals of each row, which count in a robust loss as one.
-    priors : mapping of str to Prior
-        The priors of sensor parameters that are free.
-    ranges : mapping of str to (float, float)
-        Mean and standard deviation of the logarithms of assumed parameters.
-    scale_known : bool
-        Whether the residuals have unit variance as they are.
-    gaussian : bool
-        Whether residuals are Gaussian; not where a covariance has few degrees of freedom.
-    kind : {"table", "records"}
-        What was measured.
-    called : str
-        The same in a sentence.
-    refused : mapping of str to str
-        Options of estimates that such data do not take, and why.
-    response : FrequencyResponse or None
-        The table, where the data are one: settled sines.
-    around_optimum : bool
-        Whether a posterior is that around the least-squares optimum, which has to exist.
-    n_residuals : int
-        Residuals of the data; those of priors come on top.
-    n_numbers : int
-        Residuals that can differ from zero.
-    runs : tuple
-        The runs, of which one may be named several times.
-    """
+    """Residuals as functions of search coordinates, and what is known of their noise."""
 
     arguments: ClassVar[tuple[str, ...]]
     """Names of those of the class, each an attribute as well."""
     kind: ClassVar[str]
+    """What was measured: "table" or "records"; `called` is the same in a sentence."""
     called: ClassVar[str]
     refused: ClassVar[Mapping[str, str]]
+    """Options of estimates that such data do not take, and why."""
     around_optimum: ClassVar[bool] = False
+    """Whether a posterior is that around the least-squares optimum, which has to exist."""
+    scaled_priors: ClassVar[bool] = False
+    """Whether priors are in units of the residuals, and scaled with them."""
     model: Model
     space: Space
     motion: Motion
     n_residuals: int
+    """Of the data; those of priors come on top."""
     n_numbers: int
+    """Residuals that can differ from zero."""
     runs: tuple[Any, ...]
+    """The runs, of which one may be named several times."""
     sensors: Sensors = EXACT
     parts: int = 2
+    """Residuals of each row, which count in a robust loss as one."""
     priors: Mapping[str, Prior] = {}
+    """Of sensor parameters that are free."""
     ranges: Mapping[str, tuple[float, float]] = {}
+    """Mean and standard deviation of the logarithms of assumed parameters."""
     scale_known: bool = False
-    gaussian: bool = True
+    """Whether the residuals have unit variance as they are."""
+    tail: Rho | None = None
+    """The loss of rows whose covariance has few degrees of freedom; else they are Gaussian."""
     repetitions: int = 4999
     """That are simulated: seven of them lie beyond either limit of the 99.73 % interval."""
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether residuals are Gaussian; not where a covariance has few degrees of freedom."""
+        return self.tail is None
 
     @property
     def response(self) -> FrequencyResponse | None:
@@ -183,23 +163,7 @@ class Problem(ABC):
         return (*self.model.parameters, *sensors)
 
     def to_search(self, values: ArrayLike) -> FloatArray:
-        """Return the search coordinates of parameter values, in the order of `names`.
-
-        Parameters
-        ----------
-        values : array_like, shape (P,) or (S, P)
-            In SI units.
-
-        Returns
-        -------
-        ndarray of the same shape
-            Logarithms of positive parameters, the values of most others; see ``Space``.
-
-        Raises
-        ------
-        ValidationError
-            If the shape is wrong or a positive parameter is not above zero.
-        """
+        """Return the search coordinates of values in SI units, in the order of `names`."""
         return self.space.to_search(values)
 
     def to_values(self, theta: ArrayLike) -> FloatArray:
@@ -275,6 +239,32 @@ class Problem(ABC):
         return EXPLICIT
 
     @abstractmethod
+    def data_rows(
+        self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
+    ) -> FloatArray:
+        """Return the data's residuals and, below them, their derivatives, (..., 1 or 1 + P, m).
+
+        Unchecked; not finite where there is no prediction. Without `tails`, a covariance of few
+        degrees of freedom counts as if it were known.
+        """
+
+    def rows(
+        self,
+        theta: FloatArray,
+        scale: ArrayLike = 1.0,
+        *,
+        derivatives: bool = True,
+        tails: bool = True,
+    ) -> FloatArray:
+        """Return the same over the noise's scale, () or (S,), then what priors add."""
+        rows = self.data_rows(theta, derivatives=derivatives, tails=tails)
+        size = np.asarray(scale)[..., None, None]
+        if self.scaled_priors:
+            return np.asarray(self.with_priors(rows, theta) / size)
+        if size.ndim > 2 or size != 1.0:
+            rows = rows / size
+        return self.with_priors(rows, theta)
+
     def quadratic(
         self,
         theta: FloatArray,
@@ -291,19 +281,46 @@ class Problem(ABC):
         rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
         rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
         """
+        rho, m = rho or self.tail, self.n_residuals
+        rows = self.rows(theta, scale, tails=False)
+        if chart is not None:
+            r, J = rows[..., :1, :], rows[..., 1:, :]
+            rows = np.concatenate([r, chart.swapaxes(-1, -2) @ J], axis=-2)
+        with np.errstate(over="ignore", invalid="ignore"):  # far out a law may overflow
+            if rho is None:
+                products = rows @ rows.swapaxes(-1, -2)
+                cost = 0.5 * products[..., 0, 0]
+            else:
+                z = squares_of(rows[..., 0, :m], self.parts)
+                loss, slope, curvature = rho(z)
+                cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
+                along = np.maximum(2.0 * curvature, -slope / np.maximum(z, 1e-300))
+                products = weighted(rows, m, slope, along, self.parts) @ rows.swapaxes(-1, -2)
+        cost = np.where(cost < np.inf, cost, np.inf)
+        return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
 
-    @abstractmethod
+    def residuals(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
+        """Return the whitened residuals, measured minus predicted, over `scale`, (m,) or (S, m).
+
+        Then (value - mean)/std of each prior.
+        """
+        return self.rows(self.space.checked(theta), scale, derivatives=False)[..., 0, :]
+
     def residuals_and_jacobian(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
     ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian, for the price of the Jacobian.
+        """Return residuals, (m,) or (S, m), and Jacobian, (m, P) or (S, m, P)."""
+        rows = self.rows(self.space.checked(theta), scale, tails=tails)
+        return rows[..., 0, :], rows[..., 1:, :].swapaxes(-1, -2)
 
-        Without `tails`, a covariance of few degrees of freedom counts as if it were known.
-        """
+    def whitened(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
+        """Return the data's residuals, (..., m), without priors, unchecked."""
+        return self.data_rows(theta, derivatives=False, tails=tails)[..., 0, :]
 
-    @abstractmethod
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
         """Return the sum of squared residuals of every row, (..., n), without priors, unchecked."""
+        with np.errstate(over="ignore"):
+            return squares_of(self.whitened(theta, tails=tails), self.parts)
 
     @property
     @abstractmethod
@@ -313,29 +330,16 @@ class Problem(ABC):
     def log_likelihood(self, theta: ArrayLike, scale: ArrayLike | None = None) -> FloatArray:
         """Return ln of the density of the data: of Re R and Im R of every row, or of samples.
 
-        Parameters
-        ----------
-        theta : array_like, shape (P,) or (S, P)
-            Search coordinates.
-        scale : array_like, shape () or (S,), optional
-            The noise's scale, where it is unknown: standard deviation of ln gain and of phase
-            (rad) for "relative", of Re R and Im R for "absolute", of samples over `sizes` for
-            records. Left out, the scale of the highest likelihood,
-            (sum of squares / n_residuals)^(1/2), at each theta.
+        `scale` is the noise's, where it is unknown: the standard deviation of ln gain and of phase
+        (rad) for "relative", of Re R and Im R for "absolute", of samples over `sizes` for records.
+        Left out, it is that of the highest likelihood, (sum of squares / n_residuals)^(1/2), at
+        each theta.
 
-        Returns
-        -------
-        ndarray, shape () or (S,)
-            Priors not included; -inf where the model has no prediction. All noise models give
-            densities of the same numbers, so their likelihoods compare. Where a covariance has
-            few degrees of freedom it is a likelihood up to a constant: the loss of
-            :mod:`dahl_ident.noise` in place of the sum of squares. Residuals of records count as
-            independent once they are filtered.
-
-        Raises
-        ------
-        ValidationError
-            If `scale` is given where it is known.
+        Priors are not included; -inf where the model has no prediction. All noise models give
+        densities of the same numbers, so their likelihoods compare. Where a covariance has few
+        degrees of freedom it is a likelihood up to a constant: the loss of :mod:`dahl_ident.noise`
+        in place of the sum of squares. Residuals of records count as independent once they are
+        filtered.
         """
         theta = self.space.checked(theta)
         if self.scale_known and scale is not None:

@@ -83,7 +83,7 @@ class RecordProblem(Problem):
     """
 
     arguments = ("records", "model", "output", "excitation", "calibration")
-    parts = 1
+    parts, scaled_priors = 1, True
     kind, called = "records", "records"
     refused: ClassVar[Mapping[str, str]] = {
         "noise": "their noise is estimated from the residuals",
@@ -294,10 +294,6 @@ class RecordProblem(Problem):
         stale = ("system", "coefficients", "first", "chosen")
         changes = {"free": free, "space": space, "ranges": ranges, "latest": dict(self.latest)}
         return self.altered(*stale, model=model, **changes)
-
-    def _prior_rows(self, theta: FloatArray) -> FloatArray:
-        """Return the residuals of priors, and below them their derivatives."""
-        return self.with_priors(np.zeros((1 + theta.size, 0)), theta)
 
     def differentiated_in(self, window: float) -> RecordProblem:
         """Return the same problem, displacements differentiated in a window of other length."""
@@ -572,42 +568,13 @@ class RecordProblem(Problem):
         rho: Rho | None = None,
         chart: FloatArray | None = None,
     ) -> Quadratic:
-        """Return cost, gradient and Hessian at search coordinates, (S, P) or (P,).
-
-        Where the motion cannot be found the cost is infinite.
-        """
+        """Return cost, gradient and Hessian, see ``Problem``; what has vanished is held."""
         if theta.ndim == 2:
             parts = [self.quadratic(row, scale, rho, chart) for row in theta]
             return Quadratic(*(np.stack(column) for column in zip(*parts, strict=True)))
-        P, size = theta.size, float(np.asarray(scale))
-        cost, gradient, hessian = 0.0, np.zeros(P), np.zeros((P, P))
-        nowhere = Quadratic(np.asarray(np.inf), gradient.copy(), np.eye(P))
-        if not np.isfinite(self.space.to_values(theta)).all():
-            return nowhere
-        for number in range(len(self.records)):
-            try:
-                residual, jacobian = self.rows(theta, number)
-            except FitError:
-                return nowhere
-            residual, jacobian = residual / size, jacobian / size
-            if rho is None:
-                cost += 0.5 * float(residual @ residual)
-                gradient += jacobian.T @ residual
-                hessian += jacobian.T @ jacobian
-            else:
-                z = residual**2
-                loss, slope, curvature = rho(z)
-                cost += 0.5 * float(loss.sum())
-                gradient += jacobian.T @ (slope * residual)
-                weight = np.maximum(slope + 2.0 * curvature * z, 0.0)
-                hessian += jacobian.T @ (weight[:, None] * jacobian)
-        if self.ranges:
-            priors = self._prior_rows(theta) / size
-            cost += 0.5 * float(priors[0] @ priors[0])
-            gradient += priors[1:] @ priors[0]
-            hessian += priors[1:] @ priors[1:].T
+        cost, gradient, hessian = super().quadratic(theta, scale, rho)
         if not (np.isfinite(cost) and np.isfinite(hessian).all()):  # a motion beyond all bounds
-            return nowhere
+            return Quadratic(np.asarray(np.inf), np.zeros(theta.size), np.eye(theta.size))
         far = _VANISHED * hessian.diagonal()
         vanished = self.space.positive & (gradient >= far)
         vanished |= self.space.angular & (np.abs(gradient) >= far)
@@ -615,44 +582,29 @@ class RecordProblem(Problem):
         hessian[vanished, vanished] = 1.0
         if chart is not None:
             gradient, hessian = chart.T @ gradient, chart.T @ hessian @ chart
-        return Quadratic(np.asarray(cost), gradient, hessian)
+        return Quadratic(cost, gradient, hessian)
 
-    def rows(
-        self, theta: FloatArray, number: int, *, derivatives: bool = True
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the filtered residuals of a record, and their derivatives."""
-        values, size = self.space.to_values(theta), self.sizes[number]
-        predicted = self.predict(values, number, derivatives=derivatives)
-        residual = self.filtered((self.measured[number] - predicted.output) / size)
-        if not derivatives:
-            return residual, predicted.by
-        return residual, self.filtered(predicted.by * (self.space.slopes(values) / -size))
-
-    def residuals_and_jacobian(
-        self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals, (m,), and Jacobian, (m, P), of all records at theta, (P,).
-
-        Those of priors, in units of the residuals, come last.
-        """
-        at = self.space.checked(theta)
-        try:
-            rows = [self.rows(at, number) for number in range(len(self.records))]
-        except FitError:
-            return np.full(self.n_residuals, np.nan), np.full((self.n_residuals, at.size), np.nan)
-        if self.ranges:
-            priors = self._prior_rows(at)
-            rows.append((priors[0], priors[1:].T))
-        residuals, jacobians = zip(*rows, strict=True)
-        size = float(np.asarray(scale))
-        return np.concatenate(residuals) / size, np.concatenate(jacobians) / size
-
-    def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
-        """Return the squared residuals of all samples, (m,) or (S, m)."""
-        if theta.ndim > 1:
-            return np.stack([self.squares(one) for one in theta])
-        places = range(len(self.records))
-        return np.concatenate([self.rows(theta, i, derivatives=False)[0] ** 2 for i in places])
+    def data_rows(
+        self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
+    ) -> FloatArray:
+        """Return the filtered residuals of all samples and their derivatives, see ``Problem``."""
+        if theta.ndim == 2:
+            return np.stack([self.data_rows(row, derivatives=derivatives) for row in theta])
+        values, waves = self.space.to_values(theta), []
+        lost = np.full((1 + derivatives * theta.size, self.n_residuals), np.nan)
+        if not np.isfinite(values).all():
+            return lost
+        for number, (measured, size) in enumerate(zip(self.measured, self.sizes, strict=True)):
+            try:
+                predicted = self.predict(values, number, derivatives=derivatives)
+            except FitError:
+                return lost
+            wave = (measured - predicted.output)[:, None] / size
+            if derivatives:
+                slopes = predicted.by * (self.space.slopes(values) / -size)
+                wave = np.concatenate([wave, slopes], axis=1)
+            waves.append(self.filtered(wave))
+        return np.concatenate(waves).T
 
     @property
     def rounding(self) -> FloatArray:

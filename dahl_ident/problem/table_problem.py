@@ -24,14 +24,14 @@ from dahl_ident.noise import (
     ROUNDING,
     Measured,
     Noise,
-    Rho,
+    Student,
     bend,
     correct_amplitude,
     noise_for,
     squares_of,
     weighted,
 )
-from dahl_ident.problem.base import EXPLICIT, Problem, Quadratic
+from dahl_ident.problem.base import EXPLICIT, Problem
 from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
@@ -52,41 +52,10 @@ _LOST = 2e-6
 class TableProblem(Problem):
     """Data, model, noise and sensors: residuals, Jacobian and likelihood of one estimate.
 
-    Parameters
-    ----------
-    data : FrequencyResponse
-        Displacement-controlled rows need an amplitude, force-controlled rows a drive.
-    model : Element
-        One element or a sum, such as ``Dahl() + Mass(0.3)``.
-    noise : {"measured", "relative", "absolute"}, optional
-        Default: "measured" where the data have a covariance, else "relative".
-    sensors : Sensors, optional
-        Gains and delay; left out, the channels are taken as exact.
-    free : iterable of str, optional
-        Names of given parameters to estimate all the same, from their values.
-    fixed : mapping of str to float, optional
-        Parameters to hold at a value.
-    steady : {"exact", "describing function"}, default "exact"
-        How rows whose force was controlled are predicted.
-
-    Attributes
-    ----------
-    data, model, sensors, steady
-        As given, `free` and `fixed` put in.
-    is_exact : bool
-        Whether rows are predicted by the exact steady motion: some have their force controlled,
-        and the model an equation of motion.
-    noise : str
-        The name of the noise model.
-
-    Raises
-    ------
-    ModelError
-        If nothing is free, or a name is unknown.
-    DataError
-        If the rows lack what their model or noise needs.
-    ValidationError
-        If `noise` is unknown.
+    Displacement-controlled rows need an amplitude, force-controlled rows a drive. `noise` is by
+    default "measured" where the data have a covariance, else "relative". Without `sensors` the
+    channels are exact. `free` names given parameters that are estimated all the same, from their
+    values; `fixed` holds parameters. `steady` is how rows whose force was controlled are predicted.
 
     Examples
     --------
@@ -173,13 +142,12 @@ class TableProblem(Problem):
         self.n_numbers = self.n_residuals - int(np.count_nonzero(rows.harmonic == 0))
 
     def _set_noise(self, noise: Noise) -> None:
-        if self._misfit is not None and isinstance(noise, Measured):
+        if self._misfit is not None and isinstance(noise, Measured) and noise.scale_known:
             noise = noise.widened(self._misfit)
         self._noise = noise
         self.noise = noise.name
         self.scale_known = noise.scale_known
-        self._tail = noise.tail if isinstance(noise, Measured) else None
-        self.gaussian = self._tail is None
+        self.tail: Student | None = noise.tail
 
     def widened(self, misfit: FloatArray) -> TableProblem:
         """Return the problem whose stated covariances have a misfit's variance each, (n,), added.
@@ -290,7 +258,7 @@ class TableProblem(Problem):
         Measured amplitudes are taken as they are; their noise counts to first order.
         """
         model = self.model.coarser() if self.is_exact else self.model
-        if model is self.model and getattr(self._noise, "amplitude", None) is None:
+        if model is self.model and self._noise.amplitude is None:
             return self
         other = self.altered("stiffness_data", "obstacle_to_exact", "_shooting", model=model)
         other._coarse = True
@@ -327,13 +295,7 @@ class TableProblem(Problem):
         return Predictor(self.model, self.sensors, self.space, self._rows, shooting, self._orbits)
 
     def assuming(self, spread: Mapping[str, float]) -> TableProblem:
-        """Return the problem with given parameters free, each with its value as a prior.
-
-        Parameters
-        ----------
-        spread : mapping of str to float
-            Standard deviation of the logarithm of each.
-        """
+        """Return the problem with parameters free, with priors of such a `spread` of ln."""
         other = self.like(free=spread)
         values = {p.name: p.value or 1.0 for p in other.parameters}
         other.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
@@ -358,17 +320,9 @@ class TableProblem(Problem):
     # Predictions
 
     def predict(self, theta: ArrayLike) -> ComplexArray:
-        """Return the response that the model predicts, in the data's quantity.
+        """Return the response that the model predicts, in the data's quantity, (n,) or (S, n).
 
-        Parameters
-        ----------
-        theta : array_like, shape (P,) or (S, P)
-            Search coordinates.
-
-        Returns
-        -------
-        ndarray of complex, shape (n,) or (S, n)
-            Sensors included; NaN where a driven plant has no steady amplitude.
+        Sensors included; NaN where a driven plant has no steady amplitude.
         """
         theta = self.space.checked(theta)
         prediction = self._prediction(theta)
@@ -439,126 +393,46 @@ class TableProblem(Problem):
 
     # Residuals
 
-    def residuals(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
-        """Return the whitened residuals, measured minus predicted.
-
-        Parameters
-        ----------
-        theta : array_like, shape (P,) or (S, P)
-            Search coordinates.
-        scale : array_like, shape () or (S,), default 1
-            Noise scale by which the data's residuals are divided; leave at 1 where it is known.
-
-        Returns
-        -------
-        ndarray, shape (m,) or (S, m)
-            Two numbers a row of data, in its order, then one for each prior:
-            (value - mean)/std.
-        """
-        theta = self.space.checked(theta)
-        return self._rows_at(theta, scale, derivatives=False, tails=True)[..., 0, :]
-
-    def jacobian(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
-        """Return the residuals' derivative with respect to theta, shape (m, P) or (S, m, P)."""
-        return self.residuals_and_jacobian(theta, scale)[1]
-
-    def residuals_and_jacobian(
-        self, theta: ArrayLike, scale: ArrayLike = 1.0, *, tails: bool = True
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals and Jacobian, see ``Problem``.
+    def data_rows(
+        self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
+    ) -> FloatArray:
+        """Return the data's residuals and their derivatives, two numbers a row, see ``Problem``.
 
         With noise in the amplitude the residuals are defined up to a rotation of each pair. The
-        Jacobian leaves that out, so that J' r is the exact gradient of half the sum of squares.
-        """
-        theta = self.space.checked(theta)
-        rows = self._rows_at(theta, scale, tails=tails)
-        return rows[..., 0, :], rows[..., 1:, :].swapaxes(-1, -2)
-
-    def quadratic(
-        self,
-        theta: FloatArray,
-        scale: ArrayLike = 1.0,
-        rho: Rho | None = None,
-        chart: FloatArray | None = None,
-    ) -> Quadratic:
-        """Return half the sum of squares with its gradient and Hessian, see ``Problem``."""
-        rho = rho or self._tail
-        rows = self._rows_at(theta, scale)
-        if chart is not None:
-            r, J = rows[..., :1, :], rows[..., 1:, :]
-            rows = np.concatenate([r, chart.swapaxes(-1, -2) @ J], axis=-2)
-        if rho is None:
-            with np.errstate(over="ignore", invalid="ignore"):  # far out a law may overflow
-                products = rows @ rows.swapaxes(-1, -2)
-            cost = 0.5 * products[..., 0, 0]
-        else:
-            m = self.n_residuals
-            z = squares_of(rows[..., 0, :m])
-            loss, slope, curvature = rho(z)
-            cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
-            along = np.maximum(2.0 * curvature, -slope / np.maximum(z, 1e-300))
-            products = weighted(rows, m, slope, along) @ rows.swapaxes(-1, -2)
-        cost = np.where(cost < np.inf, cost, np.inf)
-        return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
-
-    def whitened(
-        self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
-    ) -> tuple[ComplexArray, list[ComplexArray]]:
-        """Return the complex residual of each row of data, and its derivatives, unchecked.
-
-        Without `tails` a covariance of few degrees of freedom counts as if it were known.
+        derivatives leave that out, so that J' r is the exact gradient of half the sum of squares.
         """
         noise = self._noise
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
-            if isinstance(noise, Measured):
-                y, changes = self._whitened_by_covariance(noise, theta, derivatives)
-                return bend(y, changes, self._tail) if tails and self._tail else (y, changes)
-            predicted, by, _ = self._prediction(theta, 2 * derivatives)
-            return noise.residual(predicted), [noise.change(predicted, d) for d in by]
-
-    def _whitened_by_covariance(
-        self, noise: Measured, theta: FloatArray, derivatives: bool
-    ) -> tuple[ComplexArray, list[ComplexArray]]:
-        if noise.amplitude is None:
-            predicted, by, _ = self._prediction(theta, 2 * derivatives)
-            return noise.residual(predicted), [noise.change(predicted, d) for d in by]
-        if self._coarse:
-            predicted, by, slope = self._prediction(theta, 1 + derivatives)
-            whiten = noise.amplitude.whitening(noise.covariance, slope)
-            return whiten(noise.response - predicted), [-whiten(d) for d in by]
 
         def value_and_slope(error: FloatArray) -> tuple[ComplexArray, ComplexArray]:
             value, _, slope = self._predictor(theta, derivatives=1, amplitude_error=error)
             return value, slope
 
-        y, whiten, error = correct_amplitude(noise, noise.amplitude, value_and_slope)
-        by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
-        return y, [-whiten(d) for d in by]
-
-    def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
-        """Return the sum of squared residuals of every row, (..., n), without priors."""
-        y, _ = self.whitened(theta, derivatives=False, tails=tails)
-        with np.errstate(over="ignore"):
-            return np.asarray(y.real**2 + y.imag**2)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+            if noise.amplitude is None:
+                predicted, by, _ = self._prediction(theta, 2 * derivatives)
+                y, changes = noise.residual(predicted), [noise.change(predicted, d) for d in by]
+            elif self._coarse:
+                predicted, by, slope = self._prediction(theta, 1 + derivatives)
+                whiten = noise.amplitude.whitening(noise.covariance, slope)
+                y, changes = whiten(noise.response - predicted), [-whiten(d) for d in by]
+            else:
+                y, whiten, error = correct_amplitude(noise, value_and_slope)
+                by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
+                changes = [-whiten(d) for d in by]
+            pairs = np.empty((*self._shape(theta)[:-1], len(changes) + 1, self._rows.n), complex)
+            for index, numbers in enumerate((y, *changes)):
+                pairs[..., index, :] = numbers
+            rows = pairs.view(np.float64)
+            return bend(rows, self.n_residuals, self.tail) if tails and self.tail else rows
 
     def residual_change(self, theta: FloatArray, change: ComplexArray) -> FloatArray:
-        """Return how the data's residuals change where predictions change, unchecked.
+        """Return how the data's residuals change, (..., 2 n), where predictions change, (..., n).
 
-        Parameters
-        ----------
-        theta : ndarray, shape (P,)
-            Search coordinates.
-        change : ndarray of complex, shape (..., n)
-            Small change of the predicted responses.
-
-        Returns
-        -------
-        ndarray, shape (..., 2 n)
-            Derivative of the residuals, a covariance of few degrees of freedom taken as known.
+        A covariance of few degrees of freedom is taken as known.
         """
         noise = self._noise
         with np.errstate(divide="ignore", invalid="ignore"):
-            if isinstance(noise, Measured) and noise.amplitude is not None:
+            if noise.amplitude is not None:
                 slope = self._prediction(theta, 2).by_ln_amplitude
                 by = -noise.amplitude.whitening(noise.covariance, slope)(change)
             else:
@@ -568,53 +442,34 @@ class TableProblem(Problem):
     def draw(
         self, theta: ArrayLike, scale: float, size: int, rng: np.random.Generator
     ) -> ComplexArray:
-        """Return sets of responses drawn from the likelihood at theta: measurements repeated.
+        """Return sets of responses, (size, n), drawn from the likelihood: measurements repeated.
 
-        Returns
-        -------
-        ndarray of complex, shape (size, n)
-            Responses in the data's quantity. An error of the measured amplitudes appears, to
-            first order, in the responses, so that amplitudes stay as they were measured.
+        An error of the measured amplitudes appears, to first order, in the responses, so that
+        amplitudes stay as they were measured.
         """
         theta = self.space.checked(theta)
         shape, noise = (size, self._rows.n), self._noise
         pairs = rng.standard_normal((2, *shape))
         pairs[1][..., self._rows.harmonic == 0] = 0.0  # a mean force is real
         y = np.asarray(scale * (pairs[0] + 1j * pairs[1]), dtype=np.complex128)
-        if not isinstance(noise, Measured):
-            return noise.replicate(self.predict(theta), y)
-        if noise.tail is not None:
-            dof = noise.tail.dof
-            y = y * np.sqrt(dof / rng.chisquare(dof + 1.0 - noise.tail.parts, shape))
+        if self.tail is not None:
+            dof = self.tail.dof
+            y = y * np.sqrt(dof / rng.chisquare(dof + 1.0 - self.tail.parts, shape))
         if noise.amplitude is None:
             return noise.replicate(self.predict(theta), y)
         value, _, slope = self._predictor(theta)
         spread: ComplexArray = noise.amplitude.whitening(noise.covariance, slope).inverse(y)
         return np.asarray(value + spread)
 
-    def _rows_at(
-        self, theta: FloatArray, scale: ArrayLike, *, derivatives: bool = True, tails: bool = False
-    ) -> FloatArray:
-        """Return residuals and, below them, their derivatives: (..., 1 + P, m), priors last."""
-        y, changes = self.whitened(theta, derivatives=derivatives, tails=tails)
-        shape = (*self._shape(theta)[:-1], len(changes) + 1, self.n_residuals // 2)
-        pairs = np.empty(shape, dtype=np.complex128)
-        for index, numbers in enumerate((y, *changes)):
-            pairs[..., index, :] = numbers
-        rows = pairs.view(np.float64)
-        if np.ndim(scale) or scale != 1.0:
-            rows /= np.asarray(scale)[..., None, None]
-        return self.with_priors(rows, theta)
-
     def information(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None
     ) -> FloatArray:
         """Return the Fisher information; an estimated covariance counts as noise.py says."""
         theta = self.space.checked(theta)
-        if self._tail is None:
+        if self.tail is None:
             return super().information(theta, scale, chart)
-        rows, m = self._rows_at(theta, scale), self.n_residuals
-        counted = weighted(rows, m, *self._tail.information(squares_of(rows[..., 0, :m])))
+        rows, m = self.rows(theta, scale, tails=False), self.n_residuals
+        counted = weighted(rows, m, *self.tail.information(squares_of(rows[..., 0, :m])))
         J, counted = rows[..., 1:, :], counted[..., 1:, :]
         if chart is not None:
             J, counted = chart.T @ J, chart.T @ counted

@@ -77,7 +77,7 @@ def predictive_checks(
 ) -> tuple[PredictiveCheck, ...]:
     """Return the checks at draws from the posterior, (S, D)."""
     theta, scale = density.split(points)
-    y, _ = density.problem.whitened(theta, derivatives=False)
+    y = _whitened(density, theta)
     y = np.broadcast_to(y, (len(theta), density.problem.n_residuals // 2)) / scale[:, None]
     order = _neighbours(density.problem.data)
     noise = replicated_noise(density, y.shape, random)
@@ -308,8 +308,11 @@ def _residuals(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return whitened residuals at the posterior mean, and replicated ones at each point."""
     theta, scale = density.split(points)
-    whitened = density.problem.whitened
-    observed, _ = whitened(theta.mean(axis=0)[None], derivatives=False)
-    at_point, _ = whitened(theta, derivatives=False)
+    observed, at_point = _whitened(density, theta.mean(axis=0)[None]), _whitened(density, theta)
     noise = scale[:, None] * replicated_noise(density, at_point.shape, random)
     return observed[0], observed - at_point + noise
+
+
+def _whitened(density: Density, theta: FloatArray) -> ComplexArray:
+    """Return the data's residuals, real and imaginary part of each row as one number."""
+    return np.ascontiguousarray(density.problem.whitened(theta)).view(np.complex128)
