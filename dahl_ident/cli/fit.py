@@ -280,8 +280,8 @@ def report(
         console.write_json(places)
     elif STANDARD not in places:
         console.write("\n".join(places))
-    from dahl_ident.reporting.comparison import disagreements
+    from dahl_ident.reporting.comparison import comparison_of
 
-    contradictions = disagreements(fits)
-    console.finish(not contradictions, " ".join(contradictions))
+    compared = comparison_of(fits)
+    console.finish(not compared.status, " ".join(compared.verdict))
     finish(worst(fits))

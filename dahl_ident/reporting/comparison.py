@@ -1,9 +1,9 @@
-"""Parameters of several measurements compared: changes, or a table with its waveforms."""
+"""Parameters of several measurements compared: side by side, and what changed or disagrees."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
 from pathlib import Path
@@ -11,11 +11,22 @@ from typing import Any
 
 import numpy as np
 
+from dahl_ident import plots
 from dahl_ident.diagnostics.formatting import rounded, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
-from dahl_ident.reporting.document import Cell, Paragraph, Section, TextTable
+from dahl_ident.reporting.document import (
+    Bullets,
+    Cell,
+    Paragraph,
+    Picture,
+    Row,
+    Section,
+    TextTable,
+    estimated,
+    words,
+)
 from dahl_ident.results import FitResult
-from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline
+from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline, is_usable
 
 _HOW_BOTH = (
     "The same parameters, estimated from the table and sample by sample from the waveforms. The "
@@ -23,16 +34,12 @@ _HOW_BOTH = (
     "common; p is the two-sided probability of a difference this large if there is none. A "
     f"difference is called a disagreement where p times the number of rows is below {SIGNIFICANT}."
 )
-
-
 _HOW = (
     "A change is the difference of two estimates. Its standard uncertainty u combines both "
     "budgets; for a fit of a single run, the scatter between runs that the other fit shows is "
     "added. p is the two-sided probability of a change this large if there is no real change; "
     f"below {SIGNIFICANT:g} it is called significant, unless no fit shows scatter between runs."
 )
-
-
 KINDS = {"table": "Table", "records": "Waveforms"}
 """How reports call what was measured."""
 
@@ -57,22 +64,33 @@ def comparison_of(fits: Sequence[FitResult]) -> Compared:
     of_records = of_kind("records", fits)
     if 0 < len(of_records) < len(fits):
         return _of_both(fits)
-    changed = _between_records(of_records)
+    firsts = [fit.data[0] for fit in of_records]
+    channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
+    for a, b in pairwise(firsts):  # models of the same records are no changes
+        if all(np.array_equal(getattr(a, name), getattr(b, name)) for name in channels):
+            return Compared()
+    named = [Path(str((r.provenance or {}).get("file", "measurement"))).stem for r in firsts]
+    return changed_between(numbered(named), of_records)
+
+
+def changed_between(names: Sequence[str], fits: Sequence[FitResult]) -> Compared:
+    """Return what changed from each fit to the next; nothing where they share no parameter."""
+    changed = changes(dict(zip(names, fits, strict=True)))
     if not changed:
         return Compared()
+    rows: list[Row] = [
+        {
+            "parameter": c.parameter,
+            "between": f"{c.before} to {c.after}",
+            **_sizes("change", c, c.p_number if math.isfinite(c.p) else "-"),
+            "significance": c.significance,
+        }
+        for c in changed
+    ]
+    table = TextTable.of("Changes from each measurement to the next", rows)
+    section = Section("Changes", (table, Paragraph(_HOW)))
     facts = {"changes": [change.to_dict() for change in changed]}
-    return Compared((), tuple(headline(changed)), (changes_section(changed),), facts)
-
-
-def _between_records(fits: Sequence[FitResult]) -> list[Change]:
-    """Return the changes between fits to different records; none between models of the same."""
-    firsts = [fit.data[0] for fit in fits]
-    channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
-    for a, b in pairwise(firsts):
-        if all(np.array_equal(getattr(a, name), getattr(b, name)) for name in channels):
-            return []
-    named = [Path(str((r.provenance or {}).get("file", "measurement"))).stem for r in firsts]
-    return changes(dict(zip(numbered(named), fits, strict=True)))
+    return Compared((), tuple(headline(changed)), (section,), facts)
 
 
 def numbered(names: Sequence[str]) -> list[str]:
@@ -81,107 +99,124 @@ def numbered(names: Sequence[str]) -> list[str]:
 
 
 def _of_both(fits: Sequence[FitResult]) -> Compared:
-    differences = list(_differences(fits))
-    disagree = [c.parameter for c, *_ in differences if _disagree(c, differences)]
+    """Return the differences of the parameters that a table and waveforms both determine."""
+    differences = [
+        (change, [fit.params[change.parameter] for fit in (table, records)])
+        for table, records in product(of_kind("table", fits), of_kind("records", fits))
+        for change in changes({"table": table, "waveforms": records})
+    ]
+    comparable = sum(math.isfinite(change.p) for change, _ in differences)
+    verdict, disagree = [], []
+    rows: list[Row] = []
+    for c, both in differences:
+        says = "agree" if math.isfinite(c.p) else "cannot be compared"
+        if c.p * comparable < SIGNIFICANT:
+            says = "disagree"
+            disagree.append(c.parameter)
+            one, two = (with_unit(e.value, e.stderr or 0.0, c.unit) for e in both)
+            verdict.append(
+                f"Table and waveforms disagree: {c.parameter} is {one} from the table and {two} "
+                f"from the waveforms ({c.p_text}). At least one has an error that its uncertainty "
+                "does not hold."
+            )
+        texts = (" \u00b1 ".join(rounded(e.value, e.stderr or 0.0)) for e in both)
+        cells = [Cell(text, e.value) for text, e in zip(texts, both, strict=True)]
+        rows.append(
+            {
+                "parameter": c.parameter,
+                **dict(zip(("table", "waveforms"), cells, strict=True)),
+                **_sizes("difference", c, c.p_text),
+                "finding": says,
+            }
+        )
+    if not verdict:
+        verdict = ["Table and waveforms agree within their uncertainties."]
+        if not comparable:
+            verdict = [
+                "Table and waveforms cannot be compared: they have no usable estimate in common."
+            ]
     # one model, with its uncertainties, then does not describe both
     status = (str(VerdictStatus.NOT_DESCRIBED),) if disagree else ()
-    return Compared(
-        status,
-        tuple(_comparison_in_words(differences)),
-        (_comparison(differences),) if differences else (),
-        {"changes": [change.to_dict() for change, *_ in differences], "disagree": disagree},
-    )
+    sections: tuple[Section, ...] = ()
+    if rows:
+        caption = "Parameters from the table and from the waveforms, with standard uncertainties"
+        blocks = (TextTable.of(caption, rows), Paragraph(_HOW_BOTH))
+        sections = (Section("Table and waveforms", blocks),)
+    facts = {"changes": [change.to_dict() for change, _ in differences], "disagree": disagree}
+    return Compared(status, tuple(verdict), sections, facts)
 
 
-_Difference = tuple[Change, FitResult, FitResult]
-
-
-def _differences(results: Sequence[FitResult]) -> Iterator[_Difference]:
-    """Yield the differences of the parameters that a table and waveforms both determine."""
-    for fit, other in product(of_kind("table", results), of_kind("records", results)):
-        for change in changes({"table": fit, "waveforms": other}):
-            yield change, fit, other
-
-
-def _disagree(change: Change, differences: Sequence[_Difference]) -> bool:
-    return change.p * sum(math.isfinite(c.p) for c, _, _ in differences) < SIGNIFICANT
-
-
-def disagreements(results: Sequence[FitResult]) -> list[str]:
-    """Return a sentence for each parameter that a table and waveforms give differently."""
-    return _disagreements(list(_differences(results)))
-
-
-def _disagreements(differences: Sequence[_Difference]) -> list[str]:
-    sentences = []
-    for change, *fits in differences:
-        if _disagree(change, differences):
-            name = change.parameter
-            estimates = (fit.params[name] for fit in fits)
-            one, two = (with_unit(e.value, e.stderr or 0.0, change.unit) for e in estimates)
-            sentences.append(
-                f"Table and waveforms disagree: {name} is {one} from the table and {two} from the "
-                f"waveforms ({change.p_text}). At least one has an error that its uncertainty does "
-                "not hold."
-            )
-    return sentences
-
-
-def _comparison_in_words(differences: Sequence[_Difference]) -> list[str]:
-    if sentences := _disagreements(differences):
-        return sentences
-    if any(math.isfinite(change.p) for change, _, _ in differences):
-        return ["Table and waveforms agree within their uncertainties."]
-    return ["Table and waveforms cannot be compared: they have no usable estimate in common."]
-
-
-def _comparison(differences: Sequence[_Difference]) -> Section:
-    rows = []
-    for change, *fits in differences:
-        estimates = []
-        for fit in fits:
-            estimate = fit.params[change.parameter]
-            value, error = rounded(estimate.value, estimate.stderr or 0.0)
-            estimates.append(Cell(f"{value} \u00b1 {error}", estimate.value))
-        says = "disagree" if _disagree(change, differences) else "agree"
-        rows.append(
-            (
-                Cell(change.parameter),
-                *estimates,
-                *_sizes(change, change.p_text),
-                Cell(says if math.isfinite(change.p) else "cannot be compared"),
-            )
-        )
-    header = (
-        "parameter", "table", "waveforms", "difference", "standard uncertainty u", "unit", "p",
-        "finding",
-    )  # fmt: skip
-    caption = "Parameters from the table and from the waveforms, with standard uncertainties"
-    table = TextTable(caption, header, tuple(rows))
-    return Section("Table and waveforms", (table, Paragraph(_HOW_BOTH)))
-
-
-def _sizes(change: Change, p: str) -> list[Cell]:
+def _sizes(what: str, change: Change, p: str) -> Row:
     """Return a change, its uncertainty, their unit and p as written; struck if not usable."""
     value, error = rounded(change.change, change.u)
     usable = math.isfinite(change.p)
-    return [
-        Cell(value, change.change, struck=not usable),
-        Cell(error, change.u if math.isfinite(change.u) else None, struck=not usable),
-        Cell(change.unit or "-"),
-        Cell(p, change.p if usable else None),
-    ]
+    u = change.u if math.isfinite(change.u) else None
+    return {
+        what: Cell(value, change.change, struck=not usable),
+        "standard uncertainty u": Cell(error, u, struck=not usable),
+        "unit": change.unit or "-",
+        "p": Cell(p, change.p if usable else None),
+    }
 
 
-def changes_section(changed: Sequence[Change]) -> Section:
-    """Return the table of changes, and how it is made."""
+def side_by_side(names: Sequence[str], fits: Sequence[FitResult]) -> Compared:
+    """Return the estimates of fits of different tables, what changed, pictures and verdicts."""
     rows = []
-    for c in changed:
-        p = c.p_number if math.isfinite(c.p) else "-"
-        between = Cell(f"{c.before} to {c.after}")
-        rows.append((Cell(c.parameter), between, *_sizes(c, p), Cell(c.significance)))
-    header = (
-        "parameter", "between", "change", "standard uncertainty u", "unit", "p", "significance"
-    )  # fmt: skip
-    table = TextTable("Changes from each measurement to the next", header, tuple(rows))
-    return Section("Changes", (table, Paragraph(_HOW)))
+    for name in dict.fromkeys(name for fit in fits for name in fit.params):
+        unit = next(fit.params[name].unit for fit in fits if name in fit.params)
+        rows.append((*words(name, unit or "-"), *(_estimate_of(fit, name) for fit in fits)))
+    rows.append(words("status", "-", *(str(fit.status) for fit in fits)))
+    header = ("parameter", "unit", *names)
+    table = TextTable("Estimates, each with its standard uncertainty", header, tuple(rows))
+    named = dict(zip(names, fits, strict=True))
+    verdicts = tuple(f"{name}: {fit.verdict}" for name, fit in named.items())
+    changed = changed_between(names, fits)
+    sections = (
+        Section("Parameters side by side", (table,)),
+        *changed.sections,
+        Section("Pictures", (_overlaid(named),), details=True),
+        Section("Verdicts", (Bullets(verdicts),), details=True),
+    )
+    verdict = changed.verdict or tuple(headline([]))
+    return Compared((), verdict, sections, {"changes": [], **changed.facts})
+
+
+def _estimate_of(fit: FitResult, name: str) -> Cell:
+    if name not in fit.params:
+        return Cell("-")
+    p = fit.params[name]
+    if not p.vary:
+        return Cell(f"{p.value:g} (fixed)", p.value)
+    text = " \u00b1 ".join(rounded(p.value, p.stderr))
+    return estimated(p.value, text, struck=not is_usable(fit, name))
+
+
+def _overlaid(fits: Mapping[str, FitResult]) -> Picture:
+    def draw() -> Any:
+        measured = [fit.data.select(harmonic=1) for fit in fits.values()]
+        over_frequency = any(np.ptp(t.frequency_hz) > 0.5 * t.frequency_hz.max() for t in measured)
+        levels, fitted = [], []
+        for (name, fit), table in zip(fits.items(), measured, strict=True):
+            fundamental = fit.data.harmonic == 1
+            x = fit.problem.stiffness_data.amplitude[fundamental]
+            x = table.frequency_hz if over_frequency else x
+            order = np.argsort(x, kind="stable")
+            levels.append((name, x, table.response))
+            fitted.append(plots.Curve(x[order], fit.best_fit[fundamental][order]))
+        return plots.plot_frequency_response(
+            levels,
+            fitted=fitted if not over_frequency else (),
+            gain_label=f"{measured[0].quantity.replace('_', ' ')} [{measured[0].unit}]",
+            x_label="frequency [Hz]" if over_frequency else "displacement amplitude",
+        )
+
+    ranges = (
+        f"{name}: gain from {fit.data.gain.min():.3g} to {fit.data.gain.max():.3g} {fit.data.unit}"
+        for name, fit in fits.items()
+    )
+    return Picture(
+        "overlay",
+        "Data (points) and fits (lines) of every measurement.",
+        "; ".join(ranges) + ".",
+        draw,
+    )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,10 @@ class Cell:
     value: float | None = None
     struck: bool = False
     link: str | None = None
+
+
+Row = dict[str, Cell | str]
+"""Cells, or texts, by the names in the header of their table."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,12 @@ class TextTable:
     caption: str
     header: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
+
+    @classmethod
+    def of(cls, caption: str, rows: Sequence[Row]) -> TextTable:
+        """Return a table of rows, at least one, with their cells by the names in the header."""
+        cells = ([c if isinstance(c, Cell) else Cell(c) for c in row.values()] for row in rows)
+        return cls(caption, tuple(rows[0]), tuple(map(tuple, cells)))
 
 
 @dataclass(frozen=True)
@@ -200,6 +210,11 @@ def words(*texts: str) -> tuple[Cell, ...]:
 def number(value: float, digits: int = 4) -> Cell:
     """Return a number with so many digits; all of them are kept for copying."""
     return Cell(f"{value:.{digits}g}", float(value))
+
+
+def estimated(value: float, text: str, *, struck: bool = False) -> Cell:
+    """Return an estimate as text; one that ran away has none."""
+    return Cell(text, value, struck) if np.isfinite(value) else Cell("none finite")
 
 
 def figure_of(axes: Any) -> Figure:

@@ -20,7 +20,7 @@ from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.document import Block, Document, Picture
 from dahl_ident.reporting.pages import html, markdown
-from dahl_ident.reporting.sections import Result, document, overlay
+from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import FitResult, Posterior
 
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
@@ -102,22 +102,21 @@ def report(
     known = metadata_of(metadata)
     _check(listed)
     _check_calibrations(listed, known)
-    how: dict[str, Any] = {"title": title, "command": command, "metadata": known}
     of_tables = of_kind("table", listed)
     if record is not None and not of_tables:
         raise ValidationError(
             f"{argument('record', option='waveforms')} is given, the waveforms of a table, but no "
             "result on a table; leave it out"
         )
-    if all(np.array_equal(t.data.response, of_tables[0].data.response) for t in of_tables):
-        whole = document(listed, record=record, **how)
-    elif len(of_tables) < len(listed):
+    apart = any(not np.array_equal(t.data.response, of_tables[0].data.response) for t in of_tables)
+    if apart and len(of_tables) < len(listed):
         raise ValidationError(
             "fits of several tables are reported together with no fit of records; give those of "
             "one table, or write a report for each"
         )
-    else:
-        whole = overlay(listed, **how)
+    whole = document(
+        listed, title=title, command=command, record=record, metadata=known, apart=apart
+    )
     whole = replace(whole.numbered(), title=_one_line(whole.title))
     if progress is not None:
         whole = _counted(whole, progress)

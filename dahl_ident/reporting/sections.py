@@ -5,43 +5,36 @@ Fits on different data stand side by side, with the significance of their change
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from dahl_ident import plots
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.laboratory import Metadata
 from dahl_ident.diagnostics.budget import Budget
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
-from dahl_ident.diagnostics.formatting import listed, rounded, with_unit
+from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.reporting import provenance, tables
-from dahl_ident.reporting.comparison import KINDS, changes_section, comparison_of, numbered, of_kind
+from dahl_ident.reporting.comparison import KINDS, comparison_of, numbered, of_kind, side_by_side
 from dahl_ident.reporting.document import (
     MARKS,
     Block,
     Bullets,
-    Cell,
     Document,
     Listing,
     Paragraph,
-    Picture,
     Section,
     TextTable,
     words,
 )
 from dahl_ident.reporting.figures import budget_picture, corner, pictures_of, settling, trace
-from dahl_ident.reporting.provenance import parts
 from dahl_ident.results import FitResult, Posterior
-from dahl_ident.results.changes import changes, headline, is_usable
 from dahl_ident.results.fit_report import facts
 from dahl_ident.version import __version__
 
@@ -55,7 +48,7 @@ COVERAGE = (
 _MOST_FILES = 4  # lines of them before the signature
 _FACTS = {"table": "fits", "records": "record_fits"}  # names of fits in JSON, by kind of data
 _FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin
-RANK = list(MARKS).index
+_RANK = list(MARKS).index
 """The place of a status in the order from good to bad."""
 
 
@@ -66,61 +59,118 @@ def document(
     command: str | None = None,
     record: Record | None = None,
     metadata: Metadata | None = None,
+    apart: bool = False,
 ) -> Document:
+    """Return the report on fits and posteriors of one table, of records, or of both.
+
+    `apart` are fits of several tables, which are only compared.
+    """
+    known = metadata or Metadata()
+    tables_first = sorted(results, key=lambda result: result.problem.response is None)
+    if apart:
+        content = _of_several_tables(results, known)
+    else:
+        content = _of_one_table(tables_first, known, record)
+        repeated = command or provenance.equivalent_command(results)
+        origin = tuple(_origin(tables_first, repeated, typed=command is not None))
+        sections = (*content.sections, Section("Origin", origin, details=True))
+        content, command = replace(content, sections=sections), repeated
+    files = _files(tables_first)
+    of_first = (s for s in provenance.sources(tables_first[0].provenances) if s.read and s.sha256)
+    identity = [f"Report {known.number}"] if known.number else []
+    if read := list(of_first):
+        more = f" and {len(read) - 1} more" if len(read) > 1 else ""
+        identity.append(f"{Path(read[0].file).name}, SHA-256 {_short(read[0].sha256)}{more}")
+    return replace(
+        content,
+        title=title or known.title or content.title,
+        identity=" \u00b7 ".join(identity),
+        signatory=known.signatory,
+        facts={
+            **content.facts,
+            "metadata": known.facts(),
+            "files": [vars(source) for source in files],
+            "versions": provenance.versions(),
+            "date": provenance.today(),
+            "command": command,
+        },
+    )
+
+
+def _of_one_table(results: Sequence[Result], known: Metadata, record: Record | None) -> Document:
     """Return the report on fits and posteriors of one table, of records, or of both."""
     drawn = [result for result in results if isinstance(result, Posterior)]
     around = [one.fit for one in drawn if one.fit is not None and one.problem.around_optimum]
     fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
-    tables_first = sorted(results, key=lambda result: result.problem.response is None)
-    first, known = tables_first[0], metadata or Metadata()
-    repeated = command or provenance.equivalent_command(results)
     compared = comparison_of(fits)
-    front: list[Section] = []
-    details: list[Section] = []
+    front, details = list(compared.sections), list[Section]()
     for fit in fits:
         of = _of(fit, fits)
-        front += [*_answer(fit, of)]
+        front.append(_answer(fit, of))
         front.append(Section(f"Expanded uncertainty{of}", tuple(_budget(fit))))
         front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
         details += _details(fit, drawn, of)
     for one in drawn:
         if not fits or one.problem.around_optimum:
-            front.append(_posterior_answer(one))
+            priors = tuple(f"Prior of {name}: {text}" for name, text in one.priors.items())
+            front.append(Section("Posterior", (tables.posterior_summary(one), Bullets(priors))))
         details += _posterior_details(one)
-    data = first.problem.response
+    if (data := results[0].problem.response) is not None:
+        details += _extraction(data, record)
+        details.append(Section("Data", (tables.measured(data),), details=True))
+    verdict = [*compared.verdict, *(line for fit in fits for line in _verdict(fit, fits))]
+    for one in drawn:
+        verdict += [f"Posterior: {one.findings[0]}", *map(str, one.findings[1:])]
+    parts = (p for one in results[:1] for p in provenance.parts(one.provenances) if "file" in p)
+    files = [Path(str(part["file"])).name for part in parts]
     return Document(
-        title=title or known.title or title_of(first),
-        status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=RANK),
-        verdict=tuple(
-            dict.fromkeys(
-                [
-                    *compared.verdict,
-                    *(line for fit in fits for line in _verdict(fit, fits)),
-                    *(line for one in drawn for line in _posterior_verdict(one)),
-                ]
-            )
-        ),
-        header=header(tables_first, known),
-        sections=(
-            *compared.sections,
-            *(section for section in front if section.blocks),
-            *(section for section in details if section.blocks),
-            *([] if data is None else [*_extraction(data, record), _data(data)]),
-            Section(
-                "Origin",
-                tuple(_origin(tables_first, repeated, typed=command is not None)),
-                details=True,
-            ),
-        ),
+        title=f"Friction identified{f' from {files[0]}' if len(files) == 1 else ''}",
+        status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=_RANK),
+        verdict=tuple(dict.fromkeys(verdict)),
+        header=_header(results, known),
+        sections=tuple(section for section in (*front, *details) if section.blocks),
         facts={
-            **{name: list(map(fit_facts, of_kind(kind, fits))) for kind, name in _FACTS.items()},
+            **{name: list(map(_fit_facts, of_kind(kind, fits))) for kind, name in _FACTS.items()},
             "posteriors": [one.to_dict() for one in drawn],
-            "metadata": known.facts(),
             **compared.facts,
-            **origin_facts(tables_first),
-            "command": repeated,
         },
-        **signed(known, first),
+    )
+
+
+def _of_several_tables(results: Sequence[Result], known: Metadata) -> Document:
+    """Return the comparison of fits on different tables, each with the one before it."""
+    fits = [result for result in results if isinstance(result, FitResult)]
+    if len(fits) < len(results):
+        raise ValidationError(
+            "results on different data are compared only where all are fits; write a report for "
+            "each"
+        )
+    units = {fit.data.unit for fit in fits}
+    if len(units) > 1:
+        raise ValidationError(f"the fits measure in different units: {', '.join(sorted(units))}")
+    named = []
+    for i, fit in enumerate(fits, 1):
+        parts = provenance.parts(fit.provenances)
+        files = [Path(str(part["file"])).stem for part in parts if "file" in part]
+        named.append(files[0] if len(files) == 1 else f"measurement {i}")
+    names = numbered(named)
+    headers = [dict(_header([fit], known)) for fit in fits]
+    rows = dict(headers[0])
+    rows["Model"] = tuple(dict.fromkeys(line for one in headers for line in one["Model"]))
+    of_each = zip(names, headers, strict=True)
+    rows["Data"] = tuple(f"{name}: {'; '.join(one['Data'])}" for name, one in of_each)
+    compared = side_by_side(names, fits)
+    return Document(
+        title=f"Comparison of {', '.join(names)}",
+        status=max((str(fit.status) for fit in fits), key=_RANK),
+        verdict=compared.verdict,
+        header=tuple(rows.items()),
+        sections=compared.sections,
+        facts={
+            "fits": [{"name": n} | _fit_facts(fit) for n, fit in zip(names, fits, strict=True)],
+            "posteriors": [],
+            **compared.facts,
+        },
     )
 
 
@@ -133,28 +183,9 @@ def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
     return f": {', '.join(parts)}" if parts else ""
 
 
-def signed(metadata: Metadata, result: Result) -> dict[str, Any]:
-    """Return what identifies the report on every page, and who signs it."""
-    files = [s for s in provenance.sources(result.provenances) if s.read and s.sha256]
-    parts = [f"Report {metadata.number}"] if metadata.number else []
-    if files:
-        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        parts.append(f"{Path(files[0].file).name}, SHA-256 {_short(files[0].sha256)}{more}")
-    return {"identity": " \u00b7 ".join(parts), "signatory": metadata.signatory}
-
-
 def _short(sha256: str) -> str:
     """Return the beginning of a hash; the whole one stands under the origin."""
     return f"{sha256[:12]}..." if sha256 else "unknown"
-
-
-def origin_facts(results: Sequence[Result]) -> dict[str, Any]:
-    """Return files, versions and date for machines."""
-    return {
-        "files": [vars(source) for source in _files(results)],
-        "versions": provenance.versions(),
-        "date": provenance.today(),
-    }
 
 
 def _files(results: Sequence[Result]) -> list[provenance.SourceFile]:
@@ -163,27 +194,12 @@ def _files(results: Sequence[Result]) -> list[provenance.SourceFile]:
     return list(dict.fromkeys(every))
 
 
-def title_of(result: Result) -> str:
-    """Return a title that names the file, where there is one."""
-    files = [str(p["file"]) for p in provenance.parts(result.provenances) if "file" in p]
-    return (
-        f"Friction identified from {Path(files[0]).name}"
-        if len(files) == 1
-        else "Friction identified"
-    )
-
-
-def header(
+def _header(
     results: Sequence[Result], metadata: Metadata
 ) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Return specimen, model, data, instruments, operator, dates and software."""
-    of_laboratory = metadata.lines
-    specimen = {"Specimen": of_laboratory.pop("Specimen")}
-    first = {
-        name: of_laboratory.pop(name)
-        for name in ("Laboratory", "Customer")
-        if name in of_laboratory
-    }
+    stated = metadata.lines
+    first = [name for name in ("Laboratory", "Customer", "Specimen") if name in stated]
     files = []
     for source in _files(results):
         before = "" if source.read else "made from "
@@ -191,15 +207,14 @@ def header(
     if len(files) > _MOST_FILES:
         more = len(files) - _MOST_FILES + 1
         files[_MOST_FILES - 1 :] = [f"and {more} more files, listed under Origin"]
-    made_of = {
+    rows = {name: stated.pop(name) for name in first} | {
         "Model": tuple(in_words(results[0].problem.model)),
         "Data": (*dict.fromkeys(result.problem.extent for result in results), *files),
-    }
-    software = {
+        **stated,
         "Date of report": (provenance.today(),),
         "Software": (f"dahl_ident {__version__}",),
     }
-    return tuple((first | specimen | made_of | of_laboratory | software).items())
+    return tuple(rows.items())
 
 
 def in_words(model: Element) -> Iterator[str]:
@@ -230,20 +245,9 @@ def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
     yield from (f"{before}{line}" for line in (*lines, *warnings))
 
 
-def _posterior_verdict(posterior: Posterior) -> list[str]:
-    return [f"Posterior: {posterior.findings[0]}", *map(str, posterior.findings[1:])]
-
-
-def _answer(fit: FitResult, of: str) -> Iterator[Section]:
-    combinations = fit.identifiability.combinations
-    yield Section(
-        f"Result{of}",
-        (
-            tables.answer(fit),
-            Bullets(tuple(f"Determined: {c}" for c in combinations)),
-            Paragraph(RELATES),
-        ),
-    )
+def _answer(fit: FitResult, of: str) -> Section:
+    combinations = Bullets(tuple(f"Determined: {c}" for c in fit.identifiability.combinations))
+    return Section(f"Result{of}", (tables.answer(fit), combinations, Paragraph(RELATES)))
 
 
 def _stated(fit: FitResult) -> Budget | None:
@@ -318,13 +322,7 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
     if not fit.goodness.acceptable:
         compared = compare_models(fit)
         yield Paragraph(f"Other models, for comparison. {compared.headline}")
-        yield tables.comparison(compared)
-        yield tables.meanings(compared)
-
-
-def _posterior_answer(posterior: Posterior) -> Section:
-    priors = (f"Prior of {name}: {text}" for name, text in posterior.priors.items())
-    return Section("Posterior", (tables.posterior_summary(posterior), Bullets(tuple(priors))))
+        yield from tables.comparison(compared)
 
 
 def _posterior_details(posterior: Posterior) -> Iterator[Section]:
@@ -371,10 +369,6 @@ def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Sect
     )
 
 
-def _data(data: FrequencyResponse) -> Section:
-    return Section("Data", (tables.measured(data),), details=True)
-
-
 def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> Iterator[Block]:
     if files := _files(results):
         rows = tuple(
@@ -401,7 +395,7 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
     yield Listing(command)
 
 
-def fit_facts(fit: FitResult) -> dict[str, Any]:
+def _fit_facts(fit: FitResult) -> dict[str, Any]:
     """Return a fit for machines."""
     intervals = fit.conf_interval().at(CONFIDENCE)
     return {
@@ -421,130 +415,3 @@ def fit_facts(fit: FitResult) -> dict[str, Any]:
         },
         "priors": {n: tables.prior_text(prior) for n, prior in fit.problem.priors.items()},
     }
-
-
-def overlay(
-    results: Sequence[FitResult | Posterior],
-    *,
-    title: str | None = None,
-    command: str | None = None,
-    metadata: Metadata | None = None,
-) -> Document:
-    """Return the comparison of fits on different data, each with the one before it."""
-    fits = [result for result in results if isinstance(result, FitResult)]
-    if len(fits) < len(results):
-        raise ValidationError(
-            "results on different data are compared only where all are fits; write a report for "
-            "each"
-        )
-    units = {fit.data.unit for fit in fits}
-    if len(units) > 1:
-        raise ValidationError(f"the fits measure in different units: {', '.join(sorted(units))}")
-    names = _names_of(fits)
-    known = metadata or Metadata()
-    changed = changes(dict(zip(names, fits, strict=True)))
-    verdicts = tuple(f"{name}: {fit.verdict}" for name, fit in zip(names, fits, strict=True))
-    sections = (
-        Section("Parameters side by side", (_side_by_side(names, fits),)),
-        changes_section(changed),
-        Section("Pictures", (_overlaid(names, fits),), details=True),
-        Section("Verdicts", (Bullets(verdicts),), details=True),
-    )
-    return Document(
-        title=title or known.title or f"Comparison of {', '.join(names)}",
-        status=max((str(fit.status) for fit in fits), key=RANK),
-        verdict=tuple(headline(changed)),
-        header=_joint_header(fits, names, known),
-        sections=sections,
-        facts={
-            "fits": [{"name": n} | fit_facts(fit) for n, fit in zip(names, fits, strict=True)],
-            "posteriors": [],
-            "changes": [change.to_dict() for change in changed],
-            "metadata": known.facts(),
-            **origin_facts(fits),
-            "command": command,
-        },
-        **signed(known, fits[0]),
-    )
-
-
-def _names_of(fits: Sequence[FitResult]) -> list[str]:
-    """Return a name for each fit: its file, with a number if several have the same name."""
-    named = []
-    for i, fit in enumerate(fits, 1):
-        files = [Path(str(part["file"])).stem for part in parts(fit.provenances) if "file" in part]
-        named.append(files[0] if len(files) == 1 else f"measurement {i}")
-    return numbered(named)
-
-
-def _joint_header(
-    fits: Sequence[FitResult], names: Sequence[str], metadata: Metadata
-) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    rows = dict(header(fits[:1], metadata))
-    headers = [dict(header([fit], metadata)) for fit in fits]
-    rows["Model"] = tuple(dict.fromkeys(line for one in headers for line in one["Model"]))
-    rows["Data"] = tuple(
-        f"{name}: {'; '.join(one['Data'])}" for name, one in zip(names, headers, strict=True)
-    )
-    return tuple(rows.items())
-
-
-def _side_by_side(names: Sequence[str], fits: Sequence[FitResult]) -> TextTable:
-    every = list(dict.fromkeys(name for fit in fits for name in fit.params))
-    rows = []
-    for name in every:
-        unit = next(fit.params[name].unit for fit in fits if name in fit.params)
-        cells = [_estimate_of(fit, name) for fit in fits]
-        rows.append((Cell(name), Cell(unit or "-"), *cells))
-    status = (Cell("status"), Cell("-"), *(Cell(str(fit.status)) for fit in fits))
-    return TextTable(
-        "Estimates, each with its standard uncertainty",
-        ("parameter", "unit", *names),
-        (*rows, status),
-    )
-
-
-def _estimate_of(fit: FitResult, name: str) -> Cell:
-    if name not in fit.params:
-        return Cell("-")
-    estimate = fit.params[name]
-    if not estimate.vary:
-        return Cell(f"{estimate.value:g} (fixed)", estimate.value)
-    if not math.isfinite(estimate.value):
-        return Cell("none finite")
-    value, error = rounded(estimate.value, estimate.stderr)
-    return Cell(f"{value} \u00b1 {error}", estimate.value, struck=not is_usable(fit, name))
-
-
-def _overlaid(names: Sequence[str], fits: Sequence[FitResult]) -> Picture:
-    def draw() -> Any:
-        measured = [fit.data.select(harmonic=1) for fit in fits]
-        over_frequency = any(np.ptp(t.frequency_hz) > 0.5 * t.frequency_hz.max() for t in measured)
-        levels, fitted = [], []
-        for name, fit, table in zip(names, fits, measured, strict=True):
-            x = table.frequency_hz if over_frequency else _amplitude_of(fit)
-            order = np.argsort(x, kind="stable")
-            predicted = fit.best_fit[fit.data.harmonic == 1]
-            levels.append((name, x, table.response))
-            fitted.append(plots.Curve(x[order], predicted[order]))
-        return plots.plot_frequency_response(
-            levels,
-            fitted=fitted if not over_frequency else (),
-            gain_label=f"{measured[0].quantity.replace('_', ' ')} [{measured[0].unit}]",
-            x_label="frequency [Hz]" if over_frequency else "displacement amplitude",
-        )
-
-    ranges = (
-        f"{name}: gain from {fit.data.gain.min():.3g} to {fit.data.gain.max():.3g} {fit.data.unit}"
-        for name, fit in zip(names, fits, strict=True)
-    )
-    return Picture(
-        "overlay",
-        "Data (points) and fits (lines) of every measurement.",
-        "; ".join(ranges) + ".",
-        draw,
-    )
-
-
-def _amplitude_of(fit: FitResult) -> Any:
-    return fit.problem.stiffness_data.amplitude[fit.data.harmonic == 1]
