@@ -24,21 +24,12 @@ _STIFFNESS: Dimension = (1, -1, 0)  # force over displacement
 
 @dataclass(frozen=True)
 class Direction:
-    """A parameter, or its ratio to another one of the element.
-
-    Attributes
-    ----------
-    parameter : Parameter
-        The free parameter.
-    over : Parameter or None
-        What it is divided by.
-    dimension : tuple of int
-        Powers of force, displacement and time.
-    """
+    """A free parameter, or its ratio to another one of the element."""
 
     parameter: Parameter
     over: Parameter | None
     dimension: Dimension
+    """Powers of force, displacement and time."""
 
     @property
     def is_number(self) -> bool:
@@ -71,24 +62,15 @@ class Direction:
 
 @dataclass(frozen=True)
 class Directions:
-    """How an element depends on its free parameters.
-
-    Attributes
-    ----------
-    element : Element
-    linear : tuple of Parameter
-        Free ones in which the force is linear.
-    scale : tuple of Parameter
-        Those that scale the rest of the force together.
-    reference : Parameter or None
-        The one of `scale` that the others are divided by.
-    nonlinear : tuple of Direction
-    """
+    """How an element depends on its free parameters."""
 
     element: Element
     linear: tuple[Parameter, ...]
+    """Free ones in which the force is linear."""
     scale: tuple[Parameter, ...]
+    """Those that scale the rest of the force together."""
     reference: Parameter | None
+    """The one of `scale` that the others are divided by."""
     nonlinear: tuple[Direction, ...]
 
     @property

@@ -113,16 +113,10 @@ class DeterminedCombination:
 
 @dataclass(frozen=True)
 class ConstraintCost:
-    """The rise of the sum of squares that constraints make.
+    """The rise of the sum of squares that constraints which hold with equality make.
 
-    Attributes
-    ----------
-    texts : tuple of str
-        The constraints that hold with equality.
-    rise : float
-        Of the sum of squares, over the variance of the noise.
-    dof : float
-        Degrees of freedom of that variance; infinite where it is known.
+    `rise` is over the variance of the noise, which has `dof` degrees of freedom, infinite where it
+    is known.
     """
 
     texts: tuple[str, ...]
@@ -140,60 +134,36 @@ class ConstraintCost:
 
 @dataclass(frozen=True)
 class Optimum:
-    """The minimum of a problem's sum of squares.
-
-    Attributes
-    ----------
-    problem : Problem
-        What was solved; its `names` order every array here.
-    theta : ndarray, shape (P,)
-        Search coordinates. Where the optimum lies at infinity, a finite point so far out that
-        the prediction is that of the limit.
-    values : ndarray, shape (P,)
-        Parameter values; infinite or zero where the optimum has them so.
-    covariance : ndarray, shape (P, P)
-        Of theta: scale^2 times the inverse Fisher information; infinite where undetermined.
-    scale : float
-        Standard deviation of the residuals: 1 where the noise model knows it, else estimated as
-        (sum of squares / dof)^(1/2), but no less than rounding makes it.
-    scale_known : bool
-        Which of the two.
-    dof : int
-        Residuals, those of priors included, less the parameters determined.
-    cost : float
-        Half the sum of squares of `residuals`; with a robust loss, half the sum of the losses,
-        times scale^2 where the scale is unknown.
-    nfev : int
-        Evaluations of the residuals, each of all searches at once.
-    status : Status
-        How the search ended.
-    message : str
-        The same for the user, with the parameters' names.
-    method : str
-        The solver.
-    loss : str
-        "linear", or the robust loss.
-    combinations : tuple of DeterminedCombination
-        What is determined where the optimum lies at infinity.
-    constraint_cost : ConstraintCost or None
-        What constraints cost; None where there are none, or the loss is robust.
-    """
+    """The minimum of a problem's sum of squares; the problem's `names` order every array."""
 
     problem: Any
     theta: FloatArray
+    """Search coordinates, (P,). Where the optimum lies at infinity, a finite point so far out that
+    the prediction is that of the limit."""
     values: FloatArray
+    """Parameter values, (P,); infinite or zero where the optimum has them so."""
     covariance: FloatArray
+    """Of theta: scale^2 times the inverse Fisher information; infinite where undetermined."""
     scale: float
+    """Standard deviation of the residuals: 1 where the noise model knows it, else estimated as
+    (sum of squares / dof)^(1/2), but no less than rounding makes it."""
     scale_known: bool
     dof: int
+    """Residuals, those of priors included, less the parameters determined."""
     cost: float
+    """Half the sum of squares of `residuals`; with a robust loss, half the sum of the losses,
+    times scale^2 where the scale is unknown."""
     nfev: int
+    """Evaluations of the residuals, each of all searches at once."""
     status: Status
     message: str
+    """The status for the user, with the parameters' names."""
     method: str
     loss: str = "linear"
     combinations: tuple[DeterminedCombination, ...] = field(default=())
+    """What is determined where the optimum lies at infinity."""
     constraint_cost: ConstraintCost | None = None
+    """None where there are no constraints, or the loss is robust."""
 
     @property
     def success(self) -> bool:

@@ -461,23 +461,7 @@ def correlation(residuals: Sequence[FloatArray]) -> float:
 
 
 def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
-    """Return all values of a problem, states and offsets fitted, its model's values held.
-
-    Parameters
-    ----------
-    problem : RecordProblem
-    values : ndarray
-        Of the model's free parameters.
-
-    Returns
-    -------
-    ndarray, shape (P,)
-
-    Raises
-    ------
-    FitError
-        If the model gives no finite motion.
-    """
+    """Return all values of a problem, states and offsets fitted, its model's free `values` held."""
     held = problem.held(dict(zip(problem.names, values.tolist(), strict=False)))
     begin = held.to_search(started_at(held, []))
     end = RecordSearch("lm", "linear").descend(held, begin, STEPS)

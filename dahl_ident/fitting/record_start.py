@@ -34,18 +34,9 @@ _BAND = 1e-5  # of the drive's largest power: below, it has none
 
 
 def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
-    """Return starts, best first, in the problem's values; shape (S, P).
+    """Return at most `count` starts, best first, as values of the problem, (S, P).
 
-    Parameters
-    ----------
-    problem : RecordProblem
-        Its free parameters are started; values given to free parameters are kept.
-    count : int, default 4
-        How many, at most.
-
-    Returns
-    -------
-    ndarray
+    Values given to free parameters are kept.
     """
     with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
         return _Scan(problem).starts(count)
@@ -275,18 +266,7 @@ class _Scan:
 
 
 def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
-    """Return all values of a problem from those of its model: states and offsets are started.
-
-    Parameters
-    ----------
-    problem : RecordProblem
-    values : list of float
-        Of the model's free parameters.
-
-    Returns
-    -------
-    ndarray, shape (P,)
-    """
+    """Return all values from those of the model, free ones: states and offsets are started."""
     full = np.zeros(len(problem.parameters))
     full[: len(values)] = values
     for number, measured in enumerate(problem.measured):

@@ -74,36 +74,13 @@ def solve(
 ) -> Optimum:
     """Return the minimum of a problem's sum of squares, wherever it lies.
 
-    Parameters
-    ----------
-    problem : Problem
-        A table or records.
-    method : {"lm", "scipy"}, default "lm"
-        Levenberg and Marquardt's method from all starts together, or
-        `scipy.optimize.least_squares` on the same residuals and Jacobian from each of them.
-    loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
-        See :mod:`dahl_ident.fitting.losses`.
-    start : mapping of str to float, optional
-        One more start: values of some or all free parameters; the others are completed.
-    limits : bool, default True
-        Whether to go on to limits at infinity, and by other ways where nothing has converged.
-        Without, values that all free parameters have are the only start. Of tables.
-    tell : callable, optional
-        Takes the number of evaluations and the share of variance left, of records.
-
-    Returns
-    -------
-    Optimum
-        Its `status` says how the search ended.
-
-    Raises
-    ------
-    FitError
-        If there are fewer residuals than parameters, or a parameter cannot be started.
-    ModelError
-        If `start` names a parameter that is not free.
-    ValidationError
-        If `method` or `loss` is unknown, or a prior is not normal.
+    With method "lm", Levenberg and Marquardt's from all starts together, with "scipy",
+    `scipy.optimize.least_squares` on the same residuals and Jacobian from each of them. `loss` is
+    one of :mod:`dahl_ident.fitting.losses`, or "linear". `start` is one more start: values of some
+    or all free parameters; the others are completed. Without `limits` (of tables) a search does not
+    go on to limits at infinity, nor by other ways where nothing has converged, and values that all
+    free parameters have are the only start. `tell` takes the number of evaluations and the share of
+    variance left, of records.
 
     Examples
     --------
@@ -158,25 +135,8 @@ def starts_of(problem: Problem) -> FloatArray:
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
     """Return the optimum of every table of a batch.
 
-    Parameters
-    ----------
-    batch : ProblemBatch
-        What to solve.
-    start : array_like, shape (P,) or (S, P), optional
-        Search coordinates to start from, such as the optimum that replicates were drawn from;
-        left out, every table finds its own starts.
-
-    Returns
-    -------
-    OptimumBatch
-        A sequence of :class:`Optimum`, with their numbers side by side as well.
-
-    Raises
-    ------
-    FitError
-        If there are fewer residuals than parameters, or a parameter cannot be started.
-    ValidationError
-        If `start` has the wrong shape, or a prior is not normal.
+    `start` holds search coordinates, (P,) or (S, P), such as the optimum that replicates were drawn
+    from; left out, every table finds its own starts.
 
     Examples
     --------

@@ -106,18 +106,7 @@ class ProblemBatch(TableProblem):
     """The same estimate for S tables: theta has shape (S, P), one row for each table.
 
     Every method of :class:`TableProblem` takes theta of shape (S, P) and applies row s to table s.
-
-    Parameters
-    ----------
-    data : sequence of FrequencyResponse
-        Tables with the same number of rows, quantity, harmonics and controlled variable.
-    model, noise, sensors, free, fixed, steady
-        As for :class:`TableProblem`.
-
-    Raises
-    ------
-    DataError
-        If the tables do not agree in shape, or there is none.
+    The tables have the same number of rows, quantity, harmonics and controlled variable.
 
     Examples
     --------

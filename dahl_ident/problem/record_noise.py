@@ -25,14 +25,9 @@ _OUTSIDE = 0.1  # share of frequencies outside the band needed to estimate the n
 
 @dataclass(frozen=True)
 class DriveNoise:
-    """White noise of measured drives.
+    """White noise of measured drives: its std in each record, in the drive's unit.
 
-    Attributes
-    ----------
-    stds : tuple of float
-        Standard deviation in each record, in the drive's unit.
-    share : float
-        Power of the noise over that of the drives, both within their band.
+    `share` is its power over that of the drives, both within their band.
     """
 
     stds: tuple[float, ...]
@@ -40,21 +35,11 @@ class DriveNoise:
 
 
 def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
-    """Return a filter that makes correlated residuals white, or [1] where none does.
+    """Return a filter, (order + 1,), that makes correlated residuals white, or [1] where none does.
 
-    An autoregressive model e_t = sum a_k e_(t-k) + innovation is fitted by least squares, which
-    also holds where slow noise is a thousand times larger than fast; the order has the least
-    criterion of Akaike.
-
-    Parameters
-    ----------
-    residuals : sequence of ndarray, shape (n_i,)
-        Of one noise, record by record.
-
-    Returns
-    -------
-    ndarray, shape (order + 1,)
-        1, -a_1, -a_2, ...
+    An autoregressive model e_t = sum a_k e_(t-k) + innovation is fitted by least squares to the
+    residuals of all records, which also holds where slow noise is a thousand times larger than
+    fast; the order has the least criterion of Akaike.
 
     Examples
     --------
@@ -122,20 +107,10 @@ def excited(drive: FloatArray) -> NDArray[np.bool_]:
 
 
 def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement, velocity and acceleration of a record, within the drive's band.
+    """Return displacement, velocity and acceleration of a record's motion `y`, in the drive's band.
 
     Differentiated by Fourier transform of the record, its linear trend removed and mirrored at its
     ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive.
-
-    Parameters
-    ----------
-    record : Record
-    y : ndarray, shape (n,)
-        Its motion, as measured.
-
-    Returns
-    -------
-    tuple of three ndarray, shape (n,)
     """
     n = len(record)
     drive = record.force_samples
@@ -191,15 +166,6 @@ def noise_of(displacement: FloatArray) -> float:
     From fourth differences in the quieter parts of the record: an upper bound where the motion is
     rough everywhere.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (n,)
-        m.
-
-    Returns
-    -------
-    float
-
     Examples
     --------
     >>> t = np.arange(2000) / 500.0
@@ -215,19 +181,8 @@ def noise_of(displacement: FloatArray) -> float:
 def travelled(displacement: FloatArray, noise: float, lead: float = LEADS[1]) -> FloatArray:
     """Return a displacement that moves only where the measured one leaves a dead band.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (n,)
-        m.
-    noise : float
-        Its noise's standard deviation, m; the dead band is four of it to either side.
-    lead : float, default 2
-        How far ahead of the band's middle, in the direction of motion, the true displacement is
-        taken to be, in standard deviations.
-
-    Returns
-    -------
-    ndarray, shape (n,)
+    The band is four standard deviations of the `noise` to either side. The true displacement is
+    taken to be `lead` of them ahead of the band's middle, in the direction of motion.
 
     Examples
     --------

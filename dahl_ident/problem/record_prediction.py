@@ -20,21 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What a record's samples should be.
-
-    Attributes
-    ----------
-    output : ndarray, shape (n,)
-        Predicted samples.
-    by : ndarray, shape (n, P)
-        Derivatives with respect to the problem's values; P = 0 where they were not asked for.
-    by_delay : ndarray, shape (n,) or (0,)
-        With respect to the delay, of a motion.
-    """
+    """What a record's samples should be."""
 
     output: FloatArray
     by: FloatArray
+    """Derivatives with respect to the problem's values, (n, P); P = 0 where not asked for."""
     by_delay: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """With respect to the delay, of a motion."""
 
 
 def force_of(
@@ -111,13 +103,7 @@ _SMALL = 0.1  # of the motion's inverse size: rates below are searched as number
 
 
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:
-    """Return what each record adds: first states, an offset and, for forces, a drift.
-
-    Raises
-    ------
-    ModelError
-        If one is called as a parameter of the model, or as one of another element.
-    """
+    """Return what each record adds: first states, an offset and, for forces, a drift."""
     unknowns = []
     channel = records[0].motion_channel
     unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]

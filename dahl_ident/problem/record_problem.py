@@ -48,29 +48,12 @@ class RecordProblem(Problem):
     """Records of one device and a model: residuals, Jacobian and cost.
 
     Residuals are measured minus predicted samples over the standard deviation of the output, so
-    that their scale is unknown.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Each a run, or each a level of one run. Where anything is integrated, is differentiated
-        or remembers, a record is cut at its gaps into parts with a first state each; where anything
-        is integrated or differentiated, unevenly sampled parts are resampled. Both with a warning.
-    model : Element
-        One element or a sum.
-    output : {"force", "motion"}, optional
-        What is predicted. Left out: "motion" where the model has inertia, else "force".
-    excitation : {"force", "base"}, default "force"
-        For the output "motion", what the records' force channel is: a force, or the acceleration
-        of the base, m/s^2, the motion being relative to it.
-
-    Raises
-    ------
-    DataError
-        If a record lacks a channel, or is too short.
-    ModelError
-        If the model cannot predict the output, nothing is free, or a parameter of the model is
-        called as one of the records' own.
+    that their scale is unknown. Each record is a run, or each a level of one run. Where anything is
+    integrated, is differentiated or remembers, a record is cut at its gaps into parts with a first
+    state each; where anything is integrated or differentiated, unevenly sampled parts are
+    resampled. Both with a warning. The `output` that is predicted is by default "motion" where the
+    model has inertia, else "force". For the output "motion" the records' force channel is, by
+    `excitation`, a force, or the acceleration of the base, m/s^2, the motion being relative to it.
 
     Examples
     --------

@@ -20,27 +20,10 @@ _INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slop
 class Space:
     """The free parameters of a problem and their search coordinates theta, (P,) or (S, P).
 
-    Coordinates are the logarithms of positive parameters and the values of the others. On request
-    a parameter of either sign is searched by the inverse hyperbolic sine of its value over a size,
-    and one between two finite bounds by an angle, so that no step leaves the bounds.
-
-    Parameters
-    ----------
-    parameters : sequence of Parameter
-        The P free ones.
-    bends : ndarray, shape (P,), optional
-        The sizes; 0 for parameters that are searched otherwise.
-    inside : bool or ndarray of bool, shape (P,), default False
-        Whether parameters between two finite bounds are searched by angles.
-
-    Attributes
-    ----------
-    positive : ndarray of bool, shape (P,)
-        Which coordinates are logarithms.
-    angular : ndarray of bool, shape (P,)
-        Which coordinates are angles.
-    relative : ndarray of bool, shape (P,)
-        Which coordinates change by relative changes of the values, logarithms included.
+    Coordinates are the logarithms of `positive` parameters and the values of the others. Parameters
+    with a size above 0 in `bends`, (P,), are searched by the inverse hyperbolic sine of the value
+    over it, and those `inside`, between two finite bounds, by an angle (`angular`), so that no step
+    leaves the bounds. `relative` coordinates change by relative changes of the values.
     """
 
     def __init__(

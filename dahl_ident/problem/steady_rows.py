@@ -50,19 +50,10 @@ class _SteadyMotions(NamedTuple):
 class SteadyRows:
     """Steady motions of some rows at any parameters, with the orbits where they were last found.
 
-    Parameters
-    ----------
-    model : Model
-    shooting : Shooting
-        Of that model.
-    drive, omega : ndarray, shape (n,) or (S, n)
-        As measured; levels are told apart by the drive.
-    measured : ndarray of complex, shape (n,) or (S, n)
-        Fundamental of the displacement, which chooses among several motions.
-    harmonic, fundamental : ndarray of int, shape (n,)
-        Harmonic k that each row holds, and the row, of these, that holds its fundamental.
-    orbits : dict of int to ndarray
-        The orbits last found, (n, order), by their order; kept up to date.
+    `drive` and `omega`, (n,) or (S, n), are as measured; levels are told apart by the drive. The
+    `measured` fundamental of the displacement chooses among several motions. `harmonic` is the k of
+    each row, `fundamental` the row, of these, that holds its fundamental. `orbits` are those last
+    found, (n, order), by their order; kept up to date.
     """
 
     def __init__(

@@ -19,25 +19,16 @@ _CELL = 0.1  # of ln A, where starts interpolate: a curve bends by about 1 over 
 
 @dataclass(frozen=True)
 class StiffnessData:
-    """Measured F_k/X_1 at measured amplitudes, sensors taken at their starts.
-
-    Attributes
-    ----------
-    stiffness : ndarray of complex, shape (n,) or (S, n)
-        Z_k of each row, whatever the table's quantity.
-    amplitude, omega : ndarray, shape (n,) or (S, n)
-        True amplitude and angular frequency.
-    harmonic : ndarray of int, shape (n,)
-    weights : ndarray, shape (n,) or (S, n)
-        One over the standard deviation of Z that the noise model has at the data, up to the
-        unknown scale and the ellipse's shape.
-    """
+    """Measured F_k/X_1 at measured amplitudes, sensors taken at their starts."""
 
     stiffness: ComplexArray
+    """Z_k of each row, (n,) or (S, n), whatever the table's quantity."""
     amplitude: FloatArray
     omega: FloatArray
     harmonic: NDArray[np.int64]
     weights: FloatArray
+    """One over the standard deviation of Z that the noise model has at the data, up to the unknown
+    scale and the ellipse's shape."""
 
     @property
     def typical_stiffness(self) -> FloatArray:
