@@ -55,23 +55,11 @@ _NOISE = {
 
 
 class Assessment(ABC):
-    """An optimum with what its data tell of it; a ``FitResult`` hands all of it on.
-
-    Attributes
-    ----------
-    optimum : Optimum
-        The solver's result.
-    first_order : bool
-        Whether errors are of first order alone: with constraints.
-    quick_methods : tuple of str
-        Of intervals: those that a report has time for, in addition to the combined ones.
-    instead : str
-        What to do where this kind of data has no answer.
-    """
+    """An optimum with what its data tell of it; a ``FitResult`` hands all of it on."""
 
     problem: Any
-    quick_methods: tuple[Method, ...] = ("wald",)
-    instead: str
+    quick_methods: tuple[Method, ...] = ("wald",)  # that a report has time for
+    instead: str  # what to do where this kind of data has no answer
 
     def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
         self.optimum, self.first_order = optimum, first_order

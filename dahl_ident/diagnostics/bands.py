@@ -28,7 +28,6 @@ from dahl_ident.elements import Model
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import Problem, TableProblem
-from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.units import shown_unit
 
 ENERGY = "energy lost in a cycle"  # name of a derived quantity
@@ -39,35 +38,22 @@ _PASSES = 50  # at most; one is enough unless the stiffness depends on the frequ
 
 @dataclass(frozen=True)
 class ResponseBand:
-    """A predicted response with its standard deviations and bands.
+    """A predicted response with its standard deviations and bands, at n points."""
 
-    Attributes
-    ----------
-    response : ndarray of complex, shape (n,)
-        At the estimate.
-    centre : ndarray of complex, shape (n,)
-        Middle of the bands: the response, and how far the device is expected to depart from the
-        model there, judged by the residuals.
-    real_std, imag_std : ndarray, shape (n,)
-        Standard deviations of real and imaginary part, in the response's unit.
-    log_gain_std, phase_std : ndarray, shape (n,)
-        Standard deviations of ln gain and of the phase, rad.
-    dof : ndarray, shape (2, n)
-        Degrees of freedom of the standard deviations of ln gain and phase, for the factor of
-        Student's t; those of real and imaginary part are the smaller ones.
-    scores : ndarray, shape (k,)
-        Deviations of measured tests from their predictions without them, over their standard
-        deviations; where more of them are large than Student's t makes, bands of one more test
-        are wider.
-    """
-
-    response: ComplexArray
+    response: ComplexArray  # at the estimate
+    # middle of the bands: the response, and how far the device is expected to depart from the model
+    # there, judged by the residuals
     centre: ComplexArray
-    real_std: FloatArray
+    real_std: FloatArray  # in the response's unit
     imag_std: FloatArray
-    log_gain_std: FloatArray
-    phase_std: FloatArray
+    log_gain_std: FloatArray  # of ln gain
+    phase_std: FloatArray  # rad
+    # (2, n): of the standard deviations of ln gain and phase, for the factor of Student's t; those
+    # of real and imaginary part are the smaller ones
     dof: FloatArray
+    # (k,): deviations of measured tests from their predictions without them, over their standard
+    # deviations; where more of them are large than Student's t makes, bands of one more test are
+    # wider
     scores: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def gain(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
@@ -132,12 +118,14 @@ def response_band(
     if not known.any():
         real, imag = gain, phase = nothing = np.full((2, R.size), np.nan)
         return ResponseBand(R, R, real, imag, gain, phase, nothing)
-    seen = _measured(there, R, known)
+    predicted = replace(there.data.select(rows=known), response=R[known])
+    seen = there.like(data=predicted, noise="absolute").stiffness_data  # as if measured
     if errors is None:
-        own = np.zeros((R.size, 2, 2))
+        noise = np.zeros((R.size, 2, 2))
         if of_a_test:
-            own[known] = optimum.scale**2 * stated_noise(problem, theta, seen.amplitude, seen.omega)
-        return _noise_band(optimum, R, by, own)
+            stated = stated_noise(problem, theta, seen.amplitude, seen.omega)
+            noise[known] = optimum.scale**2 * stated
+        return _noise_band(optimum, R, by, noise)
     return _combined_band(
         errors, R, by, known, seen.amplitude, seen.omega, seen.stiffness, of_a_test
     )
@@ -179,12 +167,6 @@ def predicted_backbone(
 def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[TableProblem, FloatArray]:
     """Return the combined estimate with the problem it belongs to, or the plain one."""
     return (optimum.problem, optimum.theta) if errors is None else (errors.problem, errors.theta)
-
-
-def _measured(there: TableProblem, R: ComplexArray, known: NDArray[np.bool_]) -> StiffnessData:
-    """Return amplitude and stiffness of predicted responses, as if they had been measured."""
-    data = replace(there.data.select(rows=known), response=R[known])
-    return there.like(data=data, noise="absolute").stiffness_data
 
 
 def problem_at(
@@ -230,18 +212,11 @@ def describing_function_band(
     N, by = friction_and_slopes(*_estimate(optimum, errors), A)
     if errors is None:
         return _noise_band(optimum, N, by)
-    band = _combined_band(errors, *_flat(N, by), np.isfinite(N.ravel()), A.ravel(), _omega(errors))
+    omega = np.exp(np.log(errors.problem.stiffness_data.omega).mean())  # the middle of them
+    columns = by.reshape(-1, by.shape[-1])
+    band = _combined_band(errors, N.ravel(), columns, np.isfinite(N.ravel()), A.ravel(), omega)
     parts = {k: v.reshape(*v.shape[:-1], *A.shape) for k, v in vars(band).items() if k != "scores"}
     return ResponseBand(**parts)
-
-
-def _flat(N: ComplexArray, by: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    return N.ravel(), by.reshape(-1, by.shape[-1])
-
-
-def _omega(errors: ErrorModel) -> FloatArray:
-    """Return the middle of the measured angular frequencies."""
-    return np.asarray(np.exp(np.log(errors.problem.stiffness_data.omega).mean()))
 
 
 def friction_and_slopes(
@@ -325,9 +300,9 @@ def derived(
 ) -> Iterator[DerivedQuantity]:
     """Yield x_c of each law that has one, then loss, stiffness and damping at each amplitude."""
     problem, theta = _estimate(optimum, errors)
-    found = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    infinite = np.array([not np.isfinite(found.get(name, 1.0)) for name in problem.names])
-    by_search = problem.value_slopes(theta)
+    values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+    infinite = np.array([not np.isfinite(values.get(name, 1.0)) for name in problem.names])
+    by_search, std = problem.value_slopes(theta), (errors or Information(optimum)).std
     A, stds = np.asarray(amplitudes, dtype=np.float64).ravel(), iter(())
     if A.size:
         band = describing_function_band(optimum, A, errors)
@@ -338,23 +313,21 @@ def derived(
     ):
         if at is None and (slopes[infinite] != 0.0).any():
             continue
-        directions = slopes * by_search
-        known = Information(optimum).std if errors is None else errors.std
-        error = known(directions) if at is None else next(stds)
+        error = std(slopes * by_search) if at is None else next(stds)
         yield DerivedQuantity(name, unit, at, value, float(error))
 
 
 def _noise_band(
-    optimum: Optimum, R: ComplexArray, by: ComplexArray, own: FloatArray | None = None
+    optimum: Optimum, R: ComplexArray, by: ComplexArray, noise: FloatArray | None = None
 ) -> ResponseBand:
-    """Return the band from noise alone, `own` the covariance of a test's ln gain and phase."""
+    """Return the band from noise alone, `noise` the covariance of a test's ln gain and phase."""
     information = Information(optimum)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = by / R[..., None]
     dof = np.inf if optimum.scale_known else (optimum.dof if optimum.dof > 0 else np.nan)
     parts = [information.std(d) for d in (by.real, by.imag, relative.real, relative.imag)]
-    if own is not None:
-        parts = [np.hypot(a, b) for a, b in zip(parts, _parts_std(R, own), strict=True)]
+    if noise is not None:
+        parts = [np.hypot(a, b) for a, b in zip(parts, _parts_std(R, noise), strict=True)]
     real, imag, gain, phase = parts
     return ResponseBand(R, R, real, imag, gain, phase, np.full((2, *R.shape), dof))
 
@@ -366,11 +339,8 @@ def _parts_std(R: ComplexArray, covariance: FloatArray) -> list[FloatArray]:
     """
     turned = np.stack([R, 1j * R], axis=-1)  # by ln gain and phase
     gain, phase = (np.tile(axis, (R.size, 1)) for axis in np.eye(2))
-    variances = [
-        np.einsum("ni,nij,nj->n", lever, covariance, lever)
-        for lever in (turned.real, turned.imag, gain, phase)
-    ]
-    return [np.sqrt(np.maximum(v, 0.0)) for v in variances]
+    levers = np.array([turned.real, turned.imag, gain, phase])
+    return list(np.sqrt(np.maximum(np.einsum("kni,nij,knj->kn", levers, covariance, levers), 0.0)))
 
 
 def _combined_band(

@@ -24,10 +24,9 @@ distribution of |t*| (Hall, Journal of the Royal Statistical Society B 50 (1988)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
@@ -41,17 +40,8 @@ _FEWEST = 99  # with fewer a tail of 1 % holds no replicate
 _AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished
 
 
-@dataclass(frozen=True)
-class Replicates:
-    """Fits to simulated repetitions."""
-
-    # (S, P): t*, NaN where an optimum lies at infinity or is not determined
-    studentised: FloatArray
-    gone: NDArray[np.bool_]  # (S, P): which have no t*: diverging, or not determined
-
-
-def replicate(optimum: Optimum, replicates: int | None, seed: int) -> Replicates:
-    """Return fits to `replicates` simulated repetitions of the measurement."""
+def _replicate(optimum: Optimum, replicates: int | None, seed: int) -> FloatArray:
+    """Return t* of simulated repetitions, (S, P): NaN where one diverges or is not determined."""
     if replicates is None:
         replicates = optimum.problem.repetitions
     count = whole_number(replicates, "replicates", _FEWEST)
@@ -63,10 +53,9 @@ def replicate(optimum: Optimum, replicates: int | None, seed: int) -> Replicates
     if optimum.status is Status.NOT_CONVERGED or not np.isfinite(optimum.scale):
         raise FitError("there is no optimum to simulate repetitions from")
     theta, error = repetitions(optimum, count, np.random.default_rng(whole_number(seed, "seed", 0)))
-    gone = ~(np.isfinite(theta) & np.isfinite(error) & (error > 0.0))
+    known = np.isfinite(theta) & np.isfinite(error) & (error > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(gone, np.nan, (theta - optimum.theta) / error)
-    return Replicates(t, gone)
+        return np.where(known, (theta - optimum.theta) / error, np.nan)
 
 
 def bootstrap_intervals(
@@ -77,25 +66,22 @@ def bootstrap_intervals(
 ) -> ConfidenceIntervals:
     """Return studentised bootstrap intervals."""
     array = checked_levels(levels)
-    drawn = replicate(optimum, replicates, seed)
-    tail = 0.5 * (1.0 - array)
-    count = optimum.problem.n_reported
-    symmetric = bool(drawn.gone[:, :count].any(axis=1).mean() > _AT_LIMIT)
+    tail, count = 0.5 * (1.0 - array), optimum.problem.n_reported
+    drawn = _replicate(optimum, replicates, seed)[:, :count]
+    gone = np.isnan(drawn)
+    symmetric = bool(gone.any(axis=1).mean() > _AT_LIMIT)
     error = np.sqrt(np.diagonal(optimum.covariance))
-    lower, upper = (
-        np.full((len(array), count), -np.inf),
-        np.full((len(array), count), np.inf),
-    )
+    lower, upper = np.full((len(array), count), -np.inf), np.full((len(array), count), np.inf)
     for i in np.flatnonzero(np.isfinite(error[:count])):
-        t = drawn.studentised[~drawn.gone[:, i], i]
-        known = drawn.gone[:, i].mean() <= tail
+        t = drawn[~gone[:, i], i]
+        known = gone[:, i].mean() <= tail
         if known.any():
             size = np.quantile(np.abs(t), array[known])
             tails = np.quantile(t, [tail[known], 1.0 - tail[known]])
             ends = np.array([-size, size]) if symmetric else tails
             upper[known, i], lower[known, i] = optimum.theta[i] - ends * error[i]
     result = intervals_from_search(optimum, "bootstrap", array, lower, upper)
-    note = f"studentised, {len(drawn.studentised)} replicates, seed {seed}"
+    note = f"studentised, {len(drawn)} replicates, seed {seed}"
     if symmetric:
         note += "; symmetric, since replicates end at a limit of the model"
-    return result.noted(note)
+    return replace(result, note=note)

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.storage import library as data_library
 from dahl_ident.diagnostics.combinations import candidates, runaway
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY
+from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY, coverage_factor
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.error_sources import (
     HARMONICS,
@@ -58,56 +57,27 @@ _CHANNELS = {
 
 @dataclass(frozen=True)
 class BudgetRow:
-    """One source's part in the uncertainty of one parameter.
+    """One source's part in the uncertainty of one parameter."""
 
-    Attributes
-    ----------
-    source : str
-        Such as "noise" or "exponent".
-    kind : {"A", "B"}
-        Evaluated from the data's scatter, or from knowledge beforehand.
-    u : float
-        Standard uncertainty that it contributes, in the parameter's unit.
-    dof : float
-        Degrees of freedom of `u`.
-    share : float
-        Part of the squared combined uncertainty, 0 to 1.
-    """
-
-    source: str
-    kind: Literal["A", "B"]
-    u: float
-    dof: float
-    share: float
+    source: str  # such as "noise" or "exponent"
+    kind: Literal["A", "B"]  # evaluated from the data's scatter, or from knowledge beforehand
+    u: float  # standard uncertainty that it contributes, in the parameter's unit
+    dof: float  # degrees of freedom of `u`
+    share: float  # part of the squared combined uncertainty, 0 to 1
 
 
 @dataclass(frozen=True)
 class ParameterBudget:
-    """The budget of one parameter.
-
-    Attributes
-    ----------
-    name, unit : str
-        The parameter.
-    value : float
-        Its estimate.
-    rows : tuple of BudgetRow
-        One a source, the largest first.
-    u, dof, k, U : float
-        Combined standard uncertainty, its effective degrees of freedom, coverage factor for
-        95.45 %, expanded uncertainty k u.
-    limits : tuple of float, or None
-        The interval where it is not value ± U, as that of a factor either way; no U is printed
-        then.
-    """
+    """The budget of one parameter."""
 
     name: str
     unit: str
     value: float
-    rows: tuple[BudgetRow, ...]
-    u: float
-    dof: float
-    k: float
+    rows: tuple[BudgetRow, ...]  # one a source, the largest first
+    u: float  # combined standard uncertainty
+    dof: float  # its effective degrees of freedom
+    k: float  # coverage factor for 95.45 %
+    # the interval where it is not value ± U, as that of a factor either way; no U is printed then
     limits: tuple[float, float] | None = None
 
     @property
@@ -317,7 +287,7 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
             continue
         # what a limit depends on has the name that the fit gives it
         name = left.get(tuple(direction[own]), candidate.expression)
-        u = max(float(direction @ errors.covariance @ direction), 0.0) ** 0.5
+        u = float(errors.std(direction))
         # what noise alone leaves of parameters that it leaves open is what the verdict names
         open_ = candidate.members & vague and not candidate.is_sum
         named = (name in kept and u < _HARDLY) or (
@@ -332,18 +302,6 @@ def _noticed(errors: ErrorModel, direction: FloatArray) -> bool:
     return errors.estimate.basis is None or bool(errors.estimate.basis.holds(direction))
 
 
-def coverage_factor(dof: float, confidence: float = CONFIDENCE) -> float:
-    """Return k of Student's t, of the normal distribution for infinite degrees of freedom.
-
-    Examples
-    --------
-    >>> round(coverage_factor(2.0), 2), round(coverage_factor(float("inf")), 2)
-    (4.53, 2.0)
-    """
-    upper = 0.5 * (1.0 + confidence)
-    return float(special.ndtri(upper) if np.isinf(dof) else special.stdtrit(dof, upper))
-
-
 def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
     """Return the calibrations without a stated uncertainty."""
     sensors, priors = optimum.problem.sensors, optimum.problem.priors
@@ -356,8 +314,8 @@ def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
 def _parameter(
     errors: ErrorModel, name: str, unit: str, value: float, direction: FloatArray
 ) -> ParameterBudget:
-    total = max(float(direction @ errors.covariance @ direction), 0.0)
-    rows = []
+    u = float(errors.std(direction))
+    total, rows = u**2, []
     for source, covariance in errors.contributions.items():
         own = float(direction @ covariance @ direction)
         own = own if own > _ROUNDING * total else 0.0
@@ -368,7 +326,7 @@ def _parameter(
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)
     dof = dof if dof < MANY else np.inf
-    return ParameterBudget(name, unit, value, tuple(rows), total**0.5, dof, coverage_factor(dof))
+    return ParameterBudget(name, unit, value, tuple(rows), u, dof, coverage_factor(dof))
 
 
 def _dof(dof: float) -> str:

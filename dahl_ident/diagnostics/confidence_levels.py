@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 
 from dahl_ident.arrays import FloatArray, array_between
@@ -33,14 +34,28 @@ def checked_levels(levels: Sequence[float] | float) -> FloatArray:
     return array
 
 
+def coverage_factor(dof: float) -> float:
+    """Return k for the usual confidence."""
+    return float(coverage_factors(dof, CONFIDENCE))
+
+
+def coverage_factors(dof: ArrayLike, levels: ArrayLike) -> FloatArray:
+    """Return k of Student's t, of the normal distribution for infinite degrees of freedom.
+
+    Examples
+    --------
+    >>> coverage_factors([2.0, np.inf], CONFIDENCE).round(2).tolist()
+    [4.53, 2.0]
+    """
+    upper, nu = 0.5 * (1.0 + np.asarray(levels)), np.asarray(dof, dtype=np.float64)
+    t = special.stdtrit(np.where(np.isinf(nu), np.nan, nu), upper)
+    return np.where(np.isinf(nu), special.ndtri(upper), t)
+
+
 def thresholds(optimum: Optimum, levels: FloatArray) -> FloatArray:
     """Return q of each level: normal where the scale is known, else Student's t (or NaN)."""
-    upper = 0.5 * (1.0 + levels)
-    if optimum.scale_known:
-        return np.asarray(special.ndtri(upper))
-    if optimum.dof <= 0:
-        return np.full(levels.shape, np.nan)
-    return np.asarray(special.stdtrit(optimum.dof, upper))
+    dof = np.inf if optimum.scale_known else optimum.dof if optimum.dof > 0 else np.nan
+    return coverage_factors(dof, levels)
 
 
 def level_text(level: float) -> str:

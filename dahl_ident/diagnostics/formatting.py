@@ -55,25 +55,13 @@ def _alike(numbers: Sequence[float], last: int) -> list[str]:
 
 
 def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
-    """Return ``"0.0999 ± 0.0010 N"``.
-
-    Examples
-    --------
-    >>> with_unit(0.0999123, 0.00101, "N")
-    '0.0999 ± 0.0010 N'
-    """
+    """Return ``"0.0999 ± 0.0010 N"``."""
     number, error = rounded(value, uncertainty)
     return f"{number} ± {error} {unit}".rstrip()
 
 
 def p_text(p: float) -> str:
-    """Return ``"p = 0.012"``, or a bound where noise alone cannot be the reason.
-
-    Examples
-    --------
-    >>> p_text(0.01234), p_text(6e-41)
-    ('p = 0.012', 'p < 1e-12')
-    """
+    """Return ``"p = 0.012"``, or a bound where noise alone cannot be the reason."""
     return f"p = {p:.2g}" if p >= _LEAST_P else f"p < {_LEAST_P:.0e}"
 
 
@@ -89,21 +77,12 @@ def degrees_text(dof: Iterable[float]) -> str:
     least, most = min(several), max(several)
     if least >= _MANY_DOF:
         return "more than 1000" if math.isfinite(least) else "infinite"
-    last = (
-        "infinite" if math.isinf(most) else f"{most:.3g}" if most < _MANY_DOF else "more than 1000"
-    )
-    text = f"{least:.3g}"
+    text, last = f"{least:.3g}", degrees_text([most]) if most >= _MANY_DOF else f"{most:.3g}"
     return text if text == last else f"{text} to {last}"
 
 
 def listed(words: Sequence[str]) -> str:
-    """Return ``"a, b and c"``.
-
-    Examples
-    --------
-    >>> listed(["f_max", "sigma", "alpha"])
-    'f_max, sigma and alpha'
-    """
+    """Return ``"a, b and c"``."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
@@ -137,23 +116,11 @@ def interval(lower: float, upper: float, unit: str) -> str:
 
 
 def table(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
-    """Return rows of text as aligned columns, those numbered in `left` to the left.
-
-    Examples
-    --------
-    >>> print(table([["", "value"], ["f_max", "0.1"]]))
-           value
-    f_max    0.1
-    """
+    """Return rows of text as aligned columns, those numbered in `left` to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = (
-            cell.ljust(width) if i in left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+    columns = [f"{'<' if i in left else '>'}{width}" for i, width in enumerate(widths)]
+    lines = (map(format, row, columns) for row in rows)
+    return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
 def html_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -31,11 +31,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.confidence_levels import (
     LEVELS,
     MANY,
     checked_levels,
+    coverage_factors,
     level_text,
     thresholds,
 )
@@ -65,21 +65,6 @@ class Interval(NamedTuple):
 class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
     """Intervals of every free parameter at several levels; a mapping by the parameter's name.
 
-    Attributes
-    ----------
-    method : str
-        How they were made.
-    levels : ndarray, shape (L,)
-        Rising.
-    names, units : tuple of str
-        The P parameters.
-    estimate : ndarray, shape (P,)
-        The estimates.
-    lower, upper : ndarray, shape (L, P)
-        Limits in the parameters' units.
-    note : str
-        What the method assumes here, such as the degrees of freedom of its threshold.
-
     Examples
     --------
     >>> import dahl_ident as di
@@ -91,13 +76,13 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
     """
 
     method: Method
-    levels: FloatArray
-    names: tuple[str, ...]
+    levels: FloatArray  # (L,), rising
+    names: tuple[str, ...]  # of the P parameters
     units: tuple[str, ...]
-    estimate: FloatArray
-    lower: FloatArray
+    estimate: FloatArray  # (P,)
+    lower: FloatArray  # (L, P): limits in the parameters' units
     upper: FloatArray
-    note: str
+    note: str  # what the method assumes, such as the degrees of freedom of its threshold
 
     def __getitem__(self, name: str) -> tuple[Interval, ...]:
         if name not in self.names:
@@ -121,10 +106,6 @@ class ConfidenceIntervals(Mapping[str, tuple[Interval, ...]]):
         """Return these intervals at one of their levels."""
         row = np.isclose(self.levels, level)
         return replace(self, levels=self.levels[row], lower=self.lower[row], upper=self.upper[row])
-
-    def noted(self, note: str) -> ConfidenceIntervals:
-        """Return these intervals with another note."""
-        return replace(self, note=note)
 
     def __str__(self) -> str:
         head = ["", *(f"-{level_text(c)}" for c in self.levels[::-1]), "estimate"]
@@ -179,14 +160,10 @@ def combined_intervals(
     array = checked_levels(levels)
     held = np.array([errors.holds(name) for name in optimum.names])
     place = [errors.names.index(name) for name in optimum.names]
-    u = np.sqrt(np.maximum(np.diagonal(errors.covariance)[place], 0.0))
-    dof = np.array(
-        [
-            errors.dof(d) if known else np.inf
-            for d, known in zip(np.eye(len(errors.names))[place], held, strict=True)
-        ]
-    )
-    k = np.array([[coverage_factor(nu, level) for nu in dof] for level in array.tolist()])
+    u = errors.std(np.eye(len(errors.names)))[place]
+    directions = np.eye(len(errors.names))[place]
+    dof = np.where(held, [errors.dof(direction) for direction in directions], np.inf)
+    k = coverage_factors(dof, array[:, None])
     positive = optimum.problem.space.positive
     values = errors.problem.to_values(errors.theta)[place]
     slopes = optimum.problem.space.slopes(values)
@@ -278,15 +255,6 @@ class Disagreement(NamedTuple):
 class IntervalComparison:
     """Intervals of several methods side by side, with the limits on which they disagree.
 
-    Attributes
-    ----------
-    intervals : tuple of ConfidenceIntervals
-        Those that count noise alone, the most trusted last.
-    disagreements : tuple of Disagreement
-        Limits on which one of them differs from the last.
-    stated : ConfidenceIntervals
-        Those that count every source of error, as the fit states them.
-
     Examples
     --------
     >>> import dahl_ident as di
@@ -296,9 +264,9 @@ class IntervalComparison:
     (['wald', 'bootstrap', 'profile'], ())
     """
 
-    intervals: tuple[ConfidenceIntervals, ...]
-    disagreements: tuple[Disagreement, ...]
-    stated: ConfidenceIntervals
+    intervals: tuple[ConfidenceIntervals, ...]  # by noise alone, the most trusted last
+    disagreements: tuple[Disagreement, ...]  # limits on which one of them differs from the last
+    stated: ConfidenceIntervals  # by every source of error, as the fit states them
 
     def __str__(self) -> str:
         parts = [str(one) for one in (self.stated, *self.intervals)]

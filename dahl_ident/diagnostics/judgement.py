@@ -46,37 +46,20 @@ class Question(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding about a result.
+    """One finding about a result; printed, a sentence or two."""
 
-    Attributes
-    ----------
-    question : Question
-        Which of the three questions it answers.
-    severity : VerdictStatus
-        The best status that a result with this finding can have.
-    code : str
-        Its kind, such as "misfit" or "negative"; it does not change with the wording.
-    values : mapping of str to object
-        Its numbers and names. Printed, a finding is one sentence or two.
-    """
-
-    question: Question
-    severity: VerdictStatus
-    code: str
-    values: Mapping[str, Any] = field(default_factory=dict)
+    question: Question  # which of the three questions it answers
+    severity: VerdictStatus  # the best status that a result with this finding can have
+    code: str  # its kind, such as "misfit" or "negative"; it does not change with the wording
+    values: Mapping[str, Any] = field(default_factory=dict)  # its numbers and names
 
     def __str__(self) -> str:
         return sentence(self.code, self.values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as plain data, with its text."""
-        return {
-            "question": str(self.question),
-            "severity": str(self.severity),
-            "code": self.code,
-            "values": dict(self.values),
-            "text": str(self),
-        }
+        names = {"question": str(self.question), "severity": str(self.severity)}
+        return {**names, "code": self.code, "values": dict(self.values), "text": str(self)}
 
 
 def described(
@@ -97,17 +80,9 @@ _MOST_TOLD = 5  # findings of a verdict; more are not read
 class Judgement:
     """What was found about a result, the most serious first.
 
-    Attributes
-    ----------
-    status : VerdictStatus
-        The worst severity; trusted where nothing was found.
-    findings : tuple of Finding
-        All of them.
-    told : tuple of Finding
-        Those of the verdict, at most five: of an unusable result without what only a usable one
-        needs, which is what is identified or assumed; of a usable one with what is assumed.
-    further : tuple of Finding
-        The others, which back it.
+    The worst severity is its `status`. At most five findings are `told`: of an unusable result
+    without what only a usable one needs, which is what is identified or assumed; of a usable one
+    with what is assumed. The `further` ones back the verdict.
     """
 
     def __init__(self, findings: Iterable[Finding]) -> None:

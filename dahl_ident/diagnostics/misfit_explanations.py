@@ -150,17 +150,7 @@ def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
 
 
 def flagged_rows(data: FrequencyResponse) -> tuple[str, ...]:
-    """Return a sentence for each kind of flaw among the fundamentals, with its rows.
-
-    Examples
-    --------
-    >>> from dahl_ident.data import FrequencyResponse
-    >>> data = FrequencyResponse(
-    ...     [1.0, 1.0], [1.0, 2.0], [1.0, 2.0], quality={"verdict": ["good", "not settled"]}
-    ... )
-    >>> flagged_rows(data)
-    ('1 Hz, 2 m: not settled',)
-    """
+    """Return each fundamental that the extraction flagged, such as "1 Hz, 2 m: not settled"."""
     verdicts = data.quality.get("verdict")
     if verdicts is None:
         return ()

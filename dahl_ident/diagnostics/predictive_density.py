@@ -81,28 +81,7 @@ class PredictiveDensity:
 def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> PredictiveDensity:
     """Return the log density of every test, predicted by the model fitted to the others.
 
-    Parameters
-    ----------
-    optimum : Optimum
-        Of the model.
-    fitted : Optimum, optional
-        The one it is compared with, which weighs the residuals of records for both.
-
-    Raises
-    ------
-    FitError
-        If the model has no finite response at the optimum.
-
-    Examples
-    --------
-    >>> import dahl_ident as di
-    >>> data = di.load_dataset("noisy")
-    >>> one, other = (
-    ...     predictive_density(di.fit(data, model, throw=False).optimum)
-    ...     for model in (di.Dahl(), di.Spring())
-    ... )
-    >>> one.total > other.total
-    True
+    The optimum it is compared with weighs the residuals of records for both.
     """
     if optimum.problem.response is None:
         return _of_records(optimum, (fitted or optimum).problem)

@@ -62,14 +62,8 @@ _FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gai
 class Bracket:
     """S searches outwards from 0, each for the point where its function reaches its target.
 
-    Attributes
-    ----------
-    position : ndarray, shape (S,)
-        Where the functions are wanted next.
-    active : ndarray of int
-        Searches that go on.
-    end : ndarray, shape (S,)
-        Where the targets are met; infinite where they are not.
+    Of the `active` ones, the functions are wanted at `position`, (S,); `end`, (S,), is where the
+    targets are met, infinite where they are not.
     """
 
     def __init__(

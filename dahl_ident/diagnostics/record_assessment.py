@@ -14,8 +14,14 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
 from dahl_ident.diagnostics.assessment import Assessment
 from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
-from dahl_ident.diagnostics.budget import Budget, coverage_factor
-from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, checked_levels, level_text
+from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.confidence_levels import (
+    CONFIDENCE,
+    checked_levels,
+    coverage_factor,
+    coverage_factors,
+    level_text,
+)
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement
@@ -51,28 +57,14 @@ _UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
 
 @dataclass(frozen=True)
 class RecordBand:
-    """Predicted samples of a record with their uncertainty.
+    """Predicted samples of a record with their uncertainty, each of shape (n,)."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (n,)
-        s.
-    output : ndarray, shape (n,)
-        Predicted force or motion.
-    stderr : ndarray, shape (n,)
-        Standard uncertainty from the parameters.
-    lower, upper : ndarray, shape (n,)
-        95.45 % band of what would be measured, the residuals' scatter included.
-    measured : ndarray, shape (n,)
-        What the record holds.
-    """
-
-    time: FloatArray
-    output: FloatArray
-    stderr: FloatArray
-    lower: FloatArray
+    time: FloatArray  # s
+    output: FloatArray  # predicted force or motion
+    stderr: FloatArray  # standard uncertainty from the parameters
+    lower: FloatArray  # 95.45 % band of what would be measured, the residuals' scatter included
     upper: FloatArray
-    measured: FloatArray
+    measured: FloatArray  # what the record holds
 
     @property
     def rms_error(self) -> float:
@@ -178,7 +170,7 @@ class RecordAssessment(Assessment):
         """Return intervals that count every source of error."""
         array, values = checked_levels(levels), self.optimum.values
         dof = [self.errors.dof_for(place) for place in range(values.size)]
-        k = np.array([[coverage_factor(nu, level) for nu in dof] for level in array.tolist()])
+        k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
@@ -353,43 +345,19 @@ class RecordAssessment(Assessment):
 
 @dataclass(frozen=True)
 class HeldOutPart:
-    """A part of the records, predicted by a fit to the others.
+    """A part of the records, predicted by a fit to the others."""
 
-    Attributes
-    ----------
-    record : int
-        Which one, from 1.
-    start, stop : float
-        s.
-    samples : int
-    rms_share : float
-        Of the prediction errors, over the standard deviation of the part's output.
-    inside : float
-        Share of its samples within the 95.45 % band.
-    """
-
-    record: int
-    start: float
+    record: int  # which one, from 1
+    start: float  # s
     stop: float
     samples: int
-    rms_share: float
-    inside: float
+    rms_share: float  # of the prediction errors, over the standard deviation of the part's output
+    inside: float  # share of its samples within the 95.45 % band
 
 
 @dataclass(frozen=True)
 class HoldOut:
-    """The hold-out check of a fit; made by :meth:`dahl_ident.FitResult.hold_out`.
-
-    Attributes
-    ----------
-    parts : tuple of HeldOutPart
-        Each left out in turn.
-
-    Examples
-    --------
-    >>> HoldOut((HeldOutPart(1, 0.0, 5.0, 500, 0.021, 0.95),)).inside
-    0.95
-    """
+    """The hold-out check of a fit: parts of the records, each left out in turn."""
 
     parts: tuple[HeldOutPart, ...]
 

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget, coverage_factor
+from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget
+from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT

@@ -36,32 +36,19 @@ FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming
 
 @dataclass(frozen=True)
 class SlipDensity:
-    """Stiffness over slip displacement, and what it leaves of the data.
+    """Stiffness over slip displacement, and what it leaves of the data."""
 
-    Attributes
-    ----------
-    slip : ndarray, shape (n,)
-        Slip displacements d, m, evenly spaced in their logarithm. The first stands for all smaller
-        ones: only the product of both is determined there.
-    stiffness : ndarray, shape (n,)
-        Stiffness that slips at each, N/m; smooth, as far as the misfit allows.
-    spring : float
-        Stiffness that slips nowhere within the amplitudes, N/m.
-    parallel : dict of str to float
-        The free linear parameters.
-    least_misfit : float
-        Root mean square of abs(measured - fitted)/abs(measured) over the fundamentals that the
-        best law of this kind leaves, without any smoothness.
-    misfit : float
-        The same of the smooth density.
-    """
-
+    # (n,): slip displacements d, m, evenly spaced in their logarithm; the first stands for all
+    # smaller ones: only the product of both is determined there
     slip: FloatArray
+    # (n,): stiffness that slips at each, N/m; smooth, as far as the misfit allows
     stiffness: FloatArray
-    spring: float
-    parallel: dict[str, float]
+    spring: float  # stiffness that slips nowhere within the amplitudes, N/m
+    parallel: dict[str, float]  # the free linear parameters
+    # root mean square of abs(measured - fitted)/abs(measured) over the fundamentals that the best
+    # law of this kind leaves, without any smoothness
     least_misfit: float
-    misfit: float
+    misfit: float  # the same of the smooth density
 
     @property
     def statement(self) -> str:
@@ -137,15 +124,7 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
 
 
 def least_misfit(data: FrequencyResponse, model: Element) -> float:
-    """Return the least misfit of parallel Jenkins elements in place of a model's friction.
-
-    Examples
-    --------
-    >>> import dahl_ident as di
-    >>> data = di.load_dataset("alpha_2")
-    >>> print(f"{least_misfit(data, di.Dahl()):.2f}")
-    0.16
-    """
+    """Return the least misfit of parallel Jenkins elements in place of a model's friction."""
     return _solved(_system(data, [e for e in as_model(model).elements if e.is_linear]), 0.0)[1]
 
 

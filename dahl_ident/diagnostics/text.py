@@ -17,13 +17,7 @@ _LEVEL = level_text(CONFIDENCE)
 
 
 def sentence(code: str, values: Mapping[str, Any]) -> str:
-    """Return a finding in words.
-
-    Examples
-    --------
-    >>> sentence("no_degrees_of_freedom", {"numbers": 2, "parameters": 2, "scale_known": True})
-    '2 numbers and 2 parameters leave no degree of freedom to judge the model: measure more points.'
-    """
+    """Return a finding in words."""
     return _TEXT[code](**values)
 
 

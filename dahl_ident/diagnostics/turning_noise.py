@@ -34,26 +34,11 @@ def noise_at_turns(
     residuals: Sequence[FloatArray],
     noise: Sequence[FloatArray],
 ) -> FloatArray:
-    """Return the covariance of an estimate by errors of the displacement at its turning points.
+    """Return the covariance (P, P) of an estimate by errors of displacements at turning points.
 
     Their variance is that by which the residuals exceed what their mean spectrum explains in the
     directions of such errors; as it cannot be negative, its mean over a normal distribution cut
     off at zero is taken. It is at most ten times what noise the displacement's differences show.
-
-    Parameters
-    ----------
-    problem : RecordProblem
-        With forces as its output.
-    values : ndarray, shape (P,)
-        The estimate.
-    jacobians, residuals : sequence of ndarray
-        Derivatives of the prediction and measured minus predicted, of each record.
-    noise : sequence of ndarray
-        Autocovariances of the residuals' noise.
-
-    Returns
-    -------
-    ndarray, shape (P, P)
     """
     inverse = inverse_normal(jacobians)
     excess, strength, scatter = 0.0, 0.0, 0.0

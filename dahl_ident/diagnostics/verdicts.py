@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
-from dahl_ident.diagnostics.budget import coverage_factor
 from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
-from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
+from dahl_ident.diagnostics.confidence_levels import LEVELS, coverage_factor, level_text, thresholds
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
@@ -75,39 +74,26 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class ParameterVerdict:
-    """The verdict on one parameter.
-
-    Attributes
-    ----------
-    name, unit : str
-        The parameter.
-    verdict : Verdict
-        Identified, weakly or not.
-    interval : Interval
-        The 95.45 % interval: the profile's (first order where none was searched), or the combined
-        one where a fit states it.
-    known_as : str
-        What is known of it, in words: interval and verdict.
-    why : str
-        The reason, and what to do, where it is not identified.
-    """
+    """The verdict on one parameter."""
 
     name: str
     unit: str
     verdict: Verdict
+    # at 95.45 %: the profile's (first order where none was searched), or the combined one where a
+    # fit states it
     interval: Interval
-    known_as: str
-    why: str = ""
-
-    @property
-    def reason(self) -> str:
-        """What is known in words, with the reason where it is not identified."""
-        return f"{self.known_as}, not determined, {self.why}" if self.why else self.known_as
+    known_as: str  # what is known of it, in words: interval and verdict
+    why: str = ""  # the reason, and what to do, where it is not identified
 
     @property
     def text(self) -> str:
         """Name and verdict in words."""
         return f"{self.name}: {self.reason}"
+
+    @property
+    def reason(self) -> str:
+        """What is known in words, with the reason where it is not identified."""
+        return f"{self.known_as}, not determined, {self.why}" if self.why else self.known_as
 
 
 @dataclass(frozen=True)
@@ -206,34 +192,9 @@ class Identifiability:
 
 
 def identifiability(fit: Any) -> Identifiability:
-    """Say which parameters, or which combinations of them, the data determine.
+    """Return which parameters, or which combinations of them, the data of a fit determine.
 
-    Parameters
-    ----------
-    fit : FitResult
-        From :func:`dahl_ident.fit`, made with ``throw=False`` where no optimum was found.
-
-    Returns
-    -------
-    Identifiability
-        A verdict on each parameter with its reason; printed, it is a report in words.
-
-    Notes
-    -----
-    "Identified" means a standard deviation of the logarithm below 0.25, "not identified" above 1,
-    by Fisher information and profile together.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import dahl_ident as di
-    >>> rng = np.random.default_rng(1)
-    >>> A = np.geomspace(1e-4, 1e-2, 20)
-    >>> N = di.Dahl(f_max=0.1, sigma=30.0).describing_function(A)
-    >>> noise = np.exp(0.01 * rng.standard_normal((2, 20)).T @ [1.0, 1.0j])
-    >>> result = di.fit(di.FrequencyResponse(np.ones(20), N * noise, A), di.Dahl())
-    >>> print(identifiability(result).headline)
-    Every parameter is identified.
+    The fit is made with ``throw=False`` where there may be no optimum.
     """
     judged: Identifiability = fit.identifiability
     return judged

@@ -15,7 +15,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.quantities import DEFINITIONS
-from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import Candidates

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, positive_number
-from dahl_ident.diagnostics.budget import coverage_factor
+from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.elements import Element, Model
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, argument, choices, spelled

@@ -22,34 +22,19 @@ SIGNIFICANT = 0.05  # two-sided probability below which a change is called signi
 
 @dataclass(frozen=True)
 class Change:
-    """The change of one parameter.
-
-    Attributes
-    ----------
-    parameter, unit : str
-    before, after : str
-        Names of the two fits.
-    change, relative : float
-        Difference of the estimates, and its share of the earlier one.
-    u : float
-        Its standard uncertainty: both combined ones, and for a fit of a single run the scatter
-        between runs that the other one shows.
-    runs_known : bool
-        Whether `u` holds the scatter between runs.
-    p : float
-        Two-sided probability of such a difference by chance; NaN where an estimate must not be
-        used.
-    """
+    """The change of one parameter."""
 
     parameter: str
     unit: str
-    before: str
+    before: str  # name of the earlier fit
     after: str
-    change: float
-    relative: float
+    change: float  # difference of the estimates
+    relative: float  # its share of the earlier one
+    # standard uncertainty: both combined ones, and for a fit of a single run the scatter between
+    # runs that the other one shows
     u: float
-    runs_known: bool
-    p: float
+    runs_known: bool  # whether `u` holds the scatter between runs
+    p: float  # two-sided probability by chance; NaN where an estimate must not be used
 
     @property
     def significant(self) -> bool:

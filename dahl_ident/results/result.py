@@ -33,33 +33,17 @@ FORMATS = (".json",)
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter of a fit.
-
-    Attributes
-    ----------
-    name, unit, description : str
-        As declared by the element; the unit is that of the data's motion.
-    value : float
-        The estimate, or the fixed value.
-    stderr : float or None
-        Standard error, first order (Wald); infinite where undetermined, None where fixed.
-    init_value : float or None
-        The start that the user gave.
-    min, max : float
-        Bounds.
-    vary : bool
-        Whether it was estimated.
-    """
+    """One parameter of a fit: name, unit and description as the element declares them."""
 
     name: str
-    unit: str
+    unit: str  # that of the data's motion
     description: str
-    value: float
-    stderr: float | None
-    init_value: float | None
-    min: float
+    value: float  # the estimate, or the fixed value
+    stderr: float | None  # first order (Wald); infinite where undetermined, None where fixed
+    init_value: float | None  # the start that the user gave
+    min: float  # bounds
     max: float
-    vary: bool
+    vary: bool  # whether it was estimated
 
     def __str__(self) -> str:
         if not self.vary and self.stderr is None:
