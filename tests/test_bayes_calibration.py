@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.calibration import (
-    RANKS,
-    critical,
-    extremity,
-    friction,
-    plant,
-    ranks,
-    report,
-)
+from benchmarks.calibration import RANKS, critical, extremity, friction, plant, ranks, report
 
 
 def test_the_band_holds_uniform_ranks_and_sees_narrow_posteriors():

@@ -76,9 +76,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_chain(tmp_path):
     kills = 0
     for _ in range(2):
         with subprocess.Popen(
-            [sys.executable, "-c", LONG_RUN, str(path)],
-            stdout=subprocess.PIPE,
-            env=environment,
+            [sys.executable, "-c", LONG_RUN, str(path)], stdout=subprocess.PIPE, env=environment
         ) as process:
             assert process.stdout.readline() == b"ready\n"
             time.sleep(random.uniform(0.1, 0.8))

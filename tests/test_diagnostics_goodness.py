@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dahl_ident import (
-    Dahl,
-    Damper,
-    FrequencyResponse,
-    Mass,
-    Spring,
-    compare_models,
-    fit,
-    response,
-)
+from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, compare_models, fit, response
 from dahl_ident.diagnostics import Goodness
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status

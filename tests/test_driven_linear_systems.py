@@ -127,10 +127,7 @@ def test_lumped_elements_as_a_system_are_those_elements():
     x, v, a, _ = whole_motion(t)
     for quantity in ("receptance", "mobility", "accelerance"):
         s_power = {"receptance": 0, "mobility": 1, "accelerance": 2}[quantity]
-        system = di.LinearSystem(
-            control.ss(S**s_power / (M * S**2 + C * S + K)),
-            quantity=quantity,
-        )
+        system = di.LinearSystem(control.ss(S**s_power / (M * S**2 + C * S + K)), quantity=quantity)
         assert (system.n_states, system.has_inertia) == (0, True)
         force = system.force(x, velocity=v, acceleration=a)
         expected = LUMPED.force(x, velocity=v, acceleration=a)

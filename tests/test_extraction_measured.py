@@ -15,10 +15,7 @@ MEASURED = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent")) / "brfd"
 INCH, KIP = 0.0254, 4448.2216152605
 STEADY_MM = {"0.5in": 12.8, "1in": 25.5, "1.5in": 38.3}
 DISTORTED = "1Hz_1.5in"
-FILES = [
-    *(f"{f}Hz_{a}in" for f in ("0.25", "0.5", "1") for a in ("0.5", "1", "1.5")),
-    "2Hz_0.5in",
-]
+FILES = [*(f"{f}Hz_{a}in" for f in ("0.25", "0.5", "1") for a in ("0.5", "1", "1.5")), "2Hz_0.5in"]
 needs_data = pytest.mark.skipif(
     not MEASURED.is_dir(), reason="DAHL_IDENT_MEASURED_DATA names no brfd folder"
 )

@@ -5,13 +5,7 @@ import importlib
 import numpy as np
 import pytest
 
-from dahl_ident import (
-    Backlash,
-    BoucWen,
-    Dahl,
-    FrequencyResponse,
-    LinearSystem,
-)
+from dahl_ident import Backlash, BoucWen, Dahl, FrequencyResponse, LinearSystem
 from dahl_ident.errors import FitError
 from dahl_ident.fitting import solve
 from dahl_ident.problem import TableProblem

@@ -6,10 +6,7 @@ from numpy.polynomial import Chebyshev
 
 from benchmarks.general_dahl_accuracy import errors
 from dahl_ident.elements import linear_dahl
-from dahl_ident.elements.general_dahl import (
-    stiffness,
-    turning_force,
-)
+from dahl_ident.elements.general_dahl import stiffness, turning_force
 
 ODD = (1, 3, 5, 7, 9, 11, 13, 15)
 ALPHAS = st.floats(0.25, 4.0)

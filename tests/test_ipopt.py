@@ -9,16 +9,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import (
-    BoucWen,
-    Dahl,
-    Damper,
-    FitResult,
-    LinearSystem,
-    Mass,
-    Spring,
-    steady_state,
-)
+from dahl_ident import BoucWen, Dahl, Damper, FitResult, LinearSystem, Mass, Spring, steady_state
 from dahl_ident import fit as any_fit
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.errors import FitError, ModelError, ValidationError

@@ -34,8 +34,7 @@ def exact_gradient(beta):
         i0, i1 = mp.besseli(0, b), mp.besseli(1, b)
         h = mp.mpc(2 * sech * i1 / b, 4 / mp.pi * (1 - tanh / b) / b)
         slope = mp.mpc(
-            2 * sech * (i0 - 2 * i1 / b - i1 * tanh),
-            4 / (mp.pi * b) * (2 * tanh / b - 1 - sech**2),
+            2 * sech * (i0 - 2 * i1 / b - i1 * tanh), 4 / (mp.pi * b) * (2 * tanh / b - 1 - sech**2)
         )
         return complex(h), complex(-slope), complex(h + slope)
 

@@ -7,17 +7,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from dahl_ident import (
-    Backlash,
-    Dahl,
-    Damper,
-    Mass,
-    PowerDamper,
-    Record,
-    Spring,
-    fit,
-    read_record,
-)
+from dahl_ident import Backlash, Dahl, Damper, Mass, PowerDamper, Record, Spring, fit, read_record
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
 pytestmark = pytest.mark.skipif(

@@ -278,8 +278,7 @@ class TestMatlab:
             read_frequency_response(matlab, columns={"frequency": "sweep.*.f"})
         with pytest.raises(DataError, match=r"same levels; only one .* levels\[1\], levels\[2\]"):
             read_frequency_response(
-                matlab,
-                columns={"frequency": "sweep.levels[*].f", "response": "sweep.level*[0].H"},
+                matlab, columns={"frequency": "sweep.levels[*].f", "response": "sweep.level*[0].H"}
             )
 
     def test_lengths(self, matlab):

@@ -259,16 +259,8 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("columns", "error", "message"),
         [
-            (
-                {"std": [1.0, -1.0, 1.0]},
-                DataError,
-                "row 2, column 'std'.*a standard dev",
-            ),
-            (
-                {"std": 1.0, "real_std": 1.0, "imag_std": 1.0},
-                DataError,
-                "both std and real_std",
-            ),
+            ({"std": [1.0, -1.0, 1.0]}, DataError, "row 2, column 'std'.*a standard dev"),
+            ({"std": 1.0, "real_std": 1.0, "imag_std": 1.0}, DataError, "both std and real_std"),
             ({"amplitude_std [N]": 1.0}, UnitError, r"unit \[N\]; expected .* of m"),
             ({"std": 1.0, "dof": [1.0, 0.0, 1.0]}, DataError, r"dof\[1\] is 0.0"),
             ({"dof": 3.0}, DataError, "dof is given without covariance"),
@@ -283,10 +275,7 @@ class TestRefusal:
     @pytest.mark.parametrize(
         ("columns", "message"),
         [
-            (
-                {"frequency_hz": [1.0, 0.0, 2.0]},
-                r"row 2, column 'frequency_hz': found 0.0 .*a f",
-            ),
+            ({"frequency_hz": [1.0, 0.0, 2.0]}, r"row 2, column 'frequency_hz': found 0.0 .*a f"),
             ({"amplitude [mm]": [1.0, -2.0, 3.0]}, "row 2, column 'amplitude'.*a value > 0"),
             ({"drive [N]": [1.0, 2.0, 0.0]}, "row 3, column 'drive': found 0.0"),
             ({"real [N/m]": [1.0, np.nan, 1.0]}, "row 2, column 'real': the cell is empty or NaN"),

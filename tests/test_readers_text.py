@@ -84,8 +84,7 @@ class TestDialects:
         np.testing.assert_allclose(record.displacement, np.array(X) * 1e-3)
 
     @pytest.mark.parametrize(
-        ("ending", "pack"),
-        [(".gz", gzip.compress), (".bz2", bz2.compress), (".xz", lzma.compress)],
+        ("ending", "pack"), [(".gz", gzip.compress), (".bz2", bz2.compress), (".xz", lzma.compress)]
     )
     def test_packed(self, tmp_path, ending, pack):
         assert_the_run(read_record(written(tmp_path, pack(PLAIN.encode()), f"run.csv{ending}")))
@@ -337,10 +336,7 @@ class TestRefusal:
             ("just some words\nand more words\n", "no table of numbers found"),
             ("1\n2\n3\n", "no table of numbers found"),
             ("0,1,1\n0.5,2.5,2\n", "no header line; expected names and units above the numbers"),
-            (
-                "a,b\n1,2,3\n",
-                "the header names 2 columns, the rows have 3; expected a name",
-            ),
+            ("a,b\n1,2,3\n", "the header names 2 columns, the rows have 3; expected a name"),
             ("a,b,c,d\n1,2,3\n", "no header line"),
             (PLAIN + "2,3\n", r"the last line has 2 fields, '2,3', where the others have 3"),
             (PLAIN + "2;3\n", "the last line has 1 fields, '2;3'"),

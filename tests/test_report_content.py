@@ -109,10 +109,7 @@ def test_metadata_from_a_file(fit, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (
-            {"speciman": "x"},
-            r"field 'speciman'; expected any of title, number, lab",
-        ),
+        ({"speciman": "x"}, r"field 'speciman'; expected any of title, number, lab"),
         ({"operator": ["x"]}, r"operator is \['x'\]; expected a text"),
         ({"instruments": "x"}, "instruments is 'x'; expected a list"),
         ({"instruments": [{"nmae": "x"}]}, r"instruments\[0\] has the field 'nmae'"),

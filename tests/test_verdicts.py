@@ -370,9 +370,7 @@ class TestDescribed:
         noisy = N * relative_noise(len(A), 0.01, 4)
         C = (0.01 * np.abs(noisy))[:, None, None] ** 2 * np.eye(2) if stated else None
         return fit(
-            FrequencyResponse(np.ones(len(A)), noisy, A, covariance=C, run=run),
-            Dahl(),
-            throw=False,
+            FrequencyResponse(np.ones(len(A)), noisy, A, covariance=C, run=run), Dahl(), throw=False
         )
 
     @pytest.mark.parametrize("stated", [True, False])
