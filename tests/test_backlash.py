@@ -1,7 +1,6 @@
 """A gap in the link to a friction element."""
 
 import json
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -25,27 +24,6 @@ from tests.test_generic_friction import Jenkins
 AT_REST = np.zeros(())
 
 
-def by_path(f_max, sigma, b, A, k):
-    """Return F_k/A of linear Dahl behind a half-gap b, from the force over the path."""
-    x_c = f_max / sigma
-    f0 = np.tanh(sigma * (A - b) / f_max)
-    first = x_c * np.log1p(f0)
-
-    def force(path):
-        moved = np.where(path < first, path, path - 2.0 * b)
-        inside = (path >= first) & (path <= first + 2.0 * b)
-        return np.where(inside, 0.0, f_max * (-1.0 + (1.0 + f0) * np.exp(-moved / x_c)))
-
-    stops = [0.0, *np.arccos(1.0 - np.array([first, first + 2.0 * b]) / A), np.pi]
-    nodes, weights = np.polynomial.legendre.leggauss(80)
-    total = 0.0 + 0.0j
-    for low, high in pairwise(stops):
-        theta = low + 0.5 * (high - low) * (1.0 + nodes)
-        values = force(A * (1.0 - np.cos(theta))) * np.exp(-1j * k * theta)
-        total += 0.5 * (high - low) * np.sum(weights * values)
-    return complex(2.0 / np.pi * total / A)
-
-
 @pytest.mark.parametrize(
     ("law", "A", "first", "third"),
     [
@@ -56,20 +34,6 @@ def by_path(f_max, sigma, b, A, k):
 def test_the_check_values(law, A, first, third):
     assert complex(law.dynamic_stiffness(A)) == pytest.approx(first, abs=1e-7)
     assert complex(law.dynamic_stiffness(A, harmonic=3)) == pytest.approx(third, abs=1e-7)
-
-
-def test_harmonics_against_the_force_over_the_path():
-    rng = np.random.default_rng(7)
-    for _ in range(60):
-        f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
-        b = f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
-        A = b + f_max / sigma * 10.0 ** rng.uniform(-1.5, 1.2)
-        law = Backlash(Dahl(f_max, sigma), 2.0 * b)
-        size = abs(by_path(f_max, sigma, b, A, 1))
-        for k in (1, 3, 5, 7):
-            ours = complex(law.dynamic_stiffness(A, harmonic=k))
-            assert abs(ours - by_path(f_max, sigma, b, A, k)) < 1e-8 * size
-        assert abs(law.dynamic_stiffness(A, harmonic=2)) == 0.0
 
 
 def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force():
@@ -87,27 +51,6 @@ def test_the_force_steps_through_the_gap():
     # contact at 0.2; slip at 1 N; zero force at 0.5; the gap is crossed to 0.1
     expected = [0.0, 0.0, 0.6, 1.0, 0.8, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0]
     np.testing.assert_allclose(law.force(x), expected, atol=1e-9)
-
-
-def test_derivatives_of_linear_dahl_are_exact():
-    rng = np.random.default_rng(11)
-    places, weights = np.array([1.0, -1.0, 2.0, -2.0]), np.array([8.0, -8.0, -1.0, 1.0]) / 12e-5
-    law = Model(Backlash(Dahl(1.0, 3.0), 0.8)).with_free(["f_max", "sigma", "gap"])
-    for i in range(24):
-        f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
-        b = f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
-        A, k = b + f_max / sigma * 10.0 ** rng.uniform(-1.0, 1.2), (1, 3, 5)[i % 3]
-        at = [np.asarray(v) for v in (f_max, sigma, 1.0, 2.0 * b, A)]
-        found = law.stiffness_gradient(at[:4], at[4], AT_REST, k)
-        size = abs(by_path(f_max, sigma, b, A, 1))
-        for j in (0, 1, 3, 4):
-            moved = [*at[:j], at[j] * (1.0 + 1e-5 * places), *at[j + 1 :]]
-            rows = np.broadcast(*moved)
-            values = [by_path(f, s, 0.5 * g, a, k) for f, s, _, g, a in rows]
-            slope = (*found.by_parameter, found.by_amplitude)[j]
-            assert abs(complex(slope) * float(at[j]) - weights @ values) < 1e-6 * size * (
-                A / (A - b)
-            )
 
 
 def test_refusals():

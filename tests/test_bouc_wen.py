@@ -1,4 +1,4 @@
-"""Bouc-Wen of exponent 1 against direct integration with located events, and against Dahl."""
+"""Bouc-Wen against Dahl, quadrature and integration; `test_engine` has its loops and histories."""
 
 import time
 
@@ -10,32 +10,6 @@ import dahl_ident as di
 from dahl_ident import BoucWen, Dahl
 
 LAWS = [(3.0, 1.3, 0.5), (5e4, -300.0, 1900.0), (2.0, 0.7, 0.0), (1.0, 0.0, 2.0), (4.0, -0.5, -0.2)]
-
-
-def integrated(z, span, s, law):
-    """Return z after a path, with the passage through zero located."""
-    sigma, q, p = law
-    start = 0.0
-
-    def passes(_, y):
-        return float(y[0])
-
-    passes.terminal = True  # type: ignore[attr-defined]
-    while start < span:
-        loading = s * z >= 0.0
-        rate = -q if loading else p
-        solution = solve_ivp(  # type: ignore[call-overload]
-            lambda _, y, rate=rate: [s * (sigma + rate * abs(y[0]))],
-            (start, span),
-            [z],
-            method="DOP853",
-            rtol=1e-12,
-            atol=1e-14 * sigma,
-            events=None if loading else passes,
-        )
-        start = float(solution.t[-1])
-        z = 0.0 if solution.status == 1 else float(solution.y[0, -1])
-    return z
 
 
 def stiffness(point, harmonic):
@@ -72,70 +46,6 @@ def test_equal_rates_are_linear_dahl(beta, harmonic):
     expected = complex(Dahl(1.0, 1.0).dynamic_stiffness(beta, harmonic=harmonic))
     size = abs(Dahl(1.0, 1.0).describing_function(beta))
     assert abs(found - expected) <= 1e-9 * size
-
-
-@pytest.mark.parametrize("law", LAWS[:4])  # the last gains energy: its loop is unstable
-@pytest.mark.parametrize("k", [1, 3])
-def test_harmonics_against_the_integrated_loop(law, k):
-    A = 1.5 / max(abs(law[1]), abs(law[2]))
-    z = 0.0
-    for _ in range(40):  # the loop closes by going round
-        z = integrated(z, 2.0 * A, -1.0, law)
-        z = integrated(z, 2.0 * A, 1.0, law)
-    assert tip_force(A, law) == pytest.approx(z, rel=1e-9)
-    sigma, _, p = law
-    at_zero = np.log1p(p * z / sigma) / p if p else z / sigma
-    turn = 2.0 * np.arcsin(np.sqrt(at_zero / 2.0 / A))
-
-    def force(theta):
-        return integrated(z, A * (1.0 - np.cos(theta)), -1.0, law) if theta else z
-
-    def part(wave, start, stop):
-        return float(quad(lambda t: force(t) * wave(k * t), start, stop, epsrel=1e-9)[0])
-
-    halves = ((0.0, turn), (turn, np.pi))
-    expected = sum(complex(part(np.cos, *ends), -part(np.sin, *ends)) for ends in halves)
-    found = law[0] * A * stiffness(np.array([A, law[1], law[2]]), k)[0]
-    assert abs(found - 2.0 / np.pi * expected) < 1e-8 * abs(expected)
-
-
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("harmonic", [1, 3])
-def test_stiffness_derivatives(law, harmonic):
-    _, q, p = law
-    point = np.array([1.5 / max(abs(q), abs(p)), q, p])
-    found = stiffness(point, harmonic)[1:]
-    for i in range(3):
-        h = np.zeros(3)
-        h[i] = 1e-5 * max(abs(point[i]), 0.1)
-        slopes = [
-            (stiffness(point + f * h, harmonic)[0] - stiffness(point - f * h, harmonic)[0])
-            / (2.0 * f * h[i])
-            for f in (1.0, 2.0)
-        ]
-        expected = (4.0 * slopes[0] - slopes[1]) / 3.0
-        assert abs(found[i] - expected) < 1e-8 * max(abs(expected), abs(1.0 / point[0]) * (i == 0))
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_force_for_any_history(law):
-    rng = np.random.default_rng(3)
-    x = np.cumsum(rng.standard_normal(40)) / max(abs(law[1]), abs(law[2]))
-    z = start = 0.3 * law[0] / max(abs(law[1]), abs(law[2]))
-    expected = [z]
-    for step in np.diff(x):
-        z = integrated(z, abs(float(step)), float(np.sign(step)), law)
-        expected.append(z)
-    found = history(x, np.array([start, *law]))
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 * np.abs(expected).max())
-    # how densely a stretch is sampled does not matter
-    fine = np.interp(np.linspace(0, 39, 391), np.arange(40), x)
-    np.testing.assert_allclose(
-        history(fine, np.array([start, *law]))[::10],
-        found,
-        rtol=0.0,
-        atol=1e-10 * np.abs(found).max(),
-    )
 
 
 @pytest.mark.parametrize("law", LAWS)

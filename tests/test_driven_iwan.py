@@ -1,79 +1,14 @@
-"""Iwan's law driven by a force, against an integration with its exact memory."""
+"""Iwan's law driven by a force: its polygon of sliders, derivatives, and a fit."""
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import dahl_ident as di
 from tests.motions import Driven, differences, slopes
 from tests.test_forced_motion import RATE, multisine
 
 M, C, K = 2.0, 10.0, 3e4
-LINEAR = di.Mass(M) + di.Damper(C) + di.Spring(K)
 VALUES = [20.0, 4e4, -0.5, 1.0]
-LAW = di.Iwan(*VALUES)
-
-
-class Memory:
-    """The turning points that the law remembers, and the force on from the last one."""
-
-    def __init__(self):
-        self.turns: list[tuple[float, float]] = []
-
-    def force(self, x):
-        at = [np.asarray(v) for v in VALUES]
-        if not self.turns:
-            return float(np.sign(x) * LAW.backbone(at, np.asarray(abs(x))))
-        place, force = self.turns[-1]
-        path = abs(x - place)
-        return float(force + np.sign(x - place) * 2.0 * LAW.backbone(at, np.asarray(0.5 * path)))
-
-    def limit(self):
-        """Return the displacement at which the present path ends."""
-        if not self.turns:
-            return np.inf
-        return self.turns[-2][0] if len(self.turns) > 1 else -self.turns[0][0]
-
-
-def exact(samples, drive):
-    """Return displacements by DOP853, stopped at every turn and where a loop closes."""
-    times, memory = np.arange(samples) / RATE, Memory()
-    out, filled, now, y = np.empty(samples), 0, 0.0, np.zeros(2)
-    s = 1.0 if drive(0.0) > 0.0 else -1.0
-    while filled < samples:
-
-        def rates(t, y):
-            return [y[1], (drive(t) - C * y[1] - K * y[0] - memory.force(float(y[0]))) / M]
-
-        def turn(_, y):
-            return float(y[1])
-
-        def close(_, y, s=s):
-            return float(s * (y[0] - memory.limit())) if memory.turns else -1.0
-
-        for event, way in ((turn, -s), (close, 1.0)):
-            event.terminal, event.direction = True, way  # type: ignore[attr-defined]
-        found = solve_ivp(
-            rates, (now, times[-1] + 1e-9), y, method="DOP853", rtol=1e-10, atol=1e-13,
-            max_step=0.3 / RATE, events=[turn, close], dense_output=True,
-        )  # fmt: skip
-        now, y = float(found.t[-1]), found.y[:, -1].copy()
-        here = times[filled:][times[filled:] <= now]
-        if here.size and found.sol is not None:
-            out[filled : filled + here.size] = found.sol(here)[0]
-            filled += here.size
-        turned, closed = found.t_events or ((), ())
-        if len(turned):
-            memory.turns.append((float(y[0]), memory.force(float(y[0]))))
-            y[1], s = 0.0, -s
-        elif len(closed):
-            del memory.turns[-2:]
-    return out
-
-
-def motion(wave):
-    driven = Driven(LAW + LINEAR, wave, RATE)
-    return driven.motion(np.zeros(driven.order)).output
 
 
 @pytest.mark.parametrize("values", [[2.0, 5.0, -0.9, 0.1], VALUES, [1.0, 1.0, 1.5, 0.3]])
@@ -102,19 +37,6 @@ def test_harmonics_have_the_error_that_is_stated():
             exact_one, other = (e.dynamic_stiffness(A) for e in (law, slips))
             assert np.abs(other / exact_one - 1.0).max() < 2e-3
             assert np.abs(other.imag / exact_one.imag - 1.0).max() < 0.02
-
-
-def test_motion_converges_to_that_of_the_exact_law(monkeypatch):
-    samples = 128
-    wave, drive = multisine(samples)
-    truth = exact(samples, drive)
-    assert np.abs(truth).max() > 5.0 * LAW.onset
-    errors = []
-    for n in (30, 120):
-        monkeypatch.setattr(di.Iwan, "_count", n)
-        errors.append(float(np.abs(motion(wave) - truth).max() / np.abs(truth).max()))
-    assert errors[0] < 1e-4
-    assert errors[1] < errors[0] / 12.0
 
 
 def test_slopes_are_derivatives():

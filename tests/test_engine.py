@@ -1,13 +1,11 @@
 """The engine against what is not the engine: DOP853 with events, quadrature, closed forms."""
 
-import itertools
 import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
 
 import dahl_ident as di
@@ -18,7 +16,6 @@ from benchmarks.motion_oracles import (
     JenkinsByHand,
     Oracle,
     PiecewiseByHand,
-    dahl_branch,
     dahl_history,
     fixed_point,
     integrated,
@@ -83,46 +80,6 @@ def test_dahl_loops_are_the_closed_forms(beta):
         assert abs(computed - value) < 1e-6 * max(abs(value), 1e-3 * abs(N))
     by_A = N + A * complex(slopes["amplitude"])
     assert abs(result.by_amplitude[0, 0] - by_A) < 1e-6 * abs(N)
-
-
-@pytest.mark.parametrize(("alpha", "beta"), [(0.7, 3.0), (1.5, 0.01), (1.5, 1e8)])
-def test_asymmetric_loops_of_any_exponent_are_sums_over_their_branches(alpha, beta):
-    asymmetry = 0.3
-    limits = 1.0 + asymmetry, 1.0 - asymmetry
-    # tips by iteration, in units of f_max and x_c
-    low, high = 0.0, 0.0
-    for _ in range(20_000 if beta < 1.0 else 200):
-        last = high
-        rise = dahl_branch(1.0 - low / limits[0], 2.0 * beta / limits[0], alpha)
-        high = limits[0] * (1.0 - rise)
-        low = -limits[1] * (
-            1.0 - dahl_branch(1.0 + high / limits[1], 2.0 * beta / limits[1], alpha)
-        )
-        if abs(high - last) < 1e-16:
-            break
-
-    def force(theta):
-        if theta <= np.pi:
-            path = 2.0 * beta * np.sin(0.5 * theta) ** 2 / limits[1]
-            return -limits[1] * (1.0 - dahl_branch(1.0 + high / limits[1], path, alpha))
-        path = 2.0 * beta * np.cos(0.5 * theta) ** 2 / limits[0]
-        return limits[0] * (1.0 - dahl_branch(1.0 - low / limits[0], path, alpha))
-
-    # Gauss points between angles that rise by factors from each turning point
-    nodes, weights = np.polynomial.legendre.leggauss(30)
-    edges = np.concatenate([[0.0], np.pi * np.geomspace(1e-9, 1.0, 120)])
-    c = np.zeros(4, dtype=complex)
-    for start in (0.0, np.pi):
-        for a, b in itertools.pairwise(edges):
-            for x, w in zip(nodes, weights, strict=True):
-                theta = start + 0.5 * (a + b) + 0.5 * (b - a) * x
-                turn = np.exp(-1j * np.arange(4) * theta)
-                c += 0.5 * (b - a) * w / np.pi * force(theta) * turn
-    c[0] *= 0.5
-    element = di.Dahl(alpha=None, asymmetry=None)
-    result = loop_of(element, beta, [1.0, 1.0, alpha, asymmetry], harmonics=(0, 1, 2, 3))
-    assert result.found[0]
-    assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * np.max(np.abs(c))
 
 
 class Bilinear(di.Friction):
@@ -426,20 +383,6 @@ def test_floquet_maps_are_those_of_an_independent_integrator():
         slopes[:, j] = (ends[0] - ends[1]) / (2.0 * step[j])
     difference = (result.maps[0] - slopes) * sizes / sizes[:, None]
     assert np.max(np.abs(difference)) < 1e-6
-
-
-def test_a_sweep_of_an_integral_by_quadrature():
-    """A history without memory: the mean of |v| v^3 by quad, uneven kinks included."""
-    system = translate(law_equations(di.PowerDamper()))
-    result = settled(system, np.array([1.0]), np.array([2.0]), np.array([[1.0, 0.4, 1.0]]),
-                     harmonics=(3,))  # fmt: skip
-
-    def part(t):
-        v = -2.0 * np.sin(t)
-        return float(v * (v * v + 1e-12) ** -0.3 * np.sin(3.0 * t))
-
-    expected = -quad(part, 0.0, np.pi, points=[1e-6, 1e-3], limit=400, epsabs=1e-13)[0]
-    assert abs(result.coefficients[0, 0].imag - 2.0 / np.pi * expected) < 1e-8
 
 
 @pytest.mark.parametrize("home", ["unwritable", "missing"])

@@ -26,7 +26,7 @@ from tests.test_generic_friction import Jenkins
 LINEAR = {"mass", "damper", "spring", "linear_system"}
 LAWS: dict[str, list[Element]] = {
     "dahl": [Dahl(1.0, 3.0), Dahl(1.0, 3.0, 0.5), Dahl(1.0, 3.0, 2.0, asymmetry=0.3)],
-    "bouc_wen": [BoucWen(3.0, 1.3, 0.5)],
+    "bouc_wen": [BoucWen(3.0, 1.3, 0.5), BoucWen(2.0, 0.7, 0.0), BoucWen(1.0, 0.0, 2.0)],
     "backlash": [Backlash(Dahl(1.0, 3.0), 0.5)],
     "iwan": [Iwan(1.0, 3.0, -0.5, 0.7)],
     "lugre": [LuGre(1.0, 3.0, 1.5, 0.7, 0.1, 0.2)],

@@ -36,16 +36,6 @@ class SlopeOfDahl(Friction):
         return sigma * np.sign(margin) * np.abs(margin) ** alpha
 
 
-class BoucWen(Friction):
-    """Exponent 1: loading and unloading have different rates."""
-
-    parameters = tuple(Parameter(name, "", name) for name in "abc")
-
-    def slope(self, force, direction, velocity, values):
-        a, b, c = values
-        return a - np.abs(force) * (b * np.sign(direction * force) + c)
-
-
 def jenkins(k, slip, A):
     """Return the closed form of the describing function."""
     m = np.minimum(slip / A, 1.0)

@@ -2,31 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp, trapezoid
+from scipy.integrate import solve_ivp
 
 from dahl_ident import Dahl, Damper, Friction, LuGre
 from dahl_ident.errors import ModelError, ValidationError
 
 LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
-
-
-@pytest.mark.parametrize(("A", "omega"), [(3e-3, 1.0), (0.1, 50.0), (3.0, 1e-3)])
-def test_the_settled_force_has_the_harmonics(A, omega):
-    """Against exponential steps over samples that are dense where the motion turns round."""
-    fine = np.concatenate([np.geomspace(1e-6, 0.05, 1500), np.linspace(0.05, np.pi / 2, 6001)[1:]])
-    quarter = np.concatenate([[0.0], fine])
-    half = np.concatenate([quarter, np.pi - quarter[-2::-1]])
-    cycle = np.concatenate([half, np.pi + half[1:]])
-    cycles = 1 + int(np.ceil(20.0 / (4.0 * 300.0 * A)))
-    theta = np.concatenate([2.0 * np.pi * i + cycle[:-1] for i in range(cycles)] + [[0.0]])[:-1]
-    force = LAW.force(A * np.cos(theta), velocity=-A * omega * np.sin(theta))
-    last, place = force[-(cycle.size - 1) :], cycle[:-1]
-    last, place = np.append(last, last[0]), np.append(place, 2.0 * np.pi)
-    size = abs(complex(LAW.dynamic_stiffness(A, omega)))
-    for k in (1, 3, 5):
-        found = trapezoid(last * np.exp(-1j * k * place), place) / (np.pi * A)
-        assert abs(complex(LAW.dynamic_stiffness(A, omega, harmonic=k)) - found) < 2e-5 * size
-    assert LAW.dynamic_stiffness(A, omega, harmonic=2) == pytest.approx(0.0, abs=1e-9 * size)
 
 
 def test_without_stribeck_effect_it_is_linear_dahl_with_a_damper():

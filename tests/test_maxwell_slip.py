@@ -2,7 +2,6 @@
 
 import re
 
-import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
@@ -33,21 +32,6 @@ def sliders(x, start):
         f = np.clip(f + STIFF * step, -STIFF * SLIPS, STIFF * SLIPS)
         total.append(float(f.sum()))
     return np.array(total)
-
-
-@pytest.mark.parametrize("k", [1, 3, 5, 7])
-def test_a_jenkins_element_against_an_integral(k):
-    for ratio in (1e-9, 1e-4, 0.3, 0.77, 0.999, 1.0, 1.3):
-        found = complex(MaxwellSlip([ratio], [1.0]).dynamic_stiffness(1.0, harmonic=k))
-        with mpmath.workdps(30):
-            d = mpmath.mpf(ratio)
-            slips = mpmath.acos(1 - 2 * min(d, mpmath.mpf(1)))
-            stick = mpmath.quad(
-                lambda t: mpmath.sin(t) * mpmath.expjpi(-k * t / mpmath.pi), [0, slips]
-            )
-            exact = complex(2j / (mpmath.pi * k) * stick)
-        size = 1.0 if ratio >= 1.0 else 4.0 / np.pi * ratio
-        assert abs(found - exact) < 1e-11 * size
 
 
 def test_derivatives_are_exact_and_one_sided_at_a_kink():

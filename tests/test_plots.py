@@ -369,23 +369,6 @@ def test_only_wide_ranges_are_drawn_over_their_logarithm():
     plt.close("all")
 
 
-@pytest.mark.versions
-def test_every_axis_has_its_unit():
-    top, bottom = _amplitude(None)
-    assert (top.get_ylabel(), bottom.get_ylabel()) == ("gain [N/m]", "phase [degrees]")
-    assert bottom.get_xlabel() == "displacement amplitude [m]"
-    top, bottom = _frequency(None)
-    assert (top.get_ylabel(), bottom.get_xlabel()) == ("gain [m/N]", "frequency [Hz]")
-    loops = plots.plot_loops([(A, A, "a")])
-    assert (loops.get_xlabel(), loops.get_ylabel()) == ("displacement [m]", "force [N]")
-    residuals = plots.plot_residuals(A, A, A)
-    assert residuals.get_ylabel() == "residual [standard deviations]"
-    information = plots.plot_information(A, {"a": A / A.sum()})
-    assert information.get_xlabel() == "displacement amplitude [m]"
-    assert information.get_title(loc="left") == "share of the information, by area"
-    plt.close("all")
-
-
 SEEN_BY = {  # matrices of Machado, Oliveira and Fernandes 2009, for missing receptors
     "all receptors": np.eye(3),
     "no red": np.array([[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]]),

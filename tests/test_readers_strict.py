@@ -59,7 +59,7 @@ class TestSecondHeaders:
     @pytest.mark.parametrize(
         "name", ["csv", "semicolon", "csv.gz", "csv.bz2", "lvm", "json", "xlsx"]
     )
-    @pytest.mark.parametrize("row", [1, 20, 50])
+    @pytest.mark.parametrize("row", [20])
     def test_of_records(self, name, header, row, tmp_path):
         content = reader_fuzz.written(name, COLUMNS, (row, header))
         with pytest.raises(DataError):
@@ -174,13 +174,6 @@ class TestHdf5:
             read_record(path)
         found = read_record(path, missing="drop").motion_samples
         np.testing.assert_allclose(found, np.delete(X, 7), atol=6e-8)
-
-    def test_behind_a_block_of_the_user(self, tmp_path):
-        h5py: Any = importlib.import_module("h5py")
-        with h5py.File(tmp_path / "run.h5", "w", userblock_size=1024) as root:
-            for name, values, unit in (("time", TIME, "s"), ("x", X, "m"), ("F", F, "N")):
-                root.create_dataset(name, data=values).attrs["unit"] = unit
-        np.testing.assert_array_equal(read_record(tmp_path / "run.h5").motion_samples, X)
 
     def test_added_bytes_are_noticed(self, tmp_path):
         path = self.file(tmp_path, lambda root: root.create_dataset("x", data=X))
@@ -324,41 +317,29 @@ class TestDoubts:
                 force = law.force(x) + noise * np.random.default_rng(0).standard_normal(t.size)
                 assert read_record(place(tmp_path, "run.csv", csv([t, x, force]))).n == t.size
 
-    def test_channels_that_start_apart(self, tmp_path):
+    def test_channels_that_start_apart_or_together(self, tmp_path):
         nptdms: Any = importlib.import_module("nptdms")
         start = np.datetime64("2026-03-01T12:00:00")
-        channels = [
-            nptdms.ChannelObject("rig", name, values, {
-                "unit_string": unit, "wf_increment": 1 / 128.0, "wf_start_time": begun
-            })
-            for name, values, unit, begun in (
-                ("x", X, "m", start), ("F", F, "N", start + np.timedelta64(500, "ms"))
-            )
-        ]  # fmt: skip
-        buffer = io.BytesIO()
-        with nptdms.TdmsWriter(buffer) as writer:
-            writer.write_segment(channels)
-        path = place(tmp_path, "run.tdms", buffer.getvalue())
+
+        def written(later):
+            channels = [
+                nptdms.ChannelObject("rig", name, values, {
+                    "unit_string": unit, "wf_increment": 1 / 128.0, "wf_start_time": begun
+                })
+                for name, values, unit, begun in (
+                    ("x", X, "m", start), ("F", F, "N", start + later)
+                )
+            ]  # fmt: skip
+            with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
+                writer.write_segment(channels)
+            return tmp_path / "run.tdms"
+
         with (
             pytest.warns(DataWarning, match=r"start at different times, up to 0\.5 s apart"),
             pytest.raises(DataError, match="2 columns may be the time"),
         ):
-            read_record(path)
-
-    def test_channels_that_start_together(self, tmp_path):
-        nptdms: Any = importlib.import_module("nptdms")
-        start = np.datetime64("2026-03-01T12:00:00")
-        channels = [
-            nptdms.ChannelObject("rig", name, values, {
-                "unit_string": unit, "wf_increment": 1 / 128.0, "wf_start_time": begun
-            })
-            for name, values, unit, begun in (
-                ("x", X, "m", start), ("F", F, "N", start + np.timedelta64(20, "us"))
-            )
-        ]  # fmt: skip
-        with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
-            writer.write_segment(channels)
-        assert read_record(tmp_path / "run.tdms").n == TIME.size
+            read_record(written(np.timedelta64(500, "ms")))
+        assert read_record(written(np.timedelta64(20, "us"))).n == TIME.size
 
     def test_times_and_the_header_that_disagree(self, tmp_path):
         text = reader_fuzz.written("lvm", COLUMNS).decode()

@@ -9,7 +9,7 @@ import lzma
 import numpy as np
 import pytest
 
-from dahl_ident.data import FrequencyResponse, inspect, read_frequency_response, read_record
+from dahl_ident.data import inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, UnitError
 
 TIME, X, F = [0.0, 0.5, 1.0], [1e-3, 2.5e-3, -3e-3], [1000.0, 2000.0, 3500.0]
@@ -304,16 +304,12 @@ class TestUnusualTables:
                     read_record(written(tmp_path, table))
 
     def test_damaged_comments_of_this_package(self, tmp_path):
-        for comment in ("[" * 100_000, '{"quality": 3}', '{"text": [1]}', '{"drive_factor": "x"}',
+        for comment in ("{oops", "[" * 100_000, '{"quality": 3}', '{"text": [1]}',
+                        '{"drive_factor": "x"}',
                         '{"unknown": 1}', '{"provenance": {"warnings": 5}}',
                         '{"provenance": {"parts": [{"notes": [1]}]}}'):  # fmt: skip
             with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:'"):
                 read_record(written(tmp_path, f"# dahl_ident: {comment}\n{PLAIN}"))
-
-    def test_unpacked_sizes_are_limited(self, tmp_path):
-        path = written(tmp_path, gzip.compress(b"1,2\n" * 75_000_000, 1), "run.csv.gz")
-        with pytest.raises(DataError, match=r"content would take 134 MB.*at most 134 MB are read"):
-            read_record(path)
 
     def test_damaged_compression(self, tmp_path):
         packed = bytearray(gzip.compress(PLAIN.encode() * 50))
@@ -427,10 +423,6 @@ class TestRefusal:
         with pytest.raises(DataError, match="cannot be read: No such file"):
             read_record(tmp_path / "absent.csv")
 
-    def test_edited_metadata(self, tmp_path):
-        with pytest.raises(DataError, match="line 1: the comment after 'dahl_ident:' is not what"):
-            read_record(written(tmp_path, "# dahl_ident: {oops\n" + PLAIN))
-
     @pytest.mark.parametrize(
         ("columns", "message"),
         [
@@ -465,16 +457,6 @@ class TestRefusal:
         broken = written(tmp_path, "time = = 3", "lab.toml")
         with pytest.raises(DataError, match="not a TOML file"):
             read_record(path, columns=broken)
-
-
-class TestReadsAgain:
-    def test_text_quality_survives_look_alikes(self, tmp_path):
-        data = FrequencyResponse(
-            [1.0, 2.0], [1j, 2j], [1e-3, 1e-3], quality={"note": ["007", "1e5"]}, level=["", "nan"]
-        )
-        back = read_frequency_response(data.save(tmp_path / "t.csv"))
-        assert back.quality["note"].tolist() == ["007", "1e5"]
-        assert back.levels == ["", "nan"]
 
 
 def test_small_and_large_tables_are_read_alike(tmp_path):

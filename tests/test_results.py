@@ -92,32 +92,6 @@ class TestFit:
         assert result.redchi == pytest.approx(result.chisqr / 58.0)
         assert result.scale == pytest.approx(np.sqrt(result.redchi))
 
-    @pytest.mark.parametrize("alpha", [0.8, 1.0])
-    @pytest.mark.parametrize("stated", [0.002, 0.01, None])
-    def test_everything_describes_one_point(self, alpha, stated):
-        """Also where the misfit moves the estimate from the optimum, and harmonics are fitted."""
-        data = table(model=Dahl(0.1, 30.0, alpha=alpha) + Spring(0.2))
-        if stated is not None:
-            C = np.eye(2) * (stated * data.gain)[:, None, None] ** 2
-            data = replace(data, covariance=C)
-        found = fit(data, Dahl())
-        friction = Dahl(*(found.params[name].value for name in ("f_max", "sigma", "alpha")))
-        expected = friction.describing_function(data.amplitude)
-        predicted = found.predict(data.frequency_hz, amplitude=data.amplitude).response
-        np.testing.assert_allclose(predicted, expected, rtol=1e-9)
-        np.testing.assert_allclose(found.best_fit, expected, rtol=1e-9)
-        inside = found.model.dynamic_stiffness(data.amplitude, np.ones(data.n))
-        np.testing.assert_allclose(inside, expected, rtol=1e-9)
-        missed = np.abs(1.0 - expected / data.response)
-        assert found.goodness.rms_misfit == pytest.approx(np.sqrt(np.mean(missed**2)))
-        for name, p in found.params.items():
-            if p.vary:
-                assert p.stderr is not None
-                assert found.stderr_noise[name] <= p.stderr
-                limits = found.conf_interval().at(0.9545)[name]
-                assert limits.lower < p.value < limits.upper
-        assert found.covar[0, 0] ** 0.5 == pytest.approx(found.params["f_max"].stderr)
-
     def test_criteria_from_the_density(self, result):
         """ln gain and phase are normal; a density by Re and Im has the Jacobian 1/|R|^2."""
         searched = result.problem.predict(result.optimum.theta)
@@ -177,12 +151,6 @@ class TestFit:
             fit(data, Dahl())
         assert caught.value.result.optimum.status is Status.NO_LOSS
         assert caught.value.result.combinations[0].expression == "sigma"
-
-    def test_ipopt_finds_the_same(self, result):
-        other = fit(result.data, Dahl(), method="ipopt")
-        assert other.method == "ipopt"
-        for name in result.var_names:
-            assert other.params[name].value == pytest.approx(result.params[name].value, rel=1e-7)
 
     def test_constraints_leave_first_order_intervals(self):
         def tie(p):
