@@ -34,40 +34,18 @@ _HIGHEST = 9  # harmonic that counts
 
 
 class FreeMotion(NamedTuple):
-    """A periodic motion without a drive.
+    """A periodic motion without a drive."""
 
-    `amplitude` is that of the displacement's fundamental, `share` the root sum of squares of the
-    mean and the harmonics 2 to 9 over it, `growth_rate` that of the worst small disturbance, 1/s.
-    """
-
-    amplitude: float
+    amplitude: float  # of the displacement's fundamental
     omega: float
-    share: float
-    growth_rate: float
+    share: float  # root sum of squares of the mean and the harmonics 2 to 9 over it
+    growth_rate: float  # of the worst small disturbance, 1/s
 
 
 def free_motion(plant: Model, amplitude: float, omega: float) -> FreeMotion | None:
     """Return the periodic motion near ``amplitude cos(omega t)``; None where there is none.
 
-    Parameters
-    ----------
-    plant : Model
-        The whole loop, friction included, with a mass and a value for every parameter.
-    amplitude, omega : float
-        The describing function's estimate.
-
-    Raises
-    ------
-    ModelError
-        If the plant has no equation of motion.
-
-    Examples
-    --------
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring
-    >>> plant = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(-0.3) + Spring(0.3)
-    >>> orbit = free_motion(plant, 8e-4, 9.94)
-    >>> round(orbit.amplitude, 5), round(orbit.omega, 3), orbit.growth_rate < 0.0
-    (0.0008, 9.946, True)
+    The plant is the whole loop, friction included, with a mass and a value for every parameter.
     """
     loop = _Loop(plant)
     y = loop.start(amplitude, omega)

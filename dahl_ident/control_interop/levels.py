@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import control
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -60,13 +60,11 @@ class LevelResponses:
         >>> list(level_responses(plant, [1.0, 2.0], [0.1, 1.0]).to_control())
         [0.1, 1.0]
         """
-        control = importlib.import_module("control")
         omega = 2.0 * np.pi * self.frequency_hz
-        systems = {}
-        for level, row in zip(self.levels.tolist(), self.response, strict=True):
-            known = np.isfinite(row)
-            systems[level] = control.frd(row[known], omega[known])
-        return systems
+        return {
+            level: control.frd(row[np.isfinite(row)], omega[np.isfinite(row)])
+            for level, row in zip(self.levels.tolist(), self.response, strict=True)
+        }
 
     def plot(self, kind: Kind = "bode", ax: Any = None) -> Any:
         """Draw all levels in one picture.

@@ -18,6 +18,7 @@ U_A V_omega - U_omega V_A > 0 for U + jV = L + N.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,12 +27,11 @@ import numpy as np
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.free_motion import free_motion
 from dahl_ident.control_interop.linear_part import (
-    coefficients,
     has_polynomials,
     known_range,
-    transfer_stiffness,
+    rational_stiffness,
 )
-from dahl_ident.control_interop.nonlinearity import friction_and_slope, friction_elements
+from dahl_ident.control_interop.nonlinearity import friction_alone, friction_and_slope
 from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.errors import ModelError, ValidationError
@@ -175,36 +175,38 @@ def limit_cycles(
     5.78e-06 m at 16.2 Hz, stable: True
     """
     linear = as_linear(loop)
-    friction_elements(friction)
-    low, high = (float(v) for v in as_model(friction).knee(friction.known_values()))
+    friction = friction_alone(friction)
+    low, high = (float(v) for v in friction.knee(friction.known_values()))
     A = _grid(_BEYOND_KNEES[0] * low, _BEYOND_KNEES[1] * high, _AMPLITUDES_PER_DECADE)
-    N, _ = friction_and_slope(as_model(friction), A)
+    N, _ = friction_and_slope(friction, A)
     omega = _frequencies(linear, float(abs(N[0])), frequency_range_hz)
     L = stiffness_of(linear, omega)
-    crossings = []
+    refined = []
     for i, j in _crossings(-L, N):
-        cycle = _refine(linear, as_model(friction), A[j], omega[i])
+        cycle = _refine(linear, friction, A[j], omega[i])
         if cycle is not None and omega[0] <= cycle.omega <= omega[-1]:
-            crossings.append(cycle)
-    plant = Model(*linear.elements, *as_model(friction).elements)
+            refined.append(cycle)
+    crossings = _distinct(refined)
+    plant = Model(*linear.elements, *friction.elements)
     approximate = obstacle(plant) if steady == "exact" else "as asked for"
     if not approximate:
-        motions = (free_motion(plant, c.amplitude, c.omega) for c in _distinct(crossings))
-        exact = [
-            LimitCycle(m.amplitude, m.omega / (2.0 * np.pi), m.growth_rate, m.share)
-            for m in motions
-            if m is not None
-        ]
-        cycles = LimitCycles(_distinct(exact))
+        motions = [free_motion(plant, c.amplitude, c.omega) for c in crossings]
+        cycles = LimitCycles(
+            _distinct(
+                LimitCycle(m.amplitude, m.omega / (2.0 * np.pi), m.growth_rate, m.share)
+                for m in motions
+                if m is not None
+            )
+        )
         if crossings and not cycles:
-            one = _distinct(crossings)[0]
+            one = crossings[0]
             cycles.reason = (
                 f"the describing function has one of {one.amplitude:.3g} m at "
                 f"{one.frequency_hz:.3g} Hz, but no periodic motion is near it"
             )
             return cycles
     else:
-        cycles = LimitCycles(_distinct(crossings))
+        cycles = LimitCycles(crossings)
         cycles.approximate = approximate
     if not cycles:
         ends = " to ".join(f"{w / (2.0 * np.pi):.3g}" for w in (omega[0], omega[-1]))
@@ -251,7 +253,8 @@ def _frequencies(linear: Model, contact: float, asked_hz: tuple[float, float] | 
     low, high = known_range(linear)
     roots = np.zeros(0, dtype=np.complex128)
     if has_polynomials(linear):
-        numerator, denominator = coefficients(transfer_stiffness(linear))
+        stiffness = rational_stiffness(linear)
+        numerator, denominator = stiffness.numerator, stiffness.denominator
         if numerator.size - denominator.size == 2 and numerator[0] * denominator[0] < 0.0:
             raise ModelError(
                 "loop has a negative mass, so its sign is wrong; expected displacement over the "
@@ -329,14 +332,12 @@ def _refine(linear: Model, friction: Model, amplitude: float, omega: float) -> L
     return LimitCycle(float(A[0]), float(w[0] / (2.0 * np.pi)), float((slope / by_omega).imag))
 
 
-def _distinct(cycles: list[LimitCycle]) -> tuple[LimitCycle, ...]:
+def _distinct(cycles: Iterable[LimitCycle]) -> tuple[LimitCycle, ...]:
     """Return the cycles by rising amplitude, each once."""
     distinct: list[LimitCycle] = []
-    for cycle in sorted(cycles, key=lambda c: (c.amplitude, c.frequency_hz)):
-        if not any(
-            abs(cycle.amplitude / other.amplitude - 1.0) < 1e-6
-            and abs(cycle.frequency_hz / other.frequency_hz - 1.0) < 1e-6
-            for other in distinct
-        ):
-            distinct.append(cycle)
+    for one in sorted(cycles, key=lambda c: (c.amplitude, c.frequency_hz)):
+        place = one.amplitude, one.frequency_hz
+        others = ((c.amplitude, c.frequency_hz) for c in distinct)
+        if not any(np.allclose(place, other, rtol=1e-6, atol=0.0) for other in others):
+            distinct.append(one)
     return tuple(distinct)

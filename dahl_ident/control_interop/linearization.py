@@ -8,11 +8,11 @@ frequency response at constant amplitude, where the loop gain is C(j omega)/(L(o
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import control
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -25,13 +25,9 @@ from dahl_ident.arrays import (
     positive_array,
     positive_number,
 )
-from dahl_ident.control_interop.linear_part import (
-    coefficients,
-    controller_response,
-    split,
-    transfer_stiffness,
-)
+from dahl_ident.control_interop.linear_part import controller_response, rational_stiffness, split
 from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.rational import Rational
 from dahl_ident.errors import ValidationError
 
 
@@ -69,14 +65,12 @@ def equivalent_plant(plant: Element, amplitude: float, frequency_hz: float) -> A
     >>> P.den[0][0].round(4).tolist()
     [2.0, 0.0966, 0.7325]
     """
-    control = importlib.import_module("control")
     friction, linear = split(plant)
     A = positive_number(amplitude, "amplitude")
     omega = 2.0 * np.pi * positive_number(frequency_hz, "frequency_hz")
     N = complex(friction.dynamic_stiffness(A, omega))
-    Z = transfer_stiffness(linear) + control.tf([N.imag / omega, N.real], [1.0])
-    numerator, denominator = coefficients(Z)
-    return control.tf(denominator, numerator)
+    Z = rational_stiffness(linear) + Rational(np.array([N.imag / omega, N.real]), np.ones(1))
+    return control.tf(Z.denominator, Z.numerator)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import control
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, non_negative_array
-from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.facts import Sine
 from dahl_ident.errors import ModelError
 
@@ -55,8 +55,7 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
 
     def __init__(self, friction: Element) -> None:
         super().__init__()
-        friction_elements(friction)
-        self._model = as_model(friction)
+        self._model = friction_alone(friction)
         self._values = self._model.known_values()
         self._turns = [0.0]
 
@@ -109,10 +108,10 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return False
 
 
-def friction_elements(friction: Element) -> tuple[Element, ...]:
-    """Return the elements of a friction model; raise an error if it has any other element."""
-    elements = as_model(friction).elements
-    for element in elements:
+def friction_alone(friction: Element) -> Model:
+    """Return a model of rate-independent friction; raise an error if it has any other element."""
+    model = as_model(friction)
+    for element in model.elements:
         if element.is_linear:
             raise ModelError(
                 f"friction holds {element!r}; expected friction alone, such as Dahl: put "
@@ -123,8 +122,8 @@ def friction_elements(friction: Element) -> tuple[Element, ...]:
                 f"{element!r} depends on the rate, so its describing function is not a function of "
                 "the amplitude alone; expected rate-independent friction, such as Dahl"
             )
-    friction.known_values()
-    return elements
+    model.known_values()
+    return model
 
 
 def friction_and_slope(

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,8 +146,7 @@ class Objective:
         return np.asarray(sum((t.packed @ s[..., None])[..., 0] for t, s in pairs))
 
 
-@dataclass(frozen=True)
-class ContinuousDesign:
+class ContinuousDesign(NamedTuple):
     """Seconds at each candidate, the criterion, and the largest d_k/d - 1: 0 at the optimum."""
 
     seconds: FloatArray

@@ -138,22 +138,52 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
     rng, ranges = np.random.default_rng(seed), ranges or {}
     if isinstance(source, Element):
         return _of_model(as_model(source), ranges, draws, rng)
-    problem, sampled = getattr(source, "problem", None), hasattr(source, "draws")
+    problem = getattr(source, "problem", None)
     if problem is None:
         raise ValidationError(
             f"plan: got a {type(source).__name__}; expected a model such as Dahl(), a fit, or a "
             "posterior"
         )
+    sampled = hasattr(source, "draws")
     if problem.response is None:
         return _of_records(
             source, source.draws(_MANY, seed) if sampled else None, ranges, draws, rng
         )
+    centre, std = _moments(problem.parameters, ranges)
+    prior = _leaned_on(problem.parameters, centre, std)
     if sampled:
         values, P = np.asarray(source.draws(draws, seed)), len(problem.names)
-        scale = values[:, P] if values.shape[1] > P else np.ones(draws)
-        prior = _leaned_on(problem.parameters, *_moments(problem.parameters, ranges))
-        return _of_data(source, problem.to_search(values[:, :P]), scale, prior)
-    return _of_fit(source, ranges, draws, rng)
+        scale: Any = values[:, P] if values.shape[1] > P else np.ones(draws)
+        drawn = at = problem.to_search(values[:, :P])
+    else:
+        optimum = source.optimum
+        at = np.array(optimum.theta, dtype=np.float64)
+        finite = np.isfinite(at) & np.isfinite(optimum.values)
+        for i in np.flatnonzero(~finite | ~np.isfinite(np.diagonal(optimum.covariance))):
+            name = problem.names[i]
+            if np.isinf(std[i]):
+                raise ValidationError(
+                    f"plan: the fit does not determine {name}; give "
+                    f"{argument('ranges', {name: (LOW, HIGH)})}, or plan from the model with "
+                    f"{argument('ranges')}"
+                )
+        if source.errors is not None:
+            return _of_errors(source, prior, draws, rng)
+        at = np.where(finite, at, centre)
+        scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
+        # a range counts only where the data say nothing; elsewhere the estimate is the centre
+        covariance = np.linalg.inv(problem.information(at, scale) + np.diag(1.0 / std**2))
+        drawn = _drawn(rng, at, covariance, draws, problem.parameters)
+    model, assumed = _with_assumed(problem.model)
+    wider = problem.like(model=model) if assumed else problem
+    theta, at = (_among(wider.parameters, problem.names, one) for one in (drawn, at))
+    noise, cycles = _row_noise(wider, float(np.median(scale)))
+    return Knowledge(
+        model, wider.parameters, theta, _stated(source, wider.parameters),
+        _repeated(wider.information(at, scale) + _of_assumed(wider.parameters, assumed), draws),
+        _among(wider.parameters, problem.names, prior, 0.0), tuple(assumed), wider.sensors,
+        wider.data.motion, noise, cycles, wider, steady=wider.steady,
+    )  # fmt: skip
 
 
 def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
@@ -171,88 +201,32 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
             "values with 95 % probability"
         )
     model, assumed = _with_assumed(model)
-    parameters = tuple(p for p in model.parameters if p.free)
+    parameters, names = tuple(p for p in model.parameters if p.free), [p.name for p in free]
     theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
-    names, prior = [p.name for p in free], _leaned_on(free, centre, std)
-    middle, _ = _among(parameters, names, centre, prior)
-    theta, prior = _among(parameters, names, theta, prior)
-    known = np.broadcast_to(_of_assumed(parameters, assumed), (draws, *2 * prior.shape))
-    stated = Space(parameters).to_values(middle)
-    return Knowledge(model, parameters, theta, stated, known, prior, tuple(assumed))
+    return Knowledge(
+        model, parameters, _among(parameters, names, theta),
+        Space(parameters).to_values(_among(parameters, names, centre)),
+        _repeated(_of_assumed(parameters, assumed), draws),
+        _among(parameters, names, _leaned_on(free, centre, std), 0.0), tuple(assumed),
+    )  # fmt: skip
 
 
-def _of_fit(fit: Any, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
-    optimum, problem = fit.optimum, fit.optimum.problem
-    centre, std = _moments(problem.parameters, ranges)
-    theta = np.array(optimum.theta, dtype=np.float64)
-    finite = np.isfinite(theta) & np.isfinite(optimum.values)
-    for i in np.flatnonzero(~finite | ~np.isfinite(np.diagonal(optimum.covariance))):
-        name = problem.names[i]
-        if np.isinf(std[i]):
-            raise ValidationError(
-                f"plan: the fit does not determine {name}; give "
-                f"{argument('ranges', {name: (LOW, HIGH)})}, or plan from the model with "
-                f"{argument('ranges')}"
-            )
-    prior = _leaned_on(problem.parameters, centre, std)
-    if fit.errors is not None:
-        return _of_errors(fit, prior, draws, rng)
-    theta = np.where(finite, theta, centre)
-    scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
-    covariance = np.linalg.inv(problem.information(theta, scale) + np.diag(1.0 / std**2))
-    # a range counts only where the data say nothing; elsewhere the estimate is the centre
-    drawn = rng.multivariate_normal(theta, covariance, draws, method="eigh")
-    return _of_data(fit, _within(drawn, problem.parameters), scale, prior, at=theta)
-
-
-def _of_errors(fit: Any, leaned: FloatArray, draws: int, rng: np.random.Generator) -> Knowledge:
+def _of_errors(fit: Any, prior: FloatArray, draws: int, rng: np.random.Generator) -> Knowledge:
     """Return the knowledge from a fit with all its sources of error."""
     errors: ErrorModel = fit.errors
     fitted = errors.optimum.problem
     model, assumed = _with_assumed(fitted.model)
     kept = [i for i, name in enumerate(errors.names) if name in (*fitted.names, *assumed)]
     parameters, part = tuple(errors.problem.parameters[i] for i in kept), np.ix_(kept, kept)
-    drawn = rng.multivariate_normal(
-        errors.theta[kept], errors.covariance[part], draws, method="eigh"
-    )
-    prior = np.zeros(len(kept))
-    prior[[p.name in fitted.names for p in parameters]] = leaned
-    known = np.linalg.inv(errors.covariance)[part]
     stated, cycles = _row_noise(errors.problem, 0.0)
     return Knowledge(
-        model, parameters, _within(drawn, parameters), _stated(fit, parameters),
-        np.broadcast_to(known, (draws, *known.shape)), prior, tuple(assumed),
+        model, parameters,
+        _drawn(rng, errors.theta[kept], errors.covariance[part], draws, parameters),
+        _stated(fit, parameters), _repeated(np.linalg.inv(errors.covariance)[part], draws),
+        _among(parameters, fitted.names, prior, 0.0), tuple(assumed),
         fitted.sensors, fitted.data.motion,
         float(np.hypot(stated, errors.rms(NOISE))), cycles, errors.problem, errors.rms(RUNS),
         errors, steady=fitted.steady,
-    )  # fmt: skip
-
-
-def _stated(source: Any, parameters: Sequence[Parameter]) -> FloatArray:
-    """Return the values that a fit or a posterior states, (P,); NaN where they are at a limit."""
-    values = np.array([source.params[p.name].value for p in parameters])
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _of_data(
-    source: Any,
-    drawn: FloatArray,
-    scale: Any,
-    leaned: FloatArray,
-    at: FloatArray | None = None,
-) -> Knowledge:
-    """Return draws with the information of their data, at each draw or at one place."""
-    fitted: TableProblem = source.problem
-    model, assumed = _with_assumed(fitted.model)
-    problem = fitted.like(model=model) if assumed else fitted
-    theta, prior = _among(problem.parameters, fitted.names, drawn, leaned)
-    where = theta if at is None else _among(problem.parameters, fitted.names, at, leaned)[0]
-    known = problem.information(where, scale) + _of_assumed(problem.parameters, assumed)
-    noise, cycles = _row_noise(problem, float(np.median(scale)))
-    return Knowledge(
-        model, problem.parameters, theta, _stated(source, problem.parameters),
-        np.broadcast_to(known, (len(theta), *known.shape[-2:])), prior, tuple(assumed),
-        problem.sensors, problem.data.motion, noise, cycles, problem, steady=problem.steady,
     )  # fmt: skip
 
 
@@ -281,18 +255,41 @@ def _of_records(
         covariance = np.asarray(fit.covar)[:P, :P] / np.outer(slope, slope)
         if not np.isfinite(covariance).all():
             raise ValidationError("plan: the fit does not determine its parameters; give the model")
-        theta = rng.multivariate_normal(space.to_search(best), covariance, draws, method="eigh")
+        theta = _drawn(rng, space.to_search(best), covariance, draws, parameters)
     else:
         every = space.to_search(values[:, :P])
         covariance = np.atleast_2d(np.cov(every, rowvar=False))
-        theta = every[rng.integers(len(every), size=draws)]
-    known = np.broadcast_to(np.linalg.inv(covariance), (draws, P, P))
+        theta = _within(every[rng.integers(len(every), size=draws)], parameters)
     return Knowledge(
-        problem.model, parameters, _within(theta, parameters), _stated(source, parameters), known,
-        np.zeros(P),
+        problem.model, parameters, theta, _stated(source, parameters),
+        _repeated(np.linalg.inv(covariance), draws), np.zeros(P),
         motion=problem.records[0].motion,
         sample_noise=float(np.std(np.concatenate(fit.residuals))),
     )  # fmt: skip
+
+
+def _drawn(
+    rng: np.random.Generator, centre: FloatArray, covariance: FloatArray, draws: int,
+    parameters: Sequence[Parameter],
+) -> FloatArray:  # fmt: skip
+    """Return normal draws within the parameters' bounds."""
+    return _within(rng.multivariate_normal(centre, covariance, draws, method="eigh"), parameters)
+
+
+def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
+    """Return draws moved into the parameters' bounds."""
+    return np.clip(theta, *Space(parameters).bounds)
+
+
+def _repeated(information: Any, draws: int) -> FloatArray:
+    """Return the information at every draw."""
+    return np.broadcast_to(information, (draws, *information.shape[-2:]))
+
+
+def _stated(source: Any, parameters: Sequence[Parameter]) -> FloatArray:
+    """Return the values that a fit or a posterior states, (P,); NaN where they are at a limit."""
+    values = np.array([source.params[p.name].value for p in parameters])
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def _with_assumed(model: Model) -> tuple[Model, dict[str, float]]:
@@ -310,15 +307,16 @@ def _of_assumed(parameters: Sequence[Parameter], assumed: Mapping[str, float]) -
 
 
 def _among(
-    parameters: Sequence[Parameter], names: Sequence[str], theta: FloatArray, prior: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return coordinates and prior of some parameters among all, the others at their values."""
-    places = [[p.name for p in parameters].index(name) for name in names]
-    every = np.array([np.log(p.value or 1.0) for p in parameters]) * np.ones((*theta.shape[:-1], 1))
-    every[..., places] = theta
-    whole = np.zeros(len(parameters))
-    whole[places] = prior
-    return every, whole
+    parameters: Sequence[Parameter],
+    names: Sequence[str],
+    part: FloatArray,
+    others: float | None = None,
+) -> FloatArray:
+    """Return numbers of all parameters, (..., P), from those of some; the others' coordinates."""
+    every = np.array([np.log(p.value or 1.0) if others is None else others for p in parameters])
+    every = every * np.ones((*part.shape[:-1], 1))
+    every[..., [[p.name for p in parameters].index(name) for name in names]] = part
+    return every
 
 
 def _leaned_on(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
@@ -349,11 +347,6 @@ def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArra
         low, high = Space([p]).to_search(pair[:, None])[:, 0]
         centre[i], std[i] = 0.5 * (low + high), (high - low) / _NORMAL_RANGE
     return centre, std
-
-
-def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
-    """Return draws moved into the parameters' bounds."""
-    return np.clip(theta, *Space(parameters).bounds)
 
 
 def _row_noise(problem: TableProblem, scale: float) -> tuple[float, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -22,38 +21,8 @@ UNITS = {
 _FINE = 64  # places a line at which a multisine's peaks are looked for: within 0.1 %
 
 
-class PlannedMotion(ABC):
-    """One period of a motion, which begins and ends at rest at the same place."""
-
-    kind: ClassVar[str]
-
-    @property
-    @abstractmethod
-    def period(self) -> float:
-        """Seconds."""
-
-    @property
-    @abstractmethod
-    def fastest_hz(self) -> float:
-        """Frequency that the sample rate of a waveform has to resolve, Hz."""
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """What describes it, SI."""
-        return dict(vars(self))
-
-    @abstractmethod
-    def displacement(self, time: FloatArray) -> FloatArray:
-        """Return the displacement at any times from the start of a period, m."""
-
-    @property
-    @abstractmethod
-    def peaks(self) -> tuple[float, float, float]:
-        """Largest displacement, speed and acceleration, SI."""
-
-
 @dataclass(frozen=True)
-class Trapezoid(PlannedMotion):
+class Trapezoid:
     """There and back about zero with trapezoidal velocity, and a dwell at both ends.
 
     Attributes
@@ -83,6 +52,11 @@ class Trapezoid(PlannedMotion):
         for name in ("stroke", "speed", "acceleration"):
             positive_number(getattr(self, name), f"{name} of a trapezoid")
         non_negative_array(self.dwell, "dwell of a trapezoid")
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """What describes it, SI."""
+        return dict(vars(self))
 
     @property
     def _reached(self) -> float:
@@ -121,7 +95,7 @@ class Trapezoid(PlannedMotion):
 
 
 @dataclass(frozen=True)
-class Multisine(PlannedMotion):
+class Multisine:
     """Equal sines at all multiples of the lowest frequency up to the highest, Schroeder's phases.
 
     It starts at its largest displacement, at rest. Source of the phases: Schroeder, *IEEE Trans.
@@ -201,6 +175,10 @@ class Multisine(PlannedMotion):
         speed = abs(gain) * float(np.abs((w * np.sin(angle)).sum(axis=-1)).max())
         pull = abs(gain) * float(np.abs((w**2 * np.cos(angle)).sum(axis=-1)).max())
         return self.peak, speed, pull
+
+
+PlannedMotion = Trapezoid | Multisine
+"""One period of a motion, which begins and ends at rest at the same place."""
 
 
 def seconds_of_move(distance: float, speed: float, acceleration: float) -> float:
