@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
 from dahl_ident.diagnostics.physics import below_zero, is_single, slight
-from dahl_ident.diagnostics.record_errors import MODEL, NOISE
+from dahl_ident.diagnostics.record_errors import MODEL, NOISE, PATH
 from dahl_ident.elements import Element
 from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.problem.record_noise import share_in_band
@@ -33,12 +33,13 @@ _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not det
 _LONG_ENOUGH = 0.02  # share of samples near a reversal
 _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
 _WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
-_FAIRLY = 0.1  # share of variance left beyond which the model does not describe the records
+_FAIRLY = 0.04  # share of variance left: a fifth of the output, beyond which intervals fail
 _STRUCTURED = 0.5  # correlation of neighbouring residuals
 _FEW = 10.0  # degrees of freedom that know an uncertainty to a fifth
 _BECAUSE = {  # by the source of most of the uncertainty
     EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
     RUNS: "the records ask for different values: fit each alone, and look at what differs",
+    PATH: "the law misses what the force does after a reversal: choose one that describes it",
     MODEL: "parts of the records ask for different values: choose a model that describes them",
 }
 _DETERMINED, _DESCRIBED, _ASSUMED = Question
@@ -153,7 +154,7 @@ def misses(fit: RecordAssessment) -> bool:
     """Return whether the model misses more than noise."""
     goodness = fit.goodness
     structured = goodness.correlation > _STRUCTURED and goodness.share_in_band > _WELL
-    return structured or MODEL in fit.errors.contributions
+    return structured or not {MODEL, PATH}.isdisjoint(fit.errors.contributions)
 
 
 def undetermined(fit: RecordAssessment) -> Iterator[Finding]:

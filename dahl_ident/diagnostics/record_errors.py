@@ -21,6 +21,7 @@ from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
     HeldValue,
+    after_reversals,
     between_blocks,
     between_records,
     by_delay,
@@ -44,6 +45,7 @@ RELATIVE_STEP = 1e-5
 """Of parameters, for slopes of what follows from them."""
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
+PATH = "model error after each reversal"
 TURNS = "displacement at turning points"
 SAMPLING = "turning points between samples"
 WINDOW = "window of differentiation"
@@ -66,6 +68,8 @@ class RecordErrors:
         Records that were fitted together.
     exponents : tuple of HeldValue
         What the records say of exponents that the fit holds.
+    groups : int
+        Of the path since the last reversal, from which `PATH` was estimated.
     """
 
     contributions: Mapping[str, FloatArray]
@@ -73,6 +77,7 @@ class RecordErrors:
     exact: tuple[str, ...]
     runs: int
     exponents: tuple[HeldValue, ...]
+    groups: int = 0
 
     @property
     def assumed(self) -> list[HeldValue]:
@@ -93,7 +98,11 @@ class RecordErrors:
         """Degrees of freedom of one source."""
         if source == NOISE:
             return max(self.effective - len(self.covariance), 1.0)
-        return {MODEL: BLOCKS - 1.0, RUNS: self.runs - 1.0}.get(source, np.inf)
+        return {
+            MODEL: BLOCKS - 1.0,
+            PATH: self.groups - 1.0,
+            RUNS: self.runs - 1.0,
+        }.get(source, np.inf)
 
     def dof_for(self, place: int) -> float:
         """Degrees of freedom of one value, by Welch and Satterthwaite."""
@@ -178,6 +187,12 @@ def record_errors(
             more = noise_at_turns(problem, values, white, left, noise)
             count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
             count_change(SAMPLING, problem.altered("latest", motions=_beyond_samples(problem)))
+    other = {
+        name: C for name, C in sources.items() if name in (DISPLACEMENT, TURNS, SAMPLING, DELAY)
+    }
+    alike = after_reversals(problem, values, white, left, other.values())
+    if alike is not None:
+        sources[PATH] = alike[0]
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -200,7 +215,14 @@ def record_errors(
         sources[FORCE] = sources.get(FORCE, 0.0) + factor**2 * np.outer(scale, scale)
     if FORCE not in sources:
         exact.insert(0, FORCE)
-    return RecordErrors(sources, effective, tuple(exact), len(set(problem.runs)), exponents)
+    return RecordErrors(
+        sources,
+        effective,
+        tuple(exact),
+        len(set(problem.runs)),
+        exponents,
+        alike[1] if alike else 0,
+    )
 
 
 def errors_on_constraints(

@@ -7,7 +7,7 @@ noise by counts as an error of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements import Parameter
+from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.record_search import STEPS, RecordSearch
 from dahl_ident.problem.record_problem import RecordProblem
@@ -26,6 +27,8 @@ BLOCKS = 20
 """Of all records together, from which the model error is estimated."""
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
+_ROUNDING = 1e-9  # of a logarithm
+_PATHS = 5  # groups of the path since the last reversal, by factors of e
 _LONG = 0.05  # step of an exponent's logarithm, beyond which slopes change
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
@@ -326,6 +329,84 @@ def _beyond(
     values, vectors = np.linalg.eigh(between - correlation)
     beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(beyond * np.outer(size, size))
+
+
+def after_reversals(
+    problem: RecordProblem,
+    values: FloatArray,
+    jacobians: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    of_displacement: Iterable[FloatArray],
+) -> tuple[FloatArray, int] | None:
+    """Return the covariance by what the model misses alike after every reversal.
+
+    Every cycle repeats it, so that blocks in time do not differ by it. The jackknife shows it, over
+    groups of the path since the last reversal: a law's misfit changes over about a factor of e of
+    path, as a table's does with its amplitude. An assumed exponent is estimated with the other
+    values, as it is in the fit.
+
+    Parameters
+    ----------
+    problem : RecordProblem
+    values : ndarray, shape (P,)
+        The estimate.
+    jacobians, residuals : sequence of ndarray
+        Of each record.
+    of_displacement : iterable of ndarray, shape (P, P)
+        Covariances by errors of the displacement, which also show after reversals.
+
+    Returns
+    -------
+    tuple of ndarray, shape (P, P), and int; or None
+        What exceeds noise, and the number of groups. None where chance explains it, or nothing
+        remembers a reversal.
+    """
+    paths = _paths(problem, values) if problem.with_memory else []
+    farthest = max((float(path.max()) for path in paths), default=0.0)
+    if not farthest > 0.0:
+        return None
+    try:
+        exponents = [p for p in problem.exponents if p.assumed]
+        slopes = _exponent_slopes(problem, exponents, values)
+    except FitError:
+        slopes = []  # no motion next to the estimate
+    joint = [np.column_stack(parts) for parts in zip(jacobians, *slopes, strict=True)]
+    noise, count = sandwich(joint, residuals)[0], jacobians[0].shape[1]
+    for covariance in of_displacement:
+        noise[:count, :count] += covariance
+    seen = np.flatnonzero(np.isfinite(noise.diagonal()) & (noise.diagonal() > 0.0))
+    size = np.sqrt(noise.diagonal()[seen])
+    J, e = size * np.concatenate(joint)[:, seen], np.concatenate(residuals)
+    ends = [path[path.size - len(wave) :] for path, wave in zip(paths, residuals, strict=True)]
+    path = np.maximum(np.concatenate(ends), farthest * np.exp(1.0 - _PATHS))
+    group = np.floor(np.log(farthest / path) + _ROUNDING)
+    members = [group == k for k in np.unique(group)]
+    n, whole = len(members), J.T @ J
+    inverse = np.linalg.pinv(whole, hermitian=True)
+    others = [np.linalg.pinv(whole - J[rows].T @ J[rows], hermitian=True) for rows in members]
+    steps = np.array([H @ (J[r].T @ e[r]) for H, r in zip(others, members, strict=True)])
+    between = (n - 1.0) / n * steps.T @ steps
+    # chance makes as much as the variance of the estimate without a group exceeds that of all
+    lost = np.array([np.maximum((H - inverse).diagonal(), 0.0) for H in others])
+    more = np.sqrt((n - 1.0) / n * lost.sum(axis=0) / inverse.diagonal())
+    by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size) * np.outer(more, more)
+    dof = np.maximum(lost.sum(axis=0) ** 2 / (lost**2).sum(axis=0), 1.0)
+    ratio = between.diagonal() / by_chance.diagonal()
+    judged = (seen < len(problem.free)) | (seen >= count)  # not states and offsets of records
+    if not (ratio > special.chdtri(dof, 1.0 - _LEVEL) / dof)[judged].any():
+        return None
+    variances, vectors = np.linalg.eigh(between - by_chance)
+    beyond = (vectors * np.maximum(variances, 0.0)) @ vectors.T * np.outer(size, size)
+    return _embedded(beyond, seen, len(noise))[:count, :count], n
+
+
+def _paths(problem: RecordProblem, values: FloatArray) -> list[FloatArray]:
+    """Return the path of every sample since the last reversal, m; none where it is not known."""
+    if problem.output == "force":
+        return [stretches(x).path for x, _, _ in problem.motions]
+    if all(record.motion_channel == "displacement" for record in problem.records):
+        return [stretches(x).path for x in problem.outputs(values)]
+    return []
 
 
 def _embedded(part: FloatArray, places: NDArray[np.intp], size: int) -> FloatArray:
