@@ -309,7 +309,7 @@ def test_what_another_law_does_after_every_reversal_is_a_model_error(law, motion
     force += 0.01 * force.std() * np.random.default_rng(1).standard_normal(t.size)
     fit = di.fit(di.Record(t, displacement=0.0133 * x, force=force), di.Dahl())
     assert not fit.trusted
-    low, high = fit.conf_interval()["f_max"]
+    _, low, high = fit.conf_interval().at(0.9545)["f_max"]
     assert low < 0.1 < high
     if fit.goodness.rms_misfit > 0.2:
         assert fit.status.value == "not described"
