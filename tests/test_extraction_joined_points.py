@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dahl_ident.extraction.from_record import joined
-from dahl_ident.extraction.point import Point
+from dahl_ident.extraction.from_record import Point, joined
+
 
 MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",

@@ -60,6 +60,18 @@ _SWEEP_CYCLES = (4, 20)  # in a window
 
 
 @dataclass(frozen=True)
+class Span:
+    """Start and stop, s, frequency in the middle, Hz, and where the spans next to it are."""
+
+    start: float
+    stop: float
+    frequency_hz: float
+    sweep: bool = False
+    earliest: float = -np.inf
+    latest: float = np.inf
+
+
+@dataclass(frozen=True)
 class Cycles:
     """Consecutive cycles of a sine; those with a hole in the sampling are left out.
 
@@ -76,26 +88,63 @@ class Cycles:
     def __len__(self) -> int:
         return self.start.size
 
+    def part(self, first: int, last: int) -> Cycles:
+        """Return the cycles from `first` on, `last` not among them."""
+        names = ("start", "stop", "log_amplitude", "noise")
+        of_cycles = {name: getattr(self, name)[first:last] for name in names}
+        return Cycles(**of_cycles, log_frequency=self.log_frequency[first : max(last - 1, first)])
 
-def find_cycles(time: FloatArray, motion: FloatArray) -> list[Cycles]:
-    """Cut a record of unknown frequencies into runs of consecutive cycles, in order of time."""
-    runs = _crossing_runs(time, motion, 0)
-    runs.sort(key=lambda edges: float(edges[0]))
-    cycles = [_measured(time, motion, edges) for edges in _joined(runs)]
-    return [  # noise alone may have made some of them: theirs is infinite
-        replace(c, noise=np.where(c.noise > _NOISIEST_CROSSING, np.inf, c.noise)) for c in cycles
-    ]
+    @property
+    def usual_noise(self) -> float:
+        """Median of the noise."""
+        return float(np.median(self.noise))
+
+    @property
+    def trending(self) -> bool:
+        """Whether amplitude or frequency changes from end to end by more than the tolerance."""
+        amplitude, frequency = _tolerances(self.usual_noise)
+        return (
+            abs(_change(self.log_amplitude)) > amplitude
+            or abs(_change(self.log_frequency)) > frequency
+        )
+
+    @property
+    def ramping(self) -> bool:
+        """Whether the amplitude goes one way, faster than friction follows."""
+        a, n = self.log_amplitude, len(self)
+        line = np.polyfit(np.arange(n), a, 1)
+        scatter = float(np.std(a - np.polyval(line, np.arange(n)), ddof=min(2, n - 1)))
+        return self.trending and abs(_change(a)) > max(_SLOW * n, _SCATTERED * scatter)
+
+    def span(self, *, sweep: bool = False) -> Span:
+        """Return the time that they take, and their mean frequency."""
+        frequency = float(np.exp(np.mean(self.log_frequency)))
+        return Span(float(self.start[0]), float(self.stop[-1]), frequency, sweep)
 
 
-def cut_cycles(time: FloatArray, motion: FloatArray, frequency_hz: float) -> list[Cycles]:
-    """Cut a record of known frequency into its periods; in noise, several make one cycle."""
-    cycles = _cut(time, motion, frequency_hz, 1)
-    if len(cycles):
-        noise = float(np.median(cycles.noise))
-        turns = min(int(np.ceil((noise / _NOISIEST_CUT) ** 2)), len(cycles) // _FEWEST_CUTS)
+def find_cycles(
+    time: FloatArray, motion: FloatArray, frequency_hz: float | None = None
+) -> list[Cycles]:
+    """Cut a record into runs of consecutive cycles, or where their frequency is known into those.
+
+    Where noise hides the amplitude of a period, several make one cycle.
+    """
+    if frequency_hz is None:
+        runs = _crossing_runs(time, motion, 0)
+        runs.sort(key=lambda edges: float(edges[0]))
+        cycles = [_measured(time, motion, edges) for edges in _joined(runs)]
+        return [  # noise alone may have made some of them: theirs is infinite
+            replace(c, noise=np.where(c.noise > _NOISIEST_CROSSING, np.inf, c.noise))
+            for c in cycles
+        ]
+    periods = _cut(time, motion, frequency_hz, 1)
+    if len(periods):
+        turns = min(
+            int(np.ceil((periods.usual_noise / _NOISIEST_CUT) ** 2)), len(periods) // _FEWEST_CUTS
+        )
         if turns > 1:
-            cycles = _cut(time, motion, frequency_hz, turns)
-    return [cycles]
+            periods = _cut(time, motion, frequency_hz, turns)
+    return [periods]
 
 
 def _cut(time: FloatArray, motion: FloatArray, frequency_hz: float, turns: int) -> Cycles:
@@ -166,10 +215,11 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
 
 def scattered(samples: FloatArray, count: int) -> FloatArray:
     """Return so many samples, spread over the record and over the phases of any period."""
-    if samples.size <= count:
+    size = samples.shape[-1]
+    if size <= count:
         return samples
-    places = np.arange(count) * _GOLDEN % 1.0
-    return np.asarray(samples[np.sort((places * samples.size).astype(np.intp))])
+    places = np.arange(count) * _GOLDEN % 1.0  # a plain stride may fit the period of the motion
+    return np.asarray(samples[..., np.sort((places * size).astype(np.intp))])
 
 
 def _lobe_spacing(
@@ -203,9 +253,8 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: in
     counts = np.diff(cuts)
     known = np.flatnonzero((counts >= _FEWEST_A_CYCLE) & ~_with_hole(time, edges))
     start, stop, n = edges[known], edges[known + 1], counts[known]
-    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
     fits = []
-    for first, last in pairwise([*np.unique(groups).tolist(), edges.size - 1]):
+    for first, last in groups_of_cycles(cuts):
         inside = slice(int(cuts[first]), int(cuts[last]))
         per_cycle = counts[first:last]
         turn = np.repeat(2.0 * np.pi * turns / np.diff(edges[first : last + 1]), per_cycle)
@@ -221,6 +270,12 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: in
     return Cycles(
         start, stop, np.log(amplitude), noise, _log_frequency(start, stop, np.angle(phasor), turns)
     )
+
+
+def groups_of_cycles(cuts: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
+    """Yield first and last cycle of groups whose samples, from cut to cut, stay in the cache."""
+    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
+    yield from pairwise([*np.unique(groups).tolist(), cuts.size - 1])
 
 
 def sine_in_each(
@@ -272,69 +327,6 @@ def _with_hole(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
     return broken
 
 
-@dataclass(frozen=True)
-class Span:
-    """Start and stop, s, frequency in the middle, Hz, and where the spans next to it are."""
-
-    start: float
-    stop: float
-    frequency_hz: float
-    sweep: bool = False
-    earliest: float = -np.inf
-    latest: float = np.inf
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """Cycles first to last (not included) of one run of cycles."""
-
-    cycles: Cycles
-    first: int
-    last: int
-
-    def __len__(self) -> int:
-        return self.last - self.first
-
-    @property
-    def log_amplitude(self) -> FloatArray:
-        return self.cycles.log_amplitude[self.first : self.last]
-
-    @property
-    def log_frequency(self) -> FloatArray:
-        return self.cycles.log_frequency[self.first : self.last - 1]
-
-    @property
-    def noise(self) -> float:
-        return float(np.median(self.cycles.noise[self.first : self.last]))
-
-    @property
-    def trending(self) -> bool:
-        """Whether amplitude or frequency changes from end to end by more than the tolerance."""
-        amplitude, frequency = _tolerances(self.noise)
-        return (
-            abs(_change(self.log_amplitude)) > amplitude
-            or abs(_change(self.log_frequency)) > frequency
-        )
-
-    @property
-    def ramping(self) -> bool:
-        """Whether the amplitude goes one way, faster than friction follows."""
-        a, n = self.log_amplitude, len(self)
-        change = abs(_change(a))
-        line = np.polyfit(np.arange(n), a, 1)
-        scatter = float(np.std(a - np.polyval(line, np.arange(n)), ddof=min(2, n - 1)))
-        return self.trending and change > max(_SLOW * n, _SCATTERED * scatter)
-
-    def halves(self) -> tuple[_Piece, _Piece]:
-        middle = (self.first + self.last) // 2
-        return _Piece(self.cycles, self.first, middle), _Piece(self.cycles, middle, self.last)
-
-    def span(self, *, sweep: bool = False) -> Span:
-        frequency = self.log_frequency
-        start, stop = self.cycles.start[self.first], self.cycles.stop[self.last - 1]
-        return Span(float(start), float(stop), float(np.exp(np.mean(frequency))), sweep)
-
-
 def find_spans(runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | None) -> list[Span]:
     """Return the spans of runs of consecutive cycles, in order of time.
 
@@ -369,7 +361,7 @@ def _change(values: FloatArray) -> float:
     return float(place @ values / (place @ place))
 
 
-def _pieces(cycles: Cycles, unsteady: float = 1.0) -> Iterator[_Piece]:
+def _pieces(cycles: Cycles, unsteady: float = 1.0) -> Iterator[Cycles]:
     """Grow pieces cycle by cycle against the mean of what they have."""
     amplitude, frequency = cycles.log_amplitude.tolist(), cycles.log_frequency.tolist()
     noise = np.clip(cycles.noise, _LEAST_NOISE, 1.0).tolist()
@@ -387,38 +379,38 @@ def _pieces(cycles: Cycles, unsteady: float = 1.0) -> Iterator[_Piece]:
             ):
                 f_sum += frequency[j - 1]
             else:
-                yield _Piece(cycles, first, j)
+                yield cycles.part(first, j)
                 first, a_sum, f_sum, inverse = j, 0.0, 0.0, 0.0
         a_sum += amplitude[j]
         inverse += 1.0 / noise[j]
     if len(cycles):
-        yield _Piece(cycles, first, len(cycles))
+        yield cycles.part(first, len(cycles))
 
 
-def _groups(cycles: Cycles, fewest: int) -> Iterator[_Piece]:
+def _groups(cycles: Cycles, fewest: int) -> Iterator[Cycles]:
     """Group the cycles of a drive that is not steady; ramps are none of them."""
     waiting = [p for p in _pieces(cycles, _UNSTEADY) if len(p) >= fewest]
     while waiting:
         piece = waiting.pop(0)
-        if piece.trending and len(piece) >= 2 * fewest:
-            waiting[:0] = piece.halves()
+        n = len(piece)
+        if piece.trending and n >= 2 * fewest:
+            waiting[:0] = piece.part(0, n // 2), piece.part(n // 2, n)
         elif not piece.ramping:
             yield piece
 
 
-def _trimmed(piece: _Piece, fewest: int) -> _Piece:
+def _trimmed(piece: Cycles, fewest: int) -> Cycles:
     """Leave out cycles at the ends that stray from the plateau's level, the rest of a ramp."""
-    a = piece.log_amplitude
-    level = float(np.median(a))
-    scatter = 1.5 * float(np.median(np.abs(a - level)))
-    within = np.abs(a - level) <= max(_EDGE_TOLERANCE, _NOISE_FACTOR * max(piece.noise, scatter))
-    kept = np.flatnonzero(within)
+    stray = np.abs(piece.log_amplitude - np.median(piece.log_amplitude))
+    scatter = 1.5 * float(np.median(stray))
+    noise = _NOISE_FACTOR * max(piece.usual_noise, scatter)
+    kept = np.flatnonzero(stray <= max(_EDGE_TOLERANCE, noise))
     if kept.size == 0 or kept[-1] + 1 - kept[0] < fewest:
         return piece
-    return _Piece(piece.cycles, piece.first + int(kept[0]), piece.first + int(kept[-1]) + 1)
+    return piece.part(int(kept[0]), int(kept[-1]) + 1)
 
 
-def _sweeps(cycles: Cycles) -> Iterator[_Piece]:
+def _sweeps(cycles: Cycles) -> Iterator[Cycles]:
     """Return the parts of a run in which nothing jumps, yet something changes much."""
     if len(cycles) < 2:
         return
@@ -427,20 +419,19 @@ def _sweeps(cycles: Cycles) -> Iterator[_Piece]:
     jump |= np.maximum(cycles.noise[1:], cycles.noise[:-1]) > _NOISIEST
     bounds = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(cycles)]])
     for first, last in pairwise(bounds.tolist()):
-        sweep = _Piece(cycles, first, last)
+        sweep = cycles.part(first, last)
         ranges = [np.ptp(v) for v in (sweep.log_amplitude, sweep.log_frequency) if v.size]
         if len(sweep) >= _SWEEP_CYCLES[0] and max(ranges) > _SWEEP_RANGE:
             yield sweep
 
 
-def _windows(sweep: _Piece, window: int | None) -> Iterator[Span]:
+def _windows(sweep: Cycles, window: int | None) -> Iterator[Span]:
     """Cut a sweep into windows in which amplitude and frequency change little."""
     least, most = _SWEEP_CYCLES
-    first = sweep.first
-    while sweep.last - first >= (window or least):
-        ahead = _Piece(sweep.cycles, first, min(first + most, sweep.last))
+    while len(sweep) >= (window or least):
+        ahead = sweep.part(0, most)
         change = max(abs(_change(ahead.log_amplitude)), abs(_change(ahead.log_frequency)))
         fitting = int(len(ahead) * min(1.0, _SWEEP_CHANGE / max(change, 1e-12)))
         size = window or max(least, fitting)
-        yield _Piece(sweep.cycles, first, first + size).span(sweep=True)
-        first += size
+        yield sweep.part(0, size).span(sweep=True)
+        sweep = sweep.part(size, len(sweep))

@@ -17,21 +17,42 @@ from __future__ import annotations
 import shlex
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import TINY, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.errors import ExtractionError, spelled
-from dahl_ident.extraction.cycles import AMPLITUDE_TOLERANCE, FREQUENCY_TOLERANCE, Cycles
-from dahl_ident.extraction.phasors import Settings
-from dahl_ident.extraction.point import Point, measure
-from dahl_ident.extraction.segments import record_cycles, record_spans, segment_of
-from dahl_ident.extraction.sine_fit import Samples
+from dahl_ident.errors import ExtractionError, argument, spelled
+from dahl_ident.extraction.cycles import (
+    AMPLITUDE_TOLERANCE,
+    FREQUENCY_TOLERANCE,
+    Cycles,
+    find_cycles,
+)
+from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise
+from dahl_ident.extraction.phasors import Phasors, Settings, without
+from dahl_ident.extraction.segment_quality import fundamental_share, sensor_step
+from dahl_ident.extraction.segments import record_spans, segment_of
+from dahl_ident.extraction.sine_fit import (
+    FEWEST_CYCLES,
+    HARMONICS,
+    Samples,
+    Segment,
+    SineFit,
+    first_cycles,
+    last_cycles,
+    sine_fit,
+    thinned,
+    whole_cycles,
+)
+from dahl_ident.extraction.transient import MOST_CYCLES, estimate_transient
 from dahl_ident.units import percent
+
+_NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
+_TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
 _WELL_COVERED = 0.8  # of the moving time: points that cover more of it are none by chance
 _APART = 3.0  # cycles that may be missing between two parts
@@ -50,6 +71,161 @@ _SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils
 _ONE_LINE = 0.8  # of the power, of one level whatever its cycles look like
 _LEAK = 2  # lines on either side that a line leaks into
 _SPECTRUM_OF = 2**20  # samples at most
+
+
+@dataclass(frozen=True)
+class Point:
+    """One amplitude and frequency: responses of the fundamental and the harmonics.
+
+    `joint` is the covariance of what was held with each response, (rows, 3, 3); `repeating` is the
+    part of it that is alike in every cycle.
+    """
+
+    frequency_hz: float
+    amplitude: float
+    drive: float
+    harmonic: list[int]
+    response: ComplexArray
+    joint: FloatArray
+    repeating: FloatArray
+    dof: FloatArray
+    sweep: bool
+    quality: dict[str, Any]
+
+
+def measure(
+    segment: Segment, settings: Settings, samples: Samples, *, sweep: bool = False
+) -> Point:
+    """Turn a segment of known phase, and the record's samples, into a point."""
+    if settings.of_displacement and settings.integrations and 0 in settings.harmonics:
+        raise ExtractionError(
+            f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "
+            f"out of {argument('harmonics')}"
+        )
+    available = whole_cycles(segment)
+    if available < FEWEST_CYCLES:
+        raise ExtractionError(
+            f"{available} whole cycles {_where(segment)}; expected at least {FEWEST_CYCLES}: "
+            f"record longer, or check {argument('frequency')}"
+        )
+    cycles = min(available, settings.num_periods or available)
+    if not sweep and cycles - (settings.settling_periods or 0) < FEWEST_CYCLES:
+        raise ExtractionError(
+            f"{cycles} cycles {_where(segment)}, {settings.settling_periods} of them for "
+            f"settling; expected {FEWEST_CYCLES} more than for settling: record longer, or lower "
+            f"{argument('settling_periods')}"
+        )
+    whole = last_cycles(segment, cycles)
+    first = first_cycles(whole, MOST_CYCLES)
+    recorded = samples.of(whole)
+    steps = np.array([sensor_step(channel) for channel in recorded.channels])
+    rough = sine_fit(thinned(first), trend=sweep, most=HARMONICS)
+    names = (settings.motion_channel, "force")
+    for name, amplitude, step in zip(names, np.abs(rough.phasors(1)), steps, strict=True):
+        if amplitude <= step or amplitude == 0.0:
+            raise ExtractionError(
+                f"{name} {_where(rough.segment)}: amplitude {amplitude:.4g} is "
+                f"{amplitude / (step or 1.0):.3g} sensor steps (of {step:.4g}); expected more "
+                "than one step: use a larger amplitude or a finer range"
+            )
+    X = complex(rough.phasors(1)[0] * (1j * rough.segment.omega) ** -settings.integrations)
+    response = complex(rough.phasors(1)[1]) / X
+    channel = settings.transient_channel
+    transient = estimate_transient(rough, channel, float(np.angle(X)), response)
+    steady = without(transient, first, settings)
+    _check_share(rough, steady, settings, samples.within_blocks(first))
+    dropped = settings.settling_periods or 0
+    if sweep:
+        dropped = 0
+    elif settings.settling_periods is None and transient.significant and cycles > FEWEST_CYCLES:
+        looked_at = min(cycles, MOST_CYCLES)
+        fundamental = replace(settings, harmonics=(1,))
+        dropped = _settling_periods(
+            Phasors.of(rough.segment, transient, looked_at, fundamental, steps, recorded), cycles
+        )
+    used = last_cycles(whole, cycles - dropped)
+    phasors = Phasors.of(
+        used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep
+    )
+    _check_share(phasors.fit, phasors.fit.segment, settings, samples.within_blocks(used))
+    return _point(phasors, cycles, dropped)
+
+
+def _where(segment: Segment) -> str:
+    return f"around t = {segment.centre:.6g} s, {segment.omega / (2.0 * np.pi):.6g} Hz"
+
+
+def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: FloatArray) -> None:
+    """Refuse what is not one sine."""
+    shares = fundamental_share(fit, segment, within)
+    for name, share in zip((settings.motion_channel, "force"), shares, strict=True):
+        if share < settings.min_share:
+            raise ExtractionError(
+                f"{name} {_where(segment)}: the fundamental has {percent(share, 3)} of the "
+                f"power; expected at least {percent(settings.min_share, 3)}, one dominant sine: "
+                f"check the channel and {argument('frequency')}, or lower "
+                f"{argument('min_share')} if it is noise"
+            )
+
+
+def _settling_periods(phasors: Phasors, cycles: int) -> int:
+    """Return how many leading cycles to leave out, judged by the fundamental of the first ones."""
+    q = np.arange(cycles - FEWEST_CYCLES + 1)
+    kept = phasors.cycles / (cycles - q)
+    bias = abs(phasors.bias[0]) * np.exp(-phasors.transient.rate * q) * kept
+    error = np.sqrt(phasors.fundamental[1][0, 0] * kept)
+    good = bias <= _NEGLIGIBLE * error  # or else the least mean squared error
+    return int(np.argmax(good) if good.any() else np.argmin(bias**2 + 2.0 * error**2))
+
+
+def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
+    """Return the rows of a segment, and what speaks for and against them."""
+    distorted = phasors.distorted
+    response, joint, dof = phasors.rows(distorted)
+    silent = {k: LineNoise(np.zeros_like(n.lines), n.dof) for k, n in phasors.noise.items()}
+    segment, recorded = phasors.fit.segment, phasors.samples.time
+    transient, bias, lag = phasors.transient, phasors.bias, phasors.lag
+    only_mean = np.where(np.equal(phasors.harmonics, 0), 2.0, 1.0)  # whose variance is one number
+    variance = 0.5 * only_mean * np.trace(joint[:, 1:, 1:], axis1=1, axis2=2)
+    error = np.maximum(np.sqrt(variance), TINY)
+    excess = np.abs(bias) / (_TOLERATED * error)
+    forgotten = (excess <= 1.0) | (not transient.significant)
+    missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / transient.rate))
+    if phasors.mean_moves:
+        forgotten, missing = np.zeros_like(forgotten), np.maximum(missing, cycles)
+    settled = forgotten & (np.abs(lag) <= _TOLERATED * error)
+    quality = {
+        "settled": settled,
+        "bias_real": (bias + lag).real,
+        "bias_imag": (bias + lag).imag,
+        "more_periods": missing.astype(np.int64),
+        "num_periods": cycles,
+        "settling_periods": dropped,
+        "covariance_from": "cycles" if phasors.cycles >= CYCLES_FOR_SCATTER else "spectrum",
+        "start_time": recorded[0],
+        "end_time": recorded[-1],
+        **phasors.channel_quality(),
+    }
+    by_harmonic = dict(zip(phasors.harmonics, settled.tolist(), strict=True))
+    shared = phasors.objections(by_harmonic.get(1, all(settled)), quality)
+    shares = np.abs(bias + lag) / np.abs(response).max()
+    verdicts = []
+    for good, more, share in zip(settled, missing.astype(int), shares, strict=True):
+        too_fast = f"swept too fast to settle, biased by about {percent(share)}"
+        unsettled = f"not settled, {more} more periods" if more else too_fast
+        verdicts.append("; ".join([unsettled][: not good] + shared) or "good")
+    return Point(
+        frequency_hz=segment.omega / (2.0 * np.pi),
+        amplitude=float(abs(phasors.fundamentals[0])),
+        drive=float(abs(phasors.fundamentals[1])),
+        harmonic=phasors.harmonics,
+        response=response,
+        joint=joint,
+        repeating=replace(phasors, noise=silent).rows(distorted)[1],
+        dof=dof,
+        sweep=bool(phasors.fit.trending),
+        quality=quality | {"verdict": verdicts},
+    )
 
 
 def record_response(
@@ -85,24 +261,25 @@ def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]
     """Return the points, and why other segments give none; at least one does."""
     frequency, mode = settings.frequency, settings.mode
     time = record.time if record.time[0] == 0.0 else record.time - record.time[0]
-    samples = Samples(time, record.motion_samples, record.force_samples)
-    runs = record_cycles(time, samples.motion, frequency)
+    samples = Samples(time, np.stack([record.motion_samples, record.force_samples]))
+    motion = samples.channels[0]
+    runs = find_cycles(time, motion, frequency)
     points: list[Point] = []
     refused: list[str] = []
     try:
-        spans = record_spans(time, samples.motion, runs, frequency, mode, settings.num_periods)
+        spans = record_spans(time, motion, runs, frequency, mode, settings.num_periods)
     except ExtractionError as exc:
         spans, refused = [], [str(exc)]
     block = samples.block_size(max(s.frequency_hz for s in spans)) if spans else 1
-    mean_time, channels = samples.means(block)
+    means = samples.means(block)
     for span in spans:
         try:
-            segment = segment_of(mean_time, channels, span, frequency, block)
+            segment = segment_of(means.time, means.channels, span, frequency, block)
             points.append(measure(segment, settings, samples, sweep=span.sweep))
         except ExtractionError as exc:
             refused.append(str(exc))
     if frequency is None:
-        _refuse_other_motion(record, samples.motion, runs, points)
+        _refuse_other_motion(record, motion, runs, points)
     if not points:
         raise ExtractionError(_summary(refused))
     for point in points:
@@ -120,26 +297,18 @@ def _refuse_other_motion(
     if measured > _WELL_COVERED * moving:
         return
     reason = _not_a_sine_test(motion, runs, covered=measured / moving if moving else 0.0)
-    if reason:
-        swept = _is_sweep(record_cycles(record.time, record.force_samples, None))
-        file = (record.provenance or {}).get("file", "FILE") if swept else None
-        raise ExtractionError(f"{reason}; {_route(file)}")
-
-
-def _route(file: str | None = None) -> str:
-    """Return what else can be done with a record; `file` is that of a sweep of the force."""
-    if file is None:
-        how = spelled("di.fit(record, model)", "dahl-ident fit --record")
-        return (
-            "expected levels or a sweep of one sine; for any other motion fit the waveform itself: "
-            f"{how}"
+    if reason and not _is_sweep(find_cycles(record.time, record.force_samples)):
+        raise ExtractionError(
+            f"{reason}; expected levels or a sweep of one sine; for any other motion fit the "
+            f"waveform itself: {spelled('di.fit(record, model)', 'dahl-ident fit --record')}"
         )
-    model = "--mass free --damping free --stiffness free"
-    how = spelled("di.fit(record, model)", f"dahl-ident fit --record {shlex.quote(file)} {model}")
-    return (
-        "the force is a sweep of one sine, which the motion is too unsteady to follow in a table; "
-        f"fit the waveforms: {how}"
-    )
+    if reason:
+        file = shlex.quote(str((record.provenance or {}).get("file", "FILE")))
+        free = f"dahl-ident fit --record {file} --mass free --damping free --stiffness free"
+        raise ExtractionError(
+            f"{reason}; the force is a sweep of one sine, which the motion is too unsteady to "
+            f"follow in a table; fit the waveforms: {spelled('di.fit(record, model)', free)}"
+        )
 
 
 def _not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:

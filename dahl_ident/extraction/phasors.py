@@ -136,7 +136,7 @@ class Phasors:
         steps: FloatArray,
         samples: Samples,
         *,
-        sweep: bool,
+        sweep: bool = False,
     ) -> Phasors:
         """Fit a segment without its transient, which is not noise, and join the phasors' noise."""
         fit = sine_fit(without(transient, segment, settings), trend=sweep)
@@ -181,17 +181,14 @@ class Phasors:
         fit, segment = self.fit, self.fit.segment
         residual = np.sqrt(fit.residual_variance)  # of single samples
         if segment.block > 1:
-            time, motion, force = (
-                scattered(v, _LOOKED_AT)
-                for v in (self.samples.time, self.samples.motion, self.samples.force)
-            )
-            samples = segment.with_samples(time, np.stack([motion, force]))
+            time = scattered(self.samples.time, _LOOKED_AT)
+            shown = segment.with_samples(time, scattered(self.samples.channels, _LOOKED_AT))
             tau = (time - segment.centre) / segment.half_width
-            sine = fit.coefficients.T @ columns(samples.theta, tau, fit.orders, fit.trending)
-            left = without(self.transient, samples, self.settings).channels - sine
+            sine = fit.coefficients.T @ columns(shown.theta, tau, fit.orders, fit.trending)
+            left = without(self.transient, shown, self.settings).channels - sine
             residual = np.sqrt(np.mean(left**2, axis=1))
-        samples_a_cycle = self.samples.time.size / self.cycles
-        return quantisation_errors(np.abs(fit.phasors(1)), self.steps, residual, samples_a_cycle)
+        amplitudes, samples = np.abs(fit.phasors(1)), self.samples.time.size
+        return quantisation_errors(amplitudes, self.steps, residual, samples / self.cycles)
 
     @cached_property
     def repeating(self) -> dict[int, FloatArray]:
@@ -357,6 +354,8 @@ class Phasors:
         amplitudes, block = np.abs(fit.phasors(1)), fit.segment.block
         noise = np.sqrt(np.diagonal(self.noise[1].matrix).real * block)
         crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase / block)
+        longest = (crest, np.inf)
+        clipped = list(map(clipped_share, self.samples.channels, steps, noise, longest))
         with np.errstate(divide="ignore"):
             in_steps = amplitudes / steps
         return {
@@ -367,8 +366,8 @@ class Phasors:
             "asymmetry": self.asymmetry,
             "displacement_steps": in_steps[0],
             "force_steps": in_steps[1],
-            "displacement_clipped": clipped_share(self.samples.motion, steps[0], noise[0], crest),
-            "force_clipped": clipped_share(self.samples.force, steps[1], noise[1], np.inf),
+            "displacement_clipped": clipped[0],
+            "force_clipped": clipped[1],
         }
 
     def objections(self, settled: bool, quality: dict[str, Any]) -> list[str]:

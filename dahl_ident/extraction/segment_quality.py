@@ -162,9 +162,8 @@ def alias_error(fit: SineFit, harmonic: int, cycles: int) -> FloatArray:
     clear = size**2 > _CLEAR * np.outer(variance, fit.residual_variance)
     aliased = np.array([whole - harmonic, whole + harmonic])
     both = [_extended(seen[c], s[c], aliased) for c, s in zip(clear.T, size.T, strict=True)]
-    if fit.segment.block > 1:  # of which block means pass little
-        passed = fit.segment.passed(int(aliased[1]))
-        assert passed is not None
+    passed = fit.segment.passed(int(aliased[1]))
+    if passed is not None:  # block means pass little of them
         both = [size * np.abs(passed[aliased - 1]) for size in both]
     return np.asarray(_kept(per_cycle, cycles) * np.hypot.reduce(both, axis=1))
 

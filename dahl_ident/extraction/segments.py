@@ -11,9 +11,8 @@ follows F(2, 2 m - 4) for a cycle that belongs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,9 @@ from dahl_ident.extraction.cycles import (
     Cycles,
     Mode,
     Span,
-    cut_cycles,
     find_cycles,
     find_spans,
+    groups_of_cycles,
     sine_in_each,
 )
 from dahl_ident.extraction.sine_fit import (
@@ -55,18 +54,12 @@ _PADDED = 16  # lines for each cycle, so that a peak lies near one
 _FEWEST_SAMPLES = 4  # that a cycle's sine and offset leave something of
 _STRAY_BY_CHANCE = 1e-3  # of the cycles that belong, how many seem to stray
 _NEGLIGIBLE = 1e-4  # of the amplitude, that a cycle may stray in any case
-_TOGETHER = 100_000  # samples: what is computed of them stays in the cache
 _UNJUDGED = 2  # cycles at either end that are judged, and do not judge ...
 _OF_THOSE = 5  # ... and a fifth of all at most
 _SOLVABLE = 1e8  # condition of normal equations
 _STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
 _MOST_CYCLES_MORE = 2  # on either side
 _MOST_CYCLES_LESS = 3  # on either side; where more stray, the motion is no ramp but changes slowly
-
-
-def record_cycles(time: FloatArray, motion: FloatArray, frequency: float | None) -> list[Cycles]:
-    """Return the runs of cycles between crossings, or of the period where it is known."""
-    return find_cycles(time, motion) if frequency is None else cut_cycles(time, motion, frequency)
 
 
 def record_spans(
@@ -87,7 +80,7 @@ def record_spans(
         noisy = max(noise, default=np.inf) > _QUIET_CROSSINGS
         covered = _covered(spans) / float(time[-1] - time[0])
         if frequency is None and (noisy or covered < _WELL_COVERED):
-            periods = cut_cycles(time, motion, _strongest_line(time, motion))
+            periods = find_cycles(time, motion, _strongest_line(time, motion))
             spans = max(spans, find_spans(periods, mode, fewest, window), key=_covered)
         moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
         if spans and (fewest == _PLATEAU_CYCLES or _covered(spans) > _NO_CHANCE * moving):
@@ -170,7 +163,9 @@ def _refuse_drift(segment: Segment) -> None:
     phases = np.angle(phasor * np.exp(-2j * np.pi * turns * cycle))
     evenly = True
     if cycle.size >= 2 * _FEWEST_IN_HALF:
-        halves = [float(np.polyfit(*half, 1)[0]) for half in _halves(cycle, phases)]
+        n = cycle.size // 2
+        parts = (slice(None, n), slice(n, None))
+        halves = [float(np.polyfit(cycle[half], phases[half], 1)[0]) for half in parts]
         evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * turns)
     turns += float(np.polyfit(cycle, phases, 1)[0]) / (2.0 * np.pi)
     drift = 2.0 * np.pi * turns * counts.size
@@ -185,13 +180,6 @@ def _refuse_drift(segment: Segment) -> None:
             f"expected less than {_DRIFTED:g} rad: give "
             f"{argument('frequency', Placeholder(f'{shown:.6g}'))}, or leave it out"
         )
-
-
-def _halves(cycle: NDArray[np.intp], phase: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the cycles' numbers and phases of the first and the second half."""
-    middle = cycle.size // 2
-    for half in (slice(None, middle), slice(middle, None)):
-        yield cycle[half].astype(np.float64), phase[half]
 
 
 def _steady_part(
@@ -241,22 +229,18 @@ def _cycle_edges(segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Inside:
-    """The sine of the cycles inside, which may change linearly, and their scatter about it."""
+    """The sine of the cycles inside, which may change linearly; `variance` of scatter about it."""
 
     segment: Segment
     coefficients: FloatArray
     inverse: FloatArray
     variance: float
-    """Of white noise that scatters the cycles as much."""
     dof: int
-
-    def columns(self, time: FloatArray) -> FloatArray:
-        tau = (time - self.segment.centre) / self.segment.half_width
-        return columns(np.asarray(self.segment.phase(tau)), tau, 1, 1)
 
     def strays(self, time: FloatArray, motion: FloatArray) -> bool:
         """Return whether samples of the record depart from the sine by more than by chance."""
-        basis = self.columns(time)
+        tau = (time - self.segment.centre) / self.segment.half_width
+        basis = columns(np.asarray(self.segment.phase(tau)), tau, 1, 1)
         sine = basis[2:4] - basis[2:4].mean(axis=1, keepdims=True)  # the mean may wander
         inverse = np.linalg.pinv(sine @ sine.T)
         left = sine @ (motion - self.coefficients @ basis)
@@ -290,15 +274,13 @@ def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
     if dof < 2:
         return None
     explained = (ss * c**2 + cc * s**2 - 2.0 * cs * c * s)[full] / determinant[full]
-    variance = float(explained.sum()) / dof
-    return _Inside(segment, coefficients, inverse, variance, dof)
+    return _Inside(segment, coefficients, inverse, float(explained.sum()) / dof, dof)
 
 
 def _cycle_sums(segment: Segment, cuts: NDArray[np.intp], coefficients: FloatArray) -> FloatArray:
     """Return sums over each cycle of cos^2, sin^2, cos sin, and of both times the residual."""
     sums = np.zeros((5, cuts.size - 1))
-    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
-    for first, last in pairwise([*np.unique(groups).tolist(), cuts.size - 1]):
+    for first, last in groups_of_cycles(cuts):
         part = slice(int(cuts[first]), int(cuts[last]))
         basis = columns(segment.theta[part], segment.tau[part], 1, 1)
         left = segment.channels[0, part] - coefficients @ basis

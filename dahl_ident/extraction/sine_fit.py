@@ -110,11 +110,10 @@ class Segment:
 
 @dataclass(frozen=True)
 class Samples:
-    """Waveforms of motion and force as they were recorded."""
+    """Waveforms as they were recorded: times, and motion and force as rows of `channels`."""
 
     time: FloatArray
-    motion: FloatArray
-    force: FloatArray
+    channels: FloatArray
 
     @property
     def step(self) -> float:
@@ -131,31 +130,26 @@ class Samples:
                 return 1
         return max(size, 1)
 
-    def means(self, size: int) -> tuple[FloatArray, FloatArray]:
-        """Return time and channels (motion, force) as means of blocks; the last one may miss."""
+    def means(self, size: int) -> Samples:
+        """Return means of blocks; samples behind the last whole block are left out."""
         if size == 1:
-            return self.time, np.stack([self.motion, self.force])
-        count = self.time.size // size
-        time, *channels = (
-            v[: count * size].reshape(count, size).mean(axis=1)
-            for v in (self.time, self.motion, self.force)
-        )
-        return time, np.stack(channels)
+            return self
+        whole = self.time.size // size * size
+        blocks = self.channels[:, :whole].reshape(2, -1, size)
+        return Samples(self.time[:whole].reshape(-1, size).mean(axis=1), blocks.mean(axis=2))
 
     def of(self, segment: Segment) -> Samples:
         """Return the samples that a segment's block means are made of."""
         reach = (0.5 * segment.block - 0.25) * self.step if segment.block > 1 else 0.0
         first = int(np.searchsorted(self.time, segment.time[0] - reach))
         last = int(np.searchsorted(self.time, segment.time[-1] + reach, side="right"))
-        part = slice(first, last)
-        return Samples(self.time[part], self.motion[part], self.force[part])
+        return Samples(self.time[first:last], self.channels[:, first:last])
 
     def within_blocks(self, segment: Segment) -> FloatArray:
         """Return the variance of both channels that the means of a segment do not show."""
         if segment.block == 1:
             return np.zeros(2)
-        at_samples = self.of(segment)
-        whole = np.array([np.var(at_samples.motion), np.var(at_samples.force)], dtype=np.float64)
+        whole = np.var(self.of(segment).channels, axis=1)
         return np.asarray(whole - np.var(segment.channels, axis=1))
 
 
@@ -205,19 +199,15 @@ class SineFit:
 
     def phasors(self, harmonic: int) -> ComplexArray:
         """Return the phasors of motion and force at one harmonic, shape (2,); their means at 0."""
-        if harmonic == 0:
-            return np.array(self.coefficients[0], dtype=np.complex128)
-        return self._pair(2 * harmonic)
+        return self._pair(2 * harmonic, harmonic)
 
     def slopes(self, harmonic: int) -> ComplexArray:
         """Return the change of the phasors with tau, shape (2,), of a fit with trend."""
-        if harmonic == 0:
-            return np.array(self.coefficients[1], dtype=np.complex128)
-        return self._pair(2 * (self.orders + harmonic))
+        return self._pair(2 * (self.orders + harmonic) if harmonic else 1, harmonic)
 
-    def _pair(self, i: int) -> ComplexArray:
-        cos, sin = self.coefficients[i : i + 2]
-        return np.asarray(cos - 1j * sin)
+    def _pair(self, i: int, harmonic: int) -> ComplexArray:
+        cos = self.coefficients[i].astype(np.complex128)
+        return np.asarray(cos - 1j * self.coefficients[i + 1] if harmonic else cos)
 
     def phasors_of(self, waveform: FloatArray) -> ComplexArray:
         """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample."""
@@ -256,18 +246,19 @@ def sine_fit(segment: Segment, *, trend: bool = False, most: int = _MOST_HARMONI
     orders = min(resolvable_orders(segment), most)
     trending = orders if trend else 0
     theta, tau, passed = segment.theta, segment.tau, segment.passed(orders)
+
+    def blocks() -> Iterable[tuple[slice, FloatArray]]:
+        return _column_blocks(theta, tau, orders, trending, passed)
+
     width = 2 * (orders + trending) + 2
-    blocks: Iterable[tuple[slice, FloatArray]] = ()
-    if width * theta.size <= _KEPT:
-        blocks = tuple(_column_blocks(theta, tau, orders, trending, passed))
+    kept = tuple(blocks()) if width * theta.size <= _KEPT else ()
     normal, right = normal_equations(
-        theta, tau, segment.channels, orders, trending,
-        blocks or _column_blocks(theta, tau, orders, trending, passed),
-    )  # fmt: skip
+        theta, tau, segment.channels, orders, trending, kept or blocks()
+    )
     inverse = solvable_inverse(normal, segment)
     coefficients = inverse @ right
     residual = segment.channels.copy()
-    for part, block in blocks or _column_blocks(theta, tau, orders, trending, passed):
+    for part, block in kept or blocks():
         residual[:, part] -= coefficients.T @ block
     return SineFit(segment, orders, trending, coefficients, inverse, residual)
 
