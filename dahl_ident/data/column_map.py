@@ -64,44 +64,12 @@ _SHOWN = 10  # rows that a warning names
 
 @dataclass(frozen=True)
 class MappedColumn:
-    """The column of a role, by its usual name where there is no other, with its sign and factor.
-
-    A `unit` overrides the file's.
-    """
+    """The column of a role, by its usual name where there is no other; `unit` is for the file's."""
 
     column: str | None = None
     unit: str | None = None
     sign: int = 1
     factor: float = 1.0
-
-    @classmethod
-    def of(cls, entry: Any, role: str) -> MappedColumn:
-        """Return what an entry of a column map says, a name or a table."""
-        if role not in FILE_COLUMNS:
-            raise ValidationError(
-                f"unknown entry {role!r}; expected one of "
-                f"{choices((*FILE_COLUMNS, *SETTINGS), role)}"
-            )
-        if isinstance(entry, str):
-            return cls(entry)
-        if not isinstance(entry, Mapping):
-            raise ValidationError(
-                f"{role} is {entry!r}; expected a column's name, or a table with column, unit, "
-                "sign and factor"
-            )
-        unknown = sorted(set(entry) - {"column", "unit", "sign", "factor"})
-        if unknown:
-            raise ValidationError(
-                f"{role}: unknown entry {unknown[0]!r}; expected column, unit, sign or factor"
-            )
-        for key in ("column", "unit"):
-            if not isinstance(entry.get(key, ""), str):
-                raise ValidationError(f"{role}.{key} is {entry[key]!r}; expected text")
-        sign = entry.get("sign", 1)
-        if sign not in (1, -1):
-            raise ValidationError(f"{role}.sign is {sign!r}; expected 1 or -1")
-        factor = positive_number(entry.get("factor", 1.0), f"{role}.factor")
-        return cls(entry.get("column"), entry.get("unit"), int(sign), factor)
 
 
 @dataclass(frozen=True)
@@ -145,10 +113,29 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
             if key in SETTINGS and not mapped:
                 settings[key] = SETTINGS[key](entry, key)
             else:
-                roles[key] = MappedColumn.of(entry, key)
+                roles[key] = _mapped(entry, key)
     except ValidationError as exc:
         raise DataError(f"{name}: {exc}") from exc
     return ColumnMap(roles, **settings)
+
+
+def _mapped(entry: Any, role: str) -> MappedColumn:
+    """Return what an entry of a column map says of a role, a name or a table."""
+    if role not in FILE_COLUMNS:
+        known = choices((*FILE_COLUMNS, *SETTINGS), role)
+        raise ValidationError(f"unknown entry {role!r}; expected one of {known}")
+    if isinstance(entry, str):
+        return MappedColumn(entry)
+    if not isinstance(entry, Mapping):
+        raise ValidationError(
+            f"{role} is {entry!r}; expected a column's name, or a table with column, unit, sign "
+            "and factor"
+        )
+    for unknown in sorted(entry.keys() - _OF_COLUMN.keys())[:1]:
+        raise ValidationError(
+            f"{role}: unknown entry {unknown!r}; expected column, unit, sign or factor"
+        )
+    return MappedColumn(**{k: _OF_COLUMN[k](v, f"{role}.{k}") for k, v in entry.items()})
 
 
 def _controlled(entry: Any, key: str) -> str | dict[str, str]:
@@ -164,11 +151,22 @@ def _controlled(entry: Any, key: str) -> str | dict[str, str]:
 
 def _text(entry: Any, key: str) -> str:
     if not isinstance(entry, str):
-        raise ValidationError(f"{key} is {entry!r}; expected text such as '12.5 N/V'")
+        example = " such as '12.5 N/V'" if key == "drive_factor" else ""
+        raise ValidationError(f"{key} is {entry!r}; expected text{example}")
     return entry
 
 
-SETTINGS: dict[str, Callable[[Any, str], Any]] = {
+def _sign(entry: Any, key: str) -> int:
+    if entry not in (1, -1):
+        raise ValidationError(f"{key} is {entry!r}; expected 1 or -1")
+    return int(entry)
+
+
+Checks = dict[str, Callable[[Any, str], Any]]
+_OF_COLUMN: Checks = {"column": _text, "unit": _text, "sign": _sign, "factor": positive_number}
+
+
+SETTINGS: Checks = {
     "quantity": lambda entry, key: one_of(entry, key, QUANTITIES),
     "controlled": _controlled,
     "sweep": _text,
@@ -211,29 +209,32 @@ class Binding:
         """Return what the column map says of a role."""
         return self.map.roles.get(role, MappedColumn())
 
-    def named(self, role: str) -> list[RawChannel]:
+    def called(self, role: str) -> list[RawChannel]:
         """Return the columns that are called what the role is, or said to be it by the format."""
         return [c for c in self.source.channels if c.is_called(self.columns[role])]
 
     def channel(self, role: str) -> RawChannel | None:
         """Return the channel of a role, or None where the file has none."""
-        channel = self._find(role)
+        column = self.mapped(role).column
+        channel = self._called(role) if column is None else self.source.find(column)
         if channel is not None:
             self.used.add(channel.name)
         return channel
 
-    def _find(self, role: str) -> RawChannel | None:
-        column = self.mapped(role).column
-        if column is not None:
-            return self.source.find(column)
-        matches, names = self.named(role), self.columns[role].names
+    def _called(self, role: str) -> RawChannel | None:
+        """Return the one column that is called what the role is."""
+        matches, names = self.called(role), self.columns[role].names
         if role not in self.map.roles:  # a column that the map gives another role has no second one
             named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
             taken = [self.source.find(column).content for column in named]
             matches = [c for c in matches if not any(c.content is other for other in taken)]
+        elif not matches:
+            raise DataError(
+                f"{self.source.name}: no column is called {' or '.join(names)}; name "
+                f"the column of the {role} too"
+            )
         if role == "run":  # a table may have file, day and test; the first name is used
-            matches.sort(key=lambda c: names.index(plain(c.short or c.name)))
-            matches = matches[:1]
+            matches = sorted(matches, key=lambda c: names.index(plain(c.short or c.name)))[:1]
         if len(matches) > 1:
             distinct = len({c.name for c in matches}) == len(matches)
             way = f"say which one with {self.naming(role, matches[0].name)}"
@@ -241,11 +242,6 @@ class Binding:
                 f"{self.source.name}: {len(matches)} columns may be the {role}: "
                 f"{listed([c.header for c in matches])}; "
                 + (way if distinct else "rename them in the file")
-            )
-        if not matches and role in self.map.roles:
-            raise DataError(
-                f"{self.source.name}: no column is called {' or '.join(names)}; name "
-                f"the column of the {role} too"
             )
         return matches[0] if matches else None
 
@@ -296,14 +292,13 @@ class Binding:
         text = self.mapped(role).unit or channel.unit
         if text is None and channel.is_called(declared):
             text = channel.unit_in_name
-        like = (role for role in declared.like if self.has(role))
-        if not text and (other := next(like, None)) is not None:
+        if not text and (other := next(filter(self.has, declared.like), None)) is not None:
             inherited = self.unit(other, self.required(other))
             text = None if inherited.decibel else inherited.text
         elif not text and declared.unit == "1":
             text = "1"
         if not text:
-            example = declared.example
+            example = declared.unit.format(displacement="um", force="N", response="N/m")
             raise UnitError(
                 f"{self.source.name}: column {channel.name!r} has no unit; write it in the "
                 f"header, such as '{channel.name} [{example}]', or give "
@@ -341,26 +336,25 @@ class Binding:
         """Refuse keywords on the factor of a drive of this kind if they have no effect."""
         names = ("drive_factor", "drive_factor_uncertainty")
         what = " and ".join(n for n in names if self.source.options.get(n) is not None)
-        if what and kind in (None, "force"):
+        if not what:  # a column map may serve other files too, and is not refused
+            return
+        if kind in (None, "force"):
             channel = self.channel("drive")
-            why = "no column holds the drive"
-            if channel is not None:
-                why = f"the drive ({channel.name}) is a force already"
+            why = f"the drive ({channel.name}) is a force already" if channel else ""
             raise DataError(
-                f"{self.source.name}: {what} is given, but {why}; expected a drive in V or A: "
-                f"leave the factor out, or name the column with {self.naming('drive')}"
+                f"{self.source.name}: {what} is given, but {why or 'no column holds the drive'}; "
+                "expected a drive in V or A: leave the factor out, or name the column with "
+                f"{self.naming('drive')}"
             )
-        if what and self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
+        if self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
             raise DataError(f"{self.source.name}: {what} is given without drive_factor; give both")
 
     def motion(self) -> Motion:
         """Return translation or rotation, on which all units must agree."""
         kinds = set(self.motions.values())
         if len(kinds) > 1:
-            raise UnitError(
-                f"{self.source.name}: units disagree: "
-                + ", ".join(f"{role} is {motion}" for role, motion in self.motions.items())
-            )
+            stated = ", ".join(f"{role} is {motion}" for role, motion in self.motions.items())
+            raise UnitError(f"{self.source.name}: units disagree: {stated}")
         return kinds.pop() if kinds else "translation"
 
     def provenance(self) -> dict[str, Any]:
@@ -393,14 +387,11 @@ class Binding:
             more = f" and {marked.size - _SHOWN} more" if marked.size > _SHOWN else ""
             self.doubt(f"{message}: {names}{more}")
 
-    def same_length(self, roles: Mapping[str, RawChannel]) -> None:
+    def same_length(self, channels: Mapping[str, RawChannel]) -> None:
         """Refuse columns of different lengths."""
-        sizes = {role: channel.size for role, channel in roles.items()}
-        if len(set(sizes.values())) > 1:
-            raise DataError(
-                f"{self.source.name}: columns differ in length: "
-                + ", ".join(f"{role} {size}" for role, size in sizes.items())
-            )
+        if len({channel.size for channel in channels.values()}) > 1:
+            sizes = ", ".join(f"{role} {channel.size}" for role, channel in channels.items())
+            raise DataError(f"{self.source.name}: columns differ in length: {sizes}")
 
 
 def scaled(values: FloatArray, factor: float) -> FloatArray:

@@ -217,11 +217,6 @@ class Column:
         kinds = {kind: si_unit(kind, motion) for kind in ("displacement", "force")}
         return self.unit.format(**kinds, response=si_unit(quantity, motion))
 
-    def header_of(self, data: Table) -> str:
-        """Return the header with which it is saved."""
-        unit = f" [{self.unit_of(data.motion, data.quantity)}]" if self.unit else ""
-        return self.header or f"{self.names[0]}{unit}"
-
     def measures(self, unit: str | None, what: str) -> bool:
         """Return whether a unit, that `what` has, is of one of the kinds."""
         if unit is None or not self.kinds:
@@ -231,11 +226,6 @@ class Column:
         except UnitError:
             return False
         return True
-
-    @property
-    def example(self) -> str:
-        """A unit such as this column might have."""
-        return self.unit.format(displacement="um", force="N", response="N/m")
 
 
 def _polar(axis: int) -> Source:

@@ -38,12 +38,26 @@ def draw(
     `stds` gives the standard deviations of gain and phase of some rows, by default those of their
     covariance; `fitted` gives a curve through some rows, over frequency or not.
     """
-    from dahl_ident.plots import plot_amplitude_response, plot_frequency_response
+    from dahl_ident.plots import plot_amplitude_response, plot_backbone, plot_frequency_response
 
     if data.quantity == "backbone":
-        return _draw_backbone(data, ax)
+        std, ratio_std = backbone_std(data, 0), backbone_std(data, 1)
+        curves_of = [
+            ("natural frequency [Hz]", data.frequency_hz, std),
+            ("damping ratio [1]", data.response.imag, ratio_std),
+        ]
+        amplitude_label = held_label(data)
+        return plot_backbone(
+            held_amplitude(data), curves_of, amplitude_label=amplitude_label, ax=ax
+        )
+
+    def errors(part: Table) -> Stds:
+        if stds is not None:
+            return stds(part)
+        known = part.covariance is not None
+        return polar_std(part.response, part.covariance) if known else (None, None)
+
     fundamental = data.select(harmonic=1)
-    errors = _stds if stds is None else stds
     over_frequency = is_over_frequency(fundamental)
     parts = curves(fundamental)
     if over_frequency or len(parts) > 1:
@@ -69,21 +83,6 @@ def draw(
     )
 
 
-def _draw_backbone(data: Table, ax: Any) -> tuple[Any, Any]:
-    """Draw natural frequency and damping ratio over amplitude, with their standard deviations."""
-    from dahl_ident.plots import plot_backbone
-
-    labels = ("natural frequency [Hz]", "damping ratio [1]")
-    values = (data.frequency_hz, data.response.imag)
-    stds = (backbone_std(data, 0), backbone_std(data, 1))
-    return plot_backbone(
-        held_amplitude(data),
-        list(zip(labels, values, stds, strict=True)),
-        amplitude_label=held_label(data),
-        ax=ax,
-    )
-
-
 def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = None) -> Any:
     """Draw waveforms or loops of a record's table; see :meth:`Record.plot`."""
     from dahl_ident.plots import plot_recorded_loops, plot_waveforms
@@ -99,10 +98,6 @@ def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = N
     raise ValidationError(f"kind is {kind!r}; expected 'waveforms' or 'loops'")
 
 
-def _stds(data: Table) -> Stds:
-    return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
-
-
 def is_force_controlled(data: Table) -> bool:
     """Return whether most rows were driven by force."""
     return bool(np.mean(data.controlled == "force") > 0.5)
@@ -110,18 +105,18 @@ def is_force_controlled(data: Table) -> bool:
 
 def held_amplitude(data: Table) -> FloatArray:
     """Return the controlled amplitude, or the other one if that is unknown."""
-    held, other = data.amplitude, data.drive
-    if is_force_controlled(data):
-        held, other = other, held
-    amplitude = other if held is None else held
-    assert amplitude is not None  # a table has one of the two
-    return np.asarray(amplitude)
+    both = [data.amplitude, data.drive][:: -1 if is_force_controlled(data) else 1]
+    return np.asarray(next(amplitude for amplitude in both if amplitude is not None))
 
 
 def held_label(data: Table) -> str:
     """Return the axis label of that amplitude."""
-    kind = "force" if held_amplitude(data) is data.drive else "displacement"
+    kind = _held_kind(data)
     return f"{kind} amplitude [{si_unit(kind, data.motion)}]"
+
+
+def _held_kind(data: Table) -> str:
+    return "force" if held_amplitude(data) is data.drive else "displacement"
 
 
 def gain_label(data: Table) -> str:
@@ -172,8 +167,7 @@ def _level(label: Any, part: Table) -> str:
     held = float(np.median(held_amplitude(part)))
     if not held / _NOMINAL < label < held * _NOMINAL:
         return f"{label:g}"
-    kind = "force" if held_amplitude(part) is part.drive else "displacement"
-    return engineering(float(label), si_unit(kind, part.motion))
+    return engineering(float(label), si_unit(_held_kind(part), part.motion))
 
 
 def _nominal_frequency(f: FloatArray) -> FloatArray:

@@ -515,11 +515,11 @@ class FrequencyResponse(Tabular):
                 f"quality {name!r} is also the name of a column of the table; rename it"
             )
         form = "backbone" if self.quantity == "backbone" else "polar" if polar else "rectangular"
-        columns: dict[str, Any] = {
-            one.header_of(self): one.saved(self)
-            for one in RESPONSE_COLUMNS.values()
-            if one.form in ("", form)
-        }
+        columns: dict[str, Any] = {}
+        for name, one in RESPONSE_COLUMNS.items():
+            unit = f" [{one.unit_of(self.motion, self.quantity)}]" if one.unit else ""
+            if one.form in ("", form):
+                columns[one.header or f"{name}{unit}"] = one.saved(self)
         columns = {n: c for n, c in (columns | dict(self.quality)).items() if c is not None}
         frame = pd.DataFrame(columns)
         frame.attrs["dahl_ident"] = {

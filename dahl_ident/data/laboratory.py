@@ -81,21 +81,19 @@ class Metadata:
     @property
     def lines(self) -> dict[str, tuple[str, ...]]:
         """The lines of each printed field, by its printed name, in order."""
+        stated = self.facts()
         printed = {
-            key: tuple(line.strip() for line in self.texts.get(key, "").splitlines())
-            for key in _FIELDS
+            key: value if key in _LISTS else tuple(map(str.strip, value.splitlines()))
+            for key, value in stated.items()
         }
-        printed |= {"instruments": tuple(i.text for i in self.instruments), "ambient": self.ambient}
         kept = (key for key in _FIELDS if any(printed[key]) or key in _BLANK)
         return {_FIELDS[key]: printed[key] for key in kept}
 
     def facts(self) -> dict[str, Any]:
         """Return the fields for machines, empty where they are not stated."""
-        return {
-            **{name: self.texts.get(name, "") for name in _TEXTS},
-            "ambient": self.ambient,
-            "instruments": tuple(one.text for one in self.instruments),
-        }
+        texts = {name: self.texts.get(name, "") for name in _TEXTS}
+        instruments = tuple(one.text for one in self.instruments)
+        return {**texts, "ambient": self.ambient, "instruments": instruments}
 
     def calibrations(self) -> dict[str, float]:
         """Return the standard uncertainty of each parameter of the sensors, root sum of squares."""
@@ -114,11 +112,11 @@ def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
         entries, where = read_toml(entries), f"{source}: "
     texts = _texts(entries, _TEXTS, _LISTS, f"{where}metadata", where)
     ambient, instruments = entries.get("ambient", ()), entries.get("instruments", ())
+    name = f"{where}ambient"
     if isinstance(ambient, Mapping):  # such as {temperature = "22 °C"}
-        name = f"{where}ambient"
         ambient = [f"{key} {_text(item, f'{name}.{key}')}" for key, item in ambient.items()]
     elif ambient:
-        ambient = [_text(ambient, f"{where}ambient")]
+        ambient = [_text(ambient, name)]
     if not isinstance(instruments, (list, tuple)):
         raise ValidationError(
             f"{where}instruments is {instruments!r}; expected a list, one entry an instrument"
@@ -151,18 +149,18 @@ def _instrument(one: Any, name: str) -> Instrument:
     texts = _texts(one, _INSTRUMENT, (), name, f"{name}.")
     parts = [_WORDS.get(key, "") + text for key, text in texts.items() if key != "channel"]
     parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in texts]
-    return Instrument(", ".join(parts), texts.get("channel", ""), _standard(texts, name))
-
-
-def _standard(texts: Mapping[str, str], name: str) -> float:
-    """Return the standard uncertainty of an instrument's channel, 0 where none is stated."""
-    channel, text = texts.get("channel"), texts.get("uncertainty")
-    if channel is not None and channel not in CHANNELS:
+    channel = texts.get("channel", "")
+    if "channel" in texts and channel not in CHANNELS:
         raise ValidationError(
             f"{name}.channel is {channel!r}; expected {choices(CHANNELS, channel)}"
         )
-    if channel is None or text is None:
-        return 0.0
+    u = _standard(texts, name) if channel and "uncertainty" in texts else 0.0
+    return Instrument(", ".join(parts), channel, u)
+
+
+def _standard(texts: Mapping[str, str], name: str) -> float:
+    """Return the standard uncertainty of an instrument's channel."""
+    channel, text = texts["channel"], texts["uncertainty"]
     if "k" not in texts:
         raise ValidationError(
             f"{name} has an uncertainty for the channel {channel}, but no k; expected the coverage "

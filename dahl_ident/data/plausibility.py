@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.frequency_response import FrequencyResponse
+from dahl_ident.data.rows import sizes
 from dahl_ident.errors import DataError
 from dahl_ident.units import percent
 
@@ -36,16 +37,15 @@ _SMALL_PHASE = 0.1  # rad, for a gain that falls to nothing
 
 def check_phase_unit(phase: FloatArray, degrees: bool, name: str, doubt: Doubt) -> None:
     """Warn where a phase in degrees looks like radians, or the reverse."""
-    largest = np.abs(phase).max()
-    everywhere = np.ones(phase.shape, dtype=bool)
-    if degrees and 0.5 <= largest <= 2.0 * np.pi and phase.size > 1:
+    size = np.abs(phase)
+    if degrees and 0.5 <= size.max() <= 2.0 * np.pi and phase.size > 1:
         doubt(
-            everywhere,
+            np.ones(phase.shape, dtype=bool),
             f"column {name!r} is in degrees, yet no phase is above 2 pi; are they radians?",
         )
     if not degrees:
         doubt(
-            np.abs(phase) > 4.0 * np.pi,
+            size > 4.0 * np.pi,
             f"column {name!r} is in radians, yet these phases are above 4 pi; are they degrees?",
         )
 
@@ -71,7 +71,7 @@ def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
     if not fundamental.any():
         return
     part = data.select(harmonic=1).to("dynamic_stiffness")
-    amplitude = _amplitude(part)
+    amplitude = np.asarray(sizes(part)[1])
     stiffness = part.gain.max()  # scaled by the largest, squares stay within range
     weight = (amplitude / amplitude.max()) ** 2
     loss = weight * part.response.imag / stiffness
@@ -113,14 +113,12 @@ def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
     Friction that takes a share d off the gain turns the phase by about d rad.
     """
     fundamental = data.harmonic == 1
-    if data.amplitude is None and data.drive is None:
-        return
     for frequency in np.unique(data.frequency_hz[fundamental]):
         rows = fundamental & (data.frequency_hz == frequency)
-        part = data.select(rows=rows)
-        fall = 1.0 - part.gain.min() / part.gain.max()
-        angle = np.abs(np.arcsin(np.clip(part.response.imag / part.gain, -1.0, 1.0))).max()
-        if part.n >= _FEWEST_ROWS and fall > _MISMATCH and 0.0 < angle < _SMALL_PHASE * fall:
+        response, gain = data.response[rows], data.gain[rows]
+        fall = 1.0 - gain.min() / gain.max()
+        angle = np.abs(np.arcsin(np.clip(response.imag / gain, -1.0, 1.0))).max()
+        if gain.size >= _FEWEST_ROWS and fall > _MISMATCH and 0.0 < angle < _SMALL_PHASE * fall:
             doubt(
                 rows,
                 f"the gain varies by {percent(fall)} at {frequency:g} Hz, yet no phase is above "
@@ -143,12 +141,11 @@ def record_doubts(
         "the motion repeats one value while the force goes on, from {}: does a sensor stick?",
     )
     starts, stops = _runs((motion == 0.0) & (force == 0.0))
-    if starts.size:
-        torn = np.zeros(starts.shape, dtype=bool)
-        least = np.where((starts > 0) & (stops < time.size - 1), 0.2, 3.0)  # a rest may end it
-        for values in (motion, force):
-            torn |= _edges(values, starts, stops) > least * _usual(np.abs(np.diff(values)))
-        yield starts[torn], "motion and force are 0 for a while, from {}: are samples missing?"
+    least = np.where((starts > 0) & (stops < time.size - 1), 0.2, 3.0)  # a rest may end it
+    torn = np.zeros(starts.shape, dtype=bool)
+    for values in (motion, force) if starts.size else ():
+        torn |= _edges(values, starts, stops) > least * _usual(np.abs(np.diff(values)))
+    yield starts[torn], "motion and force are 0 for a while, from {}: are samples missing?"
     for name, values, other in (("motion", motion, force), ("force", force, motion)):
         yield (
             _few(np.union1d(_unit_changes(values, other), _scaled_values(values))),
@@ -260,13 +257,6 @@ def _few(places: NDArray[np.intp]) -> NDArray[np.intp]:
 def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArray[np.bool_]:
     """Return which losses are below zero by more than their noise."""
     return np.asarray(loss < -_limit(dof) * std)
-
-
-def _amplitude(part: FrequencyResponse) -> FloatArray:
-    if part.amplitude is not None:
-        return part.amplitude
-    assert part.drive is not None  # one of the two always exists
-    return part.drive / part.gain
 
 
 def _limit(dof: ArrayLike) -> FloatArray:

@@ -37,7 +37,7 @@ _CODES = (
 
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
 _CODE_RATIO = 5.0  # ratio of a missing-value mark to all measured numbers
-_FEWEST_FOR_CODES = 4  # of fewer values, one far from the others may be measured
+_FEW = 4  # of fewer values, one far from the others may be measured
 _LONGEST_WORD = 200  # letters of a cell; no label, time stamp or number has more
 _LONGEST_HEADER = 400  # from which a cell holds no name and unit
 _INDEX = re.compile(r"[\d:, ]+")
@@ -171,27 +171,23 @@ class RawFile:
     def find(self, text: str) -> RawChannel:
         """Return the one channel of this name, header, last part of a path, or number."""
         exact = [c for c in self.channels if text in (c.name, c.header)]
-        loose = [c for c in self.channels if plain(c.name) == plain(text)]
-        for matches in (exact, loose):
-            if len(matches) > 1:
-                raise DataError(
-                    f"{self.name}: {len(matches)} columns are called {text!r}; expected one. "
-                    "Rename them in the file, or count them: 'column 2'"
-                )
-            if matches:
-                return matches[0]
-        last = [c for c in self.channels if plain(c.short or "") == plain(text)]
-        if len(last) > 1:
-            paths = listed([c.name for c in last], 20)
+        matches = exact or [c for c in self.channels if plain(c.name) == plain(text)]
+        if len(matches) > 1:
             raise DataError(
-                f"{self.name}: {len(last)} columns are called {text!r}; write one of {paths}"
+                f"{self.name}: {len(matches)} columns are called {text!r}; expected one. "
+                "Rename them in the file, or count them: 'column 2'"
             )
-        if last:
-            return last[0]
+        matches = matches or [c for c in self.channels if plain(c.short or "") == plain(text)]
+        if len(matches) > 1:
+            paths = listed([c.name for c in matches], 20)
+            raise DataError(
+                f"{self.name}: {len(matches)} columns are called {text!r}; write one of {paths}"
+            )
+        if matches:
+            return matches[0]
         name, unit = split_header(text)
         if unit is not None:
-            channel = self.find(name)
-            return replace(channel, unit=unit)
+            return replace(self.find(name), unit=unit)
         counted = _COUNTED.fullmatch(text)
         if counted and 0 < int(counted[1]) <= len(self.channels):
             return self.channels[int(counted[1]) - 1]
@@ -248,15 +244,15 @@ class RawFile:
         """Return a channel's complex numbers, also those written as text, such as ``5+1i``."""
         values = np.atleast_1d(channel.values)
         if values.dtype.kind == "U":
-            cells: list[complex] = []
+            numbers = np.empty(values.size, dtype=np.complex128)
             for i, text in enumerate(values.tolist()):
                 try:
-                    cells.append(complex(text.replace(" ", "").replace("i", "j")))
+                    numbers[i] = complex(text.replace(" ", "").replace("i", "j"))
                 except ValueError:
                     raise DataError(
                         f"{self.where(channel, i)}: {text[:40]!r} is not a complex number"
                     ) from None
-            values = np.array(cells)
+            values = numbers
         if values.dtype.kind != "c":
             raise DataError(
                 f"{self.name}: column {channel.name!r} holds no complex numbers; name the columns "
@@ -278,24 +274,17 @@ class RawFile:
     def from_text(self, channel: RawChannel) -> FloatArray:
         """Return the numbers in cells of text, NaN for empty ones, or name the cell without one."""
         numbers = np.empty(channel.values.size)
-        comma, thousands = self.decimal[0] == ",", self.decimal[1:]
-        swapped = str.maketrans(",.", ".,") if comma else {}
-        mark = " with a decimal comma" if comma else ""
+        mark, thousands = self.decimal[0], self.decimal[1:]
+        swapped = str.maketrans(",.", ".,") if mark == "," else {}
         group = rf"\s*[-+]?\d{{1,3}}(?:\{thousands}\d{{3}})+" if thousands else ""
-        grouped = re.compile(rf"{group}(?:\{self.decimal[0]}\d*)?\s*")
-        for i, cell in enumerate(channel.values.flat):
-            text = str(cell)
-            if thousands and grouped.fullmatch(text):
-                text = text.replace(thousands, "")
+        grouped = re.compile(rf"{group}(?:\{mark}\d*)?\s*")
+        for i, cell in enumerate(map(str, channel.values.flat)):
+            text = cell.replace(thousands, "") if thousands and grouped.fullmatch(cell) else cell
             text = text.translate(swapped)
-            if not text.strip():
-                numbers[i] = np.nan
-                continue
-            if not _NUMBER.fullmatch(text):
-                raise DataError(
-                    f"{self.where(channel, i)}: {str(cell)[:40]!r} is not a number{mark}"
-                )
-            numbers[i] = float(text)
+            if text.strip() and not _NUMBER.fullmatch(text):
+                comma = " with a decimal comma" if mark == "," else ""
+                raise DataError(f"{self.where(channel, i)}: {cell[:40]!r} is not a number{comma}")
+            numbers[i] = float(text) if text.strip() else np.nan
         return numbers
 
 
@@ -325,10 +314,8 @@ def words(cells: Iterable[Any]) -> NDArray[np.str_]:
 
 def missing_marks(values: FloatArray) -> dict[float, float]:
     """Return marks of a missing value such as -9999, with the size of the largest other number."""
-    if values.size < _FEWEST_FOR_CODES:
-        return {}
     marks = {}
-    for code in {float(values.min()), float(values.max())}:
+    for code in {float(values.min()), float(values.max())} if values.size >= _FEW else ():
         if abs(code) in _CODES or abs(code) >= _SMALLEST_OVERFLOW:
             others = np.abs(values[values != code])
             if others.size and others.max() < abs(code) / _CODE_RATIO:

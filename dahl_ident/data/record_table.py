@@ -13,7 +13,7 @@ from dahl_ident.data.column_map import Binding, ColumnMap, scaled
 from dahl_ident.data.columns import RECORD_COLUMNS
 from dahl_ident.data.plausibility import record_doubts
 from dahl_ident.data.raw_columns import RawChannel, RawFile, missing_marks
-from dahl_ident.data.record import DriveUnit, Record, is_even
+from dahl_ident.data.record import Record, is_even
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError, UnitError, ValidationError, argument
 from dahl_ident.units import MOTION_KINDS, si_unit
@@ -22,7 +22,6 @@ _STAMP = re.compile(
     r"\s*(?P<stamp>(?P<date>\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)"
     r"(?:Z|(?P<sign>[-+])(?P<hours>\d\d):?(?P<minutes>\d\d))?\s*"
 )
-_DRIVE_UNITS: dict[str, DriveUnit] = {"voltage": "V", "current": "A"}
 
 
 def record_from(
@@ -40,16 +39,16 @@ def record_from(
     size = next(iter(channels.values())).size
     complete: Any = slice(None)
     if missing == "drop":
-        numbers = {c.name: _numeric(c) for c in channels.values()}
-        complete = np.all([np.isfinite(values_of) for values_of in numbers.values()], axis=0)
-        for name, values_of in numbers.items():
-            for mark in missing_marks(values_of[np.isfinite(values_of)]):
-                marked = values_of == mark
+        complete = np.ones(size, dtype=bool)
+        for channel in channels.values():
+            numbers = _numeric(channel)
+            complete &= np.isfinite(numbers)
+            for mark in missing_marks(numbers[np.isfinite(numbers)]):
                 bound.doubt(
-                    f"{np.sum(marked)} samples left out: column {name!r} is {mark:g} in them, a "
-                    "mark of a missing value"
+                    f"{np.sum(numbers == mark)} samples left out: column {channel.name!r} is "
+                    f"{mark:g} in them, a mark of a missing value"
                 )
-                complete &= ~marked
+                complete &= numbers != mark
         bound.source = source.rows(complete)
         channels = _channels(bound)
         if not complete.all():
@@ -89,31 +88,29 @@ def record_size(source: RawFile, columns: ColumnMap) -> int:
 
 def _channels(bound: Binding) -> dict[str, RawChannel]:
     """Return the channels of the roles that the record has, exactly one motion among them."""
-    roles = bound.map.roles
-    motions = [kind for kind in MOTION_KINDS if kind in roles]
+    source = bound.source
+    motions = [kind for kind in MOTION_KINDS if kind in bound.map.roles]
     if not motions:
-        motions = [k for k in MOTION_KINDS if bound.named(k)]
-        if len(motions) > 1:
-            bound.notes.append(f"{motions[0]} is used, and not {' or '.join(motions[1:])}")
-        motions = motions[:1]
+        motions, *others = [[k] for k in MOTION_KINDS if bound.called(k)] or [[]]
+        if others:
+            unused = " or ".join(kind for (kind,) in others)
+            bound.notes.append(f"{motions[0]} is used, and not {unused}")
     if len(motions) != 1:
         raise DataError(
-            f"{bound.source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
+            f"{source.name}: {' and '.join(motions) or 'no motion'} found; expected one of "
             f"displacement, velocity and acceleration. Name it, such as "
             f"{argument('displacement', 'x')}; there are "
-            f"{listed([c.header for c in bound.source.channels], 20)}"
+            f"{listed([c.header for c in source.channels], 20)}"
         )
-    channels = {role: bound.required(role) for role in motions}
+    channels = {motions[0]: bound.required(motions[0])}
     if bound.map.sample_rate is None:
         channels["time"] = bound.required("time")
-    for role in ("force", "drive"):
-        channel = bound.channel(role)
-        if channel is not None:
-            channels[role] = channel
-    if not {"force", "drive"} & channels.keys():
-        if {c.name for c in bound.source.channels} >= _PLANNED:
+    forces = {role: bound.channel(role) for role in ("force", "drive")}
+    channels |= {role: channel for role, channel in forces.items() if channel is not None}
+    if not any(forces.values()):
+        if {c.name for c in source.channels} >= _PLANNED:
             raise DataError(
-                f"{bound.source.name}: a waveform for the exciter, as a plan writes it, holds no "
+                f"{source.name}: a waveform for the exciter, as a plan writes it, holds no "
                 "measured force. Play it, record displacement and force, and read that record"
             )
         bound.required("force")
@@ -130,13 +127,15 @@ def _numeric(channel: RawChannel) -> FloatArray:
 def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:
     """Return SI samples; for a drive in V or A, volts or amperes."""
     if role == "time" and is_stamped(channel):
-        return _seconds(bound, channel)
+        seconds = _even(bound, channel, _seconds(bound, channel))
+        first = str(channel.values.flat[0]).strip()
+        bound.notes.append(f"time counted from the stamp {first}")
+        return seconds
     values = bound.numbers(role, channel)
     unit = bound.unit(role, channel)
     _, factor = bound.kind(role, unit)
     if role == "time":
-        _require_increasing(bound.source, channel, values)
-        values = _without_rounding(bound, values)
+        values = _even(bound, channel, values)
     if unit.marker in ("rms", "peak to peak") or unit.decibel:
         raise UnitError(
             f"{bound.source.name}: column {channel.name!r} has the unit [{unit.text}]; expected "
@@ -157,12 +156,11 @@ def _seconds(bound: Binding, channel: RawChannel) -> FloatArray:
     """Return the time since the first stamp: ISO 8601, or times of one day."""
     nanoseconds = np.empty(channel.size, dtype=np.int64)
     for i, cell in enumerate(channel.values.flat):
-        match = _STAMP.fullmatch(str(cell))
-        text = "" if match is None else match["stamp"]
-        stamp = text if match is None or match["date"] else f"1970-01-01T{text}"
         moment: Any = np.datetime64("NaT")
-        with contextlib.suppress(ValueError):
-            moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
+        if (match := _STAMP.fullmatch(str(cell))) is not None:
+            stamp = match["stamp"] if match["date"] else f"1970-01-01T{match['stamp']}"
+            with contextlib.suppress(ValueError):
+                moment = np.datetime64(stamp.replace(" ", "T").replace(",", "."), "ns")
         if match is None or np.isnat(moment):
             raise DataError(
                 f"{bound.source.where(channel, i)}: {str(cell)[:40]!r} is not a time stamp such as "
@@ -172,15 +170,18 @@ def _seconds(bound: Binding, channel: RawChannel) -> FloatArray:
         if match["sign"]:  # local time, ahead of UTC by so much
             ahead = (60 * int(match["hours"]) + int(match["minutes"])) * 60_000_000_000
             nanoseconds[i] -= -ahead if match["sign"] == "-" else ahead
-    time = np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
-    _require_increasing(bound.source, channel, time)
-    time = _without_rounding(bound, time)
-    bound.notes.append(f"time counted from the stamp {str(channel.values.flat[0]).strip()}")
-    return time
+    return np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
 
 
-def _without_rounding(bound: Binding, time: FloatArray) -> FloatArray:
-    """Return evenly spaced times where the stamps are so, but for the digits that they have."""
+def _even(bound: Binding, channel: RawChannel, time: FloatArray) -> FloatArray:
+    """Return increasing times, and evenly spaced ones where they are so but for their digits."""
+    back = (np.flatnonzero(~(time[1:] > time[:-1])) + 1).tolist()
+    if back:
+        raise DataError(
+            f"{bound.source.where(channel, back[0])}: time is {time[back[0]]:.9g} after "
+            f"{time[back[0] - 1]:.9g} ({len(back)} such steps); expected it to increase with every "
+            "row"
+        )
     if time.size < _FEWEST_STAMPS or is_even(time):
         return time
     step = (time[-1] - time[0]) / (time.size - 1)
@@ -200,21 +201,9 @@ def _drive(bound: Binding, channel: RawChannel) -> dict[str, Any]:
     bound.refuse_idle_factor(kind)
     if kind == "force":
         return {"drive_unit": si_unit("force", bound.motions["drive"])}
-    values: dict[str, Any] = {"drive_unit": _DRIVE_UNITS[kind]}
+    values: dict[str, Any] = {"drive_unit": si_unit(kind)}
+    names = ("drive_factor", "drive_factor_uncertainty")
     if bound.map.drive_factor is not None:
-        factor, uncertainty = bound.force_per(kind)
-        values |= {"drive_factor": factor, "drive_factor_uncertainty": uncertainty}
-    else:
-        saved = ("drive_factor", "drive_factor_uncertainty")
-        values |= {k: bound.source.metadata[k] for k in saved if k in bound.source.metadata}
-    return values
-
-
-def _require_increasing(source: RawFile, channel: RawChannel, time: FloatArray) -> None:
-    back = np.flatnonzero(~(time[1:] > time[:-1]))
-    if back.size:
-        i = int(back[0]) + 1
-        raise DataError(
-            f"{source.where(channel, i)}: time is {time[i]:.9g} after {time[i - 1]:.9g} "
-            f"({back.size} such steps); expected it to increase with every row"
-        )
+        return values | dict(zip(names, bound.force_per(kind), strict=True))
+    saved = bound.source.metadata
+    return values | {name: saved[name] for name in names if name in saved}

@@ -82,21 +82,18 @@ def response_from(
         first, second = map(source.numbers, source.channels[:2])
         reach = np.abs(second).max()  # above zero, and degrees
         if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
+            polar = {"gain": {"column": "real", "unit": ANY}, "phase": {"column": "imag"}}
+            polar["phase"]["unit"] = "deg"
             whole.doubt(
                 "the columns of the trace are taken as real and imaginary part, but look like "
-                "magnitude and phase in degrees; if they are, give "
-                + column_map_of(
-                    {
-                        "gain": {"column": "real", "unit": ANY},
-                        "phase": {"column": "imag", "unit": "deg"},
-                    }
-                )
+                f"magnitude and phase in degrees; if they are, give {column_map_of(polar)}"
             )
     parts = []
     for label, one in by_level(source, columns).items():
+        named, of = source, ""
         if label is not None:
-            options = replace(options, level=label)
-        named = source if label is None else replace(source, name=f"{source.name}, level {label}")
+            options, of = replace(options, level=label), f"level {label}: "
+            named = replace(source, name=f"{source.name}, level {label}")
         table = _TableBinding(named, one, options)
         try:
             parts.append(table.response())
@@ -104,7 +101,6 @@ def response_from(
             raise DataError(f"{named.name}: {exc}") from exc
         whole.used |= table.used
         whole.notes += table.notes
-        of = "" if label is None else f"level {label}: "
         whole.doubts += [f"{of}{text}" for text in table.doubts]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     assumed = {"frequency": ASSUMED} if _UNKNOWN_FREQUENCY in whole.notes else {}
@@ -123,21 +119,18 @@ def _with_stated(
     source: RawFile, columns: ColumnMap, options: ResponseOptions
 ) -> tuple[RawFile, ResponseOptions]:
     """Take the level that the file's header states, where neither a column nor the user does."""
-    levels = [RESPONSE_COLUMNS[role] for role in ("drive", "amplitude")]
-    known = {"drive", "amplitude"} & columns.roles.keys() or any(
-        any(map(c.is_called, levels)) for c in source.channels
-    )
-    stated = dict(source.stated)
+    levels = {role: RESPONSE_COLUMNS[role] for role in ("drive", "amplitude")}
+    stated: dict[str, Any] = dict(source.stated)
     if "amplitude" in stated:
         stated.pop("drive", None)
     elif "drive" in stated and columns.drive_factor is None:
         _, kind, _ = parse_quantity(stated["drive"], DRIVE_KINDS, "drive")
         stated = stated if kind == "force" else {}
-    if known or options.drive or options.amplitude or not stated:
+    known = options.drive or options.amplitude or levels.keys() & columns.roles.keys()
+    if known or any(c.is_called(level) for c in source.channels for level in levels.values()):
         return source, options
     notes = [f"{role} {text}, as the file's header states" for role, text in stated.items()]
-    options = replace(options, drive=stated.get("drive"), amplitude=stated.get("amplitude"))
-    return replace(source, notes=(*source.notes, *notes)), options
+    return replace(source, notes=(*source.notes, *notes)), replace(options, **stated)
 
 
 def _swept(sweep: str, rows: int) -> FloatArray:
@@ -239,9 +232,10 @@ class _TableBinding(Binding):
         if sweep is not None:
             self._add("frequency", _swept(sweep, rows), "Hz", "sweep", sweep)
             self.notes.append(f"frequencies from the sweep stated, {sweep}")
+        hertz = options.frequency
         if not self.has("frequency"):
             self._refuse_waveforms()
-            if options.frequency is None and rows and not self.has("amplitude"):
+            if hertz is None and rows and not self.has("amplitude"):
                 raise ValidationError(
                     "no column holds the frequency (inspect proposes a column map); name it with "
                     f"{column_map_of({'frequency': ANY})}, or say what was swept, such as "
@@ -249,11 +243,11 @@ class _TableBinding(Binding):
                 )
             if not rows:
                 self.required("frequency")
-            if options.frequency is None:
+            if hertz is None:
                 self.notes.append(_UNKNOWN_FREQUENCY)
-                self._add("frequency", np.ones(rows), "Hz", "frequency", 1.0)
-        if options.frequency is not None:
-            hertz = positive_number(options.frequency, "frequency")
+                hertz = 1.0
+        if hertz is not None:
+            hertz = positive_number(hertz, "frequency")
             self._add("frequency", np.full(rows, hertz), "Hz", "frequency", hertz)
         for role, kinds in (("amplitude", MOTION_KINDS), ("drive", DRIVE_KINDS)):
             text = getattr(options, role)
@@ -277,17 +271,13 @@ class _TableBinding(Binding):
 
     def _refuse_waveforms(self) -> None:
         """Say so where samples in time were given for responses."""
-        called = {
-            role
-            for role in ("time", *MOTION_KINDS, "force")
-            if any(c.is_called(RECORD_COLUMNS[role]) for c in self.source.channels)
-        }
-        if "time" in called and len(called) > 1:
-            channels = listed([c.header for c in self.source.channels], 5)
+        channels, roles = self.source.channels, ("time", *MOTION_KINDS, "force")
+        called = [r for r in roles if any(c.is_called(RECORD_COLUMNS[r]) for c in channels)]
+        if called[:1] == ["time"] and len(called) > 1:
             raise WaveformsError(
-                f"{self.source.name}: it holds waveforms ({channels}), and a table of responses at "
-                "some frequencies was expected. If they are sine tests, make such a table with "
-                "extract; any other motion is fitted as a record: "
+                f"{self.source.name}: it holds waveforms ({listed([c.header for c in channels], 5)}"
+                "), and a table of responses at some frequencies was expected. If they are sine "
+                "tests, make such a table with extract; any other motion is fitted as a record: "
                 f"{spelled('di.fit(di.read_record(file), model)', 'dahl-ident fit --record')}"
             )
 
@@ -305,24 +295,24 @@ class _TableBinding(Binding):
             amplitude, frequency_hz, ratio, frequency_std=frequency_std, damping_ratio_std=ratio_std
         )
 
-    def _peak_kind(self, role: str) -> str:
-        """Return the kind of a column of amplitudes, and note what is assumed of unmarked ones."""
+    def _peaks(self, role: str) -> tuple[Any, str]:
+        """Return a column of amplitudes and their kind, and note what is assumed of them."""
         channel = self.channel(role)
         if channel is None:
-            return ""
-        unit = self.unit(role, channel)
+            return None, ""
+        values, unit = self.si(role), self.unit(role, channel)
         if unit.marker is None and not self.source.metadata:
             self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
-        return self.kind(role, unit)[0]
+        return values, self.kind(role, unit)[0]
 
     def _amplitude(self, frequency_hz: FloatArray) -> FloatArray | None:
-        values, kind = self.si("amplitude"), self._peak_kind("amplitude")
+        values, kind = self._peaks("amplitude")
         if values is None:
             return None
         return np.asarray(values / (2.0 * np.pi * frequency_hz) ** MOTION_KINDS.index(kind))
 
     def _drive(self) -> FloatArray | None:
-        values, kind = self.si("drive"), self._peak_kind("drive")
+        values, kind = self._peaks("drive")
         columns = [(role, self.channel(role)) for role in ("gain", "gain_db", "real", "response")]
         units = [self.unit(role, channel).text for role, channel in columns if channel is not None]
         if all(_per_drive(unit) is None for unit in units):
@@ -421,14 +411,12 @@ class _TableBinding(Binding):
         errors: dict[str, Any] = {
             "covariance": None if form is None else self._covariance(form, quantity, response),
             "dof": None if dof is None else self.source.numbers(dof, infinite=True),
-            "amplitude_std": self.si("amplitude_std"),
-            "drive_std": self.si("drive_std"),
         }
         for level in ("amplitude", "drive"):
-            cross = [f"covariance_{level}_{part}" for part in ("real", "imag")]
-            if all(self.has(role) for role in cross):
-                both = [self.si(role, quantity) for role in cross]
-                errors[f"{level}_covariance"] = np.stack(both, -1)
+            errors[f"{level}_std"] = self.si(f"{level}_std")
+            cross = [self.si(f"covariance_{level}_{part}", quantity) for part in ("real", "imag")]
+            if all(part is not None for part in cross):
+                errors[f"{level}_covariance"] = np.stack(cross, -1)
         return errors
 
     def _covariance(
@@ -470,16 +458,14 @@ class _TableBinding(Binding):
                     f"controlled: {dict(held)}"
                 )
             return matches[0]
-        if held is not None:
-            return held
-        channel = self.channel("controlled")
-        if channel is not None:
+        if held is None and (channel := self.channel("controlled")) is not None:
             words = np.char.strip(np.atleast_1d(channel.values).astype(str))
             self.source.require(np.isin(words, CONTROLLED), channel, "displacement or force")
             return words
-        word = "force" if force_only else "displacement"
-        self.notes.append(f"controlled: {word}, as the table does not say")
-        return word
+        if held is None:
+            held = "force" if force_only else "displacement"
+            self.notes.append(f"controlled: {held}, as the table does not say")
+        return held
 
     def _quality(self, n: int) -> dict[str, NDArray[Any]]:
         """Return columns without a role, as covariates: those of an earlier save in their types."""

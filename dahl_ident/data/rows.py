@@ -1,9 +1,10 @@
-"""Rows of tables: bare columns for computation, of many tables stacked, and names for people."""
+"""Rows of tables for computation, their names for people, and the levels that they belong to."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -14,8 +15,33 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.errors import DataError
-from dahl_ident.units import Quantity, engineering, shown_unit
+from dahl_ident.data.record import Record
+from dahl_ident.errors import DataError, UnitError, ValidationError
+from dahl_ident.units import (
+    DRIVE_KINDS,
+    MOTION_KINDS,
+    Quantity,
+    engineering,
+    parse_quantity,
+    shown_unit,
+)
+
+_SAME = 1.1  # ratio up to which drives or amplitudes are one level
+_SAME_FREQUENCY = 1.001  # points next to each other at a sharp resonance differ by more
+_NEARLY_ALL = 0.99  # of a wave's samples: noise and spikes lie beyond
+_NUMBER = r"(?P<value>[0-9]+(?:[.,][0-9]+)?(?:e[-+]?[0-9]+)?)"
+_UNIT = r"[^\W\d_][^;,\t\])\"']{0,20}"
+_LINE = re.compile(
+    rf"[\W_]*(?P<key>[a-z][a-z _.-]{{2,40}}?)\s*(?:[\[(](?P<own>{_UNIT})[\])]\s*)?[\"']?\s*"
+    rf"(?:[:=;,\t]\s*|\s)[\"']?{_NUMBER}(?:[\"']?\s*[;,\t]?\s*[\[(\"']?(?P<unit>{_UNIT}))?",
+    re.IGNORECASE,
+)
+_SUBJECTS = {
+    "drive", "driving", "excitation", "source", "force", "control", "target", "reference", "test",
+    "shaker", "input", "sine", "load", "torque", "displacement", "velocity", "acceleration",
+    "response", "nominal",
+}  # fmt: skip
+_SIZES = {"level", "amplitude"}
 
 
 @dataclass(frozen=True)
@@ -92,7 +118,7 @@ class Rows:
 
     @classmethod
     def stack(cls, tables: Sequence[FrequencyResponse]) -> Rows:
-        """Return the columns of many tables of one kind of rows; shared ones have the shape (n,)."""
+        """Return the columns of many tables of one kind of rows; shared ones are (n,)."""
         first = tables[0]
         for index, table in enumerate(tables):
             if table.n != first.n or table.quantity != first.quantity:
@@ -112,25 +138,15 @@ class Rows:
         columns["response"] = np.array([table.response for table in tables])
         return cls._with(columns, first.quantity)
 
-    def take(self, tables: NDArray[np.intp] | slice) -> Rows:
-        """Return some of the stacked tables; columns that all share stay as they are."""
-        return replace(self, **{name: column[tables] for name, column in self._stacked()})
-
-    def table(self, index: int) -> Rows:
-        """Return one of the stacked tables."""
-        return replace(self, **{name: column[index] for name, column in self._stacked()})
-
-    def _stacked(self) -> Iterator[tuple[str, Any]]:
-        """Yield the columns in which the stacked tables differ."""
+    def take(self, tables: NDArray[np.intp] | slice | int) -> Rows:
+        """Return one or some of the stacked tables; columns that all share stay as they are."""
+        taken: dict[str, Any] = {}
         for one in fields(self):
             column = getattr(self, one.name)
             row = COLUMNS[one.name].shape if one.name in COLUMNS else ()
             if isinstance(column, np.ndarray) and column.ndim > 1 + len(row):
-                yield one.name, column
-
-    def with_responses(self, responses: ComplexArray) -> Rows:
-        """Return these rows with one set of responses for each of many tables."""
-        return replace(self, response=responses)
+                taken[one.name] = column[tables]
+        return replace(self, **taken)
 
 
 def _stacked(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
@@ -151,9 +167,7 @@ def _stacked(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | N
 
 
 def row_names(data: FrequencyResponse, rows: Sequence[int]) -> list[str]:
-    """Return the names of rows, such as "1 Hz, 0.67 mm, harmonic 3".
-
-    Rows of one name have their number behind it.
+    """Return the names of rows, such as "1 Hz, 0.67 mm, harmonic 3"; with numbers if alike.
 
     Examples
     --------
@@ -161,9 +175,7 @@ def row_names(data: FrequencyResponse, rows: Sequence[int]) -> list[str]:
     >>> row_names(data, [0, 2])
     ['1 Hz, 670 µm (row 0)', '2 Hz, 2 mm']
     """
-    if not len(rows):
-        return []
-    every = [_name(data, row) for row in range(data.n)]
+    every = [_name(data, row) for row in range(data.n)] if len(rows) else []
     count = Counter(every)
     return [f"{every[r]} (row {r})" if count[every[r]] > 1 else every[r] for r in rows]
 
@@ -183,3 +195,87 @@ def _name(data: FrequencyResponse, row: int) -> str:
     if data.run is not None and len(data.runs or ()) > 1:
         parts.append(f"run {data.run[row]}")
     return ", ".join(parts)
+
+
+def labelled(parts: Sequence[FrequencyResponse], names: Sequence[str]) -> list[FrequencyResponse]:
+    """Return the tables of several files with their names as levels, or else as runs.
+
+    A level measured in a file of its own is not a run: how such files differ is what levels are
+    for.
+    """
+    named = [(part, np.full(part.n, name)) for part, name in zip(parts, names, strict=True)]
+    if any(part.run is not None for part in parts) or not _one_level_each(parts):
+        return [part if part.runs else replace(part, run=label) for part, label in named]
+    return [part if part.levels else replace(part, level=label) for part, label in named]
+
+
+def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:
+    """Return whether each table holds one level, and no two the same one at one frequency."""
+    levels = [part.levels for part in parts]
+    if all(levels):
+        return max(map(len, levels)) == 1 and len(set().union(*levels)) == len(parts)
+    if any(levels):
+        return False
+    bands = np.array([(p.frequency_hz.min(), p.frequency_hz.max()) for p in parts])
+    for column in zip(*map(sizes, parts), strict=True):
+        known = [size for size in column if size is not None]
+        one_each = all(size.max() < _SAME * size.min() for size in known)
+        medians = np.array([np.median(size) for size in known])
+        if one_each and len(known) == len(parts) and _all_differ(medians, bands):
+            return True
+    return False
+
+
+def one_run(records: Sequence[Record]) -> bool:
+    """Return whether each record is a sine or a sweep at one level, and no two are alike."""
+    for channel in ("force_samples", "motion_samples"):
+        waves = [getattr(record, channel) - getattr(record, channel).mean() for record in records]
+        largest = np.array([np.quantile(np.abs(wave), _NEARLY_ALL) for wave in waves])
+        sizes = np.array([np.sqrt(2.0 * np.mean(wave**2)) for wave in waves])
+        keep = (sizes < _SAME * largest) & (largest < _SAME * sizes)
+        halves = np.array([np.count_nonzero(np.diff(np.signbit(wave))) for wave in waves])
+        rates = 0.5 * halves / [record.time[-1] - record.time[0] for record in records]
+        if keep.all() and _all_differ(sizes, rates[:, None] * [_SAME**-0.5, _SAME**0.5]):
+            return True
+    return False
+
+
+def _all_differ(sizes: FloatArray, bands: FloatArray) -> bool:
+    """Return whether no two of `sizes`, (n,), agree where `bands` of frequency, (n, 2), overlap."""
+    low, high = bands.T
+    overlap = (low[:, None] < _SAME_FREQUENCY * high) & (low < _SAME_FREQUENCY * high[:, None])
+    alike = (sizes[:, None] < _SAME * sizes) & (sizes < _SAME * sizes[:, None])
+    return bool(np.count_nonzero(overlap & alike) == len(sizes))  # each with itself
+
+
+def sizes(part: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return the amplitudes of force and displacement of the fundamental, or of all rows."""
+    first = part.select(rows=part.harmonic == 1) if (part.harmonic == 1).any() else part
+    gain = first.to("dynamic_stiffness").gain
+    drive, amplitude = first.drive, first.amplitude
+    if drive is None and amplitude is not None:
+        drive = amplitude * gain
+    if amplitude is None and drive is not None:
+        amplitude = drive / gain
+    return drive, amplitude
+
+
+def stated_levels(lines: Iterable[str]) -> dict[str, str]:
+    """Return the drive and the amplitude that lines of a header state, if each states one only."""
+    stated: dict[str, set[str]] = {}
+    for line in lines:
+        match = _LINE.match(line[:200])
+        if match is None:
+            continue
+        words = set(re.split(r"[\s_.-]+", match["key"].casefold())) - {""}
+        if not words <= _SUBJECTS | _SIZES or not (words & _SIZES or words == {"drive"}):
+            continue
+        unit = match["own"] or match["unit"] or ""
+        text = f"{match['value'].replace(',', '.')} {unit.strip()}"
+        try:
+            _, kind, _ = parse_quantity(text, (*DRIVE_KINDS, *MOTION_KINDS), "level")
+        except (UnitError, ValidationError):
+            continue
+        role = "drive" if kind in DRIVE_KINDS else "amplitude"
+        stated.setdefault(role, set()).add(text)
+    return {role: texts.pop() for role, texts in stated.items() if len(texts) == 1}

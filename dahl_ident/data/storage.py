@@ -40,11 +40,9 @@ def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False
     """Write a table in the format of the path's extension."""
     place = Path(path)
     packed = place.suffix.lower() == ".gz" and Path(place.stem).suffix.lower() in (".csv", ".tsv")
-    if not packed:
-        place_of(place, "a table", (*_WRITERS, ".csv.gz"))
-    content = _WRITERS[Path(place.stem if packed else place.name).suffix.lower()](frame)
-    packing = gzip.compress(content, mtime=0) if packed else content
-    write_whole(place, packing, overwrite=overwrite)
+    named = Path(place.stem) if packed else place_of(place, "a table", (*_WRITERS, ".csv.gz"))
+    content = _WRITERS[named.suffix.lower()](frame)
+    write_whole(place, gzip.compress(content, mtime=0) if packed else content, overwrite=overwrite)
     return place
 
 
@@ -128,27 +126,21 @@ def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool
         write(part)
         with part.open("rb+") as written:
             os.fsync(written.fileno())
-        if overwrite:
-            part.replace(path)
-        else:
-            _move_to_new(part, path)
+        if not overwrite:
+            try:
+                os.link(part, path)  # fails if the name is taken, and never shows half a file
+            except FileExistsError:
+                raise
+            except (OSError, NotImplementedError, AttributeError):  # no links on this file system
+                path.open("xb").close()
+            else:
+                part.unlink()
+                return
+        part.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()
         raise
-
-
-def _move_to_new(part: Path, path: Path) -> None:
-    """Move a file to a name that must be free."""
-    try:
-        os.link(part, path)  # fails if the name is taken, and never shows half a file
-    except FileExistsError:
-        raise
-    except (OSError, NotImplementedError, AttributeError):  # a file system without links
-        path.open("xb").close()
-        part.replace(path)
-    else:
-        part.unlink()
 
 
 @contextlib.contextmanager
@@ -202,12 +194,10 @@ def as_before_inert(frame: pd.DataFrame) -> pd.DataFrame:
 def _runs(text: str) -> bool:
     """Return whether a spreadsheet would run a text, but for apostrophes in front of it."""
     bare = text.lstrip("'")
-    if not bare.startswith(("=", "+", "-", "@", "\t", "\r")):
-        return False
     try:
         float(bare)
     except ValueError:
-        return True
+        return bare.startswith(("=", "+", "-", "@", "\t", "\r"))
     return False
 
 
@@ -217,11 +207,10 @@ def _texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
     def cell(value: Any) -> Any:
         return change(value) if isinstance(value, str) else value
 
-    texts = [c for c in frame.columns if frame[c].dtype.kind not in "fiubc"]
-    if not texts and all(cell(c) == c for c in frame.columns):
-        return frame
-    changed = frame.assign(**{c: frame[c].map(cell) for c in texts})
-    changed.columns = [cell(c) for c in frame.columns]
+    changed = frame.rename(columns=cell)
+    for i, kind in enumerate(dtype.kind for dtype in frame.dtypes):
+        if kind not in "fiubc":
+            changed.isetitem(i, frame.iloc[:, i].map(cell).array)
     return changed
 
 
@@ -248,7 +237,7 @@ def read_metadata(text: Any) -> dict[str, Any]:
     try:
         content = json.loads(text)
         known = isinstance(content, dict) and all(
-            _KNOWN_METADATA.get(key, lambda _: False)(value) for key, value in content.items()
+            key in _SAVED and _SAVED[key](value) for key, value in content.items()
         )
     except (RecursionError, TypeError) as exc:
         raise ValueError("the comment of this package is not JSON") from exc
@@ -266,19 +255,22 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_provenance(value: Any) -> bool:
-    """Return whether a value is the provenance of data, or of what they were made from."""
-    return isinstance(value, dict) and (
+    """Return whether a value is the provenance of data, or of made from; or None."""
+    if not isinstance(value, dict):
+        return value is None
+    parts = value.get("parts", [])
+    return (
         all(_is_words(value[key]) for key in ("notes", "warnings") if key in value)
-        and isinstance(value.get("parts", []), list)
-        and all(_is_provenance(part) for part in value.get("parts", []))
-        and (value.get("origin") is None or _is_provenance(value["origin"]))
+        and isinstance(parts, list)
+        and all(part is not None and _is_provenance(part) for part in parts)
+        and _is_provenance(value.get("origin"))
     )
 
 
-_KNOWN_METADATA: dict[str, Callable[[Any], bool]] = {
+_SAVED: dict[str, Callable[[Any], bool]] = {
     "quality": lambda v: isinstance(v, dict) and set(map(str, v.values())) <= set("biufU"),
     "text": _is_words,
-    "provenance": lambda v: v is None or _is_provenance(v),
+    "provenance": _is_provenance,
     "drive_factor": _is_number,
     "drive_factor_uncertainty": _is_number,
 }

@@ -67,7 +67,7 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     if provenance is None:
         return []
     parts = provenance.get("parts", [provenance])
-    files = distinct(np.array([str(part["file"]) for part in parts if "file" in part]))
+    files = list(dict.fromkeys(str(part["file"]) for part in parts if "file" in part))
     notes = dict.fromkeys(note for part in parts for note in part.get("notes", []))
     lines = [("from", listed(files, shown=3))] if files else []
     lines += [("warning", text) for text in doubts(provenance)]
@@ -89,14 +89,13 @@ def assumes_frequency(provenance: Mapping[str, Any] | None) -> bool:
 
 
 def _origins(provenance: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
-    """Yield the provenance of data, and of all that they were made from."""
+    """Yield the provenance of data, and of all that they were made from, breadth first."""
     waiting = [provenance or {}]
     while waiting:
         part = waiting.pop(0)
         yield part
-        waiting += [one for one in part.get("parts", ()) if isinstance(one, Mapping)]
-        if isinstance(part.get("origin"), Mapping):
-            waiting.append(part["origin"])
+        makers = (*part.get("parts", ()), part.get("origin"))
+        waiting += [maker for maker in makers if isinstance(maker, Mapping)]
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import whole_number
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.levels import labelled
 from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
+from dahl_ident.data.rows import labelled
 from dahl_ident.errors import DataError, ValidationError, name_options, names_options
 from dahl_ident.extraction.cycles import Mode
 from dahl_ident.extraction.from_record import record_response

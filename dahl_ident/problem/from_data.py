@@ -157,7 +157,7 @@ class ProblemBatch(TableProblem):
                 f"responses have shape {responses.shape}; expected (replicates, {n}), one number "
                 "for each row of the data"
             )
-        return problem._with_rows(cls, problem._rows.with_responses(responses))
+        return problem._with_rows(cls, replace(problem._rows, response=responses))
 
     def take(self, tables: NDArray[np.intp] | slice) -> ProblemBatch:
         """Return the batch of some of the tables."""
@@ -165,7 +165,7 @@ class ProblemBatch(TableProblem):
 
     def table(self, index: int) -> TableProblem:
         """Return the problem of one table."""
-        problem = self._with_rows(TableProblem, self._rows.table(index))
+        problem = self._with_rows(TableProblem, self._rows.take(index))
         if "tables" in self.__dict__:  # replicates are responses alone
             problem.data = self.tables[index]
         return problem

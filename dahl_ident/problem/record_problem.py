@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.levels import one_run
 from dahl_ident.data.record import at_even_times, cut, unbroken
+from dahl_ident.data.rows import one_run
 from dahl_ident.elements import Element, Friction, Model, Parameter
 from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.element import as_model

@@ -17,14 +17,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from dahl_ident.data.column_map import SETTINGS, column_map
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.frequency_response import FrequencyResponse
-from dahl_ident.data.levels import labelled
 from dahl_ident.data.raw_columns import RawFile
 from dahl_ident.data.readers.file import FORMATS, File, open_file
 from dahl_ident.data.readers.inspection import FileContents, contents
 from dahl_ident.data.record import Record
 from dahl_ident.data.record_table import record_from, record_size
 from dahl_ident.data.response_table import ResponseOptions, response_from
+from dahl_ident.data.rows import labelled
 from dahl_ident.data.storage import plain_data
 from dahl_ident.errors import DahlIdentError, DataError, DataWarning, ValidationError, argument
 from dahl_ident.units import Quantity
@@ -162,7 +163,8 @@ def read_frequency_response(
                 )
         parts.append(part)
     if len(parts) == 1:
-        return _as_saved(parts[0]) if _is_frame(paths[0]) else parts[0]
+        saved = (parts[0].provenance or {}).get("origin") if _is_frame(paths[0]) else None
+        return parts[0] if saved is None else replace(parts[0], provenance=saved)
     try:
         return FrequencyResponse.concatenate(labelled(parts, run_names(paths)))
     except ValidationError as exc:
@@ -243,8 +245,7 @@ def record_pieces(
     **roles: Any,
 ) -> Iterator[Record]:
     """Yield a record in pieces of at most so many samples, each read when its turn comes."""
-    if missing not in ("error", "drop"):
-        raise ValidationError(f"missing is {missing!r}; expected 'error' or 'drop'")
+    one_of(missing, "missing", ("error", "drop"))
     if roles.get("time") is not None and roles.get("sample_rate") is not None:
         raise ValidationError("time and sample_rate are both given; leave out one of them")
     source = open_source(path, sheet, _given(columns=columns, sheet=sheet, **roles))
@@ -254,8 +255,7 @@ def record_pieces(
     if pieces == 1:
         yield record_from(source, bound, missing)
         return
-    edges = [i * n // pieces for i in range(pieces + 1)]
-    for start, stop in pairwise(edges):
+    for start, stop in pairwise(i * n // pieces for i in range(pieces + 1)):
         channels = (c.part(slice(start, stop)) if c.size == n else c for c in source.channels)
         named = partial(lambda first, row: source.row_name(first + row), start)
         part = replace(source, channels=tuple(channels), row_name=named)
@@ -263,12 +263,6 @@ def record_pieces(
         if bound.sample_rate is not None:
             record = replace(record, time=record.time + start / bound.sample_rate)
         yield record
-
-
-def _as_saved(data: FrequencyResponse) -> FrequencyResponse:
-    """Return a table from memory with its previous provenance."""
-    origin = (data.provenance or {}).get("origin")
-    return data if origin is None else replace(data, provenance=origin)
 
 
 def _is_frame(path: Any) -> TypeIs[pd.DataFrame]:
@@ -317,14 +311,11 @@ def open_source(
     options: Mapping[str, Any] | None = None,
 ) -> RawFile:
     """Return the channels of a file of any format, with the user's options."""
-    if _is_frame(path):
-        from dahl_ident.data.readers.spreadsheets import frame_source
-
-        return replace(frame_source(path), options=options or {})
     if not isinstance(path, (str, Path)):
-        from dahl_ident.data.readers.dictionaries import dictionary_source
+        from dahl_ident.data.readers.tables import dictionary_source, frame_source
 
-        return replace(dictionary_source(path), options=options or {})
+        source = frame_source(path) if _is_frame(path) else dictionary_source(path)
+        return replace(source, options=options or {})
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
         raise DataError(
@@ -359,11 +350,8 @@ def _parsed(file: File, sheet: str | None) -> RawFile:
 
 def _given(**options: Any) -> dict[str, Any]:
     """Return the options that were given, as JSON data."""
-    return {
-        k: plain_data(v)
-        for k, v in options.items()
-        if v is not None and (k, v) != ("passive", True)
-    }
+    given = {name: plain_data(value) for name, value in options.items() if value is not None}
+    return {name: value for name, value in given.items() if (name, value) != ("passive", True)}
 
 
 def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:
@@ -383,8 +371,7 @@ def refuse_repeated(sources: Sequence[Any]) -> None:
     seen: set[Path] = set()
     for source in sources:
         if isinstance(source, (str, Path)):
-            place = Path(source).resolve()
-            if place in seen:
+            if (place := Path(source).resolve()) in seen:
                 raise DataError(f"{source}: the file is named twice; expected each file once")
             seen.add(place)
 
@@ -395,13 +382,12 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
         return {}
     name = Path(str(path)).name if not _is_frame(path) else "the table"
     try:
-        pattern = re.compile(expression)
+        match = re.search(expression, name)
     except re.error as exc:
         raise DataError(
             f"level_from_name {expression!r} is not a regular expression: {exc}"
         ) from exc
-    match = pattern.search(name)
-    if match is None or not pattern.groups:
+    if match is None or not match.re.groups:
         raise DataError(
             f"{name}: level_from_name {expression!r} finds no group in the name; put what is the "
             "level in round brackets, such as '([0-9.]+)N'"
@@ -409,23 +395,18 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
     groups: dict[str, Any] = {k: v for k, v in match.groupdict().items() if v is not None}
     level = str(groups.get("level", match[1]))
     try:
-        groups["level"] = float(level)
+        return groups | {"level": float(level)}
     except ValueError:
-        groups["level"] = level
-    return groups
+        return groups | {"level": level}
 
 
-def _filled(
-    text: str | None, groups: Mapping[str, Any], path: PathLike | pd.DataFrame
-) -> str | None:
-    if text is None:
-        return None
-    # names only: a format string would also reach into attributes
-    parts = re.split(r"\{(\w+)\}", text)
+def _filled(text: str | None, groups: Mapping[str, Any], path: PathLike | pd.DataFrame) -> Any:
+    """Return a text with its braces filled; names only, as a format string reaches attributes."""
+    parts = re.split(r"\{(\w+)\}", text or "")
     absent = [name for name in parts[1::2] if name not in groups]
     if absent or any(mark in part for part in parts[0::2] for mark in "{}"):
         raise DataError(
             f"{path}: {text!r} cannot be filled from the file's name: level_from_name gives "
             f"{sorted(groups) or 'nothing'}"
         )
-    return "".join(str(groups[p]) if i % 2 else p for i, p in enumerate(parts))
+    return text and "".join(str(groups[p]) if i % 2 else p for i, p in enumerate(parts))

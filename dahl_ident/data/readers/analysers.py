@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import RawChannel, RawFile
 from dahl_ident.data.readers.file import MOST_CHANNELS, File, utf8
+from dahl_ident.data.rows import stated_levels
 from dahl_ident.data.storage import library
 from dahl_ident.errors import DataError
 from dahl_ident.units import parse_unit

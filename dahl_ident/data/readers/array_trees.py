@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import operator
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -34,7 +35,7 @@ Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
 
 
 def tree_source(
-    file: File, kind: str, leaves: Iterator[Leaf], metadata: Mapping[str, Any] | None = None
+    file: File, kind: str, leaves: Iterable[Leaf], metadata: Mapping[str, Any] | None = None
 ) -> RawFile:
     """Return the numeric vectors and matrices of a tree as channels."""
     channels: list[RawChannel] = []
@@ -61,18 +62,16 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
     """Yield an array as one channel, or a matrix as several."""
     short = re.split(r"[./]", path)[-1]
     array = value if isinstance(value, Stored) else np.asarray(value)
-    if array.dtype.kind not in "fiubcU" or 0 in array.shape:
-        return
     shape = tuple(n for n in array.shape if n != 1)
-    upright = len(shape) < 2 or shape[1] <= shape[0]
-    if len(shape) < 2:
-        parts = [""]
-    elif len(shape) == 2 and min(shape) <= _WIDEST:
-        parts = [f"[:,{i}]" if upright else f"[{i},:]" for i in range(min(shape))]
-    else:
+    too_wide = len(shape) > 2 or (len(shape) == 2 and min(shape) > _WIDEST)
+    if array.dtype.kind not in "fiubcU" or 0 in array.shape or too_wide:
         return
+    upright = len(shape) < 2 or shape[1] <= shape[0]
+    parts = [""]
+    if len(shape) == 2:
+        parts = [f"[:,{i}]" if upright else f"[{i},:]" for i in range(min(shape))]
     for i, index in enumerate(parts):
-        read = _column(array, shape, i, upright)
+        read = partial(_column, array, shape, i, upright)
         if not isinstance(array, Stored):
             content: Any = read(slice(None))
         elif array.shape == shape and len(shape) == 1:
@@ -82,21 +81,17 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
         yield RawChannel(path + index, content, unit, short=short + index)
 
 
-def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool) -> Any:
-    """Return what reads a part of one column or row of a matrix, or of a vector in one."""
-
-    def read(rows: slice) -> NDArray[Any]:
-        if not isinstance(array, Stored):
-            matrix = array.reshape(shape)
-        elif rows != slice(None) and upright and array.shape == shape:
-            matrix, rows = array[rows], slice(None)
-        else:
-            matrix = array.array.reshape(shape)
-        if len(shape) < 2:
-            return np.asarray(matrix[rows] if shape else matrix)
-        return np.asarray(matrix[rows, i] if upright else matrix[i, rows])
-
-    return read
+def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool, rows: slice) -> NDArray[Any]:
+    """Return a part of one column or row of a matrix, or of a vector in one."""
+    if not isinstance(array, Stored):
+        matrix = array.reshape(shape)
+    elif rows != slice(None) and upright and array.shape == shape:
+        matrix, rows = array[rows], slice(None)
+    else:
+        matrix = array.array.reshape(shape)
+    if len(shape) < 2:
+        return np.asarray(matrix[rows] if shape else matrix)
+    return np.asarray(matrix[rows, i] if upright else matrix[i, rows])
 
 
 def read_npz(file: File) -> RawFile:
@@ -125,30 +120,29 @@ def read_npy(file: File) -> RawFile:
 
 def _fields(path: str, array: NDArray[Any], mapped: File | None = None) -> Iterator[Leaf]:
     """Yield an array, or each field of a table; of a mapped file each part is a mapping again."""
+
+    def read(field: str | None, rows: slice) -> NDArray[Any]:
+        assert mapped is not None  # others are in memory
+        again = np.load(mapped.stream(), mmap_mode="r", allow_pickle=False)
+        return np.array((again if field is None else again[field])[rows])
+
     for field in array.dtype.names or (None,):
-        values = array if field is None else array[field]
+        values: Any = array if field is None else array[field]
         where = path if field is None else f"{path}.{field}"
-
-        def read(rows: slice, field: str | None = field) -> NDArray[Any]:
-            assert mapped is not None  # others are in memory
-            again = np.load(mapped.stream(), mmap_mode="r", allow_pickle=False)
-            return np.array((again if field is None else again[field])[rows])
-
-        if mapped is None or not values.ndim:
-            yield where, values, None
-        else:
-            yield where, Stored(values.shape, values.dtype, read, f"{mapped.name}: {where}"), None
+        if mapped is not None and values.ndim:
+            what = f"{mapped.name}: {where}"
+            values = Stored(values.shape, values.dtype, partial(read, field), what)
+        yield where, values, None
 
 
 def read_matlab(file: File) -> RawFile:
     """Return the arrays of a MATLAB v4, v5 or v7 file; v7.3 is HDF5."""
     from scipy.io import loadmat
 
-    def load() -> dict[str, Any]:
+    def load() -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a variable twice, or one that cannot be read
-            content: dict[str, Any] = loadmat(file.stream(), appendmat=False)
-        return content
+            return loadmat(file.stream(), appendmat=False)
 
     seconds = _SECONDS + file.length // _BYTES_A_SECOND
     content, error = apart(load, seconds=seconds, bytes_at_most=2 * file.limit)
@@ -194,12 +188,12 @@ def read_hdf5(file: File) -> RawFile:
     end = int.from_bytes(block[at : at + width], "little")
     if file.length != end:
         raise ValueError(f"it has {file.length} bytes, and says that it ends after {end}")
-    matlab = root.userblock_size >= 512 and file.head.startswith(b"MATLAB")
-    tree = _Tree(file, root, h5py)
-    leaves = list(tree.matlab_group(root, "", 0) if matlab else tree.group(root, "", 0))
     text = root.attrs.get("dahl_ident")
     metadata = {} if text is None else read_metadata(text)
-    return tree_source(file, "MATLAB v7.3" if matlab else "HDF5", iter(leaves), metadata)
+    tree = _Tree(file, root, h5py)
+    if root.userblock_size >= 512 and file.head.startswith(b"MATLAB"):
+        return tree_source(file, "MATLAB v7.3", list(tree.matlab_group(root, "", 0)), metadata)
+    return tree_source(file, "HDF5", list(tree.group(root, "", 0)), metadata)
 
 
 def _refuse_fatal(file: File, h5py: Any) -> None:
@@ -271,12 +265,12 @@ class _Tree:
             yield path, words(np.ravel(item.asstr()[()])).reshape(item.shape), unit
         elif item.dtype.names:
             for name in item.dtype.names:
-                dtype = item.dtype[name]
-                yield f"{path}.{name}", self.stored(item, path, dtype, lambda a, n=name: a[n]), unit
+                form = operator.itemgetter(name)
+                yield f"{path}.{name}", self.stored(item, path, item.dtype[name], form), unit
         elif _PACKING & item.attrs.keys():
             yield path, self.stored(item, path, np.float64, partial(_unpacked, item.attrs)), unit
         else:
-            yield path, self.stored(item, path, item.dtype, lambda a: a), unit
+            yield path, self.stored(item, path, item.dtype, np.asarray), unit
 
     def stored(
         self, item: Any, path: str, dtype: Any, form: Any, *, turned: bool = False

@@ -61,16 +61,14 @@ class Format(NamedTuple):
 
 FORMATS = {
     "text": Format("a text table", ".csv .tsv .txt .dat .asc .prn", "text_table.read_text_table"),
-    "json": Format("JSON", ".json .txt .dat .asc", "dictionaries.read_json"),
-    "excel": Format(
-        "an Excel workbook", ".xlsx .xlsm", "spreadsheets.read_workbook", "the workbook"
-    ),
+    "json": Format("JSON", ".json .txt .dat .asc", "tables.read_json"),
+    "excel": Format("an Excel workbook", ".xlsx .xlsm", "tables.read_workbook", "the workbook"),
     "old excel": Format("an Excel 97 workbook"),
-    "ods": Format("an Open Document sheet", ".ods", "spreadsheets.read_workbook", "the workbook"),
+    "ods": Format("an Open Document sheet", ".ods", "tables.read_workbook", "the workbook"),
     "zip": Format("a ZIP archive"),
     "npz": Format("NumPy's .npz", ".npz", "array_trees.read_npz", "the file"),
     "npy": Format("NumPy's .npy", ".npy", "array_trees.read_npy", "the file"),
-    "parquet": Format("Parquet", ".parquet .pq", "spreadsheets.read_parquet", "the file"),
+    "parquet": Format("Parquet", ".parquet .pq", "tables.read_parquet", "the file"),
     "matlab": Format("MATLAB v5 or v7", ".mat", "array_trees.read_matlab", "the file"),
     "hdf5": Format("HDF5 or MATLAB v7.3", ".mat .h5 .hdf5", "array_trees.read_hdf5", "the file"),
     "uff": Format(

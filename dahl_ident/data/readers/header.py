@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ CELL = {
 _NUMBERED = "x-axis"  # before the numbers by which Keysight oscilloscopes call their channels
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """Consecutive rows of one width, each with a number in it, and how numeric they are."""
 
     start: int
@@ -78,22 +77,20 @@ def refuse_second_header(
     rows: Sequence[Sequence[str] | None], start: int, mark: str, where: Callable[[int], str]
 ) -> None:
     """Refuse rows of the table's own form above its header: the file has another one there."""
-    first = _numeric(rows[start] or [], mark)
-    for i in range(start if first.count(True) > 1 else 0):
-        row = rows[i]
+
+    def numeric(row: Sequence[str]) -> list[bool | None]:  # None for empty cells
+        return [CELL[mark].fullmatch(c) is not None if c.strip() else None for c in row]
+
+    first = numeric(rows[start] or [])
+    for i, row in enumerate(rows[: start if first.count(True) > 1 else 0]):
         if row is not None and len(row) == len(first):
-            same = zip(_numeric(row, mark), first, strict=True)
+            same = zip(numeric(row), first, strict=True)
             if all(one is other or None in (one, other) for one, other in same):
                 raise DataError(
                     f"{where(i)} is a row of numbers like those from {where(start)} on, and "
                     "between them are lines of words: the file has more than one header. Split "
                     "it there"
                 )
-
-
-def _numeric(row: Sequence[str], mark: str) -> list[bool | None]:
-    """Return which cells are numbers; None for empty ones."""
-    return [CELL[mark].fullmatch(cell) is not None if cell.strip() else None for cell in row]
 
 
 def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None) -> Header:
@@ -135,14 +132,11 @@ def contradict(
     names, others = ([plain(name) for name, _ in line] for line in (one, other))
     if sorted(filter(None, names)) != sorted(filter(None, others)) or len(set(names)) < 2:
         return False
-    return names != others or any(
-        _differ(unit, stated) for (_, unit), (_, stated) in zip(one, other, strict=True)
-    )
+    units = [(a, b) for (_, a), (_, b) in zip(one, other, strict=True) if a and b and a != b]
+    return names != others or any(_differ(*pair) for pair in units)
 
 
-def _differ(unit: str | None, other: str | None) -> bool:
-    if unit is None or other is None or unit == other:
-        return False
+def _differ(unit: str, other: str) -> bool:
     try:
         return replace(parse_unit(unit), text="") != replace(parse_unit(other), text="")
     except UnitError:
@@ -167,10 +161,9 @@ def _bare(cell: str) -> str | None:
 def are_units(cells: Sequence[str]) -> bool:
     """Return whether each cell is empty or a unit, and some is one."""
     try:
-        units = [parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None]
+        return bool([parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None])
     except UnitError:
         return False
-    return bool(units)
 
 
 def named_channels(
@@ -184,7 +177,7 @@ def named_channels(
         )
     channels = []
     for i, values in enumerate(columns):
-        label = named.names[i] if named.names else ""
+        label, unit = (named.names[i], named.units[i]) if named.names else ("", None)
         blank = np.char.strip(values) == "" if values.dtype.kind == "U" else values != values
         if not label and np.all(blank):
             continue
@@ -193,6 +186,5 @@ def named_channels(
                 f"{file}: the header names {named.cells} columns, the rows have {len(columns)}; "
                 "expected a name for each"
             )
-        unit = named.units[i] if named.names else None
         channels.append(RawChannel(label or f"column {i + 1}", values, unit))
     return tuple(channels)

@@ -23,17 +23,13 @@ _FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
 # The columns that are proposed; the units of some say nothing: any of them has the gain's.
 _RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("voltage", "current"))}
 _RESPONSE = {
-    role: replace(RESPONSE_COLUMNS[role], kinds=RESPONSE_COLUMNS[role].kinds if by_unit else ())
-    for by_unit, roles in (
-        (True, ("frequency", "amplitude", "drive")),
-        (False, ("response", "real", "imag")),
-        (True, ("gain",)),
-        (False, ("gain_db",)),
-        (True, ("phase",)),
-        (False, ("level",)),
+    role: RESPONSE_COLUMNS[role] if by_unit else replace(RESPONSE_COLUMNS[role], kinds=())
+    for role, by_unit in (
+        ("frequency", True), ("amplitude", True), ("drive", True), ("response", False),
+        ("real", False), ("imag", False), ("gain", True), ("gain_db", False), ("phase", True),
+        ("level", False),
     )
-    for role in roles
-}
+}  # fmt: skip
 _FREQUENCY = RESPONSE_COLUMNS["frequency"]
 _F_TOO = replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))
 
@@ -112,10 +108,9 @@ def _summary(channel: RawChannel) -> ChannelSummary:
 
 def _sampling(source: RawFile) -> tuple[str, tuple[str, ...]]:
     """Describe the sampling of the first channel that is time, and its gaps; of many, some."""
-    time_column = RECORD_COLUMNS["time"]
-    by_name = [c for c in source.channels if c.is_called(time_column)]
-    by_unit = [c for c in source.channels if time_column.measures(c.unit, c.name)]
-    for channel in by_name or by_unit:
+    column = RECORD_COLUMNS["time"]
+    named = [c for c in source.channels if c.is_called(column)]
+    for channel in named or (c for c in source.channels if column.measures(c.unit, c.name)):
         if channel.values.dtype.kind not in "fiu" or channel.size < 2:
             continue
         try:
@@ -132,15 +127,13 @@ def _sampling(source: RawFile) -> tuple[str, tuple[str, ...]]:
         )
         start, stop = gaps(time).T
         lines = tuple(f"{a:.6g} to {b:.6g} s" for a, b in zip(start, stop, strict=True))
-        if len(lines) > _FEW_GAPS:
-            lengths = stop - start
-            longest = lines[int(np.argmax(lengths))]
-            lines = (
-                f"{len(lines)} gaps, {lengths.sum():.4g} s in all, median {np.median(lengths):.4g} "
-                "s",
-                f"the longest {longest}, the first {lines[0]}, the last {lines[-1]}",
-            )
-        return text, lines
+        lengths = stop - start
+        if len(lines) <= _FEW_GAPS:
+            return text, lines
+        return text, (
+            f"{len(lines)} gaps, {lengths.sum():.4g} s in all, median {np.median(lengths):.4g} s",
+            f"the longest {lines[np.argmax(lengths)]}, the first {lines[0]}, the last {lines[-1]}",
+        )
     return "", ()
 
 
@@ -166,10 +159,11 @@ def _proposal(source: RawFile) -> str:
             roles[role] = best
     lines = [line for role, path in roles.items() for line in _entry(role, path, groups[path])]
     further = [column for role, column in every.items() if role not in roles]
-    others = {path: c for path, c in groups.items() if path not in roles.values()}
-    by_name_too = [path for path, c in others.items() if any(map(c.is_called, further))]
-    unused = [path for path in others if path not in by_name_too]
-    for what, paths in (("read by their names", by_name_too), ("not used", unused)):
+    others: dict[bool, list[str]] = {True: [], False: []}
+    for path, channel in groups.items():
+        if path not in roles.values():
+            others[any(map(channel.is_called, further))].append(path)
+    for what, paths in (("read by their names", others[True]), ("not used", others[False])):
         lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
     required = [("frequency",)] if response else [("time",), MOTION_KINDS, ("force", "drive")]
     missing = [several[0] for several in required if not set(several) & roles.keys()]

@@ -10,7 +10,7 @@ import os
 import re
 import struct
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,11 +43,10 @@ def read_tdms(file: File) -> RawFile:
     with _damage_named():
         content = nptdms.TdmsFile.open(stream)
         weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
-        starts = [t for g in content.groups() for c in g.channels() if (t := _start(c)) is not None]
+        groups = content.groups()
+        starts = [t for g in groups for c in g.channels() if (t := _start(c)) is not None]
         first = min(starts, default=None)
-        channels = [
-            c for group in content.groups() for c in _tdms_channels(file, content, group, first)
-        ]
+        channels = [c for group in groups for c in _tdms_channels(file, content, group, first)]
         begun = _begun_again(file)
     doubts = []
     if sum(c.role == "time" for c in channels) > 1 and len(set(starts)) > 1:
@@ -83,7 +82,7 @@ def _begun_again(file: File) -> list[int]:
                     f"bytes behind segment {number}, from byte {stream.tell() - len(lead)} on, "
                     "belong to none; were some added?"
                 )
-            _, _, _, following, metadata = _LEAD_IN.unpack(lead)
+            *_, following, metadata = _LEAD_IN.unpack(lead)
             number += 1
             if following > _LONGEST_SEGMENT:
                 break
@@ -120,10 +119,9 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
     for channel in group.channels():
         properties = channel.properties
         unit = properties.get("unit_string") or properties.get("NI_UnitDescription")
-        count = len(channel)
+        count, what = len(channel), f"{file.name}: {channel.path}"
         file.refuse_above_limit(8 * count, channel.path)
         read = functools.partial(_tdms_values, content, channel)
-        what = f"{file.name}: {channel.path}"
         values: Any = Stored((count,), np.dtype(channel.dtype), read, what)
         if values.dtype.kind not in "fiubc":
             values = words(map(str, values.array))
@@ -135,7 +133,7 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
                 start += step * round(float((begun - first) / np.timedelta64(1, "s")) / step, 2)
             even = functools.partial(_even_times, start, step, count)
             times[start, step, count] = Stored((count,), np.dtype(np.float64), even, what)
-    yield from _time_channels(times.values(), f"{group.name}/")
+    yield from _time_channels(list(times.values()), f"{group.name}/")
 
 
 def _tdms_values(content: Any, channel: Any, rows: slice) -> NDArray[Any]:
@@ -158,9 +156,8 @@ def _labelled(prefix: str, label: str, values: Any, unit: str | None) -> RawChan
     return RawChannel(prefix + name, values, in_label, short=name)
 
 
-def _time_channels(times: Iterable[Any], prefix: str) -> Iterator[RawChannel]:
+def _time_channels(axes: Sequence[Any], prefix: str) -> Iterator[RawChannel]:
     """Yield the time axes of a group, all different."""
-    axes = list(times)
     for i, time in enumerate(axes):
         name = "time" if len(axes) == 1 else f"time {i + 1}"
         yield RawChannel(prefix + name, time, "s", "time", name)
@@ -172,8 +169,9 @@ def read_lvm(file: File) -> RawFile:
     lines, inside = [], False
     for i, line in enumerate(text.split("\n")):
         mark = line.strip()
-        inside = (inside or mark.startswith(_SPECIAL[0])) and not mark.startswith(_SPECIAL[1])
-        if not inside and not mark.startswith(_SPECIAL[1]):
+        ends = mark.startswith(_SPECIAL[1])
+        inside = (inside or mark.startswith(_SPECIAL[0])) and not ends
+        if not inside and not ends:
             lines.append((i + 1, line))
     content = _Lvm(file, lines)
     segments: list[_LvmBlock] = []
@@ -181,11 +179,9 @@ def read_lvm(file: File) -> RawFile:
         segments.append(content.segment())
         if len(segments) > _MOST_SEGMENTS:
             raise DataError(f"{file.name}: the file has more than {_MOST_SEGMENTS} segments")
-    channels = [
-        channel
-        for i, segment in enumerate(segments)
-        for channel in segment.channels(f"segment {i}/" if len(segments) > 1 else "")
-    ]
+    channels: list[RawChannel] = []
+    for i, segment in enumerate(segments):
+        channels += segment.channels(f"segment {i}/" if len(segments) > 1 else "")
     doubts = tuple(doubt for segment in segments for doubt in segment.contradictions())
     return file.source("LVM", channels, row_name=lambda i: f"sample {i}", doubts=doubts)
 
@@ -248,11 +244,11 @@ class _Lvm:
             data[:, k] = numbers.from_text(RawChannel(label, column))
         segment = _LvmBlock(header, labels[first:width], data, self.columns == "multi")
         self.check_samples(segment)
-        following = next((pair for pair in self.lines if pair[1].strip()), (0, ""))
-        if following[1] and "_" not in following[1] and not following[1][0].isalpha():
+        number, following = next((pair for pair in self.lines if pair[1].strip()), (0, ""))
+        if following and "_" not in following and not following[0].isalpha():
             raise DataError(
-                f"{self.file.name}, line {following[0]}: numbers behind a blank line, where a "
-                "segment has ended; expected its samples without blank lines between them"
+                f"{self.file.name}, line {number}: numbers behind a blank line, where a segment "
+                "has ended; expected its samples without blank lines between them"
             )
         return segment
 
@@ -298,7 +294,7 @@ class _LvmBlock(NamedTuple):
             n = np.arange(len(self.data))
             both = zip(self.floats("X0"), self.floats("Delta_X"), strict=False)
             times = [start + step * n for start, step in both if step > 0]
-        yield from _time_channels({time.tobytes(): time for time in times}.values(), prefix)
+        yield from _time_channels(list({time.tobytes(): time for time in times}.values()), prefix)
 
     def contradictions(self) -> Iterator[str]:
         """Yield what the header says of the sampling, and the column of times does not."""

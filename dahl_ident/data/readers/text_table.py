@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.levels import stated_levels
 from dahl_ident.data.raw_columns import TRACE, RawChannel, RawFile, plain, split_header, words
 from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.readers.header import (
@@ -30,6 +29,7 @@ from dahl_ident.data.readers.header import (
     named_channels,
     refuse_second_header,
 )
+from dahl_ident.data.rows import stated_levels
 from dahl_ident.data.storage import METADATA_MARK, as_before_inert, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
@@ -77,12 +77,15 @@ _LAST_DIALECTS = ((":", "."), (":", ","))  # a colon also stands in times of day
 
 @dataclass(frozen=True)
 class _Layout:
-    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header."""
+    """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header.
+
+    `repeated` is the line above the numbers, by which a second header in the file is known;
+    `comments` are all lines above them where the header is in comments.
+    """
 
     delimiter: str | None
     mark: str
-    line: int
-    offset: int
+    start: int
     width: int
     header: Header
     repeated: bytes = b""
@@ -100,19 +103,21 @@ def read_text_table(file: File) -> RawFile:
     if trace is not None:
         data = _LINE_END.findall(trace[0])[0] + data[trace.end() :]  # lines keep their numbers
     lines = _head(data, name)
-    layout = _layout(lines, name)
+    layout = _layout([text for _, text in lines], name)
+    offset = lines[layout.start][0]
+    head = [text for _, text in lines]
     rows = [
-        None if not t.strip() or _COMMENT.match(t) else _split(t, layout.delimiter)
-        for _, t in lines
+        None if not t.strip() or _COMMENT.match(t) else _split(t, layout.delimiter) for t in head
     ]
-    refuse_second_header(rows, layout.line - 1, layout.mark, lambda i: f"{name}, line {i + 1}")
+    refuse_second_header(rows, layout.start, layout.mark, lambda i: f"{name}, line {i + 1}")
     refuse_many(name, layout.width, "fields")
-    metadata = _metadata(lines, name)
-    body, runs, notes = _body(data, layout, name)
+    metadata = _metadata(head, name)
+    body, runs, notes = _body(data, offset, layout, name)
     _refuse_cut_end(body, layout, name)
     count = max(body.count(b"\n"), body.count(b"\r"))
     file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
     columns = _parse(body, layout, metadata, name)
+    named = layout.header
     if trace is not None:
         points, count = int(trace[1]), len(columns[0])
         if count != points:
@@ -120,25 +125,25 @@ def read_text_table(file: File) -> RawFile:
                 f"{name}: the first line says {points} points, and {count} follow; the file "
                 f"{'looks cut off' if count < points else 'is damaged'}"
             )
-        layout = replace(layout, header=Header(("real", "imag"), (None, None), 2))
-    named = list(zip(layout.header.names, layout.header.units, strict=True))
-    above = _commented(lines[: layout.line - 1], layout.delimiter)
-    if any(contradict(named, [split_header(cell) for cell in row]) for row in above):
-        layout = replace(layout, header=replace(layout.header, contradicted=True))
-    channels = named_channels(columns, layout.header, name)
+        named = Header(("real", "imag"), (None, None), 2)
+    above = _commented(head[: layout.start], layout.delimiter)
+    pairs = list(zip(named.names, named.units, strict=True))
+    if any(contradict(pairs, [split_header(cell) for cell in row]) for row in above):
+        named = replace(named, contradicted=True)
+    channels = named_channels(columns, named, name)
     if runs and all(plain(c.name) != "run" for c in channels):
         labels = np.searchsorted(runs, np.arange(len(columns[0])), side="right") + 1
         channels = (*channels, RawChannel("run", labels.astype(np.str_)))
     return file.source(
         "text table" if trace is None else TRACE,
         channels,
-        headerless=not layout.header.names,
+        headerless=not named.names,
         decimal=layout.mark,
-        row_name=lambda i: f"line {layout.line + _places(body)[i]}",
+        row_name=lambda i: f"line {layout.start + 1 + _places(body)[i]}",
         metadata=metadata,
         notes=tuple(notes),
         runs=tuple(runs),
-        stated={} if metadata else stated_levels(text for _, text in lines[: layout.line - 1]),
+        stated={} if metadata else stated_levels(head[: layout.start]),
     )
 
 
@@ -177,25 +182,24 @@ def _split(line: str, delimiter: str | None) -> list[str]:
         return [line]
 
 
-def _layout(lines: list[tuple[int, str]], name: str) -> _Layout:
+def _layout(lines: list[str], name: str) -> _Layout:
     """Find dialect and start of the numbers, and read the header above them."""
-    passed = [not text.strip() or _COMMENT.match(text) is not None for _, text in lines]
-    best: _Layout | None = None
-    texts = [text for (_, text), skip in zip(lines, passed, strict=True) if not skip]
+    passed = [not text.strip() or _COMMENT.match(text) is not None for text in lines]
+    texts = [text for text, skip in zip(lines, passed, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
-        merit = (False, 0)  # a header that fits the columns counts more than another number
-        for delimiter, mark in _possible(dialects, texts):
-            candidate = _in_dialect(lines, passed, delimiter, mark)
-            if candidate is not None and candidate[0] > merit:
-                merit, best = candidate
-        if best is not None:
-            break
-    if best is None:
-        raise DataError(
-            f"{name}: no table of numbers found; expected at least two columns of numbers under a "
-            "header line"
+        tried = (
+            _in_dialect(lines, passed, delimiter, mark)
+            for delimiter, mark in _possible(dialects, texts)
         )
-    return best
+        candidates = [candidate for candidate in tried if candidate is not None]
+        # a header that fits the columns counts more than another number
+        best = max(candidates, key=lambda candidate: candidate[0], default=None)
+        if best is not None and best[0] > (False, 0):
+            return best[1]
+    raise DataError(
+        f"{name}: no table of numbers found; expected at least two columns of numbers under a "
+        "header line"
+    )
 
 
 def _possible(
@@ -212,12 +216,11 @@ def _possible(
 
 
 def _in_dialect(
-    lines: list[tuple[int, str]], passed: list[bool], delimiter: str | None, mark: str
+    lines: list[str], passed: list[bool], delimiter: str | None, mark: str
 ) -> tuple[tuple[bool, int], _Layout] | None:
     """Return the layout in one dialect and its merit, if there are numbers in it."""
     rows = [
-        None if skip else _split(text, delimiter)
-        for (_, text), skip in zip(lines, passed, strict=True)
+        None if skip else _split(text, delimiter) for text, skip in zip(lines, passed, strict=True)
     ]
     run = best_run(rows, mark)
     if run is None:
@@ -227,37 +230,34 @@ def _in_dialect(
         sure = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*").fullmatch
         if not any(sure(cell) for row in rows[run.start :] for cell in row or ()):
             return None
-    start, above = run.start, lines[run.start - 1][1] if run.start else ""
-    repeated = above.strip() if not passed[run.start - 1] and run.start else ""
+    start = run.start
+    repeated = lines[start - 1].strip() if start and not passed[start - 1] else ""
     if repeated:  # a header seen before: the numbers began there
-        first = next(i for i, (_, text) in enumerate(lines) if text.strip() == repeated)
+        first = next(i for i, text in enumerate(lines) if text.strip() == repeated)
         later = next((i for i in range(first + 1, start + 1) if not passed[i]), start)
         row = rows[later]
         start = later if row is not None and len(row) == run.width else start
-    row = rows[start] or []
-    filled = max((i + 1 for i, cell in enumerate(row) if cell.strip()), default=run.width)
+    filled = max((i + 1 for i, c in enumerate(rows[start] or []) if c.strip()), default=run.width)
     named = header([row for row in rows[:start] if row is not None], run.width, filled)
     comments: tuple[str, ...] = ()
     if not named.names:
         named = header(_commented(lines[:start], delimiter), run.width, filled)
-        comments = tuple(text.strip() for _, text in lines[:start]) if named.names else ()
+        comments = tuple(text.strip() for text in lines[:start]) if named.names else ()
         repeated = next((text for text in reversed(comments) if text), "")
-    layout = _Layout(
-        delimiter, mark, start + 1, lines[start][0], run.width, named,
-        repeated.encode() if named.names else b"", comments,
-    )  # fmt: skip
+    seen = repeated.encode() if named.names else b""
+    layout = _Layout(delimiter, mark, start, run.width, named, seen, comments)
     return (bool(named.names), run.score), layout
 
 
-def _commented(lines: list[tuple[int, str]], delimiter: str | None) -> list[list[str]]:
+def _commented(lines: Iterable[str], delimiter: str | None) -> list[list[str]]:
     """Return the cells of the comment lines, without their marks."""
-    texts = [text[m.end() :] for _, text in lines if (m := _COMMENT.match(text))]
+    texts = [text[m.end() :] for text in lines if (m := _COMMENT.match(text))]
     return [_split(text, delimiter) for text in texts if METADATA_MARK not in text]
 
 
-def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
+def _metadata(lines: Iterable[str], name: str) -> Mapping[str, Any]:
     """Return what an earlier save of this package wrote into a comment line."""
-    for i, (_, text) in enumerate(lines):
+    for i, text in enumerate(lines):
         comment = re.match(rf"\s*#\s*{METADATA_MARK}(.*)", text)
         if comment:
             try:
@@ -270,34 +270,34 @@ def _metadata(lines: list[tuple[int, str]], name: str) -> Mapping[str, Any]:
     return {}
 
 
-def _body(data: bytes, layout: _Layout, name: str) -> tuple[bytes, list[int], list[str]]:
+def _body(
+    data: bytes, offset: int, layout: _Layout, name: str
+) -> tuple[bytes, list[int], list[str]]:
     """Return the lines of numbers, all else blanked; rows at which a run begins; and notes."""
-    body = data[layout.offset :]
-    above = _LINE_END.split(data[: layout.offset])[:-1]
+    body = data[offset:]
+    above = _LINE_END.split(data[:offset])[:-1]
     for i in range(len(above) - 1, -1, -1):  # directly above are comments, by their first sign
         text = above[i].decode("utf-8", "replace")
         if text.strip() and not _COMMENT.match(text):
             break
         if _looks_like_data(text, layout):
             raise DataError(f"{name}, line {i + 1}: {_LIKE_DATA.format(text.strip()[:40])}")
-    commented = any(body.find(mark) >= 0 for mark in (b"#", b"%", b"//", b"!"))
+    commented = any(mark in body for mark in (b"#", b"%", b"//", b"!"))
     if commented:
         _refuse_odd_comments(body, layout, name)
     body, footers = _without_footers(body, layout)
     notes = [f"left out below the table: {text.strip()[:60]!r}" for text in footers]
     body, runs = _without_repeated_headers(body, layout)
-    body = _COMMENT_LINE.sub(b"", body) if commented else body
     if runs:
         rows = listed([i + 1 for i in runs])
         notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
-    return body, runs, notes
+    return _COMMENT_LINE.sub(b"", body) if commented else body, runs, notes
 
 
 def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
     """Refuse comments among the numbers that are rows, or another header."""
     for count, comment in enumerate(_COMMENT_LINE.finditer(body)):
         text = comment[0].decode("utf-8", "replace")
-        why = ""
         if _looks_like_data(text, layout):
             why = _LIKE_DATA.format(text.strip()[:40])
         elif _is_another_header(text, layout):
@@ -310,9 +310,10 @@ def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
                 f"more than {_MOST_COMMENTS} comments stand among the numbers; expected fewer. "
                 "Delete them"
             )
-        if why:
-            line = layout.line + len(_LINE_END.findall(body, 0, comment.start()))
-            raise DataError(f"{name}, line {line}: {why}")
+        else:
+            continue
+        line = layout.start + 1 + len(_LINE_END.findall(body, 0, comment.start()))
+        raise DataError(f"{name}, line {line}: {why}")
 
 
 def _looks_like_data(text: str, layout: _Layout) -> bool:
@@ -329,7 +330,7 @@ def _is_another_header(text: str, layout: _Layout) -> bool:
     """Return whether a comment is a header, and none of those above the numbers."""
     if text.strip() in layout.comments:
         return False
-    cells = next(iter(_commented([(0, text)], layout.delimiter)), [""])
+    cells = next(iter(_commented([text], layout.delimiter)), [""])
     names, units = zip(*(split_header(cell) for cell in cells), strict=True)
     known = sorted(plain(name) for name in layout.header.names if name)
     return (bool(known) and sorted(plain(name) for name in names if name) == known) or (
@@ -360,23 +361,23 @@ def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
 
 def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list[int]]:
     """Blank every later line that repeats the header, and name the rows behind them."""
-    if not layout.repeated or body.find(layout.repeated) < 0:
+    if not layout.repeated or layout.repeated not in body:
         return body, []
     lines = re.split(rb"(\r\n|\n|\r)", body)
     runs: list[int] = []
     rows = 0
     for i in range(0, len(lines), 2):
-        if lines[i].strip() == layout.repeated:
-            runs.append(rows)
-            for k in range(i, -1, -2):  # and the lines of its header above it
-                cells = _split(lines[k].decode("utf-8", "replace"), layout.delimiter)
-                if k < i and any(CELL[layout.mark].fullmatch(cell) for cell in cells):
-                    break
-                rows -= k < i and _counts(lines[k])
-                lines[k] = b""
-            runs[-1] = rows
-        else:
+        if lines[i].strip() != layout.repeated:
             rows += _counts(lines[i])
+            continue
+        lines[i] = b""
+        for k in range(i - 2, -1, -2):  # and the lines of its header above it
+            cells = _split(lines[k].decode("utf-8", "replace"), layout.delimiter)
+            if any(CELL[layout.mark].fullmatch(cell) for cell in cells):
+                break
+            rows -= _counts(lines[k])
+            lines[k] = b""
+        runs.append(rows)
     return b"".join(lines), runs
 
 
@@ -488,7 +489,7 @@ def _parse(
         if ragged is None:
             raise DataError(f"{name}: the table cannot be read: {str(exc).strip()}") from exc
         raise DataError(
-            f"{name}: line {int(ragged[2]) + layout.line - 1} has {ragged[3]} fields; expected "
+            f"{name}: line {int(ragged[2]) + layout.start} has {ragged[3]} fields; expected "
             f"{ragged[1]} as in the lines above"
         ) from exc
     except (ValueError, OverflowError) as exc:

@@ -1,0 +1,379 @@
+"""Tables that are there as cells, rows or columns: Excel, Parquet, pandas, JSON, SDyPy.
+
+JSON may hold ``{"x [mm]": [...], ...}``; ``[{"name": "x", "values": [...], "unit": "mm"}, ...]``;
+rows, ``[{"x [mm]": 1.0}, ...]`` or ``[["x [mm]"], [1.0], ...]``; ``{"columns": [...], "data":
+[[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or the time series of
+SDyPy (its enhancement proposal 5). Units stand in the names, in each column, or under ``"units"``
+or ``"displacement units"``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dahl_ident.data.raw_columns import (
+    RawChannel,
+    RawFile,
+    Stored,
+    cell_text,
+    column_of,
+    plain,
+    split_header,
+    words,
+)
+from dahl_ident.data.readers.file import ZIP_ERRORS, File, apart, refuse_many, utf8
+from dahl_ident.data.readers.header import best_run, header, named_channels, refuse_second_header
+from dahl_ident.data.rows import stated_levels
+from dahl_ident.data.storage import library, read_metadata
+from dahl_ident.data.tabular import listed
+from dahl_ident.errors import DataError, argument
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_HEAD_ROWS = 400  # looked at as text, which takes long, to find the table
+_BYTES, _SECONDS = 1 << 30, 15  # that reading may take: a small archive can unpack to anything
+_UNNAMED = "column {}"
+_UNIT_OF = re.compile(r"(.+?)[ _]units?")  # "displacement units": "mm"
+_VALUES, _UNITS = ("values", "data"), ("unit", "unit_str", "units")
+_TABLES = ("channels", "signals", "columns", "data", "rows")
+
+
+def read_workbook(file: File, sheet: str | None = None) -> RawFile:
+    """Return the table on a sheet; without a name, on the only sheet that has one."""
+    sheets = _cells(file)
+    if sheet is not None:
+        if sheet not in sheets:
+            raise DataError(f"{file.name}: no sheet {sheet!r}; there are {listed(sheets)}")
+        sheets = {sheet: sheets[sheet]}
+    tables = {name: _table(file, name, rows) for name, rows in sheets.items()}
+    with_table = {name: table for name, table in tables.items() if table is not None}
+    if not with_table:
+        raise DataError(
+            f"{file.name}: no table of numbers on {listed(tables)}; expected at least two columns "
+            "of numbers under a header line"
+        )
+    if len(with_table) > 1:
+        raise DataError(
+            f"{file.name}: sheets {listed(with_table)} hold tables; name one with "
+            f"{argument('sheet', next(iter(with_table)))}"
+        )
+    return next(iter(with_table.values()))
+
+
+def _cells(file: File) -> dict[str, list[list[Any]]]:
+    """Return the cells of every sheet, read in a process of its own."""
+    broken = None
+    with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
+        broken = archive.testzip()
+    if broken is not None:
+        raise ValueError(f"the check sum of {broken} differs")
+    calamine = library("python_calamine", "excel")
+
+    def read() -> dict[str, list[list[Any]]]:  # pragma: no cover
+        with file.opened() as content:
+            book = calamine.CalamineWorkbook.from_filelike(content)
+            return {name: _rows(book, name) for name in book.sheet_names}
+
+    cells, error = apart(read, seconds=_SECONDS, bytes_at_most=_BYTES)
+    if error:
+        raise DataError(f"{file.name}: the workbook is damaged, or too large: {error[:200]}")
+    sheets: dict[str, list[list[Any]]] = cells
+    return sheets
+
+
+def _rows(book: Any, name: str) -> list[list[Any]]:  # pragma: no cover
+    """Return the cells of a sheet; numbers, text and truth values as they are, dates as text."""
+    try:
+        rows = book.get_sheet_by_name(name).to_python(skip_empty_area=False)
+    except Exception as exc:
+        if "worksheet" in type(exc).__name__.lower() or "chart" in str(exc).lower():
+            return []  # a sheet of diagrams
+        raise
+    plain = (float, int, str, bool)
+    return [[cell if isinstance(cell, plain) else str(cell) for cell in row] for row in rows]
+
+
+def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
+    texts = [[cell_text(cell) for cell in row] for row in cells[:_HEAD_ROWS]]
+    rows = [row if any(row) else None for row in texts]
+    run = best_run(rows, ".")
+    if run is None:
+        return None
+    where = f"{file.name}, sheet {sheet!r}"
+    refuse_second_header(rows, run.start, ".", lambda i: f"{where}, row {i + 1}")
+    above = [row for row in rows[: run.start] if row is not None]
+    named = header(above, run.width)
+    filled = [i for i in range(run.start, len(cells)) if any(cell_text(c) for c in cells[i])]
+    columns = [column_of([cells[i][k] for i in filled]) for k in range(run.width)]
+    return file.source(
+        "workbook",
+        named_channels(columns, named, where),
+        headerless=not named.names,
+        row_name=lambda i: f"sheet {sheet!r}, row {filled[i] + 1}",
+        stated=stated_levels(";".join(filter(None, row)) for row in above),
+    )
+
+
+def read_parquet(file: File) -> RawFile:
+    """Return the columns of a Parquet file, each read when it is used."""
+    pa, pq = library("pyarrow", "parquet"), library("pyarrow.parquet")
+    table = pq.ParquetFile(file.stream())
+    schema, rows = table.schema_arrow, table.metadata.num_rows
+    stored = schema.metadata or {}
+    attributes = json.loads(stored.get(b"pandas", b"{}")).get("attributes")
+    if not attributes:  # where older releases of pyarrow and pandas put them
+        attributes = json.loads(stored.get(b"PANDAS_ATTRS", b"{}"))
+    saved = attributes.get("dahl_ident") if isinstance(attributes, dict) else None
+    metadata = {} if saved is None else read_metadata(json.dumps(saved))
+    if added := _added_bytes(file, table.metadata):
+        raise ValueError(f"{added} bytes belong to no column; were some added?")
+    refuse_many(file.name, len(schema.names), "columns")
+    file.refuse_above_limit(8 * rows, "one column")
+    if not rows:
+        raise DataError(f"{file.name}: the table is empty")
+    channels: list[RawChannel] = []
+    notes: list[str] = []
+    for field in schema:
+        if pa.types.is_nested(field.type) or schema.names.count(field.name) > 1:
+            notes.append(f"{field.name} ({field.type}) is not used")
+            continue
+        name, unit = split_header(field.name)
+        read = functools.partial(_parquet_values, table, field.name)
+        what = f"{file.name}: column {field.name!r}"
+        content: Any = Stored((rows,), np.dtype(np.float64), read, what)
+        number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
+        channels.append(RawChannel(name, content if number else content.array, unit))
+    if not channels:
+        raise DataError(f"{file.name}: no column of numbers or text; {listed(notes, 3)}")
+    return file.source("Parquet", channels, metadata=metadata, notes=tuple(notes))
+
+
+def _added_bytes(file: File, metadata: Any) -> int:
+    """Return the bytes between the columns and the footer, where Arrow writes indices at most."""
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    parts = [g.column(k) for g in groups for k in range(g.num_columns)]
+    # older releases repeat the description of a column behind it, and state where
+    described = any(
+        p.has_offset_index or p.file_offset or getattr(p, "bloom_filter_offset", None)
+        for p in parts
+    )
+    if "arrow" not in str(metadata.created_by) or described:
+        return 0
+    ends = [
+        (p.dictionary_page_offset or p.data_page_offset) + p.total_compressed_size for p in parts
+    ]
+    return int(file.length - 8 - metadata.serialized_size - max(ends, default=4))
+
+
+def _parquet_values(table: Any, name: str, rows: slice) -> NDArray[Any]:
+    """Return some rows of a column, from the groups of rows that hold them."""
+    metadata = table.metadata
+    start, stop, _ = rows.indices(metadata.num_rows)
+    sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    edges = np.cumsum([0, *sizes])
+    first = int(np.searchsorted(edges, start, side="right")) - 1
+    groups = list(range(first, int(np.searchsorted(edges, stop))))
+    column = table.read_row_groups(groups, [name], use_pandas_metadata=False)[name]
+    return _plain(column.slice(start - int(edges[first]), stop - start).to_pandas())
+
+
+def frame_source(
+    frame: pd.DataFrame, name: str = "the table", kind: str = "table", sha256: str | None = None
+) -> RawFile:
+    """Return the columns of a pandas table, a named index among them, units out of their names."""
+    metadata = frame.attrs.get("dahl_ident", {})
+    if any(level is not None for level in frame.index.names):
+        frame = frame.reset_index()
+    if not len(frame) or not len(frame.columns):
+        raise DataError(f"{name}: the table is empty")
+    headers = [split_header(str(label)) for label in frame.columns]
+    channels = tuple(
+        RawChannel(header, _plain(frame.iloc[:, i]), unit)
+        for i, (header, unit) in enumerate(headers)
+    )
+    return RawFile(name, kind, channels, sha256, metadata=metadata)
+
+
+def _plain(series: pd.Series[Any]) -> NDArray[Any]:
+    values = series.to_numpy()
+    if values.dtype.kind in "fiubcU":
+        return values
+    from pandas.api.types import is_numeric_dtype
+
+    if is_numeric_dtype(series.dtype):
+        return series.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' nullable numbers
+    return words(values)
+
+
+def read_json(file: File) -> RawFile:
+    """Return the columns of a JSON file."""
+    try:
+        text = utf8(file.lines(b"[{")).decode("utf-8", "replace")
+        file.refuse_above_limit(8 * text.count(","), f"JSON of {text.count(',')} numbers")
+        content = json.loads(text, object_pairs_hook=_object)
+    except DataError:  # a ValueError too
+        raise
+    except (ValueError, RecursionError) as exc:
+        raise DataError(f"{file.name}: not a JSON file: {exc}") from exc
+    return dictionary_source(content, file.name, "JSON", file.sha256)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    for repeated in [name for name, n in Counter(name for name, _ in pairs).items() if n > 1][:1]:
+        raise ValueError(f"one object has the name {repeated[:60]!r} twice")
+    return dict(pairs)
+
+
+def dictionary_source(
+    content: Any, name: str = "the list", kind: str = "channels", sha256: str | None = None
+) -> RawFile:
+    """Return the columns of a dictionary, of rows, or of a list of channels."""
+    channels = tuple(_channels(content, name))
+    if not channels:
+        raise DataError(f"{name}: no columns; expected an object of columns, or a list of rows")
+    refuse_many(name, len(channels), "columns")
+    headerless = all(c.name == _UNNAMED.format(i + 1) for i, c in enumerate(channels))
+    return RawFile(name, kind, channels, sha256, headerless=headerless)
+
+
+def _channels(content: Any, name: str, units: Any = None) -> Iterator[RawChannel]:
+    """Yield the columns; `units` are by their names, or in the order of a list of names."""
+    of_names = _is_list_of(Mapping, content) and all("name" in c for c in content)
+    sampled = of_names and any("fs" in c or "time" in c for c in content)
+    if sampled and all("data" in c for c in content):
+        yield from _sdypy(content, name)
+    elif of_names and all(any(isinstance(c.get(v), list) for v in _VALUES) for c in content):
+        for column in content:
+            yield from _columns({str(column["name"]): column}, name, units)
+    elif _is_list_of(dict, content):
+        keys = list(dict.fromkeys(key for row in content for key in row))
+        refuse_many(name, len(keys), "columns")
+        columns = {key: [row.get(key) for row in content] for key in keys}
+        yield from _columns(columns, name, units)
+    elif _is_list_of(list, content):
+        named = all(isinstance(cell, str) for cell in content[0])
+        labels = content[0] if named else [_UNNAMED.format(i + 1) for i in range(len(content[0]))]
+        yield from _columns(_upright(labels, content[named:], name), name, units)
+    elif isinstance(content, dict):
+        yield from _tables(content, name, units)
+    else:
+        raise DataError(
+            f"{name}: found a {type(content).__name__}; expected an object of columns, a list of "
+            "rows, or a list of channels"
+        )
+
+
+def _is_list_of(kind: type, content: Any) -> bool:
+    is_list = isinstance(content, Sequence) and not isinstance(content, str) and len(content) > 0
+    return is_list and all(isinstance(one, kind) for one in content)
+
+
+def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
+    """Return the columns of a list of rows."""
+    if not isinstance(labels, list) or any(
+        not isinstance(row, list) or len(row) != len(labels) for row in rows
+    ):
+        raise DataError(f"{name}: the rows of data differ in length from columns")
+    if len({str(label) for label in labels}) < len(labels):
+        raise DataError(f"{name}: several columns have one name in {listed(map(str, labels), 20)}")
+    return {str(label): [row[i] for row in rows] for i, label in enumerate(labels)}
+
+
+def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
+    """Yield the columns of an object, or of the table in it."""
+    common = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
+    units = content.get("units", units or common)
+    rows = [content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))]
+    if "columns" in content and rows:
+        columns = _upright(content["columns"], rows[0], name)
+        if isinstance(units, list) and len(units) == len(columns):
+            units = dict(zip(columns, units, strict=True))
+        yield from _columns(columns, name, units)
+        return
+    for table in (content.get(key) for key in _TABLES):
+        nested = isinstance(table, list) and any(isinstance(v, (list, dict)) for v in table)
+        if nested or isinstance(table, dict):
+            yield from _channels(table, name, units)
+            return
+    yield from _columns(content, name, units)
+
+
+def _columns(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
+    stated = units if isinstance(units, dict) else {}
+    known = {plain(str(key)): unit for key, unit in stated.items()}
+    index: Any = None
+    for key, value in content.items():
+        unit = known.get(plain(key))
+        if isinstance(value, dict) and any(v in value for v in _VALUES):
+            values = next(value[v] for v in _VALUES if v in value)
+            yield _channel(key, values, next((value[u] for u in _UNITS if u in value), unit), name)
+        elif isinstance(value, dict) and value and all(row.isdecimal() for row in value):
+            index = index or value.keys()
+            if value.keys() != index:
+                raise DataError(f"{name}: column {key!r} has other rows than the columns before it")
+            yield _channel(key, [value[row] for row in index], unit, name)
+        elif isinstance(value, list):
+            yield _channel(key, value, unit, name)
+
+
+def _channel(key: Any, values: Any, unit: Any, name: str) -> RawChannel:
+    label, in_label = split_header(str(key))
+    text = unit if isinstance(unit, str) and unit.strip() else in_label
+    return RawChannel(label, _array(values, f"{name}: column {label!r}"), text)
+
+
+def _array(values: Any, what: str) -> NDArray[Any]:
+    """Return numbers, or text where some cell is none; None is an empty cell."""
+    if isinstance(values, np.ndarray):
+        array: NDArray[Any] = values
+        if np.ma.is_masked(values) and values.dtype.kind in "fiu":
+            array = np.ma.filled(np.ma.asarray(values, np.float64), np.nan)
+        if array.ndim != 1 or array.dtype.kind not in "fiubU":
+            raise DataError(f"{what} has the shape {array.shape}; expected a list of numbers")
+        return array
+    if not isinstance(values, (list, tuple)) or any(isinstance(v, (list, dict)) for v in values):
+        raise DataError(f"{what} is nested; expected a list of numbers")
+    return column_of(values)
+
+
+def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[RawChannel]:
+    """Yield SDyPy's channels and the time that they share."""
+    labels = Counter(str(c["name"]) for c in channels)
+    twice = [label for label, count in labels.items() if count > 1]
+    if twice:
+        raise DataError(f"{name}: several channels are called {listed(twice)}; expected one each")
+    times: list[NDArray[Any]] = []
+    for channel, label in zip(channels, labels, strict=True):
+        what = f"{name}: channel {label!r}"
+        values = _array(channel["data"], what)
+        yield _channel(label, values, channel.get("unit_str", channel.get("unit")), name)
+        if channel.get("time") is not None:
+            time = _array(channel["time"], f"{what}, its time")
+            if time.size != values.size:
+                raise DataError(
+                    f"{what} has {values.size} values at {time.size} times; expected as many"
+                )
+        else:
+            rate = channel.get("fs")
+            if not isinstance(rate, (int, float, np.number)) or not 0.0 < float(rate) < np.inf:
+                raise DataError(
+                    f"{what} has fs = {rate!r} and no time; expected a sampling frequency, Hz"
+                )
+            time = np.arange(values.size) / float(rate)
+        if not any(np.array_equal(time, known) for known in times):
+            times.append(time)
+    if len(times) > 1:
+        raise DataError(f"{name}: the channels are sampled at different times; expected one time")
+    if "time" not in labels:
+        yield RawChannel("time", times[0], "s", "time")
