@@ -67,7 +67,7 @@ unit: install  ## tests and doctests, warnings as errors
 lowest: .venv-lowest/.installed
 
 test-lowest: lowest  ## the tests marked as dependent on versions, on the lowest declared ones
-	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal -m versions tests
+	.venv-lowest/bin/pytest -n $(JOBS) --dist worksteal -m "versions and not long" tests
 
 examples: install  ## renew the outputs in README, manual and notebooks
 	$(BIN)/python -m tests.examples
@@ -81,6 +81,7 @@ bench: install  ## timings side by side with the peers, written into the manual
 
 # Stated errors against records and tables whose truth is known; each page says what was met.
 validation: install  ## long statistical checks, written into docs/validation
+	$(BIN)/pytest -q -n $(JOBS) --dist worksteal -m long tests
 	$(BIN)/python -m benchmarks.extraction_validation --write docs/validation/extraction.md
 	$(BIN)/python -m benchmarks.calibration
 	$(BIN)/python -m benchmarks.coverage

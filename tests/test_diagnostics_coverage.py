@@ -14,7 +14,9 @@ from benchmarks.coverage import (
 )
 
 
-@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize(
+    "index", [0, 2, 3, *(pytest.param(i, marks=pytest.mark.long) for i in (1, 4, 5))]
+)
 def test_intervals_cover_and_verdicts_are_right(index):
     count, bootstrapped, replicates = SMALL
     if index in (2, 5):  # long profiles of a hidden spring; five parameters of a plant

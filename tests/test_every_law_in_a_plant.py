@@ -242,7 +242,12 @@ def table(case, levels, frequencies):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
+VARIANTS = ("user's law", "linear system", "Dahl, free exponent")  # of others
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.long) if n in VARIANTS else n for n in CASES]
+)
 def test_a_law_in_a_driven_plant_is_found(name):
     case = CASES[name]
     size = (3, 3) if name == "Iwan" else (3, 4)  # the slowest: thirty sliders

@@ -51,7 +51,9 @@ def assert_near_truth(data, sigmas=4.0):
 
 
 @pytest.mark.parametrize("noise", [white, one_over_f])
-@pytest.mark.parametrize("beta", [0.3, 3.0, 30.0])
+@pytest.mark.parametrize(
+    "beta", [3.0, *(pytest.param(b, marks=pytest.mark.long) for b in (0.3, 30.0))]
+)
 def test_unbiased_and_as_accurate_as_stated(noise, beta):
     kind = white if noise is white else one_over_f
     result = accuracy(beta, kind, 40, seed=20, cycles=8)

@@ -229,7 +229,7 @@ class TestPlan:
         even = plan.search.expected_after(25.0, grid=True)
         assert even["f_max"].after > 1.5 * plan.expected["f_max"].after
 
-    @pytest.mark.parametrize("model", [LINEAR, di.Dahl()])
+    @pytest.mark.parametrize("model", [LINEAR, pytest.param(di.Dahl(), marks=pytest.mark.long)])
     def test_data_of_the_shortest_plan_can_be_used(self, model):
         """One level would be enough for the friction force, were it certain that it slips."""
         limits = {"displacement": (1e-4, 10.0 * X_C), "frequency_hz": 5.0}
@@ -246,7 +246,7 @@ class TestPlan:
         assert not short.reached
         assert "too few to tell a wrong model from noise" in str(short)
 
-    @pytest.mark.parametrize("known", [False, True])
+    @pytest.mark.parametrize("known", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_its_data_alone_can_be_used(self, known):
         """One amplitude, or two levels without a covariance, cannot show a wrong model."""
         limits = {"displacement": (1e-4, 9.0 * X_C), "frequency_hz": 5.0, "time": 60.0}
@@ -513,7 +513,7 @@ class TestPlan:
 class TestProof:
     """Small versions of ``python -m benchmarks.planning``, which has the numbers at full size."""
 
-    @pytest.mark.parametrize("index", [0, 1])
+    @pytest.mark.parametrize("index", [0, pytest.param(1, marks=pytest.mark.long)])
     def test_intervals_are_narrower_than_a_grid_makes_them(self, index):
         for row in planning.compare(planning.scenarios()[index], 150, 100 + index):
             # of 150 tables the error of a standard deviation is 5.8 %
@@ -521,11 +521,12 @@ class TestProof:
             if row.aim == row.name:
                 assert row.gain > planning.GAIN
 
-    @pytest.mark.parametrize("off", [30.0, 1.0 / 30.0])
+    @pytest.mark.parametrize("off", [30.0, pytest.param(1.0 / 30.0, marks=pytest.mark.long)])
     def test_a_sequence_recovers_from_a_poor_guess(self, off):
         spent, oracle = planning.sequence(off, seed=0)
         assert spent <= planning.SEQUENCE * oracle
 
+    @pytest.mark.long
     def test_whole_experiments_give_what_was_predicted(self):
         scenario = planning.scenarios()[1]
         plan = scenario.plan(50.0, None)

@@ -40,7 +40,12 @@ def scenarios():
     }
 
 
-@pytest.mark.parametrize("name", scenarios())
+QUICK = ("knee", "gain from a sheet", "student's t", "with a spring")
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.long) for n in scenarios()]
+)
 def test_sampling_agrees_with_integration(name):
     data, model, options = scenarios()[name]
     drawn = di.posterior(data, model, seed=3, ess=200.0, **options, uncertainty="noise")

@@ -111,7 +111,7 @@ def test_runs_are_fitted_together():
     assert fit.predict(recorded(DAHL, "multisine", 600, 0.0)).rms_error < 1e-3
 
 
-@pytest.mark.parametrize("pole", [0.0, 0.9])
+@pytest.mark.parametrize("pole", [0.9, pytest.param(0.0, marks=pytest.mark.long)])
 def test_error_bars_cover(pole):
     runs, inside = 24, 0
     clean = recorded(DAHL, "random", 400, 0.0)
@@ -127,7 +127,7 @@ def test_error_bars_cover(pole):
     assert binom.ppf(1e-4, runs, 0.95) <= inside, inside
 
 
-@pytest.mark.parametrize("noise", [1e-6, 1e-5])
+@pytest.mark.parametrize("noise", [1e-5, pytest.param(1e-6, marks=pytest.mark.long)])
 def test_noise_of_the_displacement_does_not_count_as_travel(noise):
     # an encoder's noise at rest moves the model's friction by 7 standard uncertainties and more
     runs, inside, t = 10, 0, np.arange(1500) / 100.0
