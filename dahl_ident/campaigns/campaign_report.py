@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,45 +28,23 @@ _LISTED = 200
 """Devices whose rows are printed; all of them are in the table."""
 
 
-def write_campaign_report(
-    table: pd.DataFrame,
-    evaluated: Population | None,
-    path: str | Path,
-    *,
-    title: str = "Campaign",
-    reports: Path | None = None,
-    overwrite: bool = False,
-) -> Path:
-    """Write the report of a campaign; `reports` is the folder of the fits' reports, for links."""
-    from dahl_ident.data.storage import place_of, write_whole
-    from dahl_ident.reporting.publish import content_of
-
-    place = place_of(path, "a campaign's report", FORMATS)
-    folder = "" if reports is None else os.path.relpath(reports, place.parent)
-    document = campaign_document(table, evaluated, title, Path(folder).as_posix())
-    write_whole(place, content_of(document, place.suffix.lower()), overwrite=overwrite)
-    return place
-
-
 def campaign_document(
-    table: pd.DataFrame, evaluated: Population | None, title: str, reports: str = "reports"
+    table: pd.DataFrame, evaluated: Population | None, title: str, reports: str
 ) -> Document:
     """Return the report's content; `reports` is the folder of the fits' reports, for links."""
     statuses = table["status"].value_counts()
     counted = ", ".join(f"{count} {status}" for status, count in statuses.items())
     verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
-    sections = []
+    sections, status = [], "not determined"
     if evaluated is not None:
-        verdict += [f"{'; '.join(str(p).splitlines())}." for p in evaluated.parameters.values()]
-        sections = [Section(f"Population: {p.name}", tuple(_blocks(p))) for p in
-                    evaluated.parameters.values()]  # fmt: skip
+        status = "trusted" if (table["status"] == "trusted").all() else "approximate"
+        for p in evaluated.parameters.values():
+            verdict.append(f"{'; '.join(str(p).splitlines())}.")
+            sections.append(Section(f"Population: {p.name}", tuple(_blocks(p))))
     else:
         verdict.append("Fewer than three devices have usable results: there is no population.")
     sections.append(Section("Fits that cannot be used", (_unusable(table),)))
     sections.append(Section("All fits", tuple(_all(table, reports))))
-    status = "not determined"
-    if evaluated is not None:
-        status = "trusted" if (table["status"] == "trusted").all() else "approximate"
     facts = {"statuses": {str(k): int(v) for k, v in statuses.items()}}
     return Document(title, status, tuple(verdict), tuple(sections), facts=facts)
 
@@ -77,11 +53,6 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
     label = f"{p.name} [{p.unit}]" if p.unit else p.name
     measured = f"ln {p.name}" if p.logarithmic else label
     scatters = {"devices": p.between_devices, "runs": p.between_runs}
-    yield TextTable(
-        f"{measured} at the mean of the covariates, and its change per unit of each",
-        ("coefficient", "value", "standard uncertainty"),
-        tuple((Cell(k), number(v), number(u, 2)) for k, (v, u) in p.coefficients.items()),
-    )
     yield TextTable(
         f"Scatter of {measured}",
         ("source", "median", "2.3 %", "97.7 %"),
@@ -132,14 +103,8 @@ def _unusable(table: pd.DataFrame) -> Block:
     reasons = bad["error"].fillna("") if "error" in bad else bad["status"]
     if "statements" in bad:
         reasons = reasons.where(reasons != "", bad["statements"].fillna(""))
-    return Bullets(
-        tuple(
-            f"{device}: {status}. {reason}"
-            for device, status, reason in zip(
-                bad["device"][:_LISTED], bad["status"], reasons, strict=False
-            )
-        )
-    )
+    rows = zip(bad["device"][:_LISTED], bad["status"], reasons, strict=False)
+    return Bullets(tuple(f"{device}: {status}. {reason}" for device, status, reason in rows))
 
 
 def _all(table: pd.DataFrame, folder: str) -> Iterator[Block]:

@@ -8,6 +8,7 @@ lines are held in memory.
 from __future__ import annotations
 
 import json
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
@@ -37,6 +38,7 @@ from dahl_ident.data.storage import (
     as_before_inert,
     inert,
     locked,
+    place_of,
     put_in_place,
     read_text,
     regular,
@@ -55,6 +57,7 @@ _JOURNAL = "journal.jsonl"
 _TRIALS = 3  # fits that say whether the options of a new campaign can be used at all
 _ROWS_AT_ONCE = 2000
 """Rows that are in memory as dictionaries, which are ten times as large as in a table."""
+_OF_JOURNAL = ("key", "retry", "refused")
 _FIRST = ("device", "run", "status", "error", "statements")
 
 
@@ -129,16 +132,18 @@ class Campaign:
             If there is no table yet, a column is missing, or the file is there already and
             `overwrite` is not set.
         """
-        from dahl_ident.campaigns.campaign_report import write_campaign_report
+        from dahl_ident.campaigns.campaign_report import FORMATS, campaign_document
         from dahl_ident.campaigns.population import USABLE, marked, population
+        from dahl_ident.reporting.publish import content_of
 
+        place = place_of(path, "a campaign's report", FORMATS)
         table = marked(self.table)
         enough = table.loc[table["status"].isin(USABLE), "device"].nunique() >= 3
         evaluated = population(table, covariates=covariates, order=order) if enough else None
-        reports = self.folder / "reports"
-        return write_campaign_report(
-            table, evaluated, path, title=title, reports=reports, overwrite=overwrite
-        )
+        reports = Path(os.path.relpath(self.folder / "reports", place.parent)).as_posix()
+        document = campaign_document(table, evaluated, title, reports)
+        write_whole(place, content_of(document, place.suffix.lower()), overwrite=overwrite)
+        return place
 
     def __str__(self) -> str:
         counted = ", ".join(f"{count} {status}" for status, count in self.statuses.items())
@@ -335,10 +340,8 @@ def _unless_refused(
 
 
 def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
-    del row["key"]
-    for name in ("retry", "refused"):
-        row.pop(name, None)
-    labels = {"device": task.device, **({"run": task.run} if task.run else {})}
+    row = {name: value for name, value in row.items() if name not in _OF_JOURNAL}
+    labels = {"device": task.device} | ({"run": task.run} if task.run else {})
     return {**labels, **task.covariates, **row, "version": __version__}
 
 
@@ -358,9 +361,9 @@ def _job(
         with suppress(OSError, DataError):  # the worker then says what is wrong with the path
             contents = [regular(path).read_bytes() for path in task.files]
     files = tuple(zip(map(str, task.files), contents, strict=True))
-    report = definition.folder / "reports" / f"{task.name}.html" if definition.reports else None
-    return Job(task.name, files, task.runs, definition.options, str(report) if report else None,
-               laws)  # fmt: skip
+    report = str(definition.folder / "reports" / f"{task.name}.html")
+    place = report if definition.reports else None
+    return Job(task.name, files, task.runs, definition.options, place, laws)
 
 
 def _options(definition: Definition) -> bytes:
@@ -505,7 +508,7 @@ def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, i
     """Write ``results.csv`` and, with pyarrow, ``results.parquet``; return counts of statuses."""
     import pandas as pd
 
-    flat = map(_flat, rows)
+    flat = ({name: _plain(value) for name, value in row.items()} for row in rows)
     blocks = iter(lambda: list(islice(flat, _ROWS_AT_ONCE)), [])
     table = pd.concat([pd.DataFrame(), *map(pd.DataFrame, blocks)], ignore_index=True)
     first = [name for name in _FIRST if name in table]
@@ -526,14 +529,9 @@ def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, i
     return dict(Counter(table["status"].tolist())) if len(table) else {}
 
 
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return one row of the table: numbers and texts alone."""
-    flat: dict[str, Any] = {}
-    for name, value in row.items():
-        if isinstance(value, list):
-            flat[name] = " | ".join(map(str, value))
-        elif isinstance(value, int) and not isinstance(value, bool):
-            flat[name] = float(value)
-        else:
-            flat[name] = value
-    return flat
+def _plain(value: Any) -> Any:
+    """Return the value of a cell: a number or a text."""
+    if isinstance(value, list):
+        return " | ".join(map(str, value))
+    is_count = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if is_count else value

@@ -11,14 +11,11 @@ import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.campaign import campaign
-from dahl_ident.cli.demo import demo
-from dahl_ident.cli.extract import extract
-from dahl_ident.cli.fit import fit, report
+from dahl_ident.cli.estimate import fit, report, sample
+from dahl_ident.cli.experiments import plan, simulate
+from dahl_ident.cli.extract import demo, extract
 from dahl_ident.cli.one_step import app as app_page
 from dahl_ident.cli.one_step import datasets, export, inspect, template
-from dahl_ident.cli.plan import plan
-from dahl_ident.cli.sample import sample
-from dahl_ident.cli.simulate import simulate
 from dahl_ident.errors import DahlIdentError, arguments_as_options
 from dahl_ident.version import __version__
 

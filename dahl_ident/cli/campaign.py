@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.options import General, Laws, Writing, quantity, with_option_groups
+from dahl_ident.cli.options import General, Laws, Writing, option, with_option_groups
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -28,38 +28,32 @@ def campaign(
     laws: Laws,
     writing: Writing,
     definition: Annotated[Path, typer.Argument(help="TOML file that defines the campaign.")],
-    jobs: Annotated[
-        int | None, typer.Option(help="Processes; by default as many as processors.")
-    ] = None,
+    jobs: Annotated[int | None, option("Processes; by default as many as processors.")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, tls://host:port.")
+        str | None, option("Address of a Dask scheduler, tls://host:port.")
     ] = None,
     timeout: Annotated[
         float | None,
-        quantity("Longest time for a device; by default 10 medians, at least 60 s.", "s"),
+        option("Longest time for a device; by default 10 medians, at least 60 s.", unit="s"),
     ] = None,
     memory: Annotated[
-        float | None, typer.Option(help="Most memory for a device, GB; by default a fair share.")
+        float | None, option("Most memory for a device, GB; by default a fair share.")
     ] = None,
     patience: Annotated[
-        float, quantity("Longest time without an answer of the scheduler.", "s")
+        float, option("Longest time without an answer of the scheduler.", unit="s")
     ] = 120.0,
     send_files: Annotated[
-        bool, typer.Option("--send-files", help="Send workers the contents of files, not paths.")
+        bool, option("Send workers the contents of files, not paths.", "--send-files")
     ] = False,
-    report: Annotated[
-        Path | None, typer.Option(help="Report on the whole campaign: .html or .pdf.")
-    ] = None,
+    report: Annotated[Path | None, option("Report on the whole campaign: .html or .pdf.")] = None,
     covariate: Annotated[
-        list[str], typer.Option(help="Column on which parameters may depend; repeatable.")
+        list[str], option("Column on which parameters may depend; repeatable.")
     ] = [],  # noqa: B006 - typer takes lists as lists
     order: Annotated[
-        str | None, typer.Option(help="Column that orders fits in time, for control charts.")
+        str | None, option("Column that orders fits in time, for control charts.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be done.")] = False,
-    redo: Annotated[
-        bool, typer.Option("--redo", help="Repeat all fits if options have changed.")
-    ] = False,
+    dry_run: Annotated[bool, option("List what would be done.", "--dry-run")] = False,
+    redo: Annotated[bool, option("Repeat all fits if options have changed.", "--redo")] = False,
 ) -> None:
     """Read, extract and fit the files of many devices into one table.
 

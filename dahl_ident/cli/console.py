@@ -27,8 +27,6 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.progress import spinner
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from dahl_ident.data import FrequencyResponse, Record
 
 STANDARD = "-"  # standard input or output, in place of a file's name
@@ -37,7 +35,7 @@ WRONG_USE = 2  # as click has it for unknown options
 NOT_TRUSTED = 3  # the first that is free
 _NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
 _STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
-_STYLES = {"Trusted": "bold green", "Approximate": "bold yellow"}
+_STYLES, _RED = {"Trusted": "1;32", "Approximate": "1;33"}, "1;31"
 INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 
@@ -80,14 +78,14 @@ def open_streams() -> bool:
     return there
 
 
-def option(name: str) -> str:
+def option_name(name: str) -> str:
     """Return how an argument is written on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 def refuse(names: Iterable[str], why: str) -> None:
     """Refuse the options of these names, if there are any; `why` ends "are given"."""
-    if options := ", ".join(map(option, names)):
+    if options := ", ".join(map(option_name, names)):
         raise ValidationError(f"{options} is given {why}")
 
 
@@ -109,33 +107,19 @@ def typed_command() -> str:
     return f"{command}  # its input came through standard input" if piped else command
 
 
-def _terminal() -> Console:
-    """Return the console for results; colour and width follow the terminal."""
-    from rich.console import Console
-
-    terminal = sys.stdout.isatty()
-    return Console(
-        no_color=None if session.color else True,
-        highlight=False,
-        soft_wrap=True,
-        width=None if terminal else 100,
-        quiet=session.quiet,
-    )
+def _styled(text: str, style: str) -> str:
+    """Return a text in a style (bold is 1) if results go to a terminal that may have colours."""
+    plain = "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb"
+    coloured = session.color and sys.stdout.isatty() and not plain
+    return f"\x1b[{style}m{text}\x1b[0m" if coloured else text
 
 
 def write(text: str) -> None:
     """Print a text unchanged, the status of a result in colour where there is a terminal."""
-    if session.quiet:
-        return
-    status = _STATUS.match(text) if sys.stdout.isatty() else None
-    if status is None:
-        sys.stdout.write(f"{text}\n")
-        return
-    from rich.text import Text
-
-    styled = Text(text)
-    styled.stylize(_STYLES.get(status[0].strip(), "bold red"), *status.span())
-    _terminal().print(styled)
+    if not session.quiet:
+        status = _STATUS.match(text)
+        shown = _styled(status[0], _STYLES.get(status[1], _RED)) if status else ""
+        sys.stdout.write(f"{shown}{text[status.end() if status else 0 :]}\n")
 
 
 def write_wrapped(text: str) -> None:
@@ -185,32 +169,15 @@ def write_json(value: Any) -> None:
 
 
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; text from files is not interpreted as markup."""
-    from rich import box
-    from rich.measure import Measurement
-    from rich.table import Table
-    from rich.text import Text
+    """Print a table."""
+    from dahl_ident.diagnostics.formatting import table as aligned
 
-    drawn = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    cells = [list(row) for row in rows]
-    for i, name in enumerate(header):
-        # a number broken over two lines would be misread
-        whole = not any(" " in row[i] for row in cells)
-        least = max(len(text) for text in [name, *(row[i] for row in cells)]) if whole else None
-        drawn.add_column(Text(name), overflow="fold", no_wrap=whole, min_width=least)
-    for row in cells:
-        drawn.add_row(*(Text(cell) for cell in row))
-    screen = _terminal()
-    wide = screen.options.update(max_width=10_000)
-    screen.width = max(screen.width, Measurement.get(screen, wide, drawn).minimum)
-    screen.print(drawn)
+    write(f"{title}\n{aligned([header, *rows], left=range(len(header)))}")
 
 
 def heading(text: str) -> None:
     """Print the name of a step."""
-    from rich.text import Text
-
-    _terminal().print(Text(text, style="bold cyan"))
+    write(_styled(text, "1;36"))
 
 
 def finish(trusted: bool, reason: str) -> None:

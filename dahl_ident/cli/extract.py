@@ -1,23 +1,32 @@
-"""``dahl-ident extract``: from recorded waveforms to a table of responses with verdicts."""
+"""``dahl-ident extract``: from waveforms to a table; ``demo``: all steps on shipped data."""
 
 from __future__ import annotations
 
 import shlex
+import sys
+from collections.abc import Mapping
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, changed, option, write_data, write_picture
+from dahl_ident.cli.console import (
+    STANDARD,
+    changed,
+    make_folder,
+    option_name,
+    write_data,
+    write_picture,
+)
+from dahl_ident.cli.estimate import as_json, finish
 from dahl_ident.cli.options import (
     General,
     OutputFile,
     Writing,
-    controlled_option,
-    in_panel,
-    one_of,
-    quantity,
+    controlled_setting,
+    option,
+    setting,
     with_option_groups,
 )
 from dahl_ident.cli.reading import Files, RecordReading
@@ -25,32 +34,24 @@ from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
-
-_EXTRACTING = "Extracting"
-_extracting = in_panel(_EXTRACTING)
+    from dahl_ident.results import FitResult, Posterior
 
 
 @dataclass(frozen=True)
 class Extracting:
     """Measurement of points; the options of ``extract``."""
 
-    frequency: Annotated[
-        float | None, quantity("Excitation frequency if known.", "Hz", _EXTRACTING)
-    ] = None
-    mode: Annotated[str, one_of("auto, steps or sweep.", _EXTRACTING, "auto|steps|sweep")] = "auto"
-    num_periods: Annotated[int | None, _extracting("Last periods of each segment to use.")] = None
-    settling_periods: Annotated[
-        int | None, _extracting("Leading periods of each segment to omit.")
-    ] = None
-    harmonics: Annotated[
-        str | None,
-        _extracting(
-            "Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
-            "asymmetric force; if force is controlled, only 1, and others are of the displacement."
-        ),
-    ] = None
-    controlled: Annotated[str, controlled_option(_EXTRACTING)] = "displacement"
-    min_share: Annotated[float, _extracting("Minimum share of the sine in the power.")] = 0.6
+    panel: ClassVar[str] = "Extracting"
+    frequency: float | None = setting("Excitation frequency if known.", unit="Hz")
+    mode: str = setting("auto, steps or sweep.", "auto", one_of="auto|steps|sweep")
+    num_periods: int | None = setting("Last periods of each segment to use.")
+    settling_periods: int | None = setting("Leading periods of each segment to omit.")
+    harmonics: str | None = setting(
+        "Harmonics to extract, 0 to 9: by default the odd ones, and the even ones of an "
+        "asymmetric force; if force is controlled, only 1, and others are of the displacement."
+    )
+    controlled: str = controlled_setting()
+    min_share: float = setting("Minimum share of the sine in the power.", 0.6)
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``extract``."""
@@ -73,13 +74,13 @@ def extract(
     extracting: Extracting,
     writing: Writing,
     output: OutputFile = None,
-    plot: Annotated[str | None, typer.Option(help="Plot to write, such as points.png.")] = None,
+    plot: Annotated[str | None, option("Plot to write, such as points.png.")] = None,
     level_from_name: Annotated[
-        str | None, typer.Option(help="Regular expression for file names; its group is the level.")
+        str | None, option("Regular expression for file names; its group is the level.")
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Number of processes for several files.")] = 1,
+    jobs: Annotated[int, option("Number of processes for several files.")] = 1,
     good_only: Annotated[
-        bool, typer.Option("--good-only", help="Leave out points whose verdict is not good.")
+        bool, option("Leave out points whose verdict is not good.", "--good-only")
     ] = False,
 ) -> None:
     """Turn recorded waveforms into dynamic stiffness with covariance and verdicts.
@@ -104,7 +105,7 @@ def extract(
     if plot is not None:
         write_picture(data.plot(), plot, overwrite=writing.overwrite)
     if general.json:
-        console.write_json(_rows(data))
+        console.write_json(data.to_frame().to_dict("records"))
     elif output != STANDARD:
         show(data)
     _tell_of_sweeps(data, files, reading, extracting.controlled)
@@ -124,7 +125,7 @@ def _tell_of_sweeps(
     if fast.any():
         bias = np.hypot(points.quality["bias_real"], points.quality["bias_imag"]) / points.gain
         named = changed(reading)
-        words = [word for n in named for word in (option(n), str(getattr(reading, n)))]
+        words = [word for n in named for word in (option_name(n), str(getattr(reading, n)))]
         if controlled == "force":  # which moves a mass
             words += ["--mass", "free", "--damping", "free", "--stiffness", "free"]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
@@ -192,6 +193,87 @@ def judge(data: FrequencyResponse) -> None:
     console.finish(not bad, f"{len(bad)} of {len(verdicts)} points are not good ({named}{more})")
 
 
-def _rows(data: FrequencyResponse) -> list[dict[str, Any]]:
-    frame = data.to_frame()
-    return [dict(zip(frame.columns, row, strict=True)) for row in frame.to_numpy().tolist()]
+_DATASET = "plant_recording"
+
+
+@with_option_groups
+def demo(
+    general: General,
+    writing: Writing,
+    output: Annotated[
+        Path, option("Folder for the table and the report.", "--output", "-o")
+    ] = Path("out"),
+) -> None:
+    """Run all steps on a shipped recording of a plant, and compare the result with the true values.
+
+    With --json the steps are printed on standard error.
+
+    Example: dahl-ident demo
+    """
+    from dahl_ident.synthetic.shipped import load_dataset
+
+    table, page = output / "levels.csv", output / "report.html"
+    make_folder(output)
+    writing.check([table, page])
+    origin = load_dataset(_DATASET).provenance or {}
+    with redirect_stdout(sys.stderr) if general.json else nullcontext():
+        result, posterior = _chain(origin, table, page, overwrite=writing.overwrite)
+    if general.json:
+        console.write_json(
+            {
+                "truth": origin["truth"],
+                "fit": as_json(result),
+                "posterior": posterior.to_dict(),
+                "table": str(table),
+                "report": str(page.resolve()),
+            }
+        )
+    for judged in (result, posterior):
+        finish(judged)
+
+
+def _chain(
+    origin: Mapping[str, Any], table: Path, page: Path, *, overwrite: bool
+) -> tuple[FitResult, Posterior]:
+    """Run every step from the recording to the report, and print a heading for each."""
+    from dahl_ident.data import inspect, read_record
+    from dahl_ident.elements import Dahl, Damper, Mass, Spring
+    from dahl_ident.extraction import extract as extract_record
+    from dahl_ident.reporting import report
+    from dahl_ident.results import fit, posterior
+    from dahl_ident.synthetic.shipped import datasets_directory
+
+    file = datasets_directory() / origin["file"]
+    console.heading(f"1. inspect: {file}")
+    console.write(repr(inspect(file)))
+    record = read_record(file)
+    console.heading("2. extract: waveforms to dynamic stiffness")
+    data = extract_record(record, controlled="force")
+    show(data)
+    data = good_points(data)
+    data.save(table, overwrite=overwrite)
+    console.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
+    result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
+    console.write_wrapped(result.fit_report())
+    rows = []
+    for name, p in result.params.items():
+        truth = origin["truth"][name]
+        off = (p.value - truth) / p.stderr if p.stderr else 0.0
+        error = f"{p.stderr:.2g}" if p.stderr else "fixed"
+        rows.append((name, f"{p.value:.5g}", error, f"{truth:g}", f"{off:+.1f}"))
+    header = ("parameter", "estimate", "standard error", "truth", "error / standard error")
+    console.table("Compared with the truth", header, rows)
+    console.heading("4. identifiability: what the data determine")
+    console.write(str(result.identifiability))
+    console.heading("5. posterior: emcee, from the same likelihood")
+    chain = posterior(result, seed=1)
+    console.write(str(chain))
+    console.heading("6. report")
+    command = console.typed_command()
+    with console.busy("drawing") as progress:
+        report(
+            [result, chain], page, record=record, command=command, overwrite=overwrite,
+            progress=progress,
+        )  # fmt: skip
+    console.write(f"table: {table}\nreport: {page.resolve()}")
+    return result, chain

@@ -10,14 +10,14 @@ import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD, write_data, written
-from dahl_ident.cli.estimation import finish, saved_fit
+from dahl_ident.cli.estimate import finish, saved_fit
 from dahl_ident.cli.options import (
     General,
     Laws,
     OutputFile,
     Seed,
     Writing,
-    one_of,
+    option,
     starting,
     with_option_groups,
 )
@@ -32,10 +32,10 @@ def inspect(
     files: Files,
     general: General,
     writing: Writing,
-    sheet: Annotated[str | None, typer.Option(help="Sheet of an Excel workbook.")] = None,
+    sheet: Annotated[str | None, option("Sheet of an Excel workbook.")] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Column map to write, .toml, for --columns."),
+        option("Column map to write, .toml, for --columns.", "--output", "-o"),
     ] = None,
 ) -> None:
     """List channels, units, ranges, sampling and gaps, and propose a column map.
@@ -70,16 +70,13 @@ def export(
     writing: Writing,
     to: Annotated[
         str,
-        one_of(
+        option(
             "Format: a simulator, a controller, a paper, or other budgets.",
-            None,
-            "mujoco|mujoco-frictionloss|urdf|modelica|matlab|c|gtc|ufloat|latex|draws",
+            one_of="mujoco|mujoco-frictionloss|urdf|modelica|matlab|c|gtc|ufloat|latex|draws",
         ),
     ] = "",
-    output: Annotated[
-        str, typer.Option("--output", "-o", help="File; - is standard output.")
-    ] = "-",
-    size: Annotated[int, typer.Option(help="Number of draws.")] = 1000,
+    output: Annotated[str, option("File; - is standard output.", "--output", "-o")] = "-",
+    size: Annotated[int, option("Number of draws.")] = 1000,
     seed: Seed = 0,
 ) -> None:
     """Write a fit saved by fit --save in the form that another program reads.
@@ -166,9 +163,7 @@ def template(
             autocompletion=starting(_TEMPLATES),
         ),
     ],
-    output: Annotated[
-        str, typer.Option("--output", "-o", help="File; - is standard output.")
-    ] = STANDARD,
+    output: Annotated[str, option("File; - is standard output.", "--output", "-o")] = STANDARD,
 ) -> None:
     """Print a TOML file with its fields explained, to fill in.
 
@@ -196,8 +191,8 @@ def app(
     folder: Annotated[
         Path, typer.Argument(help="Folder in which the work is kept, one folder for each.")
     ] = Path(),
-    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.", min=0, max=65535)] = 0,
-    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    port: Annotated[int, option("Port; 0 takes a free one.", min=0, max=65535)] = 0,
+    browser: Annotated[bool, option("Open the page in the browser.")] = True,
 ) -> None:
     """Open a page in the browser that goes from files to a signed report, on this machine alone.
 

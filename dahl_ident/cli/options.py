@@ -16,29 +16,16 @@ import functools
 import inspect
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD
 from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
-
-OutputFile = Annotated[
-    str | None,
-    typer.Option("--output", "-o", help="File to write; - is standard output, as CSV."),
-]
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
-_LawFiles = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Python file with laws of your own, which --element then knows by kind or class name. "
-        "The file is run: give only files that you trust. Repeatable.",
-        rich_help_panel="Model",
-    ),
-]
 
 
 def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
@@ -108,20 +95,70 @@ def _assigned(value: Any) -> str:
     return ":".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
+def option(
+    help_text: str,
+    *names: str,
+    one_of: str = "",
+    unit: str = "",
+    panel: str | None = None,
+    **how: Any,
+) -> Any:
+    """Return an option of Typer.
+
+    `one_of` are its values, such as ``"lm|scipy"``, which the shell completes; an option with a
+    `unit` takes a number in SI, or one with its unit.
+    """
+    if one_of:
+        values = one_of.split("|")
+
+        def check(value: str | None) -> str | None:
+            if value is not None and value not in values:
+                raise typer.BadParameter(f"{value!r} is not one of {choices(values, value)}")
+            return value
+
+        how |= {"callback": check, "autocompletion": starting(values)}
+    if unit:
+
+        def parse(text: str) -> float:
+            from dahl_ident.cli.model import number
+
+            try:
+                return number("it", str(text), unit)
+            except (ModelError, UnitError) as exc:
+                raise typer.BadParameter(str(exc).removesuffix(", or 'free'")) from exc
+
+        how |= {"parser": parse, "metavar": f"<{unit}>"}
+    return typer.Option(*names, help=help_text, rich_help_panel=panel, **how)
+
+
+OutputFile = Annotated[
+    str | None, option("File to write; - is standard output, as CSV.", "--output", "-o")
+]
+Seed = Annotated[int, option("Seed of the random numbers.")]
+
+
+def setting(help_text: str, default: Any = None, *names: str, **how: Any) -> Any:
+    """Return the field of a group for an option; its panel in the help is that of the group."""
+    return field(default=default, metadata={"option": partial(option, help_text, *names, **how)})
+
+
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Return `command` with the fields of its dataclass arguments as separate options."""
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     parameters = []
     for name, parameter in inspect.signature(command).parameters.items():
-        if name in groups:
-            typed = get_type_hints(groups[name], include_extras=True)
-            parameters += [
-                parameter.replace(name=f.name, default=f.default, annotation=typed[f.name])
-                for f in fields(groups[name])
-            ]
-        else:
+        if name not in groups:
             parameters.append(parameter.replace(annotation=hints[name]))
+            continue
+        group, types = groups[name], get_type_hints(groups[name])
+        for one in fields(group):
+            declared = one.metadata["option"]
+            panel = {"panel": group.panel} | declared.keywords
+            declared = Annotated[types[one.name], declared(**panel)]
+            parameters.append(
+                parameter.replace(name=one.name, default=one.default, annotation=declared)
+            )
 
     @functools.wraps(command)
     def run(**typed: Any) -> None:
@@ -137,56 +174,21 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def in_panel(panel: str) -> Callable[[str], Any]:
-    """Return what makes options of one panel of the help from their texts."""
-    return lambda help_text: typer.Option(help=help_text, rich_help_panel=panel)
-
-
-def one_of(help_text: str, panel: str | None, values: str) -> Any:
-    """Return an option with values such as ``"lm|scipy"``, which the shell completes."""
-    names = values.split("|")
-
-    def check(value: str | None) -> str | None:
-        if value is not None and value not in names:
-            raise typer.BadParameter(f"{value!r} is not one of {choices(names, value)}")
-        return value
-
-    return typer.Option(
-        help=help_text, callback=check, autocompletion=starting(names), rich_help_panel=panel
-    )
-
-
 def starting(names: Iterable[str]) -> Callable[[str], list[str]]:
     """Return what completes the beginning of a word."""
     return lambda incomplete: [name for name in names if name.startswith(incomplete)]
 
 
-def steady_option(panel: str) -> Any:
+def steady_setting(default: str | None = "exact") -> Any:
     """Return the option of how the response to a force that is held is predicted."""
-    return one_of(
-        "Response to a force that is held: exact, or 'describing function' (a sine assumed).",
-        panel,
-        "exact|describing function",
-    )
+    help_text = "Response to a force that is held: exact, or 'describing function' (sine assumed)."
+    return setting(help_text, default, one_of="exact|describing function")
 
 
-def controlled_option(panel: str) -> Any:
+def controlled_setting(default: str | None = "displacement") -> Any:
     """Return the option of what was held."""
-    return one_of("Controlled quantity: displacement or force.", panel, "displacement|force")
-
-
-def quantity(help_text: str, unit: str, panel: str | None = None) -> Any:
-    """Return an option for a number in SI, or one with its unit."""
-
-    def parse(text: str) -> float:
-        from dahl_ident.cli.distributions import number
-
-        try:
-            return number("it", str(text), unit)
-        except (ModelError, UnitError) as exc:
-            raise typer.BadParameter(str(exc).removesuffix(", or 'free'")) from exc
-
-    return typer.Option(help=help_text, parser=parse, metavar=f"<{unit}>", rich_help_panel=panel)
+    help_text = "Controlled quantity: displacement or force."
+    return setting(help_text, default, one_of="displacement|force")
 
 
 def _silence(quiet: bool) -> bool:
@@ -198,29 +200,28 @@ def _silence(quiet: bool) -> bool:
 class General:
     """The options of every command."""
 
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
-    quiet: Annotated[
-        bool,
-        typer.Option(
-            "--quiet", "-q", help="Print errors, and what goes to -, alone.", callback=_silence
-        ),
-    ] = False
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            is_eager=True,
-            callback=take_options,
-            help="TOML file of options; a table named after a command, such as \\[fit], applies to "
-            "that command only. The command line has precedence.",
-        ),
-    ] = None
+    panel: ClassVar[str | None] = None
+    json: bool = setting("Print JSON.", False, "--json")
+    quiet: bool = setting(
+        "Print errors, and what goes to -, alone.", False, "--quiet", "-q", callback=_silence
+    )
+    config: Path | None = setting(
+        "TOML file of options; a table named after a command, such as \\[fit], applies to "
+        "that command only. The command line has precedence.",
+        is_eager=True,
+        callback=take_options,
+    )
 
 
 @dataclass(frozen=True)
 class Laws:
     """Laws of the user."""
 
-    laws: _LawFiles = None
+    panel: ClassVar[str] = "Model"
+    laws: list[Path] | None = setting(
+        "Python file with laws of your own, which --element then knows by kind or class name. "
+        "The file is run: give only files that you trust. Repeatable."
+    )
 
     def run(self) -> None:
         """Run the files, so that models can name the laws in them."""
@@ -234,7 +235,8 @@ class Laws:
 class Writing:
     """The treatment of existing files."""
 
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False
+    panel: ClassVar[str | None] = None
+    overwrite: bool = setting("Replace existing files.", False, "--overwrite")
 
     def check(
         self,

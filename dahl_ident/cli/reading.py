@@ -8,13 +8,13 @@ import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, changed, option, refuse
-from dahl_ident.cli.options import controlled_option, in_panel, one_of, quantity
+from dahl_ident.cli.console import STANDARD, changed, option_name, refuse
+from dahl_ident.cli.options import controlled_setting, setting
 from dahl_ident.errors import DataError, ValidationError
 
 if TYPE_CHECKING:
@@ -23,30 +23,15 @@ if TYPE_CHECKING:
 
     from dahl_ident.data import FrequencyResponse, Record
 
-_READING = "Reading"
 _OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
-reading = in_panel(_READING)
-Channel = Annotated[
-    str | None,
-    reading('Its column, with unit if needed: "x \\[mm]".'),
-]
-DriveFactor = Annotated[
-    str | None,
-    reading('Force for one unit of drive, "12.5 N/V".'),
-]
-DriveFactorUncertainty = Annotated[
-    float | None,
-    reading("Its relative standard uncertainty."),
-]
-Sheet = Annotated[str | None, reading("Sheet of an Excel workbook.")]
+_COLUMN = 'Its column, with unit if needed: "x \\[mm]".'
+_COLUMNS = (
+    "frequency_hz", "amplitude", "drive", "gain", "harmonic", "level", "run"
+)  # fmt: skip
 _COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-}
+    ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le,
+    ast.Gt: operator.gt, ast.GtE: operator.ge,
+}  # fmt: skip
 
 
 def _existing(patterns: list[str]) -> list[str]:
@@ -74,17 +59,16 @@ Files = Annotated[
 class Channels:
     """What ``read_record`` is told of the channels of a record."""
 
-    time: Channel = None
-    displacement: Channel = None
-    velocity: Channel = None
-    acceleration: Channel = None
-    force: Channel = None
-    sample_rate: Annotated[
-        float | None, quantity("For files without a time column.", "Hz", _READING)
-    ] = None
-    missing: Annotated[
-        str, one_of("Treatment of empty samples: error or drop.", _READING, "error|drop")
-    ] = "error"
+    panel: ClassVar[str] = "Reading"
+    time: str | None = setting(_COLUMN)
+    displacement: str | None = setting(_COLUMN)
+    velocity: str | None = setting(_COLUMN)
+    acceleration: str | None = setting(_COLUMN)
+    force: str | None = setting(_COLUMN)
+    sample_rate: float | None = setting("For files without a time column.", unit="Hz")
+    missing: str = setting(
+        "Treatment of empty samples: error or drop.", "error", one_of="error|drop"
+    )
 
     def refuse(self) -> None:
         """Refuse these options where tables are read."""
@@ -96,44 +80,43 @@ class Channels:
 
 
 @dataclass(frozen=True)
-class Reading:
+class _Source:
+    """What tables and records are told alike."""
+
+    panel: ClassVar[str] = "Reading"
+    columns: Path | None = setting("Column map, a TOML file.")
+    drive_factor: str | None = setting('Force for one unit of drive, "12.5 N/V".')
+    drive_factor_uncertainty: float | None = setting("Its relative standard uncertainty.")
+    sheet: str | None = setting("Sheet of an Excel workbook.")
+
+
+@dataclass(frozen=True)
+class Reading(_Source):
     """Reading of tables; the options of ``read_frequency_response``."""
 
-    columns: Annotated[Path | None, reading("Column map, a TOML file.")] = None
-    quantity: Annotated[
-        str | None,
-        reading("Response quantity, such as receptance; by default it follows from the unit."),
-    ] = None
-    amplitude: Annotated[str | None, reading('Displacement amplitude, "5 um rms".')] = None
-    drive: Annotated[
-        str | None, reading('Force amplitude, "0.2 N" or "{level} N"; of a record its column.')
-    ] = None
-    frequency: Annotated[float | None, quantity("Frequency of all rows.", "Hz", _READING)] = None
-    sweep: Annotated[
-        str | None,
-        reading('Frequencies of all rows where no column holds them: "1:100Hz log".'),
-    ] = None
-    drive_factor: DriveFactor = None
-    drive_factor_uncertainty: DriveFactorUncertainty = None
-    level: Annotated[str | None, reading("Label for all rows.")] = None
-    level_from_name: Annotated[
-        str | None, reading("Regular expression for file names; its group is the level.")
-    ] = None
-    controlled: Annotated[str | None, controlled_option(_READING)] = None
-    where: Annotated[
-        str | None,
-        reading("Keep the rows that meet a condition: '0.2 <= frequency_hz < 5 and level > 3'."),
-    ] = None
-    levels: Annotated[str | None, reading("Keep only these levels: 1,2,5.")] = None
-    runs: Annotated[
-        str | None,
-        reading(
-            "Keep only these runs: day1,day2. Each of several files is a run, or a level if "
-            "it holds one of its own."
-        ),
-    ] = None
-    sheet: Sheet = None
-    passive: Annotated[bool, reading("Refuse a table with a net gain of energy.")] = True
+    quantity: str | None = setting(
+        "Response quantity, such as receptance; by default it follows from the unit."
+    )
+    amplitude: str | None = setting('Displacement amplitude, "5 um rms".')
+    drive: str | None = setting('Force amplitude, "0.2 N" or "{level} N"; of a record its column.')
+    frequency: float | None = setting("Frequency of all rows.", unit="Hz")
+    sweep: str | None = setting(
+        'Frequencies of all rows where no column holds them: "1:100Hz log".'
+    )
+    level: str | None = setting("Label for all rows.")
+    level_from_name: str | None = setting(
+        "Regular expression for file names; its group is the level."
+    )
+    controlled: str | None = controlled_setting(None)
+    where: str | None = setting(
+        "Keep the rows that meet a condition: '0.2 <= frequency_hz < 5 and level > 3'."
+    )
+    levels: str | None = setting("Keep only these levels: 1,2,5.")
+    runs: str | None = setting(
+        "Keep only these runs: day1,day2. Each of several files is a run, or a level if it holds "
+        "one of its own."
+    )
+    passive: bool = setting("Refuse a table with a net gain of energy.", True)
 
     def read(self, files: list[str]) -> FrequencyResponse:
         """Read the files into one table."""
@@ -147,7 +130,7 @@ class Reading:
         """Read each file as a record; options of tables alone are refused."""
         from dahl_ident.data import read_record
 
-        taken = ", ".join(map(option, _OF_RECORDS))
+        taken = ", ".join(map(option_name, _OF_RECORDS))
         refuse(
             [name for name in changed(self) if name not in _OF_RECORDS],
             f"together with records of waveforms; of the options of reading, they take {taken} "
@@ -181,14 +164,10 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class RecordReading(Channels):
+class RecordReading(_Source, Channels):
     """Reading of records; the options of ``read_record``."""
 
-    columns: Annotated[Path | None, reading("Column map, a TOML file.")] = None
-    drive: Channel = None
-    drive_factor: DriveFactor = None
-    drive_factor_uncertainty: DriveFactorUncertainty = None
-    sheet: Sheet = None
+    drive: str | None = setting(_COLUMN)
 
 
 def selected(
@@ -200,7 +179,7 @@ def selected(
             data = _labelled(data, name, column, [part.strip() for part in text.split(",")])
     if where is None:
         return data
-    rows = _Condition(data, where).rows()
+    rows = _rows_where(data, where)
     if not rows.any():
         raise ValidationError(f"--where {where!r} selects none of {data.n} rows")
     return data.select(rows=rows)
@@ -220,82 +199,58 @@ def _labelled(
     return data.select(rows=np.array([str(label) in wanted for label in labels]))
 
 
-class _Condition:
-    """A condition on the columns of a table; only comparisons, and, or, not."""
+def _rows_where(data: FrequencyResponse, text: str) -> NDArray[np.bool_]:
+    """Return which rows meet a condition on columns: only comparisons, and, or, not."""
+    import numpy as np
 
-    def __init__(self, data: FrequencyResponse, text: str) -> None:
-        import numpy as np
+    every: dict[str, Any] = {
+        **{name: getattr(data, name) for name in _COLUMNS},
+        "phase_deg": np.degrees(data.phase),
+        **data.quality,
+    }
+    columns = {name: values for name, values in every.items() if values is not None}
 
-        self._text, self._n = text, data.n
-        columns: dict[str, Any] = {
-            "frequency_hz": data.frequency_hz,
-            "amplitude": data.amplitude,
-            "drive": data.drive,
-            "gain": data.gain,
-            "phase_deg": np.degrees(data.phase),
-            "harmonic": data.harmonic,
-            "level": data.level,
-            "run": data.run,
-            **data.quality,
-        }
-        self._columns = {name: values for name, values in columns.items() if values is not None}
-
-    def rows(self) -> NDArray[np.bool_]:
-        """Return which rows meet it."""
-        import numpy as np
-
-        try:
-            value = self._value(ast.parse(self._text, mode="eval").body)
-        except SyntaxError as exc:
-            raise self._refused(str(exc.msg)) from exc
-        rows = np.asarray(value)
-        if rows.dtype != np.bool_ or rows.shape != (self._n,):
-            raise self._refused("it contains no comparison")
-        return rows
-
-    def _refused(self, why: str) -> ValidationError:
+    def refused(why: str) -> ValidationError:
         return ValidationError(
-            f"--where is {self._text!r}: {why}; expected comparisons of "
-            f"{', '.join(self._columns)}, such as 'level > 3 and harmonic == 1'"
+            f"--where is {text!r}: {why}; expected comparisons of {', '.join(columns)}, such as "
+            "'level > 3 and harmonic == 1'"
         )
 
-    def _value(self, node: ast.expr) -> Any:
-        import numpy as np
-
+    def value(node: ast.expr) -> Any:
         match node:
-            case ast.Constant(value=int() | float() | str() as value):
-                return value
+            case ast.Constant(value=int() | float() | str() as constant):
+                return constant
             case ast.Name(id=name):
-                if name not in self._columns:
-                    raise self._refused(f"there is no column {name}")
-                return self._columns[name]
+                if name not in columns:
+                    raise refused(f"there is no column {name}")
+                return columns[name]
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return np.logical_not(self._value(operand))
-            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
-                return -value
+                return np.logical_not(value(operand))
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as size)):
+                return -size
             case ast.BoolOp(op=op, values=parts):
                 join = np.logical_and if isinstance(op, ast.And) else np.logical_or
-                return join.reduce([self._value(part) for part in parts])
+                return join.reduce([value(part) for part in parts])
             case ast.Compare(left=left, ops=ops, comparators=others):
-                sides = [self._value(side) for side in (left, *others)]
+                sides = [value(side) for side in (left, *others)]
                 pairs = zip(ops, sides, sides[1:], strict=False)
-                return np.logical_and.reduce([self._compared(*pair) for pair in pairs])
-            case _:
-                raise self._refused(f"{ast.unparse(node)} is not understood")
+                return np.logical_and.reduce([compared(*pair) for pair in pairs])
+        raise refused(f"{ast.unparse(node)} is not understood")
 
-    def _compared(self, op: ast.cmpop, left: Any, right: Any) -> Any:
-        import numpy as np
-
+    def compared(op: ast.cmpop, *sides: Any) -> Any:
         if type(op) not in _COMPARE:
-            raise self._refused("in, is and the like are not understood")
-        sides = [np.asarray(side) for side in (left, right)]
-        if any(side.dtype.kind in "fiu" for side in sides):
-            try:
-                sides = [side.astype(float) for side in sides]
-            except ValueError as exc:
-                raise self._refused(
-                    "a label that is not a number is compared with a number"
-                ) from exc
-        else:
-            sides = [side.astype(str) for side in sides]
-        return _COMPARE[type(op)](*sides)
+            raise refused("in, is and the like are not understood")
+        numbers = any(np.asarray(side).dtype.kind in "fiu" for side in sides)
+        try:
+            left, right = (np.asarray(side).astype(float if numbers else str) for side in sides)
+        except ValueError as exc:
+            raise refused("a label that is not a number is compared with a number") from exc
+        return _COMPARE[type(op)](left, right)
+
+    try:
+        rows = np.asarray(value(ast.parse(text, mode="eval").body))
+    except SyntaxError as exc:
+        raise refused(str(exc.msg)) from exc
+    if rows.dtype != np.bool_ or rows.shape != (data.n,):
+        raise refused("it contains no comparison")
+    return rows

@@ -1,0 +1,407 @@
+"""``dahl-ident plan`` and ``simulate``: what to measure next, and data with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import typer
+
+from dahl_ident.cli import console
+from dahl_ident.cli.console import changed, refuse, write_data, write_picture
+from dahl_ident.cli.estimate import saved_fit
+from dahl_ident.cli.model import (
+    ELEMENT_HELP,
+    OTHERS,
+    ModelOptions,
+    elements,
+    ends,
+    in_parallel,
+    number,
+    numbers,
+    refuse_with_elements,
+)
+from dahl_ident.cli.options import (
+    General,
+    Laws,
+    OutputFile,
+    Seed,
+    Writing,
+    controlled_setting,
+    option,
+    setting,
+    steady_setting,
+    with_option_groups,
+)
+from dahl_ident.errors import ModelError, UnitError, ValidationError
+
+if TYPE_CHECKING:
+    from dahl_ident.elements import Element
+    from dahl_ident.synthetic import Experiment
+
+_LIMITS = {
+    "frequency": "Hz", "displacement": "m", "force": "N", "speed": "m/s", "acceleration": "m/s^2",
+}  # fmt: skip
+_RANGE = "the highest value, or lowest:highest"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The limits of the bench and the times that it needs."""
+
+    panel: ClassVar[str] = "Bench"
+    frequency: str | None = setting(f"Frequency, 5Hz: {_RANGE}; not needed for trapezoids.")
+    displacement: str | None = setting(f"Displacement amplitude, 1mm: {_RANGE}.")
+    force: str | None = setting(f"Force amplitude, 0.2N: {_RANGE}.")
+    speed: str | None = setting("Highest speed, 50mm/s.")
+    acceleration: str | None = setting("Highest acceleration, 1m/s^2.")
+    time: float | None = setting("Total time, 10min.", unit="s")
+    controlled: str = controlled_setting()
+    steady: str | None = steady_setting(None)
+    motion: str | None = setting(
+        "Plan motions in time, for a fit of records: trapezoid or multisine; without it, settled "
+        "sines.",
+        one_of="trapezoid|multisine",
+    )
+    noise: str | None = setting(
+        "Noise of one cycle: '1 %', or 'relative=0.01,force=1mN,displacement=0.1um'; of a "
+        "force sample with --motion: force=1mN."
+    )
+    scatter: float | None = setting(
+        "Scatter of gain and phase between runs, '2 %'; by default that of the fit.", unit="1"
+    )
+    num_runs: int | None = setting("Number of runs; by default the best one.")
+    change_over: float = setting("Time from one level to the next.", 1.0, unit="s")
+    between_runs: float = setting("Additional time for each run.", 0.0, unit="s")
+
+    def limits(self) -> dict[str, Any]:
+        """Return the limits that were given."""
+        stated: dict[str, Any] = {
+            "frequency_hz" if name == "frequency" else name: ends(name, text, unit)
+            for name, unit in _LIMITS.items()
+            if (text := getattr(self, name)) is not None
+        }
+        return stated if self.time is None else {**stated, "time": self.time}
+
+    def motions(self, sample_rate: float | None) -> dict[str, Any]:
+        """Return the arguments of ``plan`` that motions in time, or settled ones, need."""
+        if self.motion is None:
+            return {"steady": self.steady}
+        return {"candidates": self.motion, "sample_rate": sample_rate}
+
+
+@dataclass(frozen=True)
+class Aim:
+    """The targets, and prior knowledge."""
+
+    panel: ClassVar[str] = "Aim"
+    target: list[str] | None = setting(
+        "Wanted relative standard uncertainty, f_max=0.02 or f_max/sigma=0.02, or expanded one, "
+        "'U(f_max)=0.04', in the least time; a name alone: least uncertainty in --time. "
+        "Repeatable; by default all parameters."
+    )
+    ranges: list[str] | None = setting(
+        "Range of a parameter with 95 % probability, f_max=0.05:0.2N; repeatable."
+    )
+    suspects: list[str] | None = setting(
+        "Parameter that may be needed, and the uncertainty wanted for it, alpha=0.1."
+    )
+
+    def keywords(self) -> dict[str, Any]:
+        """Return the arguments of ``plan``."""
+        wanted = [text.partition("=") for text in self.target or []]
+        shares = {name: number(name, value, "1") for name, sign, value in wanted if sign}
+        if shares and len(shares) < len(wanted):
+            raise ValidationError(
+                "target has names with and without a number; give every one its uncertainty, or "
+                "none"
+            )
+        ranges = dict(_pair("ranges", text) for text in self.ranges or [])
+        suspects = dict(_pair("suspects", text) for text in self.suspects or [])
+        return {
+            "target": shares or [name for name, _, _ in wanted] or None,
+            "ranges": {n: ends(f"ranges of {n}", text) for n, text in ranges.items()},
+            "suspects": {n: number(n, text, "1") for n, text in suspects.items()} or None,
+        }
+
+
+@with_option_groups
+def plan(
+    general: General,
+    laws: Laws,
+    bench: Bench,
+    aim: Aim,
+    model: ModelOptions,
+    writing: Writing,
+    fit: Annotated[
+        str | None,
+        typer.Argument(help="Saved fit of earlier data; without it, give ranges for the model."),
+    ] = None,
+    seed: Seed = 0,
+    table: Annotated[Path | None, option("File for the table of levels, .csv.")] = None,
+    waveform: Annotated[
+        Path | None, option("File for the waveform of one run for the exciter, .csv.")
+    ] = None,
+    sample_rate: Annotated[
+        float | None,
+        option("Sample rate of the waveform, and of the records of --motion.", unit="Hz"),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        option("File for a plot of uncertainty against bench time, .png, .svg or .pdf."),
+    ] = None,
+) -> None:
+    """Plan the next measurement: levels, frequencies and cycles, or motions in time.
+
+    Example: dahl-ident plan --frequency 5Hz --displacement 0.1:10mm --ranges f_max=0.05:0.2N
+    --ranges sigma=15:60 --noise 0.01 --target f_max=0.01 --target sigma=0.01
+    """
+    from dahl_ident.data.storage import write_whole
+    from dahl_ident.planning import plan as make
+
+    laws.run()
+    writing.check([table, waveform, picture], [] if fit is None else [fit], json=general.json)
+    if sample_rate is None and (waveform is not None or bench.motion is not None):
+        raise ValidationError("--waveform and --motion need --sample-rate, Hz; give it")
+    if sample_rate is not None and waveform is None and bench.motion is None:
+        raise ValidationError("--sample-rate is that of --waveform or --motion; give one of them")
+    result = make(
+        _known(fit, model), limits=bench.limits(), noise=_noise(bench.noise), scatter=bench.scatter,
+        runs=bench.num_runs, controlled=bench.controlled, change_over=bench.change_over,
+        between_runs=bench.between_runs, seed=seed, **bench.motions(sample_rate), **aim.keywords(),
+    )  # fmt: skip
+    if table is not None:
+        text = result.to_frame().to_csv(index=False)
+        write_whole(table, text.encode(), overwrite=writing.overwrite)
+    if waveform is not None and sample_rate is not None:
+        result.write_waveform(waveform, sample_rate, overwrite=writing.overwrite)
+    if picture is not None:
+        write_picture(result.plot(), str(picture), overwrite=writing.overwrite)
+    if general.json:
+        console.write_json(result.to_dict())
+    else:
+        console.write_wrapped(str(result))
+    missed = result.undetermined[0] if result.undetermined else "a wanted uncertainty is missed"
+    console.finish(result.reached, missed)
+
+
+def _known(fit: str | None, options: ModelOptions) -> Any:
+    """Return the saved fit, or the model of the options."""
+    from dahl_ident.elements.element import as_model
+
+    if fit is not None:
+        if options != ModelOptions():
+            raise ValidationError(
+                "a saved fit has its model and sensors; leave out the options that describe them"
+            )
+        return saved_fit(fit)
+    keywords = options.keywords()
+    if not keywords["sensors"].are_exact:
+        raise ValidationError("a plan before any data takes the sensors as exact; leave them out")
+    return as_model(keywords["model"]).with_free(keywords["free"])
+
+
+def _pair(option: str, text: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not sign:
+        raise ValidationError(f"{option} is {text!r}; expected a name and a value, f_max=0.1")
+    return name.strip(), value
+
+
+def _noise(text: str | None) -> Any:
+    if text is None or "=" not in text:
+        return None if text is None else number("noise", text, "1")
+    parts = [_pair("noise", part) for part in text.split(",")]
+    return {name: number(f"noise {name}", value, _LIMITS.get(name, "1")) for name, value in parts}
+
+
+_UNITS = {"displacement": "m", "force": "N"}
+_SPAN = (0.1, 10.0)  # of the characteristic displacement, if no levels are given
+_COUNT = 30  # levels: 15 a decade, as in the shipped data sets
+
+
+@dataclass(frozen=True)
+class PlantOptions:
+    """The true plant: friction and the elements in parallel."""
+
+    panel: ClassVar[str] = "Model"
+    f_max: float | None = setting("Friction force.", unit="N")
+    sigma: float | None = setting("Contact stiffness.", unit="N/m")
+    alpha: float | None = setting("Exponent; 1 if left out.")
+    element: list[str] | None = setting(ELEMENT_HELP)
+    mass: float | None = setting("Add a mass.", unit="kg")
+    damping: float | None = setting("Add a damper.", unit="N s/m")
+    stiffness: float | None = setting("Add a spring.", unit="N/m")
+
+    def built(self) -> Element:
+        """Return the plant."""
+        from dahl_ident.elements import Dahl
+
+        names = ("f_max", "sigma", "alpha")
+        stated = {n: value for n in names if (value := getattr(self, n)) is not None}
+        others = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
+        if self.element:
+            refuse_with_elements(stated)
+            return in_parallel(elements(self.element), others)
+        missing = [name for name in ("f_max", "sigma") if name not in stated]
+        if missing:
+            raise ValidationError(
+                f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma, "
+                "or --element"
+            )
+        return in_parallel(Dahl(**stated), others)
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A stepped sine; other excitations need an experiment file."""
+
+    panel: ClassVar[str] = "Excitation"
+    levels: str | None = setting(
+        "Amplitudes, 0.1,1mm or low:high:count; by default 30 around the knee."
+    )
+    frequency: str = setting("Frequencies, in the same form.", "1Hz")
+    controlled: str = controlled_setting()
+    order: str = setting(
+        "given, ascending, descending or random.",
+        "given",
+        one_of="given|ascending|descending|random",
+    )
+    settling_periods: int = setting("Before measuring.", 10)
+    num_periods: int = setting("Measured.", 5)
+    record: bool = setting("Waveforms, not a table.", False, "--record")
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Noise: relative in a table, absolute in a record."""
+
+    panel: ClassVar[str] = "Errors"
+    displacement_std: str = setting(
+        "Displacement noise: of a table a share, '0.5 %'; of samples 0.1um.", "0"
+    )
+    force_std: str = setting("Force noise: of a table a share, '0.5 %'; of samples 5mN.", "0")
+
+    def of(self, channel: str, unit: str) -> float:
+        """Return the standard deviation of a channel; a share where the unit is 1."""
+        text = getattr(self, f"{channel}_std")
+        try:
+            return number("it", text, unit)
+        except (ModelError, UnitError) as exc:
+            wanted = f"the noise of samples, such as 5e-6 or 5u{unit}"
+            if unit == "1":
+                wanted = "a share of the response, such as 0.005 or '0.5 %'; of samples: --record"
+            raise ValidationError(f"--{channel}-std is {text!r}; expected {wanted}") from exc
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """The steady motion of a driven plant."""
+
+    panel: ClassVar[str] = "Excitation"
+    steady: str = steady_setting()
+
+
+@with_option_groups
+def simulate(
+    general: General,
+    laws: Laws,
+    plant: PlantOptions,
+    excitation: Excitation,
+    errors: Errors,
+    motion: MotionOptions,
+    writing: Writing,
+    experiment: Annotated[
+        str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
+    ] = None,
+    seed: Seed = 1,
+    output: OutputFile = None,
+) -> None:
+    """Simulate an experiment; without an output file, print its description.
+
+    Example: dahl-ident simulate --f-max 0.1 --sigma 30 --force-std '1 %' -o synthetic.csv
+    """
+    from dahl_ident.arrays import whole_number
+    from dahl_ident.synthetic import Experiment
+    from dahl_ident.synthetic import simulate as run
+
+    laws.run()
+    whole_number(seed, "seed", 0)
+    if experiment is not None:
+        refuse(
+            changed(plant, excitation, errors, motion),
+            f"together with {experiment}, which describes the whole experiment; leave one of them "
+            "out",
+        )
+    inputs = [] if experiment is None else [experiment]
+    writing.check([output], inputs, json=general.json)
+    described = (
+        _experiment(plant, excitation, errors, motion)
+        if experiment is None
+        else Experiment.read(experiment)
+    )
+    if output is None:
+        console.write(described.to_json() if general.json else described.to_toml())
+        return
+    with console.busy("simulating") as update:
+        data = run(described, seed=seed, progress=lambda done: update(done, 1.0))
+    write_data(data, output, overwrite=writing.overwrite)
+
+
+def _experiment(
+    plant: PlantOptions, excitation: Excitation, errors: Errors, motion: MotionOptions
+) -> Experiment:
+    from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
+
+    truth = plant.built()
+    settings: dict[str, Any] = dict(vars(excitation))
+    as_record = settings.pop("record")
+    controlled = excitation.controlled
+    settings["levels"] = _numbers(
+        "levels", excitation.levels or _usual_levels(truth, controlled), _UNITS[controlled]
+    )
+    settings["frequencies_hz"] = _numbers("frequency", settings.pop("frequency"), "Hz")
+    steps = SteppedSine(**settings)
+    if not as_record:
+        table = Table(errors.of("displacement", "1"), errors.of("force", "1"), **vars(motion))
+        return Experiment(truth, steps, table=table)
+    sensors = Acquisition(
+        displacement=Channel(noise_std=errors.of("displacement", "m")),
+        force=Channel(noise_std=errors.of("force", "N")),
+    )
+    return Experiment(truth, steps, sensors)
+
+
+def _usual_levels(truth: Element, controlled: str) -> str:
+    """Return levels of displacement or force around the knee of the friction."""
+    import numpy as np
+
+    from dahl_ident.elements.element import as_model
+
+    laws = [e for e in as_model(truth).elements if not e.is_linear]
+    knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])
+    if controlled == "force":
+        # a square wave of the friction force has a fundamental of 4/pi times it
+        limits = [0.25 * np.pi * float(e.force_bounds(e.known_values())[1]) for e in laws]
+        knees = np.array([[sum(limits)] * 2])
+    low, high = (knees[:, 0].min(), knees[:, 1].max()) if laws else (0.0, 0.0)
+    if not (np.isfinite([low, high]).all() and 0.0 < low <= high):
+        raise ValidationError("the plant has no knee to place levels about; give --levels")
+    return f"{_SPAN[0] * low}:{_SPAN[1] * high}:{_COUNT}"
+
+
+def _numbers(name: str, text: str, unit: str) -> list[float]:
+    """Return the numbers of ``1,2,5mm`` or of ``low:high:count``, evenly spread in logarithm."""
+    import numpy as np
+
+    try:
+        if ":" not in text:
+            return numbers(name, text, unit, sep=",")
+        span, _, count = text.rpartition(":")
+        low, high = numbers(name, span, unit)
+        return [float(v) for v in np.geomspace(low, high, int(count))]
+    except (ModelError, ValueError) as exc:
+        raise ValidationError(
+            f"{name} is {text!r}; expected numbers such as 0.1,1mm, or low:high:count"
+        ) from exc
