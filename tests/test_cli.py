@@ -24,15 +24,6 @@ COMMANDS = (
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
 
-def test_fit_recovers_the_truth_and_ends_with_0(run):
-    assert run("simulate", "--f-max", "0.2", "--sigma", "50", "-o", "clean.csv").status == 0
-    outcome = run("fit", "clean.csv", "--json", "--noise", "relative")
-    params = json.loads(outcome.out)["params"]
-    assert outcome.status == 0, outcome.err
-    assert params["f_max"]["value"] == pytest.approx(0.2, rel=1e-9)
-    assert params["sigma"]["value"] == pytest.approx(50.0, rel=1e-9)
-
-
 def test_command_line_and_python_give_the_same_numbers(run):
     table = run("datasets", "noisy", "-o", "-").out
     whole = json.loads(run("fit", "-", "--json", stdin=table).out)
@@ -45,15 +36,6 @@ def test_command_line_and_python_give_the_same_numbers(run):
         assert whole["budget"]["parameters"][name]["U"] == fit.budget()[name].U
     alpha = whole["assumed"]["alpha"]
     assert f"(here {alpha['value']:.3f} ± {alpha['stderr']:.3f})" in fit.verdict
-
-
-def test_a_missing_file_is_one_line_and_status_1(run):
-    outcome = run("fit", "nothing.csv")
-    assert outcome.status == 1
-    assert outcome.out == ""
-    assert outcome.err == (
-        "error: nothing.csv: the file cannot be read: No such file or directory\n"
-    )
 
 
 @pytest.mark.parametrize(
@@ -82,11 +64,6 @@ def test_bad_input_says_what_was_expected(run, arguments, message):
     assert outcome.err.startswith("error: ")
     assert outcome.err.count("\n") == 1
     assert message in outcome.err
-
-
-@pytest.mark.parametrize("arguments", [("fit",), ("fit", "x.csv", "--nosuch"), ("nosuch",)])
-def test_wrong_use_ends_with_2(run, arguments):
-    assert run(*arguments).status == 2
 
 
 def test_a_fit_that_runs_away_ends_with_3_and_says_why(run):
@@ -260,16 +237,6 @@ def test_no_good_point_is_an_error_of_its_own(run):
     assert outcome.status == 1
     assert "creates energy: a sign is reversed" in outcome.err
     assert "no point is good" in outcome.err
-
-
-def test_sample_tells_the_posterior(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("sample", "-", "--prior", "f_max=0.01:1", "--json", stdin=table)
-    told = json.loads(outcome.out)
-    assert outcome.status == 0, outcome.err
-    assert told["priors"]["f_max"].startswith("log-uniform from 0.01 to 1 N")
-    row = told["summary"]["f_max"]
-    assert abs(row["median"] - 0.1) < 4.0 * row["std"]
 
 
 def test_sample_integrates_at_once_where_asked(run):
@@ -621,16 +588,6 @@ def test_a_report_goes_to_standard_output(run):
     assert out.startswith("<!doctype html>")
     assert out.rstrip().endswith("</html>")
     assert list(Path().iterdir()) == []
-
-
-def test_both_solvers_find_the_same_optimum(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    one, two = (
-        json.loads(run("fit", "-", "--json", *extra, stdin=table).out)["params"]
-        for extra in ((), ("--method", "ipopt", "--start", "f_max=0.2"))
-    )
-    for name in ("f_max", "sigma"):
-        assert two[name]["value"] == pytest.approx(one[name]["value"], rel=1e-7)
 
 
 def test_sensors_are_fixed_free_or_have_a_prior(run):

@@ -7,7 +7,6 @@ import pytest
 
 from dahl_ident.extraction.from_record import Point, joined
 
-
 MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
     "force_distortion", "asymmetry", "displacement_steps", "force_steps", "displacement_clipped",

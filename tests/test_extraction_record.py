@@ -373,12 +373,6 @@ def test_labels_and_origin_are_kept():
     assert_near_truth(data)
 
 
-def test_table_of_points_and_verdicts():
-    frame = extract(waves().record(), harmonics=(1, 3)).to_frame()
-    assert {"settled", "verdict", "more_periods", "displacement_distortion"} <= set(frame.columns)
-    assert len(frame) == 2
-
-
 def two_tones(n=4000):
     time = np.arange(n) / RATE
     x = np.sin(2.0 * np.pi * time) + np.sin(2.0 * np.pi * 2.6 * time)

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,7 @@ from dahl_ident.data import FrequencyResponse, read_frequency_response
 from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.units import QUANTITIES
 
-FIELDS = (
-    "frequency_hz",
-    "response",
-    "amplitude",
-    "drive",
-    "covariance",
-    "dof",
-    "amplitude_std",
-    "amplitude_covariance",
-    "level",
-    "run",
-    "controlled",
-    "harmonic",
-    "quantity",
-    "motion",
-    "drive_factor_uncertainty",
-)
+FIELDS = [f.name for f in fields(FrequencyResponse) if f.name not in ("quality", "provenance")]
 
 
 def full_table(n=7, seed=3, motion="translation", **changes):

@@ -130,40 +130,6 @@ def test_friction_under_a_held_displacement_is_the_exact_force(alpha, amplitude)
     assert force == pytest.approx(expected, abs=1e-13 * 0.1)
 
 
-def steady(level, f):
-    """Return harmonics 0 to 7 of the displacement, the motion, and the start of a period."""
-    wave = SteppedSine((level,), (f,), controlled="force", settling_periods=60).waveform(seed=0)
-    motion = Mechanism.of(PLANT).displacement_under(wave)
-    start = wave.windows[0].start
-    return np.array([phasor(motion, f, start, 4, k) for k in range(8)]), motion, start
-
-
-@pytest.mark.parametrize(("f", "level"), [(0.8, 0.02), (1.0, 0.12), (1.3, 0.06), (2.0, 0.12)])
-def test_the_describing_function_errs_as_the_third_harmonic_says(f, level):
-    harmonics, _, start = steady(level, f)
-    drive = level * np.exp(2j * np.pi * f * -start) / 1j  # a sine from the window's start
-    predicted = response(PLANT, f, level, steady="describing function").receptance
-    error = abs(harmonics[1] / drive / predicted - 1.0)
-    third = abs(harmonics[3] / harmonics[1])
-    assert 1e-4 < error < 4.0 * third
-
-    omega = 2.0 * np.pi * f
-    theta = np.linspace(0.0, 40.0 * np.pi, 40 * 2048 + 1)
-    last = slice(-2048, None)
-
-    def left_over(*kept):
-        """Return the imbalance of the fundamental, friction moved by some harmonics alone."""
-        x = sum(np.real(harmonics[k] * np.exp(1j * k * (theta + omega * start))) for k in kept)
-        force = Dahl(*FRICTION).force(np.asarray(x))[last]
-        turned = np.exp(-1j * (theta[last] + omega * start))
-        friction = 2.0 * np.mean(force * turned)
-        return float(abs(LINEAR.dynamic_stiffness(0.0, omega) * harmonics[1] + friction - drive))
-
-    # with its third harmonic the motion balances the drive, as a pure sine does not
-    assert left_over(1, 3) < 0.25 * left_over(1)
-    assert left_over(1, 3, 5, 7) < 0.05 * left_over(1)
-
-
 def test_time_can_be_scaled():
     slow, fast = (
         Mechanism.of(Dahl(*FRICTION) + Mass(0.3 * s**2) + Damper(0.24 * s) + Spring(0.3))
