@@ -57,92 +57,60 @@ def _confounding_gain(optimum: Optimum, name: str, lost: frozenset[str]) -> str:
 
 
 def _of_friction(
-    optimum: Optimum,
-    element: Element,
-    parameter: Parameter,
-    limits: Interval,
-    lost: frozenset[str],
+    optimum: Optimum, element: Element, parameter: Parameter, limits: Interval, lost: frozenset[str]
 ) -> str:
     label, dimension = element.label(parameter), parameter.dimension
     scales = label in element.scale_parameters
     amplitude = optimum.problem.stiffness_data.amplitude
     unit = shown_unit("m", optimum.problem.data.motion)
     least, most = f"{amplitude.min():.2g} {unit}", f"{amplitude.max():.2g} {unit}"
-    rival = _rival(optimum, element, label, lost)
-    if rival:
-        return f"because {rival} can take its place: leave one of the two elements out"
-    spring = _hiding_spring(optimum, lost)
+    elements = optimum.problem.model.elements
+    for other in elements:  # the same parameter of another element of this law
+        if other is not element and other.kind == element.kind and label in other.labels:
+            rival = other.parameter(label).name
+            if rival in lost:
+                return f"because {rival} can take its place: leave one of the two elements out"
+    values = parameter_values(optimum)
+    low, high = map(float, element.knee([np.asarray(values[p.name]) for p in element.parameters]))
     if not scales and not any(dimension):
-        low, high = _knee(optimum, element)
         near = f"{low:.2g} {unit}" if low == high else f"{low:.2g} to {high:.2g} {unit}"
         return (
             f"because {parameter.name} shows only where stick turns to slip, and the data from "
             f"{least} to {most} do not resolve it: add amplitudes around {near}, or fix it"
         )
-    unlimited = limits.lower <= 0.0 and np.isinf(limits.upper)
+    springs = [p.name for e in elements if is_spring(e) for p in e.parameters if p.free]
+    spring = next((name for name in springs if name in lost), springs[0] if springs else "")
+    parallel = f" in parallel with the free {spring}" if spring else ""
+    fix = f", or measure the spring and fix {spring}" if spring else ""
+    share = f"friction's share of the response from {least} to {most}"
+    no_most, sticks = np.isinf(limits.upper), amplitude.max() < low
     is_limit, is_stiffness = scales and dimension == _FORCE, scales and dimension == _STIFFNESS
     limit_lost = any(p.name in lost for p in _scaled(element, _FORCE))
-    if spring and unlimited and limit_lost:
-        return (
-            f"because friction's share of the response from {least} to {most}, in parallel with "
-            f"the free {spring}, is within the noise: cover amplitudes where it is larger, reduce "
-            f"the noise, or measure the spring and fix {spring}"
-        )
-    if is_limit and np.isinf(limits.upper):
-        if spring:
-            return (
-                f"because the free {spring} hides it below {most}: drive above that, or measure "
-                f"the spring and fix {spring}"
-            )
-        return f"because no amplitude up to {most} reaches slip: drive above that"
-    if is_stiffness and (spring in lost or (spring and _sticks(optimum, element))):
-        return (
-            f"because the free {spring} can take its place: drive far into slip, or measure the "
-            f"spring and fix {spring}"
-        )
-    if is_stiffness and np.isinf(limits.upper) and not limit_lost:
-        parallel = f" in parallel with the free {spring}" if spring else ""
-        fix = f", or measure the spring and fix {spring}" if spring else ""
-        return (
-            f"because every amplitude from {least} slips and friction's stiffness fades{parallel}: "
-            f"drive below that{fix}"
-        )
-    if spring:
-        return (
-            f"because the free {spring} explains the data from {least} to {most} nearly as well: "
-            f"cover more amplitudes, or measure the spring and fix {spring}"
-        )
-    return (
-        f"because friction's share of the response from {least} to {most} is within the noise: "
-        "cover amplitudes where it is larger, or reduce the noise"
-    )
-
-
-def _sticks(optimum: Optimum, element: Element) -> bool:
-    """Return whether no amplitude reaches the knee, where an element begins to slip."""
-    return bool(optimum.problem.stiffness_data.amplitude.max() < _knee(optimum, element)[0])
-
-
-def _knee(optimum: Optimum, element: Element) -> tuple[float, float]:
-    values = parameter_values(optimum)
-    low, high = element.knee([np.asarray(values[p.name]) for p in element.parameters])
-    return float(low), float(high)
+    if spring and limits.lower <= 0.0 and no_most and limit_lost:
+        reason = f"{share},{parallel}, is within the noise"
+        remedy = "cover amplitudes where it is larger, reduce the noise"
+    elif is_limit and no_most:
+        hidden = f"the free {spring} hides it below {most}"
+        reason = hidden if spring else f"no amplitude up to {most} reaches slip"
+        remedy = "drive above that"
+    elif is_stiffness and spring and (spring in lost or sticks):
+        reason, remedy = f"the free {spring} can take its place", "drive far into slip"
+    elif is_stiffness and no_most and not limit_lost:
+        reason = f"every amplitude from {least} slips and friction's stiffness fades{parallel}"
+        remedy = "drive below that"
+    elif spring:
+        reason = f"the free {spring} explains the data from {least} to {most} nearly as well"
+        remedy = "cover more amplitudes"
+    else:
+        reason = f"{share} is within the noise"
+        remedy = "cover amplitudes where it is larger, or reduce the noise"
+    return f"because {reason}: {remedy}{fix}"
 
 
 def _scaled(element: Element, dimension: tuple[int, int, int]) -> list[Parameter]:
     """Return the scale parameters with a given dimension."""
     scale = (element.parameter(label) for label in element.scale_parameters)
     return [p for p in scale if p.dimension == dimension]
-
-
-def _rival(optimum: Optimum, element: Element, label: str, lost: frozenset[str]) -> str:
-    """Return the same parameter of another element of this law, if it is not determined either."""
-    for other in optimum.problem.model.elements:
-        if other is not element and other.kind == element.kind and label in other.labels:
-            name: str = other.parameter(label).name
-            if name in lost:
-                return name
-    return ""
 
 
 def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
@@ -154,10 +122,3 @@ def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
             "without friction, or drive far into slip"
         )
     return "because its force is below the noise of the response: measure where it is larger"
-
-
-def _hiding_spring(optimum: Optimum, lost: frozenset[str]) -> str:
-    """Return the name of a free spring that is not identified either, or of any free one."""
-    elements = optimum.problem.model.elements
-    springs = [p.name for e in elements if is_spring(e) for p in e.parameters if p.free]
-    return next((name for name in springs if name in lost), springs[0] if springs else "")

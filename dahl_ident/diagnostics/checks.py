@@ -279,14 +279,9 @@ def robust_values(
 # Assumed?
 
 
-def reading(fit: Assessment) -> Iterator[Finding]:
-    """Yield the warnings on reading the data."""
-    yield from doubted(*fit.problem.provenances)
-
-
-def doubted(*provenances: Mapping[str, Any] | None) -> Iterator[Finding]:
-    """Yield the warnings that were shown when the data were read."""
-    texts = list(dict.fromkeys(text for one in provenances for text in doubts(one)))
+def reading(fit: Any) -> Iterator[Finding]:
+    """Yield the warnings that were shown when the data of a fit or posterior were read."""
+    texts = list(dict.fromkeys(text for one in fit.problem.provenances for text in doubts(one)))
     yield from (described("warning", text=text) for text in texts[:_DOUBTS_SHOWN])
     if len(texts) > _DOUBTS_SHOWN:
         yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)
@@ -306,12 +301,8 @@ def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding
             continue
         if parameter.assumed and errors is not None and name in errors.assumed:
             low, high = parameter.prior
-            ranges.append(
-                {
-                    "name": name, "low": low, "high": high, "value": errors.values[name],
-                    "stderr": errors.stderr[name], "unit": parameter.unit,
-                }
-            )  # fmt: skip
+            known = {"value": errors.values[name], "stderr": errors.stderr[name]}
+            ranges.append({"name": name, "low": low, "high": high, "unit": parameter.unit, **known})
         elif parameter.value is not None:
             stated[name] = parameter.value
     sensors = {p.name for p in optimum.problem.sensors.parameters if p.free}

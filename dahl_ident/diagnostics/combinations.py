@@ -44,31 +44,39 @@ class Candidate:
 
 def candidates(optimum: Optimum) -> list[Candidate]:
     """Return every combination that the optimum's free parameters could form."""
-    free = {p.name: p for p in optimum.problem.parameters}
-    theta = dict(zip(optimum.names, optimum.problem.to_values(optimum.theta), strict=True))
-    elements = optimum.problem.model.elements
+    problem, names = optimum.problem, optimum.names
+    theta = dict(zip(names, problem.to_values(optimum.theta), strict=True))
+    slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
+    units = {p.name: p.unit for p in problem.parameters}
+    elements = problem.model.elements
     friction = [e for e in elements if e.has_memory]
-    springs = [p.name for e in elements if is_spring(e) for p in e.parameters if p.free]
+    springs = [p for e in elements if is_spring(e) for p in e.parameters if p.free]
     found: list[Candidate] = []
     for element in friction:
         for combination in element.combinations():
             powers = {element.parameter(n): power for n, power in combination.powers.items()}
             if all(p.free for p in powers):
-                text = element.named(combination.expression)
-                found.append(_product(optimum, theta, powers, text))
+                by_name = {p.name: power for p, power in powers.items()}
+                with np.errstate(over="ignore", under="ignore"):
+                    logarithm = sum(power * np.log(theta[n]) for n, power in by_name.items())
+                    value = float(np.exp(logarithm))
+                direction = np.array([by_name.get(name, 0.0) for name in names])
+                text, unit = element.named(combination.expression), _unit(powers)
+                unit = shown_unit(unit, problem.data.motion)
+                found.append(Candidate(text, unit, value, direction, frozenset(by_name)))
     scale = [{n: e.parameter(n) for n in e.scale_parameters} for e in friction]
-    pairs = [
-        (p.name, k)
-        for own in scale
-        for p in own.values()
-        if p.free and p.dimension == _STIFFNESS
-        for k in springs
-    ]
-    for (one, own), (other, its) in combinations(zip(friction, scale, strict=True), 2):
+    stiff = (p for labels in scale for p in labels.values() if p.dimension == _STIFFNESS)
+    pairs = [(p, spring) for p in stiff for spring in springs]
+    for (one, first), (other, second) in combinations(zip(friction, scale, strict=True), 2):
         if one.kind == other.kind:
-            both = ((own[label], its[label]) for label in own if label in its)
-            pairs += [(a.name, b.name) for a, b in both if a.free and b.free]
-    found += [_sum(optimum, theta, free, pair) for pair in pairs]
+            pairs += [(first[label], second[label]) for label in first if label in second]
+    for pair in pairs:
+        if all(p.free for p in pair):
+            both = [p.name for p in pair]
+            value = sum(theta[name] for name in both)
+            direction = np.array([slopes[n] / value if n in both else 0.0 for n in names])
+            text, members = " + ".join(both), frozenset(both)
+            found.append(Candidate(text, units[both[0]], value, direction, members, is_sum=True))
     return found
 
 
@@ -102,43 +110,17 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
 
 def runaway(optimum: Optimum) -> frozenset[str]:
     """Return the names of the parameters whose optimum lies at infinity, or at a positive zero."""
-    positive = np.array([p.positive for p in optimum.problem.parameters])
-    gone = ~np.isfinite(optimum.values) | (positive & (optimum.values == 0.0))
+    positive, values = optimum.problem.space.positive, optimum.values
+    gone = ~np.isfinite(values) | (positive & (values == 0.0))
     return frozenset(np.array(optimum.names)[gone].tolist())
-
-
-def _product(
-    optimum: Optimum, theta: Mapping[str, float], powers: Mapping[Parameter, float], text: str
-) -> Candidate:
-    by_name = {p.name: power for p, power in powers.items()}
-    direction = np.array([by_name.get(name, 0.0) for name in optimum.names])
-    with np.errstate(over="ignore", under="ignore"):
-        value = float(np.exp(sum(power * np.log(theta[n]) for n, power in by_name.items())))
-    unit = shown_unit(_unit(powers), optimum.problem.data.motion)
-    return Candidate(text, unit, value, direction, frozenset(by_name))
 
 
 def _unit(powers: Mapping[Parameter, float]) -> str:
     """Return the unit of a product, such as "N/m^2"."""
-    above: list[str] = []
-    below: list[str] = []
+    above, below = list[str](), list[str]()
     for place, unit in enumerate(_UNITS):
         power = sum(by * p.dimension[place] for p, by in powers.items())
-        text = unit if abs(power) == 1 else f"{unit}^{abs(power):g}"
         if power:
+            text = unit if abs(power) == 1 else f"{unit}^{abs(power):g}"
             (above if power > 0 else below).append(text)
     return "/".join([" ".join(above) or "1", *below]) if above or below else ""
-
-
-def _sum(
-    optimum: Optimum,
-    theta: Mapping[str, float],
-    free: Mapping[str, Parameter],
-    pair: tuple[str, str],
-) -> Candidate:
-    slopes = dict(zip(optimum.names, optimum.problem.value_slopes(optimum.theta), strict=True))
-    value = sum(theta[name] for name in pair)
-    direction = np.array([slopes[n] / value if n in pair else 0.0 for n in optimum.names])
-    return Candidate(
-        " + ".join(pair), free[pair[0]].unit, value, direction, frozenset(pair), is_sum=True
-    )

@@ -181,7 +181,7 @@ def combined_intervals(
         beyond = np.where(held, np.maximum(u**2 - by_noise**2, 0.0), 0.0)
         ends = []
         for end, sign in ((shape.lower, -1.0), (shape.upper, 1.0)):
-            theta = _search(noise, end)
+            theta = search_coordinates(noise, end)
             far = np.hypot(theta - noise.theta, k * np.sqrt(beyond))
             moved = noise.problem.to_values(noise.theta + sign * far)
             ends.append(np.where(np.isfinite(theta) & (beyond > 0.0), moved, end))
@@ -295,28 +295,20 @@ def compare(
         if not np.array_equal(other.levels, last.levels):
             raise ValidationError(f"{other.method} and {last.method} intervals differ in level")
         for side in ("lower", "upper"):
-            ours, theirs = (
-                _search(optimum, getattr(one, side)[:, :count]) for one in (last, other)
-            )
+            a, b = (getattr(one, side)[:, :count] for one in (last, other))
+            ours, theirs = (search_coordinates(optimum, one) for one in (a, b))
             with np.errstate(invalid="ignore"):
                 apart = np.abs(ours - theirs) > tolerance * np.abs(ours - theta)
             apart |= np.isinf(ours) != np.isinf(theirs)
-            a, b = (getattr(one, side)[:, :count] for one in (last, other))
             apart &= ~np.isclose(a, b, rtol=_ROUNDING, atol=0)
-            found += [
-                Disagreement(
-                    last.names[i],
-                    float(last.levels[level]),
-                    side,
-                    (other.method, last.method),
-                    (getattr(other, side)[level, i], getattr(last, side)[level, i]),
-                )
-                for level, i in np.argwhere(apart).tolist()
-            ]
+            for row, i in np.argwhere(apart).tolist():
+                level, limits = float(last.levels[row]), (b[row, i], a[row, i])
+                methods = (other.method, last.method)
+                found.append(Disagreement(last.names[i], level, side, methods, limits))
     return IntervalComparison(tuple(intervals), tuple(found), stated)
 
 
-def _search(optimum: Optimum, values: FloatArray) -> FloatArray:
+def search_coordinates(optimum: Optimum, values: FloatArray) -> FloatArray:
     """Return search coordinates, infinite where a value has none."""
     positive = optimum.problem.space.positive[: values.shape[-1]]
     with np.errstate(divide="ignore"):

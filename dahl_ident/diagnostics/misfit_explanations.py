@@ -61,20 +61,12 @@ def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[Suspiciou
     """Return the points that stand apart, the most deviant first."""
     found = _beyond_noise(optimum) if optimum.loss != "linear" else _standing_apart(optimum, space)
     data, amplitude = optimum.problem.data, optimum.problem.stiffness_data.amplitude
-    return tuple(
-        SuspiciousPoint(
-            row,
-            name,
-            float(data.frequency_hz[row]),
-            float(amplitude[row]),
-            None if data.level is None else data.level[row].item(),
-            deviation,
-            p,
-        )
-        for (row, deviation, p), name in zip(
-            found, row_names(data, [row for row, *_ in found]), strict=True
-        )
-    )
+    names, points = row_names(data, [row for row, *_ in found]), []
+    for (row, deviation, p), name in zip(found, names, strict=True):
+        level = None if data.level is None else data.level[row].item()
+        place = float(data.frequency_hz[row]), float(amplitude[row]), level
+        points.append(SuspiciousPoint(row, name, *place, deviation, p))
+    return tuple(points)
 
 
 def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float, float]]:
@@ -219,9 +211,8 @@ def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum],
         try:
             problem = optimum.problem.like(data=turn(optimum.problem.data))
             # single rows near a resonance may miss at a start: the median is not bent by them
-            first = float(
-                np.median(_misfit(problem, problem.predict(own_starts(problem).theta[0])))
-            )
+            started = problem.predict(own_starts(problem).theta[0])
+            first = float(np.median(_misfit(problem, started)))
         except DahlIdentError:
             continue
         if first * _PROMISING < middle:
@@ -261,8 +252,8 @@ def least_misfit_without(optimum: Optimum, rows: Sequence[int]) -> float:
     y = (1.0 - predicted[kept] / response[kept]).view(np.float64)
     J = np.ascontiguousarray((problem.prediction_jacobian(theta)[kept] / response[kept, None]).T)
     J = J.view(np.float64).T
-    move = np.linalg.lstsq(J[:, np.isfinite(J).all(axis=0)], y, rcond=None)[0]
-    left = y - J[:, np.isfinite(J).all(axis=0)] @ move
+    J = J[:, np.isfinite(J).all(axis=0)]
+    left = y - J @ np.linalg.lstsq(J, y, rcond=None)[0]
     return float(np.sqrt(2.0 * np.mean(left**2)))
 
 

@@ -74,15 +74,12 @@ class MixedModel:
 
     def without(self, left_out: Collection[int]) -> MixedModel:
         """Return the model without some of its sources."""
-        kept = [k for k in range(len(self.starts)) if k not in left_out]
-        Z = [self.U[:, self.columns(k)] for k in kept]
-        J, most = self.U[:, : self.parameters], self.most[self.noises :][kept]
-        return MixedModel(self.y, J, Z, self.group, self.known, self.noises, most)
+        return self.elsewhere(self.y, self.U[:, : self.parameters], left_out)
 
-    def elsewhere(self, y: FloatArray, J: FloatArray) -> MixedModel:
-        """Return the same sources with residuals and derivatives at other parameters."""
-        Z = [self.U[:, self.columns(k)] for k in range(len(self.starts))]
-        most = self.most[self.noises :]
+    def elsewhere(self, y: FloatArray, J: FloatArray, left_out: Collection[int] = ()) -> MixedModel:
+        """Return the sources with residuals and derivatives at other parameters."""
+        kept = [k for k in range(len(self.starts)) if k not in left_out]
+        Z, most = [self.U[:, self.columns(k)] for k in kept], self.most[self.noises :][kept]
         return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
 
     def at(self, variances: FloatArray) -> MixedState:

@@ -79,9 +79,8 @@ def prediction_error(
         by_variance[0] += _diagonal(noise)
         for k, source in enumerate(errors.sources):
             if source.name == NOISE:
-                rows = source.columns[: errors.problem.n_residuals].reshape(
-                    -1, 2, errors.problem.data.n
-                )
+                n = errors.problem.data.n
+                rows = source.columns[: 2 * n].reshape(n, 2, -1)
                 drawn = _row_noise(errors.estimate.relative_units[near] @ rows[near])
                 covariance = covariance + errors.variances[k] * drawn
                 by_variance[model.noises + k] += _diagonal(drawn)
@@ -90,10 +89,8 @@ def prediction_error(
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
     if errors.by_runs is not None:  # a new run scatters about the mean of the others
-        mean, runs = (
-            _diagonal(own @ errors.by_runs.covariance @ own.swapaxes(1, 2)),
-            errors.by_runs.runs,
-        )
+        mean = _diagonal(own @ errors.by_runs.covariance @ own.swapaxes(1, 2))
+        runs = errors.by_runs.runs
         dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
     if basis is not None:
         covariance[~basis.holds(own).all(axis=1)] = np.inf

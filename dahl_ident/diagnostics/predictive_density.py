@@ -124,19 +124,18 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     state = model.reml(np.ones(len(Z)))
     tests = _densities(state, np.repeat(test, 2)[keep], unit, robust=optimum.loss != "linear")
     first = np.unique(test, return_index=True)[1]
-    square = np.abs(missed) ** 2
-    others = ~fundamental
-    misfit = float(np.sqrt(square[fundamental].mean())) if fundamental.any() else float("nan")
-    return PredictiveDensity(
-        tests,
-        run[first],
-        misfit,
-        float(np.sqrt(square[others].sum() / max(fundamental.sum(), 1)))
-        if others.any()
-        else float("nan"),
-        misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan)),
-        int(np.count_nonzero(fundamental)),
+    square, count, misfit, of_harmonics = (
+        np.abs(missed) ** 2,
+        int(fundamental.sum()),
+        np.nan,
+        np.nan,
     )
+    if count:
+        misfit = float(np.sqrt(square[fundamental].mean()))
+    if not fundamental.all():
+        of_harmonics = float(np.sqrt(square[~fundamental].sum() / max(count, 1)))
+    noise = misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan))
+    return PredictiveDensity(tests, run[first], misfit, of_harmonics, noise, count)
 
 
 def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:

@@ -67,14 +67,9 @@ class Bracket:
     """
 
     def __init__(
-        self,
-        target: FloatArray,
-        first: FloatArray,
-        step: FloatArray,
-        furthest: FloatArray,
-        logarithmic: BoolArray,
-        narrow_enough: FloatArray,
-    ) -> None:
+        self, target: FloatArray, first: FloatArray, step: FloatArray, furthest: FloatArray,
+        logarithmic: BoolArray, narrow_enough: FloatArray,
+    ) -> None:  # fmt: skip
         self._target, self._furthest, self._logarithmic = target, furthest, logarithmic
         self._narrow_enough = narrow_enough
         self.position, self._step = np.minimum(first, furthest), step
@@ -303,16 +298,10 @@ class Profiler:
             return Quadratic(cost, gradient, np.where(either, 0.0, hessian))
 
         ends = minimise(
-            evaluate,
-            start,
-            self._logarithmic,
-            self._problem.n_residuals,
-            tolerance_factor=_TOLERANCE_FACTOR,
-            enough=lambda _: _ENOUGH,
-            steps=_SEARCH_STEPS,
-            accuracy=self._problem.accuracy,
-            bounds=(self._low, self._high),
-        ).theta
+            evaluate, start, self._logarithmic, self._problem.n_residuals,
+            tolerance_factor=_TOLERANCE_FACTOR, enough=lambda _: _ENOUGH, steps=_SEARCH_STEPS,
+            accuracy=self._problem.accuracy, bounds=(self._low, self._high),
+        ).theta  # fmt: skip
         step = ends - theta
         moved = step.any(axis=1, keepdims=True)  # else a cost may be infinite
         turn = np.where(moved, np.einsum("sij,sj->si", lowest.hessian, step), 0.0)
@@ -427,15 +416,10 @@ class Profiler:
         view = self._problem.stiffness_data
         stiffness = view.typical_stiffness
         has_spring = any(e.is_linear and e.holds_at_rest for e in self._problem.model.elements)
-        return _Distances(
-            float(np.log(view.amplitude.min() * _LEAST_X_C)),
-            float(
-                np.log(view.amplitude.max() * (_MOST_X_C_WITH_SPRING if has_spring else _MOST_X_C))
-            ),
-            float(np.log(view.amplitude.min())),
-            float(np.log(stiffness * _SOFTEST)),
-            float(np.log(stiffness * _STIFFEST)),
-        )
+        low, high = view.amplitude.min(), view.amplitude.max()
+        most = _MOST_X_C_WITH_SPRING if has_spring else _MOST_X_C
+        ends = low * _LEAST_X_C, high * most, low, stiffness * _SOFTEST, stiffness * _STIFFEST
+        return _Distances(*np.log(ends).tolist())
 
     @cached_property
     def _farthest(self) -> FloatArray:

@@ -26,10 +26,10 @@ from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement
 from dahl_ident.diagnostics.record_checks import (
+    CHECKS,
     RecordGoodness,
     misses,
     record_goodness,
-    record_judgement,
     undetermined,
 )
 from dahl_ident.diagnostics.record_errors import (
@@ -204,7 +204,7 @@ class RecordAssessment(Assessment):
     @cached_property
     def judgement(self) -> Judgement:
         """Every finding about the fit, and the status that follows from them."""
-        return record_judgement(self)
+        return Judgement(finding for check in CHECKS for finding in check(self))
 
     def assumptions(self, *, counted: bool = True) -> tuple[Finding, ...]:
         """Return what the result depends on."""

@@ -16,7 +16,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.checks import assumed, constraints, reading
 from dahl_ident.diagnostics.error_sources import RUNS
 from dahl_ident.diagnostics.estimate import EXPONENT
-from dahl_ident.diagnostics.judgement import Finding, Judgement, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.physics import below_zero, is_single, slight
 from dahl_ident.diagnostics.record_errors import MODEL, NOISE, PATH
 from dahl_ident.elements import Element
@@ -143,11 +143,6 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
         len(records),
         left,
     )
-
-
-def record_judgement(fit: RecordAssessment) -> Judgement:
-    """Return the findings of every check, and with them the status."""
-    return Judgement(finding for check in CHECKS for finding in check(fit))
 
 
 def misses(fit: RecordAssessment) -> bool:

@@ -49,19 +49,10 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     volume += float(np.log(np.abs(np.linalg.det(factors))).sum())
     _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
     return RowErrors(
-        counted,
-        turn,
-        np.maximum(ratios, 0.0),
-        volume,
-        factors,
-        *_dof_and_share(errors),
-        jacobian,
-        size * root * estimate.y[:m],
-        known,
-        np.where(scatters, errors.theta, np.nan),
-        np.where(scatters, slopes[:m], 0.0),
-        inside,
-    )
+        counted, turn, np.maximum(ratios, 0.0), volume, factors, *_dof_and_share(errors), jacobian,
+        size * root * estimate.y[:m], known, np.where(scatters, errors.theta, np.nan),
+        np.where(scatters, slopes[:m], 0.0), inside,
+    )  # fmt: skip
 
 
 def _dof_and_share(errors: ErrorModel) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from string import Formatter
 from typing import Any
 
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
@@ -18,7 +19,25 @@ _LEVEL = level_text(CONFIDENCE)
 
 def sentence(code: str, values: Mapping[str, Any]) -> str:
     """Return a finding in words."""
-    return _TEXT[code](**values)
+    text = _TEXT[code]
+    return (
+        text(**values) if callable(text) else _WORDS.vformat(text, (), {"level": _LEVEL, **values})
+    )
+
+
+class _Words(Formatter):
+    """Sentences with fields, which are numbers, shares or lists."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if format_spec in _FIELDS:
+            return _FIELDS[format_spec](value)
+        return str(format(value, format_spec))
+
+
+_WORDS = _Words()
+_FIELDS: Mapping[str, Callable[[Any], str]] = {
+    "percent": percent, "list": listed, "parts": "; ".join
+}  # fmt: skip
 
 
 def joined(parts: Sequence[str], most: int = 100) -> str:
@@ -90,21 +109,6 @@ def _misfit(rms: float, objections: Sequence[str], counted: bool) -> str:
     )
 
 
-def _too_few_points(dof: int, rms: float) -> str:
-    return (
-        f"With {dof} degrees of freedom a wrong model cannot be distinguished from noise "
-        f"({percent(rms)} rms misfit): measure more points, or repeat them so that their "
-        "covariance is known."
-    )
-
-
-def _one_amplitude(rms: float) -> str:
-    return (
-        "One amplitude gives no more numbers than friction has parameters, so any model fits "
-        f"({percent(rms)} rms misfit): measure at other amplitudes as well."
-    )
-
-
 def _noise(rms: float, hints: Sequence[str], scatter: str) -> str:
     hint = f", with a hint that {joined(hints)}" if hints else ""
     but = f", but {scatter}" if scatter else ""
@@ -144,33 +148,12 @@ def _flagged(points: Sequence[str], every: bool) -> str:
     )
 
 
-def _beyond_limit(row: str, carried: str, limit: str) -> str:
-    return (
-        f"At {row} the force held exceeds friction's limit ({limit}) by more than the other "
-        f"elements carry ({carried}): the limit is wrong, or an element is missing."
-    )
-
-
-def _beyond_slip(row: str, force: str, limit: str) -> str:
-    return (
-        f"At {row} friction's fundamental is {force}, more than full slip can give ({limit}): an "
-        "element is missing."
-    )
-
-
 def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, width: float) -> str:
     of = "" if tests == available else f" of {available}"
     return (
         f"Without each of {tests}{of} tests in turn, {gains} of {rows} held-out gains and {phases} "
         f"of {rows} phases of fundamentals are inside their {_LEVEL} bands (half width "
         f"{percent(width)})."
-    )
-
-
-def _narrow_bands(width: float, misfit: float) -> str:
-    return (
-        f"The {_LEVEL} bands (half width {percent(width)}) do not cover the misfit "
-        f"({percent(misfit)} rms): no uncertainty can be stated."
     )
 
 
@@ -229,14 +212,6 @@ def _jenkins_bound(least: float, law: bool) -> str:
     return (
         "No symmetric rate-independent law of parallel Jenkins elements leaves less than "
         f"{share}: the rest is noise, rate, asymmetry, a gap, or a loop of another shape."
-    )
-
-
-def _displacement_noise(noise: float, unit: str, travel: float) -> str:
-    return (
-        f"The displacement's noise of {noise:.2g} {unit} (standard deviation) is not counted as "
-        f"travel, of which it would add {percent(travel)}; the residuals are smaller without "
-        "it. A quieter displacement would determine more."
     )
 
 
@@ -309,33 +284,37 @@ def _assumed(
     return f"Assumed: {'; '.join(parts)}."
 
 
-_TEXT: Mapping[str, Callable[..., str]] = {
+_TEXT: Mapping[str, str | Callable[..., str]] = {
     "identified": _identified,
     "undetermined": _undetermined,
-    "combinations": lambda combinations: f"Determined: {'; '.join(combinations)}.",
+    "combinations": "Determined: {combinations:parts}.",
     "undetermined_parameters": lambda shown, why: (
         f"{'; '.join(f'{name}: {known}' for name, known in shown.items())}"
         f"{f', not determined, {why}' if why else ''}."
     ),
-    "solver": lambda message: message,
+    "solver": "{message}",
     "no_degrees_of_freedom": _no_degrees_of_freedom,
-    "sign": lambda convention: f"{convention}. Do not use the numbers of this fit.",
+    "sign": "{convention}. Do not use the numbers of this fit.",
     "rows_apart": _rows_apart,
     "misfit": _misfit,
-    "large_misfit": lambda rms: (
-        f"The misfit is {percent(rms)} rms, more than half of the response: no uncertainty can "
-        "be stated."
-    ),
-    "too_few_points": _too_few_points,
-    "one_amplitude": _one_amplitude,
+    "large_misfit": "The misfit is {rms:percent} rms, more than half of the response: no "
+    "uncertainty can be stated.",
+    "too_few_points": "With {dof} degrees of freedom a wrong model cannot be distinguished from "
+    "noise ({rms:percent} rms misfit): measure more points, or repeat them so that their "
+    "covariance is known.",
+    "one_amplitude": "One amplitude gives no more numbers than friction has parameters, so any "
+    "model fits ({rms:percent} rms misfit): measure at other amplitudes as well.",
     "noise": _noise,
     "suspicious": _suspicious,
     "jenkins_bound": _jenkins_bound,
     "flagged": _flagged,
-    "beyond_limit": _beyond_limit,
-    "beyond_slip": _beyond_slip,
+    "beyond_limit": "At {row} the force held exceeds friction's limit ({limit}) by more than the "
+    "other elements carry ({carried}): the limit is wrong, or an element is missing.",
+    "beyond_slip": "At {row} friction's fundamental is {force}, more than full slip can give "
+    "({limit}): an element is missing.",
     "held_out": _held_out,
-    "narrow_bands": _narrow_bands,
+    "narrow_bands": "The {level} bands (half width {width:percent}) do not cover the misfit "
+    "({misfit:percent} rms): no uncertainty can be stated.",
     "constraint": _constraint,
     "prior": _prior,
     "beyond_range": lambda name, value, stderr, low, high: (
@@ -350,62 +329,51 @@ _TEXT: Mapping[str, Callable[..., str]] = {
     "jump": _jump,
     "unstable_rows": _unstable_rows,
     "distorted_force": _distorted_force,
-    "no_steady_motion": lambda: (
-        "The force was held, but the describing function predicts the motion: the plant would "
-        "drive itself, and no steady motion is there."
-    ),
-    "describing_function": lambda why: (
-        f"The force was held, but the describing function predicts the motion: {why}."
-    ),
-    "records_not_described": lambda: "The model does not describe the records.",
-    "no_optimum": lambda message: f"The search found no optimum. {message}",
+    "no_steady_motion": "The force was held, but the describing function predicts the motion: the "
+    "plant would drive itself, and no steady motion is there.",
+    "describing_function": "The force was held, but the describing function predicts the motion: "
+    "{why}.",
+    "records_not_described": "The model does not describe the records.",
+    "no_optimum": "The search found no optimum. {message}",
     "motion_may_be_imposed": lambda: (
         "If the exciter imposed the motion, fit the force instead "
         f"({argument('output', 'force', option='predicted')}): what it moves hardly depends on the "
         "force, and the model cannot follow it."
     ),
-    "records_misfit": lambda: "The misfit exceeds the noise.",
+    "records_misfit": "The misfit exceeds the noise.",
     "record_parameter": _record_parameter,
-    "unphysical": lambda objection: f"Physically doubtful: {objection}.",
+    "unphysical": "Physically doubtful: {objection}.",
     "exponent": lambda name, wanted: (
         f"The records ask for {name} = {wanted}, beyond the range that is assumed: estimate it "
         f"({spelled(f'{name}=None', f'{name}=free')})."
     ),
-    "stated_exponent": lambda name, wanted, held: (
-        f"The records contradict {name} = {held:g}, which was stated: they ask for {wanted}."
-    ),
-    "few_effective_samples": lambda effective, unknowns: (
-        f"The residuals are so slow that they are worth {effective:.0f} samples, few for "
-        f"{unknowns} unknowns: record for longer."
-    ),
+    "stated_exponent": "The records contradict {name} = {held:g}, which was stated: they ask for "
+    "{wanted}.",
+    "few_effective_samples": "The residuals are so slow that they are worth {effective:.0f} "
+    "samples, few for {unknowns} unknowns: record for longer.",
     "delay": lambda delay, samples: (
         f"The motion {'lags' if delay > 0.0 else 'leads'} the force by {abs(samples):.2g} samples "
         f"({abs(delay):.2g} s): taken out."
     ),
-    "record_residuals": lambda rms, output, worst: (
-        f"The residuals are {percent(rms)} rms of the measured {output}; {worst}."
-    ),
-    "slow_residuals": lambda rms: (
-        f"Most of this varies slowly, as noise in the drive causes it: {percent(rms)} rms remains "
-        "at the drive's frequencies, and the residuals are weighted by their spectrum."
-    ),
-    "displacement_noise": _displacement_noise,
+    "record_residuals": "The residuals are {rms:percent} rms of the measured {output}; {worst}.",
+    "slow_residuals": "Most of this varies slowly, as noise in the drive causes it: {rms:percent} "
+    "rms remains at the drive's frequencies, and the residuals are weighted by their spectrum.",
+    "displacement_noise": "The displacement's noise of {noise:.2g} {unit} (standard deviation) is "
+    "not counted as travel, of which it would add {travel:percent}; the residuals are smaller "
+    "without it. A quieter displacement would determine more.",
     "effective_samples": lambda effective, samples: (
         "Error bars take the residuals' correlation into account: "
-        f"{min(effective, samples):.0f} effective of "
-        f"{samples} samples."
+        f"{min(effective, samples):.0f} effective of {samples} samples."
     ),
-    "not_converged": lambda message: message,
-    "sampled": lambda message: message,
+    "not_converged": "{message}",
+    "sampled": "{message}",
     "prior_influence": _prior_influence,
-    "predictive_check": lambda text: text,
-    "counted": lambda sources: f"Counted: {'; '.join(sources)}.",
-    "noise_alone": lambda compared: (
-        f"Noise alone is counted; with every source of the budget, u is {listed(compared)}."
-    ),
-    "evidence": lambda ln: f"ln evidence: {ln:.4f}",
-    "records_assumed": lambda parts: f"Assumed: {'; '.join(parts)}.",
-    "warning": lambda text: f"Warning on reading: {text}.",
-    "more_warnings": lambda count: f"{count} more warnings on reading.",
+    "predictive_check": "{text}",
+    "counted": "Counted: {sources:parts}.",
+    "noise_alone": "Noise alone is counted; with every source of the budget, u is {compared:list}.",
+    "evidence": "ln evidence: {ln:.4f}",
+    "records_assumed": "Assumed: {parts:parts}.",
+    "warning": "Warning on reading: {text}.",
+    "more_warnings": "{count} more warnings on reading.",
     "assumed": _assumed,
 }

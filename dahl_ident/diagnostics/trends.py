@@ -17,9 +17,8 @@ centre. Rows that are predicted by the exact steady motion have no such test.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -32,7 +31,6 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import friction_stiffness, is_spring
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
-from dahl_ident.elements import Element
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import percent, shown_unit
 
@@ -79,29 +77,36 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     if not rows.size:
         return None
     kept, band = _bands(np.log(view.amplitude[rows]))
-    rows = rows[kept]
-    count = int(band.max()) + 1 if band.size else 0
+    rows, count = rows[kept], int(band.max(initial=-1)) + 1
     own = (band[:, None] == np.arange(count)).astype(np.float64)
-    x = np.log(view.amplitude[rows])
+    x, weights = np.log(view.amplitude[rows]), view.weights[rows]
     centre = x @ own / own.sum(axis=0)
     design = np.column_stack([own, own * (x[:, None] - centre)])
-    if any(_is_free_mass(e) for e in elements):
+    linear = (e.parameter(n) for e in elements if e.is_linear for n in e.linear_parameters)
+    if any(p.free and p.is_mass for p in linear):
         square = view.omega[rows] ** 2
         design = np.column_stack([design, square / square.mean() - 1.0])
     dof = len(rows) - design.shape[1]
     if count < 2 or dof < LEAST_DOF:
         return None
     stiffness = friction_stiffness(optimum, with_springs=True).real[rows]
-    values, covariance = _weighted_means(design, stiffness, view.weights[rows], dof)
-    unit = shown_unit("m", optimum.problem.data.motion)
-    return _largest_rise(
-        np.exp(centre).tolist(), unit, values[:count], covariance[:count, :count], dof
-    )
-
-
-def _is_free_mass(element: Element) -> bool:
-    own = [element.parameter(label) for label in element.linear_parameters]
-    return element.is_linear and any(p.free and p.is_mass for p in own)
+    inverse = np.linalg.pinv(weights[:, None] * design)
+    values = inverse @ (weights * stiffness)
+    left = weights * (stiffness - design @ values)
+    covariance = inverse @ inverse.T * float(left @ left / dof)  # as they scatter
+    i, j = np.triu_indices(count, 1)
+    rise, variance = values[j] - values[i], np.diagonal(covariance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.sqrt(variance[i] + variance[j] - 2.0 * covariance[i, j])
+        t = np.nan_to_num(rise / error)
+    best = int(np.argmax(t))
+    low, high = i[best], j[best]
+    if t[best] <= 0.0 or values[low] <= 0.0:
+        return None
+    ends, unit = np.exp(centre), shown_unit("m", optimum.problem.data.motion)
+    p = min(1.0, len(t) * float(special.stdtr(dof, -t[best])))
+    size, spread = rise[best] / values[low], error[best] / values[low]
+    return Stiffening(float(ends[low]), float(ends[high]), unit, float(size), float(spread), p)
 
 
 def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -112,36 +117,6 @@ def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     kept = size[number] >= _FEWEST_ROWS
     _, band = np.unique(number[kept], return_inverse=True)
     return kept, band
-
-
-def _weighted_means(
-    design: FloatArray, y: FloatArray, weights: FloatArray, dof: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the coefficients of weighted least squares and their covariance as they scatter."""
-    inverse = np.linalg.pinv(weights[:, None] * design)
-    values = inverse @ (weights * y)
-    left = weights * (y - design @ values)
-    return values, inverse @ inverse.T * float(left @ left / dof)
-
-
-def _largest_rise(
-    amplitude: Sequence[float], unit: str, values: FloatArray, covariance: FloatArray, dof: int
-) -> Stiffening | None:
-    """Return the rise between two bands that is the largest against its error."""
-    pairs = list(combinations(range(len(values)), 2))
-    rise = np.array([values[j] - values[i] for i, j in pairs])
-    error = np.array(
-        [(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]) ** 0.5 for i, j in pairs]
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.nan_to_num(rise / error)
-    best = int(np.argmax(t))
-    i, j = pairs[best]
-    if t[best] <= 0.0 or values[i] <= 0.0:
-        return None
-    p = min(1.0, len(pairs) * float(special.stdtr(dof, -t[best])))
-    size, spread = rise[best] / values[i], error[best] / values[i]
-    return Stiffening(amplitude[i], amplitude[j], unit, float(size), float(spread), p)
 
 
 @dataclass(frozen=True)
@@ -259,7 +234,7 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
     friction, relative = _friction_parts(optimum), RelativeSpace(optimum)
     for name, values, unit in covariates(optimum):
         x = np.log(values)
-        distinct = _distinct(x)
+        distinct = 1 + int((np.diff(np.sort(x)) > _SAME).sum())
         degree = min(_DEGREES[name], distinct - 1, space.dof // (2 * _LEAST_DOF_PER_COLUMN))
         if degree < 1:
             continue
@@ -270,18 +245,11 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
         if np.isnan(p):
             continue
         stiffness, loss = (relative.coefficient(0.5 * unit_range * part) for part in friction)
-        found.append(
-            Trend(
-                name,
-                float(values.min()),
-                float(values.max()),
-                unit,
-                stiffness,
-                loss,
-                _largest(relative.fitted(changes)),
-                p,
-            )
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            sizes = np.abs(np.expm1(relative.fitted(changes)))
+        largest = float(np.where(np.isnan(sizes), np.inf, sizes).max())
+        ends = float(values.min()), float(values.max())
+        found.append(Trend(name, *ends, unit, stiffness, loss, largest, p))
     return found
 
 
@@ -343,17 +311,6 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = sign * stiffness / total, sign * loss / total
     return np.nan_to_num(parts[0]), np.nan_to_num(parts[1])
-
-
-def _largest(logarithms: ComplexArray) -> float:
-    """Return the largest relative change of a response whose logarithm changes so much."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        sizes = np.abs(np.expm1(logarithms))
-    return float(np.where(np.isnan(sizes), np.inf, sizes).max())
-
-
-def _distinct(x: FloatArray) -> int:
-    return 1 + int((np.diff(np.sort(x)) > _SAME).sum())
 
 
 def _change(part: Coefficient) -> str:

@@ -35,7 +35,12 @@ from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information
-from dahl_ident.diagnostics.intervals import ConfidenceIntervals, Interval, wald_intervals
+from dahl_ident.diagnostics.intervals import (
+    ConfidenceIntervals,
+    Interval,
+    search_coordinates,
+    wald_intervals,
+)
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.fitting import Optimum, Status
 
@@ -224,16 +229,15 @@ def judged(
         name: _verdict(std, intervals[name][-1])
         for name, std in zip(problem.names, spread, strict=True)
     }
-    beyond = {} if errors is None else _lost_beyond_noise(errors, verdicts, natural)
-    blind = _unseen(optimum)
-    verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
+    beyond, blind = dict[str, str](), _unseen(optimum)
     if errors is not None:
+        beyond = _lost_beyond_noise(errors, verdicts, natural)
         for name, size in zip(problem.names, natural.tolist(), strict=True):
-            place = errors.names.index(name)
-            u = float(errors.covariance[place, place]) ** 0.5 / size
-            k = coverage_factor(errors.dof(np.eye(len(errors.names))[place]))
-            if verdicts[name] is Verdict.IDENTIFIED and 0.5 * k * u > IDENTIFIED_BELOW:
+            direction = np.eye(len(errors.names))[errors.names.index(name)]
+            U = coverage_factor(errors.dof(direction)) * float(errors.std(direction))
+            if verdicts[name] is Verdict.IDENTIFIED and 0.5 * U / size > IDENTIFIED_BELOW:
                 verdicts[name] = Verdict.WEAK
+    verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
     for name in _set_by_prior(optimum, errors):
         if verdicts[name] is Verdict.IDENTIFIED:
             verdicts[name] = Verdict.BY_PRIOR
@@ -366,8 +370,7 @@ def natural_sizes(optimum: Optimum) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         whole = 1.0 / np.nanmax(slope / response, axis=0)
     size = np.maximum(np.abs(optimum.theta), _SIZE_THAT_MATTERS * whole)
-    positive = np.array([p.positive for p in problem.parameters])
-    return np.where(positive | ~np.isfinite(size) | (size == 0.0), 1.0, size)
+    return np.where(problem.space.positive | ~np.isfinite(size) | (size == 0.0), 1.0, size)
 
 
 def _profile_std(
@@ -375,13 +378,11 @@ def _profile_std(
 ) -> FloatArray:
     """Return half the width of the 95.45 % interval over its threshold, in natural sizes."""
     (q,) = thresholds(optimum, np.array([LEVELS[1]]))
-    positive = np.array([p.positive for p in optimum.problem.parameters])
+    lower, upper = (
+        search_coordinates(optimum, end[1]) for end in (intervals.lower, intervals.upper)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = [
-            np.where(positive, np.log(np.where(positive, values, 1.0)), values)
-            for values in (intervals.lower[1], intervals.upper[1])
-        ]
-        std = (ends[1] - ends[0]) / (2.0 * q * natural)
+        std = (upper - lower) / (2.0 * q * natural)
     return np.where(np.isnan(std), np.inf, std)
 
 
@@ -406,8 +407,19 @@ def _determined(
     Of `loose` parameters, short of identified, a product needs two: with known ones it says no
     more than its one unknown member, which has a verdict of its own.
     """
+
+    def stated(c: Candidate) -> Iterator[StatedCombination]:
+        std = float(information.std(c.direction))
+        if std < IDENTIFIED_BELOW and errors is not None and errors.estimate.basis is None:
+            direction = np.zeros(len(errors.names))
+            direction[[errors.names.index(name) for name in optimum.names]] = c.direction
+            std = float(errors.std(direction))
+        if std < IDENTIFIED_BELOW and np.isfinite(c.value):
+            yield StatedCombination(c.expression, c.unit, c.value, abs(c.value) * std)
+
+    every = candidates(optimum)
     units = {p.name: p.unit for p in optimum.problem.parameters}
-    units |= {c.expression: c.unit for c in candidates(optimum)}
+    units |= {c.expression: c.unit for c in every}
     found = [
         StatedCombination(
             c.expression,
@@ -420,50 +432,20 @@ def _determined(
     ]
     known = {c.expression for c in optimum.combinations}
     gone = runaway(optimum)  # the optimum itself says which combinations of these are left
-    for candidate in candidates(optimum):
+    for candidate in every:
         if candidate.expression in known or _runs_away(candidate, optimum, gone):
             continue
         members = candidate.members
         enough = bool(members & lost) and len(members & loose) > 1
         if not (members <= lost if candidate.is_sum else enough):
             continue
-        std = float(information.std(candidate.direction))
-        if candidate.is_sum and std > float(information.std(_split(candidate)).min()):
-            continue  # one of its parts alone is known better
-        if std < IDENTIFIED_BELOW:
-            std = _combined_std(candidate, optimum, errors, std)
-        if std < IDENTIFIED_BELOW:
-            size = abs(candidate.value) * std
-            found.append(
-                StatedCombination(candidate.expression, candidate.unit, candidate.value, size)
-            )
-    return tuple(found) if found else _stiffness_seen(optimum, information, loose, errors)
-
-
-def _combined_std(
-    candidate: Candidate, optimum: Optimum, errors: ErrorModel | None, by_noise: float
-) -> float:
-    """Return the relative standard uncertainty of a combination from every source known."""
-    if errors is None or errors.estimate.basis is not None:
-        return by_noise
-    direction = np.zeros(len(errors.names))
-    direction[[errors.names.index(name) for name in optimum.names]] = candidate.direction
-    return float(errors.std(direction))
-
-
-def _stiffness_seen(
-    optimum: Optimum,
-    information: Information,
-    loose: frozenset[str],
-    errors: ErrorModel | None,
-) -> tuple[StatedCombination, ...]:
-    seen = stiffness_seen(optimum)
-    if seen is None or not seen.members <= loose or not np.isfinite(seen.value):
-        return ()
-    std = _combined_std(seen, optimum, errors, float(information.std(seen.direction)))
-    if not std < IDENTIFIED_BELOW:
-        return ()
-    return (StatedCombination(seen.expression, seen.unit, seen.value, abs(seen.value) * std),)
+        if candidate.is_sum:
+            parts = np.diag(candidate.direction)[np.flatnonzero(candidate.direction)]
+            if information.std(candidate.direction) > information.std(parts).min():
+                continue  # one of its parts alone is known better
+        found += stated(candidate)
+    seen = None if found else stiffness_seen(optimum)
+    return tuple(found if seen is None or not seen.members <= loose else stated(seen))
 
 
 def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> bool:
@@ -471,12 +453,6 @@ def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> 
     going = candidate.direction[[name in gone for name in optimum.names]]
     together = optimum.status is Status.NO_FULL_SLIP and not candidate.is_sum
     return bool(going.any()) and not (together and going.sum() == 0.0)
-
-
-def _split(candidate: Candidate) -> FloatArray:
-    """Return the direction of each member of a sum, one a row."""
-    members = np.flatnonzero(candidate.direction)
-    return np.diag(candidate.direction)[members]
 
 
 def _within(limits: Interval, unit: str) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from dahl_ident.bayes.chain import ChainSettings, Pool
 from dahl_ident.bayes.density import Density, LogDensity, RecordDensity
 from dahl_ident.bayes.priors import PriorLike, joint_prior
-from dahl_ident.bayes.sample import ChainSample, Start, sample_chain, sample_points
+from dahl_ident.bayes.sample import sample_chain, sample_points
 from dahl_ident.bayes.walker_start import (
     centre_and_covariance,
     optimum_of,
@@ -367,23 +367,14 @@ def posterior(
     if source is not None:
         _refuse_with_a_fit(source, options)
 
-    def chain(density: LogDensity, start: Start) -> ChainSample:
-        settings = ChainSettings.of(
-            len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
-            walkers=walkers, ensembles=ensembles,
-        )  # fmt: skip
-        with progress_bar(settings) if progress else nullcontext() as bar:
-            listeners = [] if bar is None else [bar]
-            return sample_chain(
-                density, start, settings, seed=seed, resume=resume, pool=pool, listeners=listeners
-            )
-
     fitted: FitResult | None = source
     if source is not None:
         problem = source.problem
+    elif model is None:
+        raise ModelError("there is no model; give one, such as Dahl(), or pass a fit")
     else:
         problem = problem_of(
-            data, _checked(model), free=free, fixed=fixed, sensors=sensors, noise=noise,
+            data, model, free=free, fixed=fixed, sensors=sensors, noise=noise,
             steady=steady or "exact",
         )  # fmt: skip
         with fit_progress() if progress else nullcontext() as tell:
@@ -397,7 +388,16 @@ def posterior(
         with grid_progress() if progress else nullcontext() as told:
             points = sample_points(density, begin, problem.names, tolerance, told)
         return Posterior(density, points, fitted, uncertainty)
-    drawn = chain(density, partial(starting_points, density, optimum))
+    settings = ChainSettings.of(
+        len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
+        walkers=walkers, ensembles=ensembles,
+    )  # fmt: skip
+    start = partial(starting_points, density, optimum)
+    with progress_bar(settings) if progress else nullcontext() as bar:
+        drawn = sample_chain(
+            density, start, settings, seed=seed, resume=resume, pool=pool,
+            listeners=[] if bar is None else [bar],
+        )  # fmt: skip
     result = Posterior(density, drawn, fitted, uncertainty)
     drawn.check(result.names, result)
     return result
@@ -431,20 +431,11 @@ def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
             f"{', '.join(named)} is given together with a FitResult, which has its own; pass the "
             "data instead"
         )
-    if fit.first_order:
+    if fit.first_order or fit.optimum.loss != "linear":
+        had = "constraints" if fit.first_order else "a robust loss"
         raise ValidationError(
-            "the fit had constraints, which a posterior does not take; pass the data instead"
+            f"the fit had {had}, which a posterior does not take; pass the data instead"
         )
-    if fit.optimum.loss != "linear":
-        raise ValidationError(
-            "the fit had a robust loss, which a posterior does not take; pass the data instead"
-        )
-
-
-def _checked(model: Element | None) -> Element:
-    if model is None:
-        raise ModelError("there is no model; give one, such as Dahl(), or pass a fit")
-    return model
 
 
 def _record_density(

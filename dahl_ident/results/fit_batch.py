@@ -23,13 +23,6 @@ class FitBatch(Sequence[FitResult]):
 
     A sequence: ``batch[i]`` is the full result of table i.
 
-    Attributes
-    ----------
-    tables : tuple of FrequencyResponse
-        What was fitted.
-    optima : OptimumBatch
-        The solver's plain result.
-
     Examples
     --------
     >>> import numpy as np

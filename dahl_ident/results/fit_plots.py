@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,12 +31,13 @@ _POINTS = 200  # of a curve that looks smooth
 
 def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
     """Draw a fit in one of the kinds that its data have; the first where none is given."""
+    of_table = fit.problem.response is not None
     kinds: dict[str, Callable[[], Any]] = {
-        "fit": lambda: _FIT[fit.problem.kind](fit, ax, record),
+        "fit": lambda: _fit_of_table(fit, ax) if of_table else _fit_of_record(fit, ax, record),
         "residuals": lambda: draw_residuals(fit, None, ax, record),
         "budget": lambda: draw_budget(fit.budget(), ax),
     }
-    if fit.problem.response is None:
+    if not of_table:
         kinds["loop"] = lambda: _draw_loop(fit, ax, record)
     if kind is not None and kind not in kinds:
         raise ValidationError(f"kind is {kind!r}; expected one of {choices(kinds, kind)}")
@@ -45,7 +46,9 @@ def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
 
 def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None, record: int) -> Axes:
     """Draw residuals over a quantity, by default the one that suits the data."""
-    return _RESIDUALS[fit.problem.kind](fit, against, ax, record)
+    if fit.problem.response is not None:
+        return _residuals_of_table(fit, against, ax)
+    return _residuals_of_record(fit, against, ax, record)
 
 
 def draw_budget(budget: Budget, ax: Axes | None = None) -> Axes:
@@ -54,7 +57,7 @@ def draw_budget(budget: Budget, ax: Axes | None = None) -> Axes:
     return plot_budget(shares, ax=ax)
 
 
-def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None, _record: int) -> tuple[Axes, Axes]:
+def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
     """Draw data with error bars and fit with its band, over amplitude or over frequency."""
     return curves.draw(
         fit.data,
@@ -75,7 +78,7 @@ def standardized_residuals(fit: FitResult) -> FloatArray:
     return residuals
 
 
-def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None, _record: int) -> Axes:
+def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None) -> Axes:
     """Draw both residuals of every row over a quantity, by default the one that suits the table."""
     data = fit.data
     if against is None:
@@ -188,9 +191,3 @@ def _displacement(record: Record) -> FloatArray:
 def _labels(record: Record) -> dict[str, str]:
     """Return the labels of a record's channels with units."""
     return {name.partition(" ")[0]: str(name) for name in record.to_frame().columns}
-
-
-_FIT: Mapping[str, Callable[..., Any]] = {"table": _fit_of_table, "records": _fit_of_record}
-_RESIDUALS: Mapping[str, Callable[..., Axes]] = {
-    "table": _residuals_of_table, "records": _residuals_of_record
-}  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.diagnostics.comparison import compare_models
@@ -35,12 +34,7 @@ def facts(fit: FitResult) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class ReportPart:
-    """A heading with its lines."""
-
-    title: str
-    lines: list[str]
+_Section = tuple[str, list[str]]  # a heading with its lines
 
 
 def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
@@ -48,38 +42,33 @@ def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool 
     sections = _all(fit, intervals)
     if details:
         return "\n".join(_lines(sections))
-    verdict, shown = next(sections), fit.problem.of_device
-    parameters = ReportPart("Parameters", _parameters(fit, intervals, shown))
-    numbers = list(_lines([parameters]))[: _BRIEF - 2]
+    title, verdict = next(sections)
+    parameters = _parameters(fit, intervals, fit.problem.of_device)
+    numbers = list(_lines([("Parameters", parameters)]))[: _BRIEF - 2]
     room = _BRIEF - 1 - len(numbers)
-    if len(verdict.lines) > room:
-        left = len(verdict.lines) - room + 1
-        verdict = ReportPart(
-            verdict.title, [*verdict.lines[: room - 1], f"({left} more statements)"]
-        )
-    return "\n".join([*_lines([verdict]), *numbers])
+    if len(verdict) > room:
+        verdict = [*verdict[: room - 1], f"({len(verdict) - room + 1} more statements)"]
+    return "\n".join([*_lines([(title, verdict)]), *numbers])
 
 
-def _lines(sections: Iterable[ReportPart]) -> Iterator[str]:
-    for section in sections:
-        yield section.title
-        yield from (f"    {line}" for line in section.lines)
+def _lines(sections: Iterable[_Section]) -> Iterator[str]:
+    for title, lines in sections:
+        yield title
+        yield from (f"    {line}" for line in lines)
 
 
 def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
     """Return the whole report as HTML."""
-    parts = []
-    for section in _all(fit, intervals):
-        body = html.escape("\n".join(section.lines))
-        parts.append(f"<h4>{html.escape(section.title)}</h4><pre>{body}</pre>")
-    return f"<div>{''.join(parts)}</div>"
+    parts = [(title, html.escape("\n".join(lines))) for title, lines in _all(fit, intervals)]
+    body = "".join(f"<h4>{title}</h4><pre>{lines}</pre>" for title, lines in parts)
+    return f"<div>{body}</div>"
 
 
-def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[ReportPart]:
+def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[_Section]:
     first, *others = fit.statements
     warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
-    yield ReportPart("Verdict", [first, *warnings, *others])
-    yield ReportPart("Parameters", _parameters(fit, intervals, fit.params))
+    yield "Verdict", [first, *warnings, *others]
+    yield "Parameters", _parameters(fit, intervals, fit.params)
     further = {
         "Further findings": list(map(str, fit.judgement.further)),
         "Determined combinations": list(map(str, fit.identifiability.combinations)),
@@ -87,14 +76,14 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[ReportPart]
         "Uncertainty budget": str(fit.stated_budget or "").splitlines(),
         "Correlations": _correlations(fit),
     }
-    yield from (ReportPart(title, lines) for title, lines in further.items() if lines)
+    yield from ((title, lines) for title, lines in further.items() if lines)
     loss = fit.optimum.loss
     robust = [] if loss == "linear" else [f"robust loss: {loss}"]
-    yield ReportPart("Noise", [*fit.assessment.noise_in_words, *robust])
-    yield ReportPart("Goodness of fit", fit.goodness.details or ["no test applies"])
+    yield "Noise", [*fit.assessment.noise_in_words, *robust]
+    yield "Goodness of fit", fit.goodness.details or ["no test applies"]
     if not fit.goodness.acceptable:
-        yield ReportPart("Other models, for comparison", str(compare_models(fit)).splitlines())
-    yield ReportPart("Solver", _solver(fit))
+        yield "Other models, for comparison", str(compare_models(fit)).splitlines()
+    yield "Solver", _solver(fit)
 
 
 def _parameters(fit: FitResult, intervals: ConfidenceIntervals, names: Iterable[str]) -> list[str]:

@@ -35,6 +35,7 @@ _TEXTS = ("level", "run", "controlled", "harmonic")  # labels, words and counts
 _SENSORS = ("force_gain", "displacement_gain", "delay")
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 _OF_RECORD = ("drive_unit", "drive_factor", "drive_factor_uncertainty", "motion", "provenance")
+_OF_PROBLEM = ("output", "excitation", "calibration")  # as they are given
 
 
 def to_json(optimum: Optimum, first_order: bool) -> str:
@@ -133,28 +134,20 @@ def _table_problem(content: Mapping[str, Any]) -> TableProblem:
 
 
 def _describe_records(problem: RecordProblem) -> dict[str, Any]:
-    names = ("runs", "output", "excitation", "calibration", "whitening", "delay")
-    return {
-        "records": [
-            {
-                "time": record.time,
-                **{c: x for c in _CHANNELS if (x := getattr(record, c)) is not None},
-                **{name: getattr(record, name) for name in _OF_RECORD},
-            }
-            for record in problem.records
-        ],
-        **{name: getattr(problem, name) for name in names},
-        "displacement_noise": problem.displacement_noise,
-    }
+    names = ("runs", *_OF_PROBLEM, "whitening", "delay", "displacement_noise")
+    records = []
+    for record in problem.records:
+        channels = {c: x for c in _CHANNELS if (x := getattr(record, c)) is not None}
+        others = {name: getattr(record, name) for name in _OF_RECORD}
+        records.append({"time": record.time, **channels, **others})
+    return {"records": records, **{name: getattr(problem, name) for name in names}}
 
 
 def _record_problem(content: Mapping[str, Any]) -> RecordProblem:
     problem = RecordProblem(
         [Record(**record) for record in content["records"]],
         model_from_description(content["model"]),
-        output=content["output"],
-        excitation=content["excitation"],
-        calibration=content["calibration"],
+        **{name: content[name] for name in _OF_PROBLEM},
     )
     problem.runs = tuple(content["runs"])
     problem = problem.weighted(_floats(content["whitening"]))
@@ -171,17 +164,13 @@ _BUILT: Mapping[str, Callable[[Mapping[str, Any]], Problem]] = {
 
 def _describe_optimum(optimum: Optimum) -> dict[str, Any]:
     """Return an optimum as data, its problem left out."""
+    cost, combinations = optimum.constraint_cost, [asdict(c) for c in optimum.combinations]
     stored = {one.name: getattr(optimum, one.name) for one in fields(optimum)}
-    for follows in ("problem", "scale_known"):
-        del stored[follows]
-    cost = optimum.constraint_cost
-    return {
-        "names": list(optimum.names),
-        **stored,
-        "status": optimum.status.name,
-        "combinations": [asdict(c) for c in optimum.combinations],
-        "constraint_cost": None if cost is None else asdict(cost),
-    }
+    stored |= {"status": optimum.status.name, "combinations": combinations}
+    stored["constraint_cost"] = None if cost is None else asdict(cost)
+    follows = ("problem", "scale_known")
+    kept = {name: value for name, value in stored.items() if name not in follows}
+    return {"names": list(optimum.names), **kept}
 
 
 def _optimum(problem: Problem, stored: Mapping[str, Any]) -> Optimum:

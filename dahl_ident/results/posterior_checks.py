@@ -33,7 +33,7 @@ from dahl_ident.bayes.priors import JointPrior, ParameterPrior
 from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.storage import library
-from dahl_ident.diagnostics.checks import doubted
+from dahl_ident.diagnostics.checks import reading
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def findings_of(posterior: Posterior) -> Iterator[Finding]:
     """Yield every finding about a posterior."""
     yield from _objections(posterior)
     yield from _notes(posterior)
-    yield from doubted(*posterior.provenances)
+    yield from reading(posterior)
 
 
 def _objections(posterior: Posterior) -> Iterator[Finding]:

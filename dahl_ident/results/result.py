@@ -75,16 +75,11 @@ class Parameters(Mapping[str, Estimate]):
         for p in problem.every_parameter:
             value = values.get(p.name, p.value)
             estimates[p.name] = Estimate(
-                name=p.name,
-                unit=shown_unit(p.unit, problem.motion),
-                description=p.description,
-                value=math.nan if value is None else value,
-                stderr=stderr.get(p.name),
+                p.name, shown_unit(p.unit, problem.motion), p.description,
+                math.nan if value is None else value, stderr.get(p.name),
                 init_value=p.value if p.name in values else None,
-                min=p.lower,
-                max=p.upper,
-                vary=bool(p.free),
-            )
+                min=p.lower, max=p.upper, vary=bool(p.free),
+            )  # fmt: skip
         return cls(estimates)
 
     def __getitem__(self, name: str) -> Estimate:
