@@ -19,7 +19,7 @@ gain therefore leaves only x_c determined, and an unknown displacement gain only
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -57,6 +57,13 @@ def calibrations(metadata: Metadata) -> dict[str, Any]:
     return {n: stats.norm(0.0 if n == "delay" else 1.0, u) for n, u in stated.items()}
 
 
+_CHANNELS = (
+    ("force_gain", "", "measured over true force", 1.0),
+    ("displacement_gain", "", "measured over true displacement", 1.0),
+    ("delay", "s", "lag of the displacement channel", 0.0),
+)
+
+
 @dataclass(frozen=True)
 class Sensors:
     """Gains of the two channels and the delay between them.
@@ -87,7 +94,7 @@ class Sensors:
     delay: float | Prior | None = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("force_gain", "displacement_gain", "delay"):
+        for name, *_ in _CHANNELS:
             stated = getattr(self, name)
             if stated is not None and not hasattr(stated, "logpdf"):
                 object.__setattr__(self, name, finite_number(stated, name))
@@ -108,7 +115,7 @@ class Sensors:
         {'force_gain': 0.005}
         """
         uncertainties = {}
-        for name, right in (("force_gain", 1.0), ("displacement_gain", 1.0), ("delay", 0.0)):
+        for name, _, _, right in _CHANNELS:
             stated = getattr(self, name)
             if stated is not None and not hasattr(stated, "logpdf") and stated == right:
                 continue
@@ -158,16 +165,9 @@ class Sensors:
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """The three parameters, in the order of the constructor."""
-        return (
-            _parameter("force_gain", "", "measured over true force", self.force_gain, 1.0),
-            _parameter(
-                "displacement_gain",
-                "",
-                "measured over true displacement",
-                self.displacement_gain,
-                1.0,
-            ),
-            _parameter("delay", "s", "lag of the displacement channel", self.delay, 0.0),
+        return tuple(
+            _parameter(name, unit, meaning, getattr(self, name), neutral)
+            for name, unit, meaning, neutral in _CHANNELS
         )
 
     @cached_property
@@ -183,17 +183,11 @@ class Sensors:
 
     def with_free(self, names: Sequence[str]) -> Sensors:
         """Return these sensors with the named parameters free and without a prior."""
-        return self._with(dict.fromkeys(names))
+        return replace(self, **dict.fromkeys(names))
 
     def with_fixed(self, values: Mapping[str, float]) -> Sensors:
         """Return these sensors with the named parameters held at the given values."""
-        return self._with(values)
-
-    def _with(self, changes: Mapping[str, float | Prior | None]) -> Sensors:
-        if not changes:
-            return self
-        current = {p.name: getattr(self, p.name) for p in self.parameters}
-        return Sensors(**{**current, **changes})
+        return replace(self, **values)
 
 
 def measured_stiffness_factor(

@@ -61,8 +61,8 @@ _MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by n
 _MOST_LOOPS, _MOST_ROWS = 10_000, 20  # of a law that depends on the rate: a second or two
 _MOST_STARTS = 4  # searches a table: a limit on their cost
 _HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
-_ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
 _AROUND = np.array([-1, 0, 1])  # a node and its neighbours, for a parabola
+_ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
 
 
 class Starts(NamedTuple):
@@ -102,52 +102,33 @@ def own_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
 def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
     grid = _grid(problem, view)
     cost, coefficients = grid.solved()
-    best = _vertices(grid, cost, coefficients)
-    lead = cost.shape[:-1]
-    S, nodes = problem.n_tables, cost.shape[-1]
+    S = problem.n_tables
     table, place = _local_minima(cost.reshape(S, *grid.shape), mixed=grid.mixed)
-    at_edge = grid.shape == (nodes,) and ((place == 0) | (place == nodes - 1)).any()
-    if at_edge and nodes > sum(_FINE_ENDS):  # bounds may keep an optimum far out from there
+    last = cost.shape[-1] - 1
+    if grid.shape == (last + 1,) and last >= sum(_FINE_ENDS):
         first = np.flatnonzero(np.diff(table, prepend=-1))
-        for edge, nearer in ((0, _FINE_ENDS[0]), (nodes - 1, nodes - 1 - _FINE_ENDS[1])):
-            there = first[place[first] == edge]
-            table = np.append(table, table[there])
-            place = np.append(place, np.full(there.size, nearer))
+        for edge, nearer in ((0, _FINE_ENDS[0]), (last, last - _FINE_ENDS[1])):
+            there = table[first[place[first] == edge]]  # a bound may keep it far out from there
+            table, place = np.append(table, there), np.append(place, np.full(there.size, nearer))
         order = np.argsort(table, kind="stable")
         table, place = table[order], place[order]
-    theta = best
-    if table.size > S:
-        if lead:
-            theta = grid.of_tables(table).theta(coefficients[table], place[:, None])[:, 0]
-        else:
-            theta = grid.theta(coefficients, place)
-        theta[np.diff(table, prepend=-1) > 0] = best
+    if cost.ndim > 1:
+        theta = grid.of_tables(table).theta(coefficients[table], place[:, None])[:, 0]
+    else:
+        theta = grid.theta(coefficients, place)
     begin = Starts(table, theta)
     if all(p.value is None for p in problem.parameters):
         return begin
-    values = problem.to_values(best).reshape(S, -1)
+    best = theta[np.diff(table, prepend=-1) > 0]
+    values = problem.to_values(best)
     for index, parameter in enumerate(problem.parameters):
         if parameter.value is not None:
             values[:, index] = parameter.value
     stated = problem.to_search(values)
     new = ~np.isclose(stated, best, rtol=1e-12).all(axis=1)
-    more = Starts(np.flatnonzero(new), stated[new])
-    begin = begin.joined(more)
+    begin = begin.joined(Starts(np.flatnonzero(new), stated[new]))
     order = np.argsort(begin.table, kind="stable")
     return Starts(begin.table[order], begin.theta[order])
-
-
-def _vertices(grid: _Grid, cost: FloatArray, coefficients: FloatArray) -> FloatArray:
-    """Return the best node of each table, (S, P); between nodes where there is one grid."""
-    best = cost.argmin(axis=-1)[..., None]
-    nodes, P = cost.shape[-1], len(grid.problem.parameters)
-    if grid.shape != (nodes,) or nodes < 3:
-        return grid.theta(coefficients, best).reshape(-1, P)
-    around = np.minimum(np.maximum(best, 1), nodes - 2) + _AROUND
-    theta = grid.theta(coefficients, around)
-    vertex = _vertex(_taken(cost, around), theta)
-    vertex = np.where(best == 0, theta[..., 0, :], vertex)
-    return np.where(best == nodes - 1, theta[..., 2, :], vertex).reshape(-1, P)
 
 
 def grid_size(problem: TableProblem) -> int:
@@ -168,16 +149,6 @@ def edge_starts(problem: TableProblem) -> list[FloatArray]:
             there = np.where(at[grid.nodes[:, index]], cost, np.inf)
             edges.append(grid.theta(coefficients, there.argmin(axis=-1)[..., None])[..., 0, :])
     return edges
-
-
-def _vertex(cost: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return theta at the vertex of the parabola through three nodes, (..., 3) and (..., 3, P)."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        left, middle, right = cost[..., 0], cost[..., 1], cost[..., 2]
-        u = 0.5 * (left - right) / (left - 2.0 * middle + right)
-    u = np.where(np.abs(u) <= 1.0, u, 0.0)[..., None]
-    left, middle, right = theta[..., 0, :], theta[..., 1, :], theta[..., 2, :]
-    return np.asarray(middle + 0.5 * u * (right - left + u * (right - 2.0 * middle + left)))
 
 
 @dataclass(frozen=True)
@@ -220,12 +191,7 @@ class _Grid:
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
         """Return the sum of squares, (..., C), and the linear coefficients, (..., C, Q)."""
-        one = len(self.curves) == 1 and len(self.curves[0].columns) == 1 and not self.common
-        if one and self.curves[0].known is None:
-            curve = self.curves[0].columns[0].curve
-            cost, coefficients = _solve_one(self.target, curve, self.weights)
-        else:
-            cost, coefficients = _solve_linear(*self._system())
+        cost, coefficients = _solve_linear(*self._system())
         separate = coefficients[..., len(self.common) :]
         positive = [c.is_positive for curves in self.curves for c in curves.columns]
         allowed = ((separate > 0.0) | ~np.array(positive, dtype=np.bool_)).all(axis=-1)
@@ -575,6 +541,8 @@ def _computed_table(
 
     Beyond the last amplitude at which the law has a loop there is none.
     """
+    from scipy.interpolate import CubicSpline
+
     low, high = (float(np.asarray(v)) for v in element.knee(values))
     if not 0.0 < low <= high < np.inf:
         low = high = 1.0
@@ -600,7 +568,7 @@ def _computed_table(
     if count < _LEAST:
         return np.full((orders.size, fine.size), np.nan, dtype=np.complex128)
     x, Z, ends = x[:count], Z[:, :count], count < x.size
-    table = _between(Z, (np.clip(fine, x[0], x[-1]) - x[0]) / (_COMPUTED * _STEP))
+    table = CubicSpline(x, Z, axis=1)(np.clip(fine, x[0], x[-1]))
     for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
         for whole, Y in ((table.real, Z.real), (table.imag, Z.imag)):
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -610,37 +578,6 @@ def _computed_table(
     if ends:
         table[:, fine > x[-1]] = np.nan
     return table
-
-
-def _between(Z: ComplexArray, place: FloatArray) -> ComplexArray:
-    """Return columns (K, n) at places from 0 to n - 1, by cubics through the four nearest."""
-    first = np.clip(place.astype(np.intp) - 1, 0, Z.shape[1] - 4)
-    u = place - first
-    weights = (
-        (u - 1) * (u - 2) * (3 - u) / 6,
-        u * (u - 2) * (u - 3) / 2,
-        u * (u - 1) * (3 - u) / 2,
-        u * (u - 1) * (u - 2) / 6,
-    )
-    return np.asarray(sum(Z[:, first + i] * w for i, w in enumerate(weights)))
-
-
-def _solve_one(
-    target: ComplexArray, curve: ComplexArray, weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return what `_solve_linear` does for the one column curve times weights, (..., K, n)."""
-    # a hardening law overflows at some nodes: no starts
-    usable = np.asarray((np.abs(curve) < _LARGEST).all(axis=-1))
-    if not usable.all():
-        curve = np.where(usable[..., None], curve, 0.0)
-    parts = curve.view(np.float64)
-    power = curve.real**2 + curve.imag**2
-    pulled = (target * weights).view(np.float64)
-    size = (target.real**2 + target.imag**2).sum(axis=-1)[..., None]
-    overlap = (parts @ pulled[..., None])[..., 0]
-    norm = (power @ (weights**2)[..., None])[..., 0]
-    coefficient = overlap / np.maximum(norm, 1e-300)
-    return np.where(usable, size - coefficient * overlap, np.inf), coefficient[..., None]
 
 
 def _solve_linear(
@@ -660,18 +597,23 @@ def _solve_linear(
     )
     # a hardening law overflows at some nodes: no starts
     usable = np.asarray((np.abs(columns) < _LARGEST).all(axis=(-2, -1)))
-    columns = np.where(usable[..., None, None], columns, 0.0)
+    if not usable.all():
+        columns = np.where(usable[..., None, None], columns, 0.0)
     left = _projected(columns, Q[..., None, :, :])
-    norm = np.sqrt((left * left).sum(axis=-1))
-    norm[norm < _DEPENDENT * np.sqrt((columns * columns).sum(axis=-1))] = 0.0
+    norm = np.sqrt(np.einsum("...i,...i->...", left, left))
+    if common:
+        whole = np.sqrt(np.einsum("...i,...i->...", columns, columns))
+        norm[norm < _DEPENDENT * whole] = 0.0
     left = left / np.where(norm > 0.0, norm, np.inf)[..., None]
     gram = left @ left.swapaxes(-1, -2) + 1e-13 * np.eye(left.shape[-2])
     scaled = np.linalg.solve(gram, left @ rest[..., None])
     rest = rest - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
     coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
+    cost = np.where(usable, np.einsum("...i,...i->...", rest, rest), np.inf)
+    if not common:
+        return cost, coefficients
     explained = target - (coefficients[..., None, :] @ columns)[..., 0, :]
     base = np.linalg.solve(R[..., None, :, :], (explained @ Q)[..., None])[..., 0]
-    cost = np.where(usable, (rest * rest).sum(axis=-1), np.inf)
     return cost, np.concatenate([base, coefficients], axis=-1)
 
 
@@ -692,7 +634,7 @@ def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, 
 
 def _projected(rows: FloatArray, Q: FloatArray) -> FloatArray:
     """Return rows, (..., C, 2 n), less their part in the span of Q; twice, for the last digits."""
-    for _ in range(2):
+    for _ in range(2 if Q.shape[-1] else 0):
         rows = rows - (rows @ Q) @ Q.swapaxes(-1, -2)
     return rows
 

@@ -5,8 +5,16 @@ the cost and its exact gradient J' r are those of the problem's own residuals. T
 difference of gradients: far from the optimum Gauss and Newton's leads IPOPT astray. From the
 least-squares optimum it takes a few steps.
 
-**Constraints** are comparisons of casadi expressions, see :mod:`dahl_ident.fitting.constraints`;
-casadi differentiates them twice. An equality takes one parameter's worth of freedom
+**Constraints** are comparisons by name. A function takes a mapping of every parameter's name to its
+casadi symbol, in SI units, and returns comparisons::
+
+    lambda p: [
+        p["f_max"] <= 1e-3 * p["sigma"],         # x_c of at most 1 mm
+        p["pivot_sigma"] == p["seal_sigma"],
+    ]
+
+Fixed parameters stand there as well, as the numbers they are held at. ``<`` means ``<=``. casadi
+differentiates them twice. An equality takes one parameter's worth of freedom
 away: the covariance is that of the estimate on the constraint. An inequality that holds with
 equality acts as a bound does; the covariance is that without it.
 
@@ -16,18 +24,17 @@ residuals by their own size, so that nothing depends on physical units.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
 from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
-from dahl_ident.errors import FitError, ValidationError, argument
-from dahl_ident.fitting.constraints import Constraints, Relations
+from dahl_ident.errors import FitError, ModelError, ValidationError, argument
 from dahl_ident.fitting.convergence import Ends, optima
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import loss_named
@@ -44,6 +51,9 @@ from dahl_ident.fitting.record_search import Tell
 from dahl_ident.fitting.search import solve, starts_of
 from dahl_ident.problem import Problem, Quadratic, TableProblem
 
+if TYPE_CHECKING:
+    import casadi as ca
+
 _TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
 _ITERATIONS = 300  # a limit for searches that do not end
 _LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size makes
@@ -59,6 +69,111 @@ _WORDS = {
     "Error_In_Step_Computation": "it could not compute a step",
     "Not_Enough_Degrees_Of_Freedom": "there are more equations than unknowns",
 }
+
+
+Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
+"""What a user gives; see the head of this module."""
+
+
+_EXAMPLE = "lambda p: [p['f_max'] <= 1e-3 * p['sigma']]"
+
+
+@dataclass(frozen=True)
+class Relations:
+    """The user's constraints: text, and lhs - rhs of all parameters' values."""
+
+    texts: tuple[str, ...]
+    equal: tuple[bool, ...]
+    differences: ca.Function | None
+
+    @property
+    def freedom_lost(self) -> int:
+        """Number of equalities."""
+        return sum(self.equal)
+
+    @classmethod
+    def of(cls, problem: Problem, constraints: Constraints | None) -> Relations:
+        """Read the user's comparisons, or say what they are instead."""
+        import casadi as ca
+
+        if constraints is None:
+            return cls((), (), None)
+        symbols = _Symbols((p.name, ca.SX.sym(p.name)) for p in problem.every_parameter)
+        free = ca.vertcat(*(symbols[name] for name in problem.names))
+        texts, equal, differences = [], [], []
+        for index, item in enumerate(_called(constraints, symbols)):
+            relation = _is_comparison(item)
+            if relation is None:
+                raise ValidationError(
+                    f"constraints[{index}] is {item!r}; expected a comparison with <=, >= or == "
+                    "such as p['f_max'] <= 1e-3 * p['sigma']"
+                )
+            difference = item.dep(0) - item.dep(1)
+            if not ca.depends_on(difference, free):
+                raise ValidationError(
+                    f"constraints[{index}], {item}, holds no free parameter; free are "
+                    f"{', '.join(problem.names)}"
+                )
+            texts.append(str(item).removeprefix("(").removesuffix(")"))
+            equal.append(relation == ca.OP_EQ)
+            differences.append(difference)
+        if not differences:
+            return cls((), (), None)
+        function = ca.Function("differences", list(symbols.values()), [ca.vertcat(*differences)])
+        return cls(tuple(texts), tuple(equal), function)
+
+    def at(self, problem: Problem, theta: ca.SX) -> ca.SX:
+        """Return lhs - rhs as expressions of the search coordinates theta."""
+        import casadi as ca
+
+        if self.differences is None:
+            return ca.SX(0, 1)
+        values = []
+        for parameter in problem.every_parameter:
+            if parameter.name in problem.names:
+                index = problem.names.index(parameter.name)
+                values.append(problem.space.value(index, theta[index], ca))
+            else:
+                values.append(ca.SX(float(parameter.value or 0.0)))
+        differences: ca.SX = self.differences.call(values)[0]
+        return differences
+
+
+class _Symbols(dict[str, "ca.SX"]):
+    """Symbols by name; an unknown name is an error that lists the known ones."""
+
+    def __missing__(self, name: str) -> ca.SX:
+        raise ModelError(f"a constraint names {name!r}; the parameters are {', '.join(self)}")
+
+
+def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
+    import casadi as ca
+
+    if not callable(constraints):
+        raise ValidationError(f"constraints is {constraints!r}; expected a function: {_EXAMPLE}")
+    try:
+        relations = constraints(symbols)
+    except RuntimeError as exc:  # casadi's, for the truth value that 0 <= x <= 1 asks for
+        if "truth value" not in str(exc):
+            raise
+        raise ValidationError(
+            "a constraint chains comparisons or joins them with 'and'; write each as one item, "
+            "such as [p['sigma'] >= 1, p['sigma'] <= 2]"
+        ) from None
+    if isinstance(relations, ca.SX) or not isinstance(relations, Iterable):
+        raise ValidationError(
+            f"constraints returned {relations!r}; expected a list of comparisons: {_EXAMPLE}"
+        )
+    return list(relations)
+
+
+def _is_comparison(item: Any) -> int | None:
+    """Return casadi's code of the comparison of two scalars that `item` is, else None."""
+    import casadi as ca
+
+    if not isinstance(item, ca.SX) or not item.is_scalar():
+        return None
+    return next((op for op in (ca.OP_LE, ca.OP_LT, ca.OP_EQ) if item.is_op(op)), None)
 
 
 def solve_ipopt(

@@ -14,11 +14,11 @@ of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.problem import EXPLICIT, Quadratic
@@ -39,7 +39,6 @@ _MOST_DAMPING = 1e12  # steps are below rounding then
 _ROUNDING = 1e-12  # of a scaled Hessian's entries, with room
 _LONGEST_STEP = 2.0  # of a logarithm
 _NOISE_TOLERANCE = 1e-8  # of a standard deviation of the residuals
-_REMAINDER = 3e-7  # standard deviations that the last step may leave
 _LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
 _FLAT = 1e-3  # of the residuals' size, by which a coordinate from bound to bound changes them
 _NEAR = 0.01  # of the way between bounds: a last step of theirs
@@ -50,8 +49,29 @@ NEARLY = 1e-4  # relative difference of costs that are nearly alike
 
 
 @dataclass(frozen=True)
-class Minima:
-    """Where S searches ended; arrays with a leading axis S."""
+class _Searches:
+    """Arrays with a leading axis S, one place for each search."""
+
+    def take(self, which: BoolArray | IntArray) -> Self:
+        """Return some of the searches."""
+        return type(self)(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def assign(self, which: IntArray, other: Self) -> None:
+        """Replace some of the searches."""
+        for f in fields(self):
+            getattr(self, f.name)[which] = getattr(other, f.name)
+
+    def where(self, wins: BoolArray, other: Self) -> Self:
+        """Return, search by search, the other where it `wins`."""
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        return type(self)(
+            *(np.where(wins.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs)
+        )
+
+
+@dataclass(frozen=True)
+class Minima(_Searches):
+    """Where S searches ended."""
 
     theta: FloatArray
     cost: FloatArray
@@ -59,32 +79,16 @@ class Minima:
     converged: BoolArray
     evaluations: IntArray
 
-    def take(self, which: IntArray) -> Minima:
-        """Return some of the searches."""
-        return Minima(
-            self.theta[which],
-            self.cost[which],
-            self.hessian[which],
-            self.converged[which],
-            self.evaluations[which],
-        )
-
     def put(self, which: IntArray, other: Minima) -> None:
         """Let some of the searches end where those of `other`, which went on from there, did."""
         before = self.evaluations[which]
         self.assign(which, other)
         self.evaluations[which] += before
 
-    def assign(self, which: IntArray, other: Minima) -> None:
-        """Replace some of the searches."""
-        for name in ("theta", "cost", "hessian", "converged", "evaluations"):
-            getattr(self, name)[which] = getattr(other, name)
-
     @classmethod
     def stacked(cls, parts: Sequence[Minima]) -> Minima:
         """Return the searches of all parts, one after the other."""
-        names = ("theta", "cost", "hessian", "converged", "evaluations")
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def best(self, owner: IntArray, S: int) -> Minima:
         """Return the best search of each of S owners: converged ones first if nearly as low."""
@@ -113,16 +117,29 @@ class Minima:
         return self._or(other, others < ours)
 
     def _or(self, other: Minima, wins: BoolArray) -> Minima:
-        row = wins[:, None]
-        return Minima(
-            np.where(row, other.theta, self.theta),
-            np.where(wins, other.cost, self.cost),
-            np.where(row[:, :, None], other.hessian, self.hessian),
-            np.where(wins, other.converged, self.converged),
-            self.evaluations + other.evaluations,
+        every = self.evaluations + other.evaluations
+        return replace(self.where(wins, other), evaluations=every)
+
+
+@dataclass(frozen=True)
+class _State(_Searches):
+    """Where each search stands."""
+
+    theta: FloatArray
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+    def moved(self, which: BoolArray, step: FloatArray, fall: FloatArray) -> _State:
+        """Return this state with a last short step taken by some."""
+        return replace(
+            self,
+            theta=self.theta + np.where(which[:, None], step, 0.0),
+            cost=np.where(which, np.maximum(self.cost - fall, 0.0), self.cost),
         )
 
 
+@np.errstate(all="ignore")
 def minimise(
     evaluate: Evaluate,
     theta: FloatArray,
@@ -149,72 +166,6 @@ def minimise(
     leads beyond the `bounds` of theta; a coordinate at its bound that would go on stays there.
     """
     owner = np.arange(len(theta)) if owner is None else owner
-    with np.errstate(all="ignore"):
-        return _minimise(
-            evaluate, theta, logarithmic, n_residuals, inside, owner, tolerance_factor, enough,
-            steps, accuracy, bounds, unseen,
-        )  # fmt: skip
-
-
-def gauss_newton(
-    evaluate: Callable[[FloatArray], Quadratic],
-    theta: FloatArray,
-    logarithmic: BoolArray,
-    n_residuals: int,
-    steps: int = 12,
-    accuracy: float = EXPLICIT,
-) -> Minima | None:
-    """Return the minimum near a good start of one problem, shape (P,), by undamped steps alone.
-
-    It ends with the step after which, as the steps shrink, less than 3e-7 standard deviations
-    are left. None at the first sign of trouble; :func:`minimise` takes longer and copes.
-    """
-    at, last, dof = evaluate(theta), 1e-300, max(n_residuals - theta.size, 1)
-    for count in range(1, steps):
-        size = np.sqrt(at.hessian.diagonal())
-        if not 0.0 < size.min() <= size.max() < np.inf:
-            return None
-        _, scaled, failed = dposv(at.hessian / (size * size[:, None]), at.gradient / size)
-        if failed:
-            return None
-        step = scaled / -size
-        longest = (np.abs(step) * logarithmic).max()
-        if not longest < _LONGEST_STEP:
-            return None
-        moves = -float(step @ at.gradient)
-        if longest < _LAST_STEP:
-            lever = size * np.where(logarithmic, 1.0, theta)
-            shortest = max(
-                2.0 * _REMAINDER**2 * float(at.cost) / dof,
-                accuracy**2 * float(lever @ lever),
-            )
-            if moves * min(1.0, moves / last) <= shortest:
-                cost = np.maximum(at.cost - 0.5 * moves, 0.0)
-                converged, counts = np.ones(1, dtype=np.bool_), np.array([count])
-                end = (theta + step)[None]
-                return Minima(end, cost[None], at.hessian[None], converged, counts)
-        theta = theta + step
-        cost, last = at.cost, moves
-        at = evaluate(theta)
-        if not at.cost < cost:
-            return None
-    return None
-
-
-def _minimise(
-    evaluate: Evaluate,
-    theta: FloatArray,
-    logarithmic: BoolArray,
-    n_residuals: int,
-    inside: Callable[[FloatArray, IntArray | None], BoolArray] | None,
-    owner: IntArray,
-    tolerance_factor: float,
-    enough: Fall | None,
-    steps: int,
-    accuracy: float,
-    bounds: Bounds | None,
-    unseen: bool,
-) -> Minima:
     S, P = theta.shape
     unseen_change = _UNSEEN if accuracy <= EXPLICIT else _OF_ACCURACY * accuracy
     at = _State(theta, *evaluate(theta, None))
@@ -247,7 +198,7 @@ def _minimise(
             converged[active] = settled
             np.minimum.at(first, owners[settled], count)
             np.minimum.at(lowest, owners[settled], at.cost[settled])
-            ends.put(active, at.moved(settled & (short | unseen), step, predicted))
+            ends.assign(active, at.moved(settled & (short | unseen), step, predicted))
             keep = ~ended
             active, at = active[keep], at.take(keep)
             if not active.size:
@@ -267,44 +218,9 @@ def _minimise(
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
         last = np.where(better, moves, 1e-300)
-        at = new if better.all() else at.replaced(new, better)
-    ends.put(active, at)
+        at = new if better.all() else at.where(better, new)
+    ends.assign(active, at)
     return Minima(ends.theta, ends.cost, ends.hessian, converged, evaluations)
-
-
-@dataclass(frozen=True)
-class _State:
-    """Where each search stands."""
-
-    theta: FloatArray
-    cost: FloatArray
-    gradient: FloatArray
-    hessian: FloatArray
-
-    def take(self, keep: BoolArray | IntArray) -> _State:
-        return _State(self.theta[keep], self.cost[keep], self.gradient[keep], self.hessian[keep])
-
-    def moved(self, which: BoolArray, step: FloatArray, fall: FloatArray) -> _State:
-        """Return this state with a last short step taken by some."""
-        return _State(
-            self.theta + np.where(which[:, None], step, 0.0),
-            np.where(which, np.maximum(self.cost - fall, 0.0), self.cost),
-            self.gradient,
-            self.hessian,
-        )
-
-    def put(self, where: IntArray, other: _State) -> None:
-        self.theta[where], self.cost[where] = other.theta, other.cost
-        self.gradient[where], self.hessian[where] = other.gradient, other.hessian
-
-    def replaced(self, new: _State, better: BoolArray) -> _State:
-        row = better[:, None]
-        return _State(
-            np.where(row, new.theta, self.theta),
-            np.where(better, new.cost, self.cost),
-            np.where(row, new.gradient, self.gradient),
-            np.where(row[:, :, None], new.hessian, self.hessian),
-        )
 
 
 def _step(

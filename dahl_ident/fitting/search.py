@@ -39,7 +39,6 @@ from dahl_ident.fitting.levenberg_marquardt import (
     NEARLY,
     IntArray,
     Minima,
-    gauss_newton,
     minimise,
 )
 from dahl_ident.fitting.losses import Loss, loss_named
@@ -347,14 +346,6 @@ class TableSearch:
         minima = None
         if self.method == "scipy":
             minima = self._by_scipy(begin, phi, scale, chart, None if limit else inside)
-        elif chart is None and loss is None and len(phi) == 1:
-            one = problem.table(0)
-            minima = gauss_newton(
-                lambda theta: one.quadratic(theta, scale), phi[0], logarithmic, self.m,
-                accuracy=problem.accuracy,
-            )  # fmt: skip
-            if minima is not None and not self._within(minima.theta).all():
-                minima = None
         minima = minima or minimise(
             evaluate,
             phi,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from inspect import signature
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_problem import RecordProblem
-from dahl_ident.problem.stiffness import as_response, checked_table
+from dahl_ident.problem.stiffness import checked_table
 from dahl_ident.problem.table_problem import TableProblem
 from dahl_ident.sensors import Sensors
 from dahl_ident.steady_state import Steady
@@ -123,27 +123,15 @@ class ProblemBatch(TableProblem):
     True
     """
 
-    def __init__(
-        self,
-        data: Sequence[FrequencyResponse],
-        model: Element,
-        *,
-        noise: str | None = None,
-        sensors: Sensors | None = None,
-        free: Iterable[str] = (),
-        fixed: Mapping[str, float] | None = None,
-        steady: Steady = "exact",
-    ) -> None:
-        self.steady = steady
+    def _checked(self, data: Any) -> list[FrequencyResponse]:
         if isinstance(data, FrequencyResponse) or not len(data):
             shown = "one table" if isinstance(data, FrequencyResponse) else "empty"
             raise DataError(f"data is {shown}; expected a sequence of at least one")
-        tables = [checked_table(table) for table in data]
-        self._set_model(model, sensors, free, fixed, tables[0].motion)
-        tables = [as_response(table, self.model) for table in tables]
-        self._set_rows(Rows.stack(tables), noise)
-        self._check_harmonics()
-        self.tables = tuple(tables)
+        return [checked_table(table) for table in data]
+
+    def _rows_of(self, tables: list[FrequencyResponse]) -> Rows:
+        self.tables, self._orbits = tuple(tables), {}
+        return Rows.stack(tables)
 
     @classmethod
     def replicates(cls, problem: TableProblem, responses: ComplexArray) -> ProblemBatch:

@@ -37,7 +37,7 @@ from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.steady_state import ACCURACY, STEADY, Shooting, Steady, obstacle
-from dahl_ident.units import Motion, shown_unit
+from dahl_ident.units import shown_unit
 
 _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()
 """Where shooting last ended, by table and number of states: one fit makes many problems of one."""
@@ -84,7 +84,7 @@ class TableProblem(Problem):
 
     def __init__(
         self,
-        data: FrequencyResponse,
+        data: Any,
         model: Element,
         *,
         noise: str | None = None,
@@ -93,45 +93,47 @@ class TableProblem(Problem):
         fixed: Mapping[str, float] | None = None,
         steady: Steady = "exact",
     ) -> None:
+        one_of(steady, "steady", STEADY)
         self.steady = steady
-        table = checked_table(data)
-        self._set_model(model, sensors, free, fixed, table.motion)
-        rates = [type(e).__name__ for e in self.model.elements if not e.rate_independent]
-        if rates and assumes_frequency(table.provenance):
-            raise DataError(
-                f"the table says no frequency, on which the force of {', '.join(rates)} depends; "
-                f"give it when the table is read: {argument('frequency', 1.0)} (Hz)"
-            )
-        self.data = as_response(table, self.model)
-        self.runs = tuple(self.data.runs or ())
-        self._orbits = _ORBITS.setdefault(self.data, {})
-        self._set_rows(Rows.of(self.data), noise)
-        self._check_harmonics()
-
-    def _set_model(
-        self,
-        model: Element,
-        sensors: Sensors | None,
-        free: Iterable[str],
-        fixed: Mapping[str, float] | None,
-        motion: Motion,
-    ) -> None:
-        one_of(self.steady, "steady", STEADY)
+        tables = self._checked(data)
         model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
-        self.model, self.sensors, self.motion = model, sensors, motion
+        self.model, self.sensors, self.motion = model, sensors, tables[0].motion
         parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
-        if motion == "rotation":
-            parameters = [replace(p, unit=shown_unit(p.unit, motion)) for p in parameters]
+        if self.motion == "rotation":
+            parameters = [replace(p, unit=shown_unit(p.unit, self.motion)) for p in parameters]
         if not parameters:
             raise ModelError(
                 f"{model!r} has no free parameter; leave one out, or name it in {argument('free')}"
             )
         self.space = Space(parameters)
-        self._orbits = {}
         self._misfit: FloatArray | None = None
         self._alike = Interchangeable(model, self.names)
         self.priors: dict[str, Prior] = sensors.priors
         self.ranges: dict[str, tuple[float, float]] = {}
+        self._set_rows(self._rows_of([as_response(table, model) for table in tables]), noise)
+        if self._rows.of_displacement.any() and not self.is_exact:
+            raise DataError(
+                "the rows hold harmonics of the displacement, and the describing function takes "
+                f"that for a sine ({self.obstacle_to_exact or 'as asked for'}): leave them out "
+                f"with {fundamental_alone()}"
+            )
+
+    def _checked(self, data: Any) -> list[FrequencyResponse]:
+        """Return the tables that `data` are: one."""
+        return [checked_table(data)]
+
+    def _rows_of(self, tables: list[FrequencyResponse]) -> Rows:
+        """Keep the tables, and return the rows of all."""
+        (self.data,) = tables
+        rates = [type(e).__name__ for e in self.model.elements if not e.rate_independent]
+        if rates and assumes_frequency(self.data.provenance):
+            raise DataError(
+                f"the table says no frequency, on which the force of {', '.join(rates)} depends; "
+                f"give it when the table is read: {argument('frequency', 1.0)} (Hz)"
+            )
+        self.runs = tuple(self.data.runs or ())
+        self._orbits = _ORBITS.setdefault(self.data, {})
+        return Rows.of(self.data)
 
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
@@ -229,15 +231,6 @@ class TableProblem(Problem):
         return (
             self.steady == "exact" and bool(self._rows.forced.any()) and not self.obstacle_to_exact
         )
-
-    def _check_harmonics(self) -> None:
-        """Refuse harmonics of the displacement where it is taken for a sine."""
-        if self._rows.of_displacement.any() and not self.is_exact:
-            raise DataError(
-                "the rows hold harmonics of the displacement, and the describing function takes "
-                f"that for a sine ({self.obstacle_to_exact or 'as asked for'}): leave them out "
-                f"with {fundamental_alone()}"
-            )
 
     def unstable_rows(self, theta: ArrayLike) -> list[int]:
         """Return the rows whose predicted steady motion is not stable, for want of one that is."""
