@@ -145,7 +145,6 @@ def test_a_reader_that_has_seen_enough_is_no_error(tmp_path, command):
     [
         ("datasets >&-", 1, b"error: standard output is closed; send it to a file, or /dev/null\n"),
         ("datasets noisy -o n.csv >&- 2>&-", 1, b""),
-        ("fit absent.csv 2>&-", 1, b""),
         ("fit - <&-", 1, b"error: standard input: the file is empty\n"),
         ("datasets noisy -o n.csv 2>&-", 0, b""),
     ],

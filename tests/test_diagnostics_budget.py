@@ -358,7 +358,9 @@ class TestEstimate:
         plain = fit(data, Dahl(alpha=1.0)).optimum
         np.testing.assert_allclose(found.theta, plain.theta, atol=1e-7)
 
-    @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+    @pytest.mark.parametrize(
+        "loss", ["huber", pytest.param("soft_l1", marks=pytest.mark.long), "student_t"]
+    )
     @pytest.mark.parametrize("stated", [False, True])
     def test_a_robust_loss_counts_every_source(self, loss, stated):
         """As least squares does without the gross errors: exponent, days, noise."""

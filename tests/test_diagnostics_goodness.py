@@ -59,7 +59,7 @@ class TestSilence:
         assert found.chi_square.p_value == pytest.approx(expected)
         assert found.acceptable
 
-    @pytest.mark.parametrize("dof", [4.0, 12.0])
+    @pytest.mark.parametrize("dof", [4.0, pytest.param(12.0, marks=pytest.mark.long)])
     def test_noise_known_with_few_degrees_of_freedom(self, dof):
         """Covariances as rough as a few cycles give: chi-square keeps its distribution."""
         rng = np.random.default_rng(5)

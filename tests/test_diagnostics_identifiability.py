@@ -215,7 +215,9 @@ class TestVerdicts:
         found = identifiability(fit(turned(data), Dahl(alpha=1.0) + Spring(), throw=False))
         assert [c.unit for c in found.combinations] == ["N m/rad^2", "N m/rad"]
 
-    @pytest.mark.parametrize("seed", [0, 6, 9, 10])
+    @pytest.mark.parametrize(
+        "seed", [0, *(pytest.param(s, marks=pytest.mark.long) for s in (6, 9, 10))]
+    )
     def test_friction_that_does_not_show_leaves_the_stiffness_seen(self, seed):
         """Where friction may as well be none, sigma and its sum with the spring have no end."""
         data = table(model=FRICTION + Spring(30.0), beta=(1e-3, 1e-2), seed=seed)

@@ -10,7 +10,7 @@ import dahl_ident as di
 from benchmarks.driven_plants import PLANTS, scored, simulated, table
 
 
-@pytest.mark.parametrize("number", [0, 2])
+@pytest.mark.parametrize("number", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_a_sweep_of_another_integrator_is_trusted(number):
     plant = PLANTS[number]
     frequency, drive, receptance, closure = simulated(plant, 4, 6)
@@ -23,7 +23,7 @@ def test_a_sweep_of_another_integrator_is_trusted(number):
     assert max(score.spreads) < 0.1
 
 
-@pytest.mark.parametrize("upwards", [True, False])
+@pytest.mark.parametrize("upwards", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards):
     """A gap stiffens the plant: swept upwards the large motion lasts, downwards the small one."""
     known = di.Mass(0.3) + di.Spring(3.0)

@@ -167,7 +167,7 @@ def test_robust_losses_stay_with_the_bulk(loss):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("factor", [1e9, 1e12])
+@pytest.mark.parametrize("factor", [pytest.param(1e9, marks=pytest.mark.long), 1e12])
 @pytest.mark.parametrize("row", [7, -1])
 def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(loss, factor, row):
     """Its pull is bounded, also where its cost is so large that the others' is rounding."""
@@ -275,7 +275,7 @@ def test_as_many_numbers_as_parameters_leave_no_scale():
 
 @pytest.mark.parametrize("noise", ["relative", "absolute"])
 @pytest.mark.parametrize("loss", ["linear", *LOSSES])
-@pytest.mark.parametrize("copies", [1, 2])
+@pytest.mark.parametrize("copies", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_data_without_noise_are_met_to_rounding(noise, loss, copies):
     """Rounding errors are not noise: they repeat, and standard errors cannot be smaller."""
     amplitude = np.tile(np.geomspace(1e-3, 1e-1, 30), copies)
@@ -304,7 +304,7 @@ def test_an_outlier_among_exact_data_is_no_rounding():
 
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("noise", ["relative", "absolute"])
-@pytest.mark.parametrize("factor", [1e-9, 1e-3, 0.1, 10.0, 1e3])
+@pytest.mark.parametrize("factor", [1e-9, 0.1, 1e3])
 def test_one_wrong_row_does_not_even_rule_the_start(loss, noise, factor):
     rng = np.random.default_rng(0)
     error = 0.02 * (rng.normal(size=n) + 1j * rng.normal(size=n))
@@ -326,7 +326,9 @@ ODD_RESPONSES: dict[str, ComplexArray] = {
 }
 
 
-@pytest.mark.parametrize("model", [Dahl(), Dahl() + Spring()], ids=repr)
+@pytest.mark.parametrize(
+    "model", [Dahl(), pytest.param(Dahl() + Spring(), marks=pytest.mark.long)], ids=repr
+)
 @pytest.mark.parametrize("name", ODD_RESPONSES)
 def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name, model):
     data = FrequencyResponse(np.ones(n), ODD_RESPONSES[name], A)

@@ -144,7 +144,9 @@ class TestProfile:
         assert tied.upper == pytest.approx(0.1002)
         assert tied.lower == pytest.approx(free.lower, rel=1e-3)
 
-    @pytest.mark.parametrize("seed", [4, 8, 53, 204])
+    @pytest.mark.parametrize(
+        "seed", [4, 8, *(pytest.param(s, marks=pytest.mark.long) for s in (53, 204))]
+    )
     def test_with_a_hidden_spring_the_limits_are_those_of_a_global_search(self, seed):
         """The profile's valley is bent and long; fits with the value fixed find it from scratch.
 

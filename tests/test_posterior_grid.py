@@ -105,7 +105,9 @@ def brute_force(grid, priors, panels):
     return nodes, mass
 
 
-@pytest.mark.parametrize("seed", [0, 5, 10, 13])
+@pytest.mark.parametrize(
+    "seed", [0, 10, *(pytest.param(s, marks=pytest.mark.long) for s in (5, 13))]
+)
 def test_few_points_and_much_noise_stay_inside_the_stated_error(seed):
     random = np.random.default_rng(seed)
     low, noise = 10.0 ** random.uniform([-2.0, -1.2], [1.5, 0.0])

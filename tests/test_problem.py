@@ -112,8 +112,17 @@ def test_predictions_and_derivatives_agree_with_mpmath(controlled):
 
 @pytest.mark.parametrize("noise", ["measured", "relative", "absolute"])
 @pytest.mark.parametrize("controlled", ["displacement", "force", "mixed"])
-@pytest.mark.parametrize("quantity", QUANTITIES)
-@pytest.mark.parametrize("steady", ["exact", "describing function"])
+@pytest.mark.parametrize(
+    ("quantity", "steady"),
+    [
+        *((quantity, "describing function") for quantity in QUANTITIES),
+        *((quantity, "exact") for quantity in ("accelerance", "dynamic_stiffness")),
+        *(
+            pytest.param(q, "exact", marks=pytest.mark.long)
+            for q in ("receptance", "mobility", "apparent_mass")
+        ),
+    ],
+)
 def test_jacobian_is_the_residuals_derivative(quantity, controlled, noise, steady):
     words = np.where(np.arange(n) % 2, "force", "displacement")
     table = data(quantity, words if controlled == "mixed" else controlled)

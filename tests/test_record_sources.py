@@ -108,7 +108,9 @@ def test_a_record_takes_priors_of_its_channels_alone():
             di.fit(record, di.Dahl(), sensors=sensors)
 
 
-@pytest.mark.parametrize("alpha", [0.5, 0.8, 1.3, 2.0])
+@pytest.mark.parametrize(
+    "alpha", [0.5, 2.0, *(pytest.param(a, marks=pytest.mark.long) for a in (0.8, 1.3))]
+)
 def test_an_exponent_that_nobody_stated_is_estimated(alpha):
     record = recorded(di.Dahl(0.1, 30.0, alpha=alpha), "random", 1500, 1e-3)
     fit, free = di.fit(record, di.Dahl(), throw=False), di.fit(record, di.Dahl(alpha=None))
@@ -224,7 +226,7 @@ def held(law, seed, *, delay=0.0, power=0.0, size=8e-3, noise=5e-4):
     return di.Record(at, displacement=shown, force=force[2000::10] + errors)
 
 
-@pytest.mark.parametrize("delay", [-0.5, 0.05, 0.5])
+@pytest.mark.parametrize("delay", [-0.5, 0.05, pytest.param(0.5, marks=pytest.mark.long)])
 def test_a_delay_that_nobody_stated_is_estimated(delay):
     for seed in range(3):
         fit = di.fit(held(DAHL, seed, delay=delay), di.Dahl())
