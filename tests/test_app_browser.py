@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from dahl_ident import Damper
 from tests.app_server import started
 from tests.browser import CHROMIUM, chromium
+from tests.test_record_fit import DAHL, recorded
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 SETS = Path(__file__).parents[1] / "datasets" / "synthetic"
@@ -110,16 +112,16 @@ def test_a_table_becomes_a_report_and_every_page_is_accessible(page, server, tmp
     assert server.page(f"{run}/file/report.pdf").startswith("%PDF")
 
 
-def test_sweeps_become_a_report(page, server):
-    file = "sweep_plant.csv.gz"
-    _to_model(page, SETS / file)
-    for name in ("mass", "damping", "stiffness"):
-        page.value(f"document.getElementById('{name}').value = 'free'")
+def test_waveforms_become_a_report(page, server, tmp_path):
+    truth = DAHL + Damper(0.3)
+    recorded(truth, "random", 500, 1e-3).to_frame().to_csv(tmp_path / "run.csv", index=False)
+    _to_model(page, tmp_path / "run.csv")
+    page.value("document.getElementById('damping').value = 'free'")
     _click(page, "form > .buttons button", _RUN)
     page.wait(_ENDED)
     text = page.value("document.body.innerText")
     assert "Trusted" in text
-    assert f"dahl-ident fit data/{file} --record" in text
+    assert "dahl-ident fit data/run.csv --record" in text
     assert server.page(f"{page.value('location.pathname')}/file/report.pdf").startswith("%PDF")
 
 
