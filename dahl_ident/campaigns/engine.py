@@ -48,18 +48,7 @@ class LostError(DataError):
 
 
 class Limits:
-    """How long a fit may take, s, and how much memory it may use, GB.
-
-    Examples
-    --------
-    >>> limits = Limits()
-    >>> limits.seconds
-    600.0
-    >>> for seconds in (5.0, 30.0, 20.0):
-    ...     limits.note({"status": "trusted", "seconds": seconds})
-    >>> limits.seconds
-    200.0
-    """
+    """How long a fit may take, s, and how much memory it may use, GB."""
 
     def __init__(
         self,

@@ -6,13 +6,14 @@ import logging
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.options import General, Laws, Writing, option, with_option_groups
+from dahl_ident.cli.options import General, Laws, Writing, setting, with_option_groups
 from dahl_ident.errors import ValidationError
 
 if TYPE_CHECKING:
@@ -22,38 +23,80 @@ _LINE_EVERY = 60.0
 """Seconds between lines of progress where there is no terminal."""
 
 
+@dataclass(frozen=True)
+class Running:
+    """How the fits are run; options of ``campaign``."""
+
+    panel: ClassVar[str | None] = None
+    jobs: int | None = setting("Processes; by default as many as processors.")
+    scheduler: str | None = setting("Address of a Dask scheduler, tls://host:port.")
+    timeout: float | None = setting(
+        "Longest time for a device; by default 10 medians, at least 60 s.", unit="s"
+    )
+    memory: float | None = setting("Most memory for a device, GB; by default a fair share.")
+    patience: float = setting("Longest time without an answer of the scheduler.", 120.0, unit="s")
+    send_files: bool = setting(
+        "Send workers the contents of files, not paths.", False, "--send-files"
+    )
+    dry_run: bool = setting("List what would be done.", False, "--dry-run")
+    redo: bool = setting("Repeat all fits if options have changed.", False, "--redo")
+
+
+@dataclass(frozen=True)
+class Reporting:
+    """The report on the whole campaign."""
+
+    panel: ClassVar[str | None] = None
+    report: Path | None = setting("Report on the whole campaign: .html or .pdf.")
+    covariate: list[str] | None = setting("Column on which parameters may depend; repeatable.")
+    order: str | None = setting("Column that orders fits in time, for control charts.")
+
+    def check(self, definition: Definition, *, overwrite: bool) -> None:
+        """Refuse, before anything runs, what the report could not be made from."""
+        from dahl_ident.campaigns.campaign_report import FORMATS
+        from dahl_ident.data.storage import place_of
+
+        columns, place = self.covariate or [], self.report
+        if place is None:
+            if columns or self.order:
+                raise ValidationError(
+                    "--covariate and --order are for a report; give --report as well"
+                )
+            return
+        place_of(place, "a campaign's report", FORMATS)
+        Writing(overwrite).check([place])
+        tasks = definition.tasks
+        known = set.intersection(*(set(task.covariates) for task in tasks))
+        for name, choice in [*(("--covariate", c) for c in columns), ("--order", self.order)]:
+            also = {"run"} if name == "--order" else set()
+            if choice is not None and choice not in known | also:
+                there = ", ".join(sorted(known)) or "none"
+                raise ValidationError(f"{name} {choice}: the fits have the covariates {there}")
+        texts = {
+            column: [v for task in tasks if isinstance(v := task.covariates[column], str)]
+            for column in known
+        }
+        for column in columns:
+            if texts[column]:
+                raise ValidationError(
+                    f"--covariate {column} is {texts[column][0]!r}; expected numbers"
+                )
+        unused = sorted(c for c in known - {*columns, self.order} if not texts[c])
+        if unused:
+            console.note(
+                f"the report does not use {', '.join(unused)}; --covariate {unused[0]} states how "
+                "parameters depend on it"
+            )
+
+
 @with_option_groups
 def campaign(
     general: General,
     laws: Laws,
     writing: Writing,
     definition: Annotated[Path, typer.Argument(help="TOML file that defines the campaign.")],
-    jobs: Annotated[int | None, option("Processes; by default as many as processors.")] = None,
-    scheduler: Annotated[
-        str | None, option("Address of a Dask scheduler, tls://host:port.")
-    ] = None,
-    timeout: Annotated[
-        float | None,
-        option("Longest time for a device; by default 10 medians, at least 60 s.", unit="s"),
-    ] = None,
-    memory: Annotated[
-        float | None, option("Most memory for a device, GB; by default a fair share.")
-    ] = None,
-    patience: Annotated[
-        float, option("Longest time without an answer of the scheduler.", unit="s")
-    ] = 120.0,
-    send_files: Annotated[
-        bool, option("Send workers the contents of files, not paths.", "--send-files")
-    ] = False,
-    report: Annotated[Path | None, option("Report on the whole campaign: .html or .pdf.")] = None,
-    covariate: Annotated[
-        list[str], option("Column on which parameters may depend; repeatable.")
-    ] = [],  # noqa: B006 - typer takes lists as lists
-    order: Annotated[
-        str | None, option("Column that orders fits in time, for control charts.")
-    ] = None,
-    dry_run: Annotated[bool, option("List what would be done.", "--dry-run")] = False,
-    redo: Annotated[bool, option("Repeat all fits if options have changed.", "--redo")] = False,
+    running: Running,
+    reporting: Reporting,
 ) -> None:
     """Read, extract and fit the files of many devices into one table.
 
@@ -66,74 +109,26 @@ def campaign(
     from dahl_ident.campaigns.run import campaign as run_campaign
 
     laws.run()
-    read = read_definition(definition)
-    _check_report(report, writing.overwrite, covariate, order, read)
+    reporting.check(read_definition(definition), overwrite=writing.overwrite)
     with console.busy("fits") as show:
         update = show if sys.stderr.isatty() else _lines()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
         done = run_campaign(
-            definition, jobs=jobs, scheduler=scheduler, timeout=timeout, memory=memory,
-            patience=patience, send_files=send_files, dry_run=dry_run, redo=redo,
-            progress=lambda number, total, _: update(number, total),
-        )  # fmt: skip
-    if report is not None and not dry_run:
-        place = done.report(
-            report,
-            covariates=covariate,
-            order=order,
-            title=definition.stem,
-            overwrite=writing.overwrite,
+            definition, progress=lambda number, total, _: update(number, total), **vars(running)
         )
-        console.note(f"report: {place}")
+    if reporting.report is not None and not running.dry_run:
+        how: dict[str, Any] = {"covariates": reporting.covariate or [], "order": reporting.order}
+        how |= {"title": definition.stem, "overwrite": writing.overwrite}
+        console.note(f"report: {done.report(reporting.report, **how)}")
     if general.json:
         facts = {"finished": list(done.finished), "to_do": list(done.to_do)}
         console.write_json({**facts, "statuses": dict(done.statuses), "folder": str(done.folder)})
+    elif running.dry_run:
+        console.write("\n".join([*(f"to do: {name}" for name in done.to_do), str(done)]))
     else:
-        if dry_run:
-            for name in done.to_do:
-                console.write(f"to do: {name}")
-        console.write(str(done))
-        if not dry_run:
-            console.write(f"table: {done.folder / 'results.csv'}")
+        console.write(f"{done}\ntable: {done.folder / 'results.csv'}")
     usable = any(status in USABLE for status in done.statuses)
-    console.finish(dry_run or usable, "no fit can be used; the table says why")
-
-
-def _check_report(
-    report: Path | None, overwrite: bool, covariates: list[str], order: str | None, read: Definition
-) -> None:
-    """Refuse, before anything runs, what the report could not be made from."""
-    from dahl_ident.campaigns.campaign_report import FORMATS
-    from dahl_ident.data.storage import place_of, refuse_existing
-
-    if report is None:
-        if covariates or order:
-            raise ValidationError("--covariate and --order are for a report; give --report as well")
-        return
-    place_of(report, "a campaign's report", FORMATS)
-    if not overwrite:
-        refuse_existing(report)
-    if not report.parent.is_dir():
-        raise ValidationError(f"--report {report}: there is no folder {report.parent}")
-    known = set.intersection(*(set(task.covariates) for task in read.tasks))
-    for name, choice in [*(("--covariate", c) for c in covariates), ("--order", order)]:
-        if choice is not None and choice not in known | ({"run"} if name == "--order" else set()):
-            there = ", ".join(sorted(known)) or "none"
-            raise ValidationError(f"{name} {choice}: the fits have the covariates {there}")
-    for column in covariates:
-        texts = [v for task in read.tasks if isinstance(v := task.covariates[column], str)]
-        if texts:
-            raise ValidationError(f"--covariate {column} is {texts[0]!r}; expected numbers")
-    unused = sorted(
-        name
-        for name in known - set(covariates)
-        if name != order and all(not isinstance(task.covariates[name], str) for task in read.tasks)
-    )
-    if unused:
-        console.note(
-            f"the report does not use {', '.join(unused)}; --covariate {unused[0]} states how "
-            "parameters depend on it"
-        )
+    console.finish(running.dry_run or usable, "no fit can be used; the table says why")
 
 
 def _lines() -> Callable[[int, int], None]:

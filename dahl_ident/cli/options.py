@@ -38,35 +38,35 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
         content = tomllib.loads(read_text(path))
     except (DataError, tomllib.TOMLDecodeError) as exc:
         raise DataError(f"{path}: no TOML file of options: {exc}") from exc
+    here = ctx.info_name or ""
     tables = {k: v for k, v in content.items() if isinstance(v, dict)}
-    shared = _named({k: v for k, v in content.items() if k not in tables})
-    of_command = _named(tables.get(ctx.info_name or "", {}))
-    commands = _options_of_commands(ctx)
-    known = commands.get(ctx.info_name or "", set())
+    shared = {k.replace("-", "_"): v for k, v in content.items() if k not in tables}
+    of_command = {k.replace("-", "_"): v for k, v in tables.get(here, {}).items()}
+    every: Mapping[str, Any] = getattr(ctx.find_root().command, "commands", {})
+    commands = {name: {p.name for p in one.params} - {"config"} for name, one in every.items()}
+    known = commands.get(here, set())
     _refuse_unknown(path, "no command is called", tables, commands.keys())
-    _refuse_unknown(path, f"{ctx.info_name} has no option", of_command, known)
+    _refuse_unknown(path, f"{here} has no option", of_command, known)
     _refuse_unknown(path, "no command has the option", shared, set().union(*commands.values()))
     chosen = {k: v for k, v in shared.items() if k in known} | of_command
-    several = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
-    several |= {p.name for p in ctx.command.params if p.nargs != 1}
-    ctx.default_map = {k: _repeated(v) if k in several else _joined(v) for k, v in chosen.items()}
+    parameters = ctx.command.params
+    several = {p.name for p in parameters if getattr(p, "multiple", False) or p.nargs != 1}
+    ctx.default_map = {k: _typed(v, several=k in several) for k, v in chosen.items()}
     return path
 
 
-def _repeated(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
-
-
-def _joined(value: Any) -> Any:
-    return ",".join(map(str, value)) if isinstance(value, list) else value
-
-
-def _options_of_commands(ctx: typer.Context) -> dict[str, set[str]]:
-    """Return the names of the options of every command."""
-    commands: Mapping[str, Any] = getattr(ctx.find_root().command, "commands", {})
-    return {
-        name: {p.name for p in command.params} - {"config"} for name, command in commands.items()
-    }
+def _typed(value: Any, *, several: bool) -> Any:
+    """Return a value as it would be typed, bounds as ``low:high``; `several` values as a list."""
+    if isinstance(value, dict):
+        value = [
+            f"{name}={':'.join(map(str, item)) if isinstance(item, list) else item}"
+            for name, item in value.items()
+        ]
+    each = value if isinstance(value, list) else [value]
+    words = [item if isinstance(item, bool) else str(item) for item in each]
+    if several:
+        return words
+    return ",".join(map(str, words)) if isinstance(value, list) else words[0]
 
 
 def _refuse_unknown(path: Path, what: str, names: Iterable[str], known: Collection[str]) -> None:
@@ -75,24 +75,6 @@ def _refuse_unknown(path: Path, what: str, names: Iterable[str], known: Collecti
         raise DataError(
             f"{path}: {what} {', '.join(unknown)}; there are {choices(sorted(known), *unknown)}"
         )
-
-
-def _named(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options by the names of their parameters, values as they would be typed."""
-    return {k.replace("-", "_"): _typed(v) for k, v in options.items()}
-
-
-def _typed(value: Any) -> Any:
-    if isinstance(value, dict):
-        return [f"{name}={_assigned(item)}" for name, item in value.items()]
-    if isinstance(value, list):
-        return [_typed(item) for item in value]
-    return value if isinstance(value, bool) else str(value)
-
-
-def _assigned(value: Any) -> str:
-    """Return bounds as ``low:high``, anything else unchanged."""
-    return ":".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def option(

@@ -65,12 +65,25 @@ def plot_corner(
         for line in (axis.xaxis, axis.yaxis):
             style.few_plain_ticks(line)
         if i == j:
-            _marginal(axis, values[:, i], edges[i])
+            axis.hist(
+                values[:, i], edges[i], color=style.PALE_BLUE, ec=style.BLUE, histtype="stepfilled"
+            )
+            for q in np.quantile(values[:, i], _QUANTILES):
+                axis.axvline(q, color=style.BLUE, lw=0.8, ls="--")
+            axis.set_yticks([])
         else:
             pair = [edges[j], edges[i]]
             axis.hist2d(values[:, j], values[:, i], pair, cmap="Blues", rasterized=True)
-        _mark(axis, names, i, j, truth or {})
-        _name_outer_axes(axis, names, i, j)
+        if truth and names[j] in truth:
+            axis.axvline(truth[names[j]], color=style.VERMILION, lw=1)
+        if truth and i != j and names[i] in truth:
+            axis.axhline(truth[names[i]], color=style.VERMILION, lw=1)
+        bottom, left = i == p - 1, j == 0 and i > 0  # only outer panels have numbers and names
+        axis.grid(visible=False)
+        axis.tick_params(labelbottom=bottom, labelleft=left, which="both")
+        axis.tick_params(axis="x", labelrotation=30, which="both")
+        axis.set_xlabel(style.on_two_lines(names[j]) if bottom else "", fontsize=8)
+        axis.set_ylabel(style.on_two_lines(names[i]) if left else "", fontsize=8)
     return grid
 
 
@@ -130,32 +143,3 @@ def _edges(values: Any, log: bool) -> Any:
     if not high > low:
         low, high = low - 0.5 * abs(low) - 1e-300, high + 0.5 * abs(high) + 1e-300
     return np.geomspace(low, high, 31) if log else np.linspace(low, high, 31)
-
-
-def _marginal(axis: Axes, values: FloatArray, edges: Any) -> None:
-    """Draw the density of one parameter, and its quantiles."""
-    axis.hist(values, edges, color=style.PALE_BLUE, ec=style.BLUE, histtype="stepfilled")
-    for q in np.quantile(values, _QUANTILES):
-        axis.axvline(q, color=style.BLUE, lw=0.8, ls="--")
-    axis.set_yticks([])
-
-
-def _name_outer_axes(axis: Axes, names: Sequence[str], i: int, j: int) -> None:
-    """Put numbers and names on the axes of the outer panels only."""
-    bottom, left = i == len(names) - 1, j == 0 and i > 0
-    axis.grid(visible=False)
-    axis.tick_params(labelbottom=bottom, labelleft=left, which="both")
-    axis.tick_params(axis="x", labelrotation=30, which="both")
-    axis.set(
-        xlabel=style.on_two_lines(names[j]) if bottom else "",
-        ylabel=style.on_two_lines(names[i]) if left else "",
-    )
-    axis.xaxis.label.set_fontsize(8)
-    axis.yaxis.label.set_fontsize(8)
-
-
-def _mark(axis: Axes, names: Sequence[str], i: int, j: int, truth: Mapping[str, float]) -> None:
-    if names[j] in truth:
-        axis.axvline(truth[names[j]], color=style.VERMILION, lw=1)
-    if i != j and names[i] in truth:
-        axis.axhline(truth[names[i]], color=style.VERMILION, lw=1)

@@ -74,24 +74,12 @@ class TextTable:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure, which is drawn when a writer needs it.
+    """A figure, which is drawn when a writer needs it."""
 
-    Attributes
-    ----------
-    name : str
-        Short, for a file name.
-    caption : str
-        What is shown.
-    alt : str
-        Description for readers who cannot see it: the kind of plot and its result.
-    draw : callable
-        Draws on new axes, and returns them.
-    """
-
-    name: str
+    name: str  # for a file
     caption: str
-    alt: str
-    draw: Callable[[], Any]
+    alt: str  # for readers who cannot see it: the kind of plot and its result
+    draw: Callable[[], Any]  # draws on new axes, and returns them
 
     def rendered(self, kind: str) -> bytes:
         """Return the picture as "svg" or "png"; the same each time."""
@@ -134,37 +122,16 @@ MARKS = {
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report.
-
-    Attributes
-    ----------
-    title : str
-        First line.
-    status : str
-        "trusted", "approximate", "not determined" or "not described".
-    verdict : tuple of str
-        The result, and the objections to it.
-    header : tuple of (name, lines)
-        Specimen, model, data, instruments and so on; a field without lines is to be filled in by
-        hand.
-    sections : tuple of Section
-        The rest, in reading order, details last.
-    facts : mapping
-        The same for machines.
-    identity : str
-        Number and data of the report, for every page.
-    signatory : tuple of str
-        Name and role of who signs it; empty to be filled in by hand.
-    """
+    """A whole report; a field of the header without lines is to be filled in by hand."""
 
     title: str
-    status: str
-    verdict: tuple[str, ...]
-    sections: tuple[Section, ...]
-    header: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    identity: str = ""
-    signatory: tuple[str, ...] = ()
+    status: str  # one of MARKS
+    verdict: tuple[str, ...]  # the result, and the objections to it
+    sections: tuple[Section, ...]  # in reading order, details last
+    header: tuple[tuple[str, tuple[str, ...]], ...] = ()  # specimen, model, data and so on
+    facts: Mapping[str, Any] = field(default_factory=dict)  # the same for machines
+    identity: str = ""  # number and data of the report, for every page
+    signatory: tuple[str, ...] = ()  # name and role; empty to be filled in by hand
 
     @property
     def trusted(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
 _APART = 1.2  # of the largest frequency over the smallest
+_PROFILE_POINTS = 41
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 _WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / amplitude
 _INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
@@ -225,32 +226,25 @@ def _profiles(fit: FitResult) -> Picture:
 
 
 def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
+    """Draw a profile out to its widest limit; over three decades if it is open."""
     name, parameter = fit.var_names[index], fit.problem.parameters[index]
     profiler = Profiler(fit.optimum)
     q = thresholds(fit.optimum, np.array(LEVELS))
-    coordinate = _profile_range(fit, index, profiler, q)
-    logarithmic = parameter.positive
+    best = float(fit.optimum.theta[index])
+    reach = np.log(1e3) if parameter.positive else abs(best) + 1.0
+    lower, upper = (side[-1, index] for side in profiler.limits(q))
+    low = lower if np.isfinite(lower) else best - reach
+    high = upper if np.isfinite(upper) else best + reach
+    coordinate = np.linspace(low, high, _PROFILE_POINTS)
     plots.plot_profile(
-        np.exp(coordinate) if logarithmic else coordinate,
+        np.exp(coordinate) if parameter.positive else coordinate,
         profiler.curve(index, coordinate),
         best=float(fit.optimum.values[index]),
         limits={level_text(c): float(t**2) for c, t in zip(LEVELS, q, strict=True)},
         label=f"{name} [{parameter.unit}]" if parameter.unit else name,
-        log=bool(logarithmic and np.ptp(coordinate) > _STRAIGHT),
+        log=bool(parameter.positive and np.ptp(coordinate) > _STRAIGHT),
         ax=axis,
     )
-
-
-def _profile_range(
-    fit: FitResult, index: int, profiler: Profiler, q: FloatArray, points: int = 41
-) -> FloatArray:
-    """Return search coordinates out to the widest limit; three decades if it is open."""
-    lower, upper = (side[-1, index] for side in profiler.limits(q))
-    best = float(fit.optimum.theta[index])
-    reach = np.log(1e3) if fit.problem.parameters[index].positive else abs(best) + 1.0
-    low = lower if np.isfinite(lower) else best - reach
-    high = upper if np.isfinite(upper) else best + reach
-    return np.linspace(low, high, points)
 
 
 def _correlation(fit: FitResult) -> Picture:
@@ -303,7 +297,11 @@ def _loops(fit: FitResult, friction: Friction) -> Picture:
     """Return the picture of the loops at the smallest, a middle and the largest amplitude."""
     sizes, measured = _chosen(fit, friction)
     unit, force_unit = (si_unit(kind, fit.data.motion) for kind in ("displacement", "force"))
-    losses = [q for q in fit.derived(sizes.tolist()) if q.name == ENERGY]
+    lost = [
+        f"{with_unit(q.value, q.stderr, 'J')} at {q.amplitude:.3g} {unit}"
+        for q in fit.derived(sizes.tolist())
+        if q.name == ENERGY
+    ]
     drawn = [friction.loop(float(A), 6 * (_LOOP_POINTS - 1) + 1) for A in sizes]
     over_amplitude = bool(sizes[-1] > _WIDE * sizes[0])
 
@@ -313,38 +311,28 @@ def _loops(fit: FitResult, friction: Friction) -> Picture:
             (x / by, force, engineering(A, unit))
             for A, by, (x, force) in zip(sizes, scale, drawn, strict=True)
         ]
-        dots = [(x / by, force) for by, (x, force) in zip(scale, measured, strict=False)]
-        x_label = "displacement over amplitude" if over_amplitude else f"displacement [{unit}]"
         return plots.plot_loops(
             model,
-            measured=dots,
-            displacement_label=x_label,
+            measured=[(x / by, force) for by, (x, force) in zip(scale, measured, strict=False)],
+            displacement_label="displacement over amplitude"
+            if over_amplitude
+            else f"displacement [{unit}]",
             force_label=f"friction [{force_unit}]",
         )
 
-    lines = "Lines: friction of the fitted element at three amplitudes of the data."
-    dots = (
-        "Dots: the sum of the measured harmonics, less the force of the other elements."
-        if measured
-        else "The data hold no higher harmonics of the force, so there is no measured loop."
-    )
-    finding = (
-        f"A cycle loses {with_unit(losses[0].value, losses[0].stderr, 'J')} at {sizes[0]:.3g} "
-        f"{unit} and {with_unit(losses[-1].value, losses[-1].stderr, 'J')} at {sizes[-1]:.3g} "
-        f"{unit} (standard uncertainties)."
-    )
-    if measured:
-        finding += f" {_distance(drawn, measured)}"
-    return Picture("loops", f"{lines} {dots}", finding, draw)
-
-
-def _measured_loop(
-    amplitude: float, harmonics: Sequence[int], stiffness: ComplexArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return displacement and force of one cycle from F_k/X_1, X_1 taken as real."""
-    theta = np.linspace(0.0, 2.0 * np.pi, _LOOP_POINTS)
-    turning = np.exp(1j * np.outer(harmonics, theta))
-    return amplitude * np.cos(theta), amplitude * (stiffness @ turning).real
+    caption = "Lines: friction of the fitted element at three amplitudes of the data. "
+    finding = f"A cycle loses {lost[0]} and {lost[-1]} (standard uncertainties)."
+    if not measured:
+        caption += "The data hold no higher harmonics of the force, so there is no measured loop."
+        return Picture("loops", caption, finding, draw)
+    caption += "Dots: the sum of the measured harmonics, less the force of the other elements."
+    away = [
+        np.sqrt(np.mean((force - model[:: (model.size - 1) // (force.size - 1)]) ** 2))
+        / np.abs(force).max()
+        for (_, model), (_, force) in zip(drawn, measured, strict=True)
+    ]
+    finding += f" The measured loops are within {percent(max(away))} rms of the model's."
+    return Picture("loops", caption, finding, draw)
 
 
 def _chosen(
@@ -353,39 +341,26 @@ def _chosen(
     """Return three amplitudes and their measured loops, where harmonics were measured."""
     data = fit.data
     fundamental = data.harmonic == 1
-    if (data.harmonic != 1).any() and fit.problem.sensors.are_exact:
-        assert data.amplitude is not None  # harmonics belong to a displacement
-        run = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
-        points = np.stack([data.frequency_hz, data.amplitude, run])
-        rows_of = [np.flatnonzero((points[:, i] == points.T).all(axis=1)) for i in range(data.n)]
-        full = [i for i in np.flatnonzero(fundamental) if rows_of[i].size > 1]
-        rank = [full[i] for i in np.argsort(data.amplitude[full])]
-        three = [rank[0], rank[len(rank) // 2], rank[-1]]
-        others = fit.best_fit - friction.dynamic_stiffness(
-            data.amplitude, 2.0 * np.pi * data.frequency_hz
-        )
-        friction_alone = np.where(fundamental, data.response - others, data.response)
-        cycles = [
-            _measured_loop(
-                data.amplitude[i], data.harmonic[rows_of[i]].tolist(), friction_alone[rows_of[i]]
-            )
-            for i in three
-        ]
-        return data.amplitude[three], cycles
-    amplitude = fit.problem.stiffness_data.amplitude[fundamental]
-    return np.geomspace(amplitude.min(), amplitude.max(), 3), []
-
-
-def _distance(
-    drawn: Sequence[tuple[FloatArray, FloatArray]],
-    measured: Sequence[tuple[FloatArray, FloatArray]],
-) -> str:
-    """Return a sentence on the distance of the measured loops from those of the model."""
-    away = []
-    for (_, model), (_, force) in zip(drawn, measured, strict=True):
-        same = model[:: (model.size - 1) // (force.size - 1)]
-        away.append(np.sqrt(np.mean((force - same) ** 2)) / np.abs(force).max())
-    return f"The measured loops are within {percent(max(away))} rms of the model's."
+    if fundamental.all() or not fit.problem.sensors.are_exact:
+        amplitude = fit.problem.stiffness_data.amplitude[fundamental]
+        return np.geomspace(amplitude.min(), amplitude.max(), 3), []
+    A = data.amplitude
+    assert A is not None  # harmonics belong to a displacement
+    run = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
+    points = np.stack([data.frequency_hz, A, run])
+    rows_of = [np.flatnonzero((points[:, i] == points.T).all(axis=1)) for i in range(data.n)]
+    full = [i for i in np.flatnonzero(fundamental) if rows_of[i].size > 1]
+    rank = [full[i] for i in np.argsort(A[full])]
+    three = [rank[0], rank[len(rank) // 2], rank[-1]]
+    others = fit.best_fit - friction.dynamic_stiffness(A, 2.0 * np.pi * data.frequency_hz)
+    friction_alone = np.where(fundamental, data.response - others, data.response)
+    theta = np.linspace(0.0, 2.0 * np.pi, _LOOP_POINTS)
+    cycles = []
+    for i in three:  # from F_k/X_1, X_1 taken as real
+        turning = np.exp(1j * np.outer(data.harmonic[rows_of[i]], theta))
+        force = A[i] * (friction_alone[rows_of[i]] @ turning).real
+        cycles.append((A[i] * np.cos(theta), force))
+    return A[three], cycles
 
 
 def settling(data: FrequencyResponse, record: Record) -> Picture:

@@ -45,6 +45,10 @@ COVERAGE = (
     "The expanded uncertainty U is the combined standard uncertainty u times the coverage factor "
     f"k, for a coverage of about {level_text(CONFIDENCE)}."
 )
+_OF_CHAIN = (
+    "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, r_hat "
+    "compares independent ensembles and is 1 if they agree."
+)
 _MOST_FILES = 4  # lines of them before the signature
 _FACTS = {"table": "fits", "records": "record_fits"}  # names of fits in JSON, by kind of data
 _FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin
@@ -106,8 +110,12 @@ def _of_one_table(results: Sequence[Result], known: Metadata, record: Record | N
     front, details = list(compared.sections), list[Section]()
     for fit in fits:
         of = _of(fit, fits)
-        front.append(_answer(fit, of))
-        front.append(Section(f"Expanded uncertainty{of}", tuple(_budget(fit))))
+        determined = tuple(f"Determined: {c}" for c in fit.identifiability.combinations)
+        answer = (tables.answer(fit), Bullets(determined), Paragraph(RELATES))
+        front.append(Section(f"Result{of}", answer))
+        if (stated := _stated(fit)) is not None:
+            combined = (tables.uncertainty(stated), Paragraph(COVERAGE))
+            front.append(Section(f"Expanded uncertainty{of}", combined))
         front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
         details += _details(fit, drawn, of)
     for one in drawn:
@@ -245,22 +253,10 @@ def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
     yield from (f"{before}{line}" for line in (*lines, *warnings))
 
 
-def _answer(fit: FitResult, of: str) -> Section:
-    combinations = Bullets(tuple(f"Determined: {c}" for c in fit.identifiability.combinations))
-    return Section(f"Result{of}", (tables.answer(fit), combinations, Paragraph(RELATES)))
-
-
 def _stated(fit: FitResult) -> Budget | None:
     """Return the uncertainty budget; None where no uncertainty can be stated."""
     lost = fit.status is VerdictStatus.NOT_DESCRIBED
     return None if lost else fit.stated_budget
-
-
-def _budget(fit: FitResult) -> Iterator[Block]:
-    """Yield the combined uncertainties; nothing if none can be stated."""
-    if (stated := _stated(fit)) is not None:
-        yield tables.uncertainty(stated)
-        yield Paragraph(COVERAGE)
 
 
 def _assumed(fit: FitResult) -> Iterator[str]:
@@ -326,24 +322,22 @@ def _goodness(fit: FitResult) -> Iterator[Block]:
 
 
 def _posterior_details(posterior: Posterior) -> Iterator[Section]:
-    yield Section("Posterior", tuple(_posterior_numbers(posterior)), details=True)
-    pictures = [corner(posterior), *([trace(posterior)] if posterior.is_chain else [])]
+    """Yield numbers, convergence and pictures."""
+    priors = tuple(f"{name}: {text}" for name, text in posterior.priors.items())
+    numbers: list[Block] = [
+        Paragraph(posterior.message),
+        tables.posterior_summary(posterior),
+        Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):"),
+        Bullets(priors),
+        Bullets(tuple(map(str, posterior.findings))),
+    ]
+    pictures = [corner(posterior)]
+    if posterior.is_chain:
+        numbers.insert(2, Paragraph(_OF_CHAIN))
+        numbers.append(Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain."))
+        pictures.append(trace(posterior))
+    yield Section("Posterior", tuple(numbers), details=True)
     yield Section("Pictures of the posterior", tuple(pictures), details=True)
-
-
-def _posterior_numbers(posterior: Posterior) -> Iterator[Block]:
-    yield Paragraph(posterior.message)
-    yield tables.posterior_summary(posterior)
-    if posterior.is_chain:
-        yield Paragraph(
-            "mcse is the Monte Carlo standard error of the mean, ess the effective number of "
-            "draws, r_hat compares independent ensembles and is 1 if they agree."
-        )
-    yield Paragraph(f"Priors (likelihood: {posterior.likelihood.replace('_', ' ')}):")
-    yield Bullets(tuple(f"{name}: {text}" for name, text in posterior.priors.items()))
-    yield Bullets(tuple(map(str, posterior.findings)))
-    if posterior.is_chain:
-        yield Paragraph(f"Seed {posterior.seed}; the same seed gives the same chain.")
 
 
 def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:

@@ -31,26 +31,14 @@ class Law:
 
 @dataclass(frozen=True)
 class Device:
-    """The elements of a fit.
+    """The elements of a fit."""
 
-    Attributes
-    ----------
-    laws : tuple of Law
-        All but masses, viscous dampers and springs.
-    mass, damping, stiffness : float
-        Sums of those.
-    rotation : bool
-        Whether forces are torques.
-    notes : tuple of str
-        Origin and verdict, and what the format leaves out.
-    """
-
-    laws: tuple[Law, ...]
-    mass: float
+    laws: tuple[Law, ...]  # all but masses, viscous dampers and springs
+    mass: float  # sums, as are damping and stiffness
     damping: float
     stiffness: float
-    rotation: bool
-    notes: tuple[str, ...]
+    rotation: bool  # whether forces are torques
+    notes: tuple[str, ...]  # origin and verdict, and what the format leaves out
 
 
 def device(result: Any, form: str, carried: Mapping[str, str]) -> Device:
