@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.bayes.decorrelation import decorrelation_of
+from dahl_ident.bayes.moves import decorrelation_of
 from dahl_ident.problem import TableProblem
 from tests.bayes_cases import FRICTION, X_C, friction_table, spring_table
 

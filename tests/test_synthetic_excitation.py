@@ -7,7 +7,7 @@ import pytest
 
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic import AmplitudeRamp, FrequencySweep, SteppedSine
-from dahl_ident.synthetic.randomness import Draws
+from dahl_ident.synthetic.acquisition import Draws
 
 Excitation = AmplitudeRamp | FrequencySweep | SteppedSine
 RUNS: list[Excitation] = [

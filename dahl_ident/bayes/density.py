@@ -39,7 +39,7 @@ import numpy as np
 from scipy.special import gammaln, logsumexp
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.decorrelation import Decorrelation, decorrelation_of
+from dahl_ident.bayes.moves import STRAIGHT, Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.data.columns import one_of
@@ -111,9 +111,9 @@ class LogDensity(ABC):
         return False
 
     @property
-    def decorrelation(self) -> Decorrelation | None:
+    def decorrelation(self) -> Decorrelation:
         """Coordinates in which ridges are straight, where there are some."""
-        return None
+        return STRAIGHT
 
     @property
     def around(self) -> tuple[FloatArray, FloatArray] | None:
@@ -207,9 +207,9 @@ class Density(LogDensity):
         return not self.problem.scale_known and self.likelihood != "none"
 
     @property
-    def decorrelation(self) -> Decorrelation | None:
+    def decorrelation(self) -> Decorrelation:
         """Coordinates in which ridges between linear elements and friction are straight."""
-        return decorrelation_of(self.quick)
+        return decorrelation_of(self.quick) or STRAIGHT
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return theta, (S, P), and s, (S,), which is 1 where it is known."""

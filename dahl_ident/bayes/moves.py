@@ -1,4 +1,4 @@
-"""Proposals for several independent ensembles, all evaluated in one call.
+r"""Proposals for several independent ensembles, all evaluated in one call.
 
 Each ensemble of walkers is split at random into halves; one half moves with the other as its guide,
 then they exchange roles (as in emcee, whose sampler runs these moves). A density that takes many
@@ -12,6 +12,19 @@ points at once costs least when the halves of all ensembles go into one call.
 - `independent`: to a draw from Student's t around the mean of the other half, shaped by its
   covariance; in few dimensions many draws are accepted, successive positions are nearly
   independent, and heavy tails are reached from the centre.
+
+Decorrelated coordinates, in which the posterior ridges of plants are straight.
+
+The data determine the sum of the stiffnesses of a spring and of friction in parallel. Where they do
+not determine f_max and sigma, the stiffness depends on these along a curve, which straight steps
+leave. The dependence of the linear parameters l on friction is estimated by weighted least squares
+of the describing function N(p), of any law with parameters p, on the columns of spring, damper and
+mass, at the amplitudes and with the weights of the data:
+
+    phi = l + W N(p),    W = (G' w^2 G)^-1 G' w^2.
+
+phi is the combination that the data determine. For given friction it is a shift of l, so volumes
+are preserved and the density over phi equals the density over l.
 """
 
 from __future__ import annotations
@@ -21,9 +34,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.decorrelation import Decorrelation
+from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.elements import Element
+from dahl_ident.problem import TableProblem
 
 Random = np.random.RandomState  # emcee's
 Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArray]]
@@ -35,6 +50,49 @@ _TAIL = 2.0  # degrees of freedom of the independent proposals: few, to reach fa
 _SNOOKER = 1.7  # mean of the factors of ter Braak and Vrugt (2008), as in emcee
 
 
+_FARTHEST = 1e300  # replaces a shift that is not finite; no prior reaches it
+
+
+@dataclass(frozen=True)
+class Decorrelation:
+    """The shift of the linear parameters; made by :func:`decorrelation_of`."""
+
+    problem: TableProblem | None  # whose theta, (S, P), come first in the points moved, (S, D)
+    friction: tuple[Element, ...]  # the nonlinear elements with free parameters
+    linear: NDArray[np.intp]  # (L,) coordinates in which the force of linear elements is linear
+    projection: FloatArray  # (2 n, L) from Re N and Im N at every row to the shift
+
+    def decorrelated(self, x: FloatArray) -> FloatArray:
+        """Return points with phi instead of l."""
+        return self._moved(x, 1.0)
+
+    def original(self, x: FloatArray) -> FloatArray:
+        """Return points with l instead of phi."""
+        return self._moved(x, -1.0)
+
+    def _moved(self, x: FloatArray, sign: float) -> FloatArray:
+        if self.problem is None:
+            return x
+        names, view, moved = self.problem.names, self.problem.stiffness_data, x.copy()
+        by_name = dict(zip(names, self.problem.to_values(x[:, : len(names)]).T, strict=True))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
+            N = sum(
+                view.of(
+                    e,
+                    [by_name.get(p.name, np.asarray(p.value)) for p in e.parameters],
+                    at_nodes=True,
+                )
+                for e in self.friction
+            )
+            shift = _parts(np.asarray(N)) @ self.projection
+        moved[:, self.linear] += sign * np.where(np.isfinite(shift), shift, _FARTHEST)
+        return moved
+
+
+STRAIGHT = Decorrelation(None, (), np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+"""Leaves all coordinates as they are."""
+
+
 @dataclass(frozen=True)
 class EnsembleMove:
     """One kind of proposal, applied to every ensemble by itself; a move of emcee's sampler.
@@ -44,7 +102,7 @@ class EnsembleMove:
 
     proposal: Proposal
     ensembles: int
-    decorrelation: Decorrelation | None = None
+    decorrelation: Decorrelation = STRAIGHT
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Any]:
         """Return the state after one proposal to every walker, and which were accepted."""
@@ -54,18 +112,12 @@ class EnsembleMove:
         order = random.uniform(size=(self.ensembles, each)).argsort(axis=1)
         order += each * np.arange(self.ensembles)[:, None]
         accepted = np.zeros(walkers, dtype=bool)
-        straight = (
-            state.coords
-            if self.decorrelation is None
-            else self.decorrelation.decorrelated(state.coords)
-        )
+        straight = self.decorrelation.decorrelated(state.coords)
         halves = (order[:, : each // 2], order[:, each // 2 :])
         for half, guide in (halves, halves[::-1]):
             proposed, factor = self.proposal(straight[half], straight[guide], random)
             who, proposed = half.ravel(), proposed.reshape(-1, dims)
-            places = (
-                proposed if self.decorrelation is None else self.decorrelation.original(proposed)
-            )
+            places = self.decorrelation.original(proposed)
             log_density, _ = model.compute_log_prob_fn(places)
             gain = factor.ravel() + log_density - state.log_prob[who]
             moves = gain > np.log(random.uniform(size=who.size))
@@ -77,15 +129,10 @@ class EnsembleMove:
         return state, accepted
 
 
-def moves_for(
-    ensembles: int, decorrelation: Decorrelation | None
-) -> list[tuple[EnsembleMove, float]]:
+def moves_for(ensembles: int, decorrelation: Decorrelation) -> list[tuple[EnsembleMove, float]]:
     """Return the moves and how often each is taken."""
-    return [
-        (EnsembleMove(independent, ensembles, decorrelation), 0.5),
-        (EnsembleMove(differential_evolution, ensembles, decorrelation), 0.4),
-        (EnsembleMove(snooker, ensembles, decorrelation), 0.1),
-    ]
+    shares = {independent: 0.5, differential_evolution: 0.4, snooker: 0.1}
+    return [(EnsembleMove(move, ensembles, decorrelation), p) for move, p in shares.items()]
 
 
 def differential_evolution(
@@ -149,3 +196,31 @@ def _partners(half: FloatArray, guide: FloatArray, random: Random, count: int) -
         chosen.append(index)
     rows = np.arange(ensembles)[:, None]
     return [guide[rows, index] for index in chosen]
+
+
+def decorrelation_of(problem: TableProblem) -> Decorrelation | None:
+    """Return the coordinates of a problem; None where friction or a linear element is not free."""
+    view = problem.stiffness_data
+    free = set(problem.names)
+    elements = [e for e in problem.model.elements if any(p.name in free for p in e.parameters)]
+    friction = tuple(e for e in elements if not e.is_linear)
+    linear = [
+        (e, p.name)
+        for e in elements
+        if e.is_linear and len(e.parameters) == 1
+        for p in e.parameters
+        if e.label(p) in e.linear_parameters
+    ]
+    if not friction or not linear:
+        return None
+    weights = np.repeat(view.weights, 2)
+    columns = np.stack([_parts(view.of(e, [np.ones(())])) for e, _ in linear], axis=-1)
+    weighted = columns * weights[:, None]
+    size = np.sqrt((weighted**2).sum(axis=0))
+    projection = np.linalg.pinv(weighted / size) * weights / size[:, None]
+    at = [problem.names.index(name) for _, name in linear]
+    return Decorrelation(problem, friction, np.array(at), projection.T)
+
+
+def _parts(values: ComplexArray) -> FloatArray:
+    return np.ascontiguousarray(values).view(np.float64)

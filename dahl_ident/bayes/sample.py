@@ -26,8 +26,8 @@ from dahl_ident.bayes.importance import (
     WeightedPoints,
     in_blocks,
     integrate,
+    interpolated,
 )
-from dahl_ident.bayes.interpolation import interpolated
 from dahl_ident.errors import SamplingError, ValidationError, argument
 
 _MOST_AXES = 3  # the number of points is a power of the number of axes

@@ -258,9 +258,9 @@ class Exchange:
             chosen = chosen if np.isfinite(value) else []
         improves = True
         while improves:
-            too_few = len(chosen) < fewest
+            added = self._promising(chosen, time) if len(chosen) < _MOST_LEVELS else []
             for trials, least in (
-                (self._additions(chosen, time), -np.inf if too_few else value),
+                (([*chosen, k] for k in added), -np.inf if len(chosen) < fewest else value),
                 (self._exchanges(chosen, time), value),
             ):
                 tried = list(trials)
@@ -271,19 +271,12 @@ class Exchange:
                     break
         return self.whole(chosen, time) if chosen else None
 
-    def _additions(self, chosen: list[int], time: float) -> Iterator[list[int]]:
-        if len(chosen) < _MOST_LEVELS:
-            for k in self._promising(chosen, time):
-                yield [*chosen, k]
-
     def _exchanges(self, chosen: list[int], time: float) -> Iterator[list[int]]:
         for k in chosen:
             others = [j for j in chosen if j != k]
             if len(others) >= self._coverage.fewest:
                 yield others
-            for j in self._promising(others, time):
-                if j != k:
-                    yield [*others, j]
+            yield from ([*others, j] for j in self._promising(others, time) if j != k)
 
     def _share(
         self, levels: NDArray[np.intp], time: float, iterations: int

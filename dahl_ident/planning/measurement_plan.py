@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -215,14 +216,8 @@ class Plan:
                 measured[(time >= window.start) & (time < window.stop)] = True
                 step[time >= window.stop] = min(i + 1, len(wave.windows))
         what = "drive" if self.controlled == "force" else "displacement"
-        frame = pd.DataFrame(
-            {
-                "time [s]": time,
-                f"{what} [{self._unit}]": value,
-                "step": step,
-                "measured": measured.astype(int),
-            }
-        )
+        columns = {"time [s]": time, f"{what} [{self._unit}]": value, "step": step}
+        frame = pd.DataFrame(columns | {"measured": measured.astype(int)})
         place = place_of(path, "a waveform", (".csv",))
         write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
         return place
@@ -258,10 +253,8 @@ class Plan:
         Path
         """
         place = place_of(path, "a plan", (".json",))
-        text = json.dumps(
-            plain_data(self.to_dict(), not_finite=lambda _: None), indent=2, allow_nan=False
-        )
-        write_whole(place, text.encode(), overwrite=overwrite)
+        plain = plain_data(self.to_dict(), not_finite=lambda _: None)
+        write_whole(place, json.dumps(plain, indent=2).encode(), overwrite=overwrite)
         return place
 
     def curves(self) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
@@ -271,18 +264,17 @@ class Plan:
         levels with equal cycles; NaN where the time is too short. At the plan's own time, its
         uncertainties are those of the plan.
         """
-        times = self.seconds * np.array(_CURVE)
-        planned = [
-            self.expected if time == self.seconds else self.search.expected_after(time)
-            for time in times.tolist()
-        ]
-        even = [self.search.expected_after(time, grid=True) for time in times.tolist()]
+        times, search = self.seconds * np.array(_CURVE), self.search
+        both: tuple[list[Mapping[str, Expected]], ...] = (
+            [self.expected if t == self.seconds else search.expected_after(t) for t in times],
+            [search.expected_after(t, grid=True) for t in times],
+        )
 
-        def after(by_time: Sequence[Mapping[str, Expected]], name: str) -> FloatArray:
-            return np.array([e[name].after if e else np.nan for e in by_time])
+        def after(name: str) -> tuple[FloatArray, FloatArray]:
+            planned, even = ([e[name].after if e else np.nan for e in each] for each in both)
+            return np.array(planned), np.array(even)
 
-        names = list(self.target or self.expected)
-        return {name: (times, after(planned, name), after(even, name)) for name in names}
+        return {name: (times, *after(name)) for name in self.target or self.expected}
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the predicted uncertainty against bench time, next to that of a logarithmic grid.
@@ -322,14 +314,18 @@ class Plan:
             )
             for name, e in self.expected.items()
         ]
-        lines += ["", *_aligned([("", "value", "before", "after", "wanted"), *rows], 24, [11] * 4)]
-        expanded = any(name.startswith("U(") for name in self.expected)
-        kinds = "; U(...) expanded, 95.45 %." if expanded else "."
-        lines += [f"Relative standard uncertainties{kinds}"]
-        lines += [f"{text}." for text in self.undetermined]
-        lines += self._spare()
-        lines.append(f"Assumed: {'; '.join(self.assumptions)}.")
-        return "\n".join(lines)
+        expanded = any(map(is_expanded, self.expected))
+        return "\n".join(
+            [
+                *lines,
+                "",
+                *_aligned([("", "value", "before", "after", "wanted"), *rows], 24, [11] * 4),
+                "Relative standard uncertainties" + "; U(...) expanded, 95.45 %" * expanded + ".",
+                *(f"{text}." for text in self.undetermined),
+                *self._spare(),
+                f"Assumed: {'; '.join(self.assumptions)}.",
+            ]
+        )
 
     def _spare(self) -> list[str]:
         """Return what the time that is left would buy, and what to use it for."""
@@ -441,15 +437,15 @@ def _prevented_by(search: Search, name: str) -> str:
         return "give more time or wider limits"
     base = _within_reach(q, name, q.limits)
     for limit in q.limits.stated:
-        try:
-            most[limit] = _within_reach(q, name, q.limits.relaxed(limit, _RELAXED))
-        except ValidationError:
-            continue
+        low, high = getattr(q.limits, limit)
+        wider: dict[str, Any] = {limit: (low / _RELAXED, high * _RELAXED)}
+        with suppress(ValidationError):
+            most[limit] = _within_reach(q, name, replace(q.limits, **wider))
     if np.isfinite(q.limits.time):
         most["time"] = base / np.sqrt(_RELAXED)
     if not most:
         return "no limit was stated that prevents it"
-    helps = min(most, key=lambda limit: most[limit])
+    helps = min(most, key=most.__getitem__)
     if not most[helps] < 0.8 * base:
         if search.forecast.model_error == "estimated":
             return "no limit alone prevents it: use a model that describes the data better"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -65,12 +65,6 @@ class BenchLimits:
                 )
             checked[name] = tuple(pair)
         return cls(**checked)
-
-    def relaxed(self, name: str, factor: float) -> BenchLimits:
-        """Return the limits with one of them `factor` times wider at both ends."""
-        low, high = getattr(self, name)
-        changed: dict[str, Any] = {name: (low / factor, high * factor)}
-        return replace(self, **changed)
 
     @property
     def stated(self) -> tuple[str, ...]:
@@ -238,8 +232,9 @@ def least_factor(name: str) -> float:
 
 def powers_of(expression: str, names: tuple[str, ...]) -> FloatArray:
     """Return the power of each parameter in a product such as ``sigma^2/f_max``."""
-    expanded = _EXPANDED.fullmatch(expression.replace(" ", ""))
-    product = (expanded["quantity"] if expanded else expression).replace(" ", "")
+    text = expression.replace(" ", "")
+    expanded = _EXPANDED.fullmatch(text)
+    product = expanded["quantity"] if expanded else text
     powers = np.zeros(len(names))
     for place, part in enumerate(product.split("/")):
         for factor in part.split("*"):

@@ -105,7 +105,7 @@ class Search:
             start = design.levels.tolist()
         return best
 
-    def _objective(self, weight: float = 0.0, runs: int = 1) -> Objective:
+    def _objective(self, weight: float, runs: int = 1) -> Objective:
         weighted = zip(self._terms, (1.0 - weight, weight), strict=False)
         return Objective(tuple(replace(term, weight=w) for term, w in weighted if w > 0.0), runs)
 
@@ -141,9 +141,9 @@ class Search:
             reachable = alone + LEAST_CYCLES / f <= time
             rate = f * usual / (usual + alone) * reachable + 1e-12
             objective = self._objective(0.5 if self._suspects else 0.0)
-            seconds = continuous_design(
+            seconds, _, _ = continuous_design(
                 objective, rate, usual, tolerance=0.05, iterations=200
-            ).seconds
+            )
             best = np.argsort(-seconds, kind="stable")[: _POOL // 2]
             even = np.argsort(self.bench.force, kind="stable")[spread(K, _POOL // 2)]
             self._pool = np.unique(np.concatenate([best[seconds[best] > 0.0], even]))

@@ -32,6 +32,7 @@ from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting import Optimum
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_checks import (
+    PredictiveBand,
     PredictiveCheck,
     PriorInfluence,
     findings_of,
@@ -39,7 +40,6 @@ from dahl_ident.results.posterior_checks import (
     prior_influences,
     to_arviz,
 )
-from dahl_ident.results.posterior_prediction import PredictiveBand
 from dahl_ident.results.result import Estimate, Parameters, Result, part
 from dahl_ident.units import Quantity
 

@@ -6,6 +6,13 @@ A channel stores, at its nominal sampling times t,
 
 where y is the true signal after a first-order anti-alias filter. Jitter is common to the
 channels, since one clock samples both; noise is not.
+
+Random numbers that depend only on a seed and a purpose.
+
+Every effect of the synthetic laboratory has its own stream, so that adding an effect does not
+change the others. The bits come from PCG64, and normal numbers from the inverse of their
+distribution: no draw is ever rejected, so platform differences in the last digit cannot shift a
+stream.
 """
 
 from __future__ import annotations
@@ -14,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import ndtri
 
 from dahl_ident.arrays import (
     ComplexArray,
@@ -27,7 +35,6 @@ from dahl_ident.data.columns import one_of, set_checked
 from dahl_ident.errors import ValidationError
 from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.synthetic.mechanism import Signal
-from dahl_ident.synthetic.randomness import Draws
 
 _FILTER_OVERSAMPLING = 16  # points a sample: the signal is taken as linear between
 _WAVEFORM_FAULTS = (
@@ -273,3 +280,41 @@ class Table:
         """Return the rows that get a gross error, rising."""
         count = round(self.outlier_fraction * rows)
         return sorted(draws.permutation("outlier rows", rows)[:count])
+
+
+class Draws:
+    """The random streams of one seed, a whole number >= 0, each identified by its purpose."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+
+    def uniform(self, purpose: str, n: int) -> FloatArray:
+        """Return `n` numbers between 0 and 1, both excluded."""
+        key = np.random.SeedSequence(self._seed, spawn_key=tuple(purpose.encode()))
+        bits = np.random.PCG64(key).random_raw(n)
+        return np.asarray(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+
+    def normal(self, purpose: str, n: int) -> FloatArray:
+        """Return `n` standard normal numbers."""
+        return np.asarray(ndtri(self.uniform(purpose, n)))
+
+    def complex_normal(self, purpose: str, n: int) -> ComplexArray:
+        """Return `n` complex numbers of standard normal parts."""
+        parts = (self.normal(f"{purpose}, {part}", n) for part in ("real", "imaginary"))
+        return np.asarray(next(parts) + 1j * next(parts))
+
+    def flicker(self, purpose: str, n: int) -> FloatArray:
+        """Return `n` numbers of 1/f noise: power falling as 1/f, mean 0, expected variance 1."""
+        spectrum = np.fft.rfft(self.normal(purpose, n))
+        weight = np.zeros(spectrum.size)
+        weight[1:] = np.arange(1, spectrum.size) ** -0.5
+        lines = np.full(spectrum.size, 2.0)
+        if n % 2 == 0:
+            lines[-1] = 1.0
+        # white noise has a power of n in each line; the inverse transform divides by n
+        scale = np.sqrt(n / np.sum(lines * weight**2))
+        return np.asarray(scale * np.fft.irfft(spectrum * weight, n))
+
+    def permutation(self, purpose: str, n: int) -> list[int]:
+        """Return the whole numbers below `n` in random order."""
+        return [int(i) for i in np.argsort(self.uniform(purpose, n), kind="stable")]

@@ -12,11 +12,10 @@ from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.steady_state import response
-from dahl_ident.synthetic.acquisition import Table
+from dahl_ident.synthetic.acquisition import Draws, Table
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment
 from dahl_ident.synthetic.mechanism import Mechanism, Progress, Signal
-from dahl_ident.synthetic.randomness import Draws
 
 GENERATOR = "dahl_ident.synthetic 3"
 """Raised whenever the same experiment and seed would give other values."""
