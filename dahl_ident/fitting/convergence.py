@@ -66,11 +66,6 @@ class Ends:
             if new in other.limits:
                 self.limits[old] = other.limits[new]
 
-    def put_one(self, table: int, minimum: Minima) -> None:
-        """Let one table end at a finite minimum."""
-        self.minima.assign(np.array([table]), minimum)
-        self._inverse = None
-
     def at_limit(self, table: int, limit: Limit, there: Minima) -> None:
         """Let one table end at a limit, whose searches of all tables are given."""
         which = np.array([table])

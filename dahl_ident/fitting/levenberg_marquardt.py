@@ -8,20 +8,25 @@ does not fall. All problems take their steps together; those that have ended dro
 A problem has converged where the step after the next, as the steps shrink, would move the
 residuals by less than 1e-8 of their standard deviation, or by no more than what rounding, or the
 accuracy of predictions, leaves of the data; it ends with the next step, which needs no evaluation
-of its own.
+of its own. `scipy.optimize.least_squares` is the other method, on the same residuals and Jacobian.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.problem import EXPLICIT, Quadratic
+from dahl_ident.fitting.losses import Loss
+from dahl_ident.noise import bend
+from dahl_ident.problem import EXPLICIT, Problem, Quadratic
+
+if TYPE_CHECKING:
+    from dahl_ident.fitting.asymptotes import Chart
 
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
@@ -45,6 +50,8 @@ _NEAR = 0.01  # of the way between bounds: a last step of theirs
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
 _OF_ACCURACY = 0.3  # the same, where predictions are less accurate: of that accuracy
 _OVERTIME = 2.0  # times the steps of another search that has converged, and lower
+_OF_COST, _OF_STEP, _OF_SLOPE = 1e-13, 1e-10, 1e-14  # relative changes that end scipy's searches
+_EVALUATIONS = 300  # a limit for searches that do not end
 NEARLY = 1e-4  # relative difference of costs that are nearly alike
 
 
@@ -280,3 +287,56 @@ def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: f
     lever = np.where(logarithmic, 1.0, at.theta)
     signal = (at.hessian[:, range(P), range(P)] * lever**2).max(axis=1)
     return np.asarray(np.maximum(_NOISE_TOLERANCE**2 * noise, accuracy**2 * signal))
+
+
+def minimise_by_scipy(
+    problem: Problem,
+    start: FloatArray,
+    scale: float,
+    loss: Loss | None,
+    chart: Chart | None = None,
+) -> Minima:
+    """Return the minimum of one table's cost between its bounds, from one start, shape (P,).
+
+    The trust-region reflective algorithm. In a `chart`, from phi and without bounds.
+    """
+    from scipy import optimize
+
+    last: dict[bytes, FloatArray] = {}  # scipy asks for residuals, and then for their Jacobian
+
+    def rows(phi: FloatArray) -> FloatArray:
+        key = phi.tobytes()
+        if key not in last:
+            last.clear()
+            last[key] = evaluated(phi)
+        return last[key]
+
+    def evaluated(phi: FloatArray) -> FloatArray:
+        theta, m = phi if chart is None else chart.theta(phi), problem.n_residuals
+        values = problem.to_values(theta)
+        if not np.isfinite(values).all() or (values[problem.space.positive] == 0.0).any():
+            return np.full((1 + phi.size, m + problem.n_priors), np.nan)
+        at = problem.rows(theta, scale, tails=loss is None)
+        if loss is not None:
+            at = bend(at, m, loss, problem.parts)
+        if chart is not None:
+            at = np.concatenate([at[:1], chart.derivative(theta).T @ at[1:]])
+        if not np.isfinite(at).all():
+            at[0] = np.nan  # a step that scipy takes back
+        return at
+
+    bounds = problem.bounds() if chart is None else (-np.inf, np.inf)
+    phi, converged, nfev = start, False, 1
+    if np.isfinite(rows(start)[0]).all():
+        with np.errstate(all="ignore"):
+            end = optimize.least_squares(
+                lambda phi: rows(phi)[0], start, lambda phi: rows(phi)[1:].T, bounds=bounds,
+                x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
+            )  # fmt: skip
+        phi, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
+    theta = phi if chart is None else chart.theta(phi)
+    slopes = None if chart is None else chart.derivative(theta)
+    there = problem.quadratic(theta, scale, loss, slopes)
+    cost = float(there.cost) if nfev > 1 or converged else np.inf
+    counts = np.array([converged]), np.array([nfev])
+    return Minima(phi[None], np.array([cost]), there.hessian[None], *counts)

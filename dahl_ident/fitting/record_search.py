@@ -10,11 +10,10 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError, FitInterrupted, argument
 from dahl_ident.fitting.convergence import Ends, optima
-from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
+from dahl_ident.fitting.levenberg_marquardt import Minima, minimise, minimise_by_scipy
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, agreed_scale
 from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
-from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem

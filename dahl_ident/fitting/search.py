@@ -40,12 +40,12 @@ from dahl_ident.fitting.levenberg_marquardt import (
     IntArray,
     Minima,
     minimise,
+    minimise_by_scipy,
 )
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
 from dahl_ident.fitting.record_search import Tell, solve_records, solve_repetitions
 from dahl_ident.fitting.record_start import record_starts
-from dahl_ident.fitting.scipy_least_squares import minimise_by_scipy
 from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
 
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
@@ -294,7 +294,8 @@ class TableSearch:
             ends.put(where, part._look_wider(ends.take(where), begin.of(where), scale))
         for table in np.flatnonzero(self._strayed | ~ends.minima.converged).tolist():
             if table not in ends.limits:
-                ends.put_one(table, self._trust_region(table, ends, begin, scale))
+                end = self._trust_region(table, ends, begin, scale)
+                ends.put(np.array([table]), Ends(end))
         return ends
 
     def _of(self, tables: IntArray) -> TableSearch:
