@@ -36,7 +36,7 @@ def test_parameters_are_recovered_within_their_uncertainties():
         fit = di.fit(measured(seed), MODEL)
         for name, value in TRUTH.items():
             found = fit.params[name]
-            inside[name] += abs(found.value - value) < 1.96 * (found.stderr or 0.0)
+            inside[name] += abs(found.value - value) < 1.96 * found.stderr
     assert fit.trusted, fit.verdict
     assert min(inside.values()) >= binom.ppf(1e-4, runs, 0.95), inside
 

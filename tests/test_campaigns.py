@@ -675,7 +675,6 @@ def test_cells_that_spreadsheets_run_are_inert(tmp_path):
         -3,
     )
     data = di.load_dataset("noisy")
-    assert isinstance(data, di.FrequencyResponse)
     labels = np.array(["=1", "'=1", "-3 dB", "-3", *["d"] * (len(data.response) - 4)])
     named = di.FrequencyResponse(data.frequency_hz, data.response, data.amplitude, level=labels)
     named.save(tmp_path / "table.csv")

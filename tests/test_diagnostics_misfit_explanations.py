@@ -24,9 +24,7 @@ def scaled(data, rows, factors):
 
 
 def noisy():
-    data = load_dataset("noisy")
-    assert isinstance(data, FrequencyResponse)
-    return data
+    return load_dataset("noisy")
 
 
 def test_a_sign_is_named_where_there_is_no_finite_optimum():
@@ -38,7 +36,6 @@ def test_a_sign_is_named_where_there_is_no_finite_optimum():
 class TestRows:
     def test_lead_the_verdict_where_they_alone_are_the_cause(self):
         data = load_dataset("outliers")
-        assert isinstance(data, FrequencyResponse)
         found = fit(data, Dahl())
         kept = ~np.isin(np.arange(30), [18, 19, 27])  # as the data set was made
         alone = fit(data.select(rows=kept), Dahl()).goodness.rms_misfit

@@ -22,7 +22,7 @@ def test_a_negative_damper_is_said_with_what_to_do():
     fit = di.fit(table(device), di.Dahl() + di.Damper(), throw=False)
     assert not fit.trusted
     damping = fit.params["damping"]
-    assert abs(damping.value + 0.1) < 3.0 * (damping.stderr or 0.0)
+    assert abs(damping.value + 0.1) < 3.0 * damping.stderr
     assert f"damping is negative ({damping.value:.4f}" in fit.verdict
     assert "leave the damper out" in fit.verdict
     sound = di.fit(table(di.Dahl(0.1, 30.0) + di.Damper(0.1), 1), di.Dahl() + di.Damper())

@@ -48,7 +48,7 @@ def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards):
     fit = di.fit(data, unknown + known + di.Damper())
     assert fit.status.usable
     for name, truth in (("gap", 0.02), ("damping", 0.12)):
-        assert abs(fit.params[name].value - truth) < 3.0 * (fit.params[name].stderr or 0.0)
+        assert abs(fit.params[name].value - truth) < 3.0 * fit.params[name].stderr
     (jump,) = (finding for finding in fit.findings if finding.code == "jump")
     ((drive, low, high),) = jump.values["places"]
     assert (drive, 0.8 < low < 1.0, 1.3 < high <= 1.5) == (0.06, True, True)

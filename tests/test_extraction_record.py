@@ -1,6 +1,7 @@
 import re
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks.extraction_validation import accuracy, one_over_f, steady, white
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data import FrequencyResponse, Record
+from dahl_ident.data import Record
 from dahl_ident.elements import Dahl, Damper, Mass
 from dahl_ident.errors import DahlIdentError, ExtractionError, ValidationError
 from dahl_ident.extraction import extract
@@ -283,11 +284,9 @@ def test_harmonics_of_a_displacement_under_a_held_force_are_rows_of_receptance()
     plant = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24)
     steps = SteppedSine((0.08, 0.4), controlled="force", settling_periods=30, num_periods=20)
     noisy = Acquisition(200.0, Channel(noise_std=2e-6), Channel(noise_std=2e-5))
-    record = simulate(Experiment(plant, steps, noisy), seed=2)
-    assert isinstance(record, Record)
+    record: Any = simulate(Experiment(plant, steps, noisy), seed=2)
     data = extract(record, controlled="force", harmonics=(1, 3, 5))
     exact = simulate(Experiment(plant, steps, table=Table(harmonics=(1, 3, 5))), seed=2)
-    assert isinstance(exact, FrequencyResponse)
     assert (data.quantity, set(data.quality["verdict"])) == ("receptance", {"good"})
     assert data.harmonic.tolist() == exact.harmonic.tolist() == [1, 3, 5] * 2
     off = data.response - exact.response

@@ -1,5 +1,7 @@
 """Ends of segments: cycles that depart go, by amplitude or phase; those of a level stay."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -62,8 +64,7 @@ def test_a_level_that_drifts_slowly_is_kept_whole():
 
 def test_levels_of_a_plant_end_where_they_were_held():
     """Each is held for 30 periods; a ramp's first cycle and a half may hide in the noise."""
-    record = di.load_dataset("plant_recording")
-    assert isinstance(record, Record)
+    record: Any = di.load_dataset("plant_recording")
     data = extract(record, controlled="force")
     windows = np.array(record.provenance["windows"])
     loud = windows[:, 0] >= 0.5

@@ -146,9 +146,7 @@ class TestPlan:
         for name in TRUTH:
             own = chain.params[name]
             # 60 steps of 32 walkers: the standard deviation itself is known to some percent
-            assert after.expected[name].before == pytest.approx(
-                float(own.stderr or 0.0) / own.value, rel=0.1
-            )
+            assert after.expected[name].before == pytest.approx(own.stderr / own.value, rel=0.1)
             assert after.expected[name].value == pytest.approx(own.value, rel=1e-12)
             assert after.expected[name].after < after.expected[name].before
         with pytest.raises(ValidationError, match="ranges are given with a fit of records"):
@@ -158,7 +156,7 @@ class TestPlan:
         plan = di.plan(fit, limits=BENCH, target=target, candidates="trapezoid", sample_rate=RATE)
         told = plan.expected["f_max"]
         assert told.before == pytest.approx(
-            float(fit.params["f_max"].stderr or 0.0) / fit.params["f_max"].value, rel=0.05
+            fit.params["f_max"].stderr / fit.params["f_max"].value, rel=0.05
         )
         assert told.value == pytest.approx(fit.params["f_max"].value, rel=1e-12)
         assert told.after <= 0.003

@@ -203,7 +203,6 @@ def test_a_bolted_ridge_keeps_its_time():
 def test_friction_that_may_be_none_at_either_end():
     # sigma alone shows; with a free spring friction may as well be none
     data = di.load_dataset("microslip")
-    assert isinstance(data, di.FrequencyResponse)
     grid = di.posterior(data, di.Dahl() + di.Spring(), method="grid", uncertainty="noise")
     assert grid.converged
     # the product of Gauss's rule, 240 nodes in ln f_max and in ln sigma, with the trapezoidal rule

@@ -172,7 +172,7 @@ def test_noise_in_the_drive_does_not_pass_for_stiffness():
     for name, value in truth.items():
         found = fit.params[name]
         assert abs(found.value - value) < 4.0 * found.stderr, fit
-    assert (fit.params["stiffness"].stderr or 0.0) < 0.6
+    assert fit.params["stiffness"].stderr < 0.6
     assert fit.budget()["mass"].rows[0].source == "noise"
     assert {"noise", "noise in the drive"} <= {r.source for r in fit.budget()["mass"].rows}
 
@@ -483,6 +483,6 @@ def test_results_of_records_are_copied_and_pickled():
         ):
             for name, p in copied.params.items():
                 assert p.value == expected[name].value
-                assert (p.stderr or 0.0) == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)
+                assert p.stderr == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)
             assert copied.statements == result.statements
             assert str(copied.budget()) == str(result.budget())

@@ -63,8 +63,8 @@ def assert_recovered(fit, truth):
         found = fit.params[parameter.name]
         if found.vary:
             value = float(parameter.value or 0.0)
-            assert abs(found.value - value) < 4.5 * float(found.stderr or 0.0), found
-            assert float(found.stderr or 0.0) < 0.3 * abs(value), found
+            assert abs(found.value - value) < 4.5 * found.stderr, found
+            assert found.stderr < 0.3 * abs(value), found
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_trapezoids_that_are_hard_to_search(truth, model, noise):
         found = fit.params[parameter.name]
         if found.vary:
             error = abs(found.value - float(parameter.value or 0.0))
-            assert error < 4.5 * float(found.stderr or 0.0), found
+            assert error < 4.5 * found.stderr, found
 
 
 def damped_record(damper):

@@ -51,8 +51,8 @@ def test_a_posterior_counts_noise_alone_or_the_stated_calibration():
         )
         for kind in ("combined", "noise")
     }
-    u = {kind: float(one.params["f_max"].stderr or 0.0) for kind, one in both.items()}
-    assert u["combined"] == pytest.approx(float(fit.params["f_max"].stderr or 0.0), rel=0.1)
+    u = {kind: one.params["f_max"].stderr for kind, one in both.items()}
+    assert u["combined"] == pytest.approx(fit.params["f_max"].stderr, rel=0.1)
     assert u["combined"] == pytest.approx(0.05 * 0.1, rel=0.1)
     assert u["noise"] == pytest.approx(fit.stderr_noise["f_max"], rel=0.1)
     assert "Noise alone is counted" in both["noise"].verdict
@@ -61,11 +61,11 @@ def test_a_posterior_counts_noise_alone_or_the_stated_calibration():
 def test_priors_and_prediction():
     fit = di.fit(recorded(DAHL, "random", 300, 1e-3), di.Dahl())
     sigma = fit.params["sigma"]
-    at = float(sigma.value) + 3.0 * float(sigma.stderr or 0.0)
+    at = float(sigma.value) + 3.0 * sigma.stderr
     narrow = di.posterior(
         fit, priors={"sigma": norm(at, sigma.stderr or 0.0)}, seed=2, steps=100, walkers=64
     )
-    shift = (narrow.params["sigma"].value - sigma.value) / float(sigma.stderr or 0.0)
+    shift = (narrow.params["sigma"].value - sigma.value) / sigma.stderr
     assert shift == pytest.approx(1.5, abs=0.15)  # half way: prior and data weigh the same
     other = recorded(DAHL, "multisine", 300, 1e-3)
     ours, theirs = narrow.predict(other, size=20), fit.predict(other)
@@ -130,6 +130,6 @@ def test_importance_points_of_a_plant_take_few_motions():
     assert grid.evaluations < 1000
     for name in grid.names:
         parameter, low, high = fit.params[name], *grid.quantile(name, np.array([0.16, 0.84]))
-        half = t(fit.errors.dof).ppf(0.84) * float(parameter.stderr or 0.0)
+        half = t(fit.errors.dof).ppf(0.84) * parameter.stderr
         assert 0.5 * float(high - low) == pytest.approx(half, rel=0.03)
         assert 0.5 * float(high + low) == pytest.approx(parameter.value, abs=0.2 * half)

@@ -1,6 +1,7 @@
 """Sweeps and stepped sines of a driven plant as waveforms: fitted at once, levels as one run."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,7 @@ SENSORS = Acquisition(32.0, displacement=Channel(noise_std=1e-4), force=Channel(
 
 
 def sweep(level, seed):
-    data = di.simulate(Experiment(PLANT, FrequencySweep(level, 0.4, 5.0, 60.0), SENSORS), seed=seed)
-    assert isinstance(data, di.Record)
-    return data
+    return di.simulate(Experiment(PLANT, FrequencySweep(level, 0.4, 5.0, 60.0), SENSORS), seed=seed)
 
 
 def assert_true(fit):
@@ -33,8 +32,7 @@ def test_the_shipped_sweeps_are_fitted_as_waveforms():
 
 
 def test_a_sweep_says_how_far_its_points_are_from_settled():
-    data = di.load_dataset("sweep_plant")
-    assert isinstance(data, di.Record)
+    data: Any = di.load_dataset("sweep_plant")
     points = di.extract(data, controlled="force")
     assert np.mean(["swept too fast" in v for v in points.quality["verdict"]]) > 0.8
     settled = points.drive / di.response(PLANT, points.frequency_hz, points.drive).displacement
@@ -81,8 +79,7 @@ def test_a_table_of_stepped_sines_and_their_waveforms_agree():
         (0.08, 0.3, 1.0), (1.2, 2.0, 3.5), controlled="force", settling_periods=12,
         num_periods=12, ramp_periods=8.0,
     )  # fmt: skip
-    record = di.simulate(Experiment(PLANT, steps, SENSORS), seed=3)
-    assert isinstance(record, di.Record)
+    record: Any = di.simulate(Experiment(PLANT, steps, SENSORS), seed=3)
     points = di.extract(record, controlled="force")
     table = di.fit(points, MODEL)
     waves = di.fit(record, MODEL)

@@ -226,7 +226,6 @@ def test_a_prior_that_the_data_contradict_is_named():
 
 def test_a_free_delay_states_the_gain_that_it_assumes():
     data = load_dataset("delayed")
-    assert isinstance(data, FrequencyResponse)
     delayed = fit(data, Dahl(), sensors=Sensors(delay=None), throw=False)
     assert "force_gain = 1 exactly" in delayed.verdict
 
