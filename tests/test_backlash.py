@@ -6,17 +6,7 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident import (
-    Backlash,
-    Dahl,
-    Element,
-    FrequencyResponse,
-    Friction,
-    Model,
-    PowerDamper,
-    Spring,
-    fit,
-)
+from dahl_ident import fit
 from dahl_ident.elements import describe_model
 from dahl_ident.errors import ModelError
 from tests.test_generic_friction import Jenkins
@@ -27,8 +17,8 @@ AT_REST = np.zeros(())
 @pytest.mark.parametrize(
     ("law", "A", "first", "third"),
     [
-        (Backlash(Dahl(1.0, 3.0), 0.8), 2.0, 0.3901538 + 0.4032069j, 0.0288864 - 0.0183396j),
-        (Backlash(Dahl(1.0, 1.0), 0.6), 1.0, 0.5368324 + 0.1217627j, 0.0781530 + 0.0417040j),
+        (di.Backlash(di.Dahl(1.0, 3.0), 0.8), 2.0, 0.3901538 + 0.4032069j, 0.0288864 - 0.0183396j),
+        (di.Backlash(di.Dahl(1.0, 1.0), 0.6), 1.0, 0.5368324 + 0.1217627j, 0.0781530 + 0.0417040j),
     ],
 )
 def test_the_check_values(law, A, first, third):
@@ -38,15 +28,15 @@ def test_the_check_values(law, A, first, third):
 
 def test_a_closed_gap_is_none_and_a_wide_one_carries_no_force():
     A = np.geomspace(0.01, 10.0, 20)
-    tight = Backlash(Dahl(1.0, 3.0, 2.0), 1e-12).describing_function(A)
-    np.testing.assert_allclose(tight, Dahl(1.0, 3.0, 2.0).describing_function(A), rtol=1e-6)
-    wide = Backlash(Dahl(1.0, 3.0), 2.0)
+    tight = di.Backlash(di.Dahl(1.0, 3.0, 2.0), 1e-12).describing_function(A)
+    np.testing.assert_allclose(tight, di.Dahl(1.0, 3.0, 2.0).describing_function(A), rtol=1e-6)
+    wide = di.Backlash(di.Dahl(1.0, 3.0), 2.0)
     assert wide.describing_function([0.0, 0.5, 1.0]).tolist() == [0.0, 0.0, 0.0]
     assert wide.force([0.0, 0.9, -0.9, 0.9]).tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
 def test_the_force_steps_through_the_gap():
-    law = Backlash(Jenkins(2.0, 0.5), 0.4)
+    law = di.Backlash(Jenkins(2.0, 0.5), 0.4)
     x = [0.0, 0.2, 0.5, 1.0, 0.9, 0.5, 0.2, 0.1, 0.0, 0.1, 0.4]
     # contact at 0.2; slip at 1 N; zero force at 0.5; the gap is crossed to 0.1
     expected = [0.0, 0.0, 0.6, 1.0, 0.8, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0]
@@ -54,11 +44,15 @@ def test_the_force_steps_through_the_gap():
 
 
 def test_refusals():
-    wrong: list[Element] = [Spring(1.0), PowerDamper(1.0, 0.5), Backlash(Dahl(), 0.1)]
+    wrong: list[di.Element] = [
+        di.Spring(1.0),
+        di.PowerDamper(1.0, 0.5),
+        di.Backlash(di.Dahl(), 0.1),
+    ]
     for element in wrong:
         with pytest.raises(ModelError, match="Backlash got"):
-            Backlash(element, 0.1)
-    assert isinstance(Backlash(Dahl()).element, Friction)
+            di.Backlash(element, 0.1)
+    assert isinstance(di.Backlash(di.Dahl()).element, di.Friction)
 
 
 def test_two_limits_behind_a_gap_are_those_of_the_general_loop():
@@ -68,12 +62,12 @@ def test_two_limits_behind_a_gap_are_those_of_the_general_loop():
         f_max, sigma = 10.0 ** rng.uniform(-2.0, 2.0, 2)
         asymmetry, gap = rng.uniform(-0.7, 0.7), f_max / sigma * 10.0 ** rng.uniform(-2.0, 1.0)
         A = 0.5 * gap + f_max / sigma * 10.0 ** rng.uniform(-1.0, 1.2, 2)
-        law = Backlash(Dahl(f_max, sigma, asymmetry=asymmetry), gap)
-        free = Model(law).with_free(["f_max", "sigma", "asymmetry", "gap"])
+        law = di.Backlash(di.Dahl(f_max, sigma, asymmetry=asymmetry), gap)
+        free = di.Model(law).with_free(["f_max", "sigma", "asymmetry", "gap"])
         values, k = law.known_values(), i % 8
         found = free.stiffness_gradient(values, A, AT_REST, k)
         # an exponent of 1 to rounding has no closed form
-        other = Backlash(Dahl(f_max, sigma, 1.0 + 1e-12, asymmetry=asymmetry), gap)
+        other = di.Backlash(di.Dahl(f_max, sigma, 1.0 + 1e-12, asymmetry=asymmetry), gap)
         general = other.stiffness(other.known_values(), A, AT_REST, k)
         size = np.abs(law.stiffness(values, A, AT_REST))
         assert np.all(np.abs(found.value - general) < 1e-8 * size)
@@ -94,7 +88,7 @@ def test_two_limits_behind_a_gap_are_those_of_the_general_loop():
 def test_a_history_that_starts_in_contact_changes_with_the_gap(start):
     """The engine's derivative, for a law without a closed form."""
     x = 2.0 * np.sin(0.05 * np.arange(300.0))
-    law = Backlash(Dahl(1.0, 3.0, 1.5))
+    law = di.Backlash(di.Dahl(1.0, 3.0, 1.5))
     values = [1.0, 3.0, 1.5, 0.8]
     by_gap = law.force_history_gradient(values, x, state=start).by_parameter[-1]
     ends = [law.force_history([*values[:3], 0.8 + h], x, state=start) for h in (1e-4, -1e-4)]
@@ -109,8 +103,8 @@ def test_a_history_behind_a_gap_is_exact(asymmetry, start):
     """Against the tables that every law takes, and its derivatives against differences."""
     rng = np.random.default_rng(5)
     x = 0.3 * np.cumsum(rng.standard_normal(300)) + 2.0 * np.sin(0.05 * np.arange(300.0))
-    inner = Dahl(1.0, 3.0, asymmetry=asymmetry) if asymmetry else Dahl(1.0, 3.0)
-    law = Backlash(inner, 0.8)
+    inner = di.Dahl(1.0, 3.0, asymmetry=asymmetry) if asymmetry else di.Dahl(1.0, 3.0)
+    law = di.Backlash(inner, 0.8)
     values = [float(v) for v in law.known_values()]
     law = law.with_bound(tuple(p if p.name == "alpha" else p.freed() for p in law.parameters))
     found = law.force_history_gradient(values, x, state=start)
@@ -139,7 +133,7 @@ def test_the_element_behind_a_gap_is_written_on_the_command_line(run):
         assert f"has no value for {missing};" in run("simulate", "--element", text).err
     text = "backlash(dahl(f_max=2, sigma=3, asymmetry=0.1), 0.1)"
     told = json.loads(run("simulate", "--element", text, "--json").out)
-    expected = Backlash(Dahl(2.0, 3.0, asymmetry=0.1), 0.1)
+    expected = di.Backlash(di.Dahl(2.0, 3.0, asymmetry=0.1), 0.1)
     assert told["plant"] == describe_model(expected)
 
 
@@ -147,10 +141,10 @@ def test_amplitudes_within_the_gap_are_no_misfit():
     """Rows of noise alone, where nothing is crossed, do not hide that the others are met."""
     A = np.concatenate([np.geomspace(1e-4, 4e-4, 5), np.geomspace(6e-4, 5e-2, 20)])
     noise = np.random.default_rng(1).standard_normal((2, A.size))
-    law = Backlash(Dahl(0.1, 30.0), gap=1e-3)
+    law = di.Backlash(di.Dahl(0.1, 30.0), gap=1e-3)
     N = law.dynamic_stiffness(A) + 0.02 * (noise[0] + 1j * noise[1])
-    data = FrequencyResponse(np.ones(A.size), N, A, quantity="dynamic_stiffness")
-    found = fit(data, Backlash(Dahl(alpha=1.0)), noise="absolute")
+    data = di.FrequencyResponse(np.ones(A.size), N, A, quantity="dynamic_stiffness")
+    found = fit(data, di.Backlash(di.Dahl(alpha=1.0)), noise="absolute")
     assert found.status == "trusted"
     assert found.params["gap"].value == pytest.approx(1e-3, rel=2e-3)
     assert found.goodness.rms_misfit < 0.02

@@ -6,22 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+import dahl_ident as di
 from benchmarks.selection import choices
-from dahl_ident import (
-    Backlash,
-    BoucWen,
-    Dahl,
-    Damper,
-    FrequencyResponse,
-    LuGre,
-    Mass,
-    MaxwellSlip,
-    PowerDamper,
-    Record,
-    Spring,
-    compare_models,
-    fit,
-)
+from dahl_ident import compare_models, fit
 from dahl_ident.diagnostics.comparison import _candidates
 from dahl_ident.diagnostics.predictive_density import predictive_density
 from dahl_ident.errors import FitError
@@ -38,7 +25,7 @@ def test_tiny_covariances_of_harmonics_do_not_rule():
     data = table()
     third = FRICTION.dynamic_stiffness(data.amplitude, harmonic=3) * 1.05
     size = np.abs(data.response)
-    both = FrequencyResponse(
+    both = di.FrequencyResponse(
         np.ones(60),
         np.concatenate([data.response, third]),
         np.tile(data.amplitude, 2),
@@ -46,7 +33,7 @@ def test_tiny_covariances_of_harmonics_do_not_rule():
         covariance=np.concatenate([0.01 * size, 1e-5 * size])[:, None, None] ** 2 * np.eye(2),
     )
     plain, spring = compare_models(
-        fit(both, Dahl(), throw=False), {"spring": Dahl() + Spring()}
+        fit(both, di.Dahl(), throw=False), {"spring": di.Dahl() + di.Spring()}
     ).models
     assert plain.bic - spring.bic > 100.0
     assert spring.density.gain_over(plain.density)[0] < 10.0
@@ -54,7 +41,8 @@ def test_tiny_covariances_of_harmonics_do_not_rule():
 
 def test_what_means_the_same_whatever_the_law():
     found = compare_models(
-        fit(table(noise=1e-3), Dahl()), {"gap": Backlash(Dahl(), 1e-6), "spring": Spring()}
+        fit(table(noise=1e-3), di.Dahl()),
+        {"gap": di.Backlash(di.Dahl(), 1e-6), "spring": di.Spring()},
     )
     first, gap, spring = (model.meaning for model in found.models)
     assert first["force limit"] == pytest.approx(0.1, rel=0.01)
@@ -82,25 +70,25 @@ def test_lugre_is_tried_where_the_force_falls_with_the_frequency():
 
     def tried(law):
         N = law.dynamic_stiffness(A, 2.0 * np.pi * f)
-        data = FrequencyResponse(f, N * noise, A)
-        found = fit(data, Dahl(), throw=False).optimum
+        data = di.FrequencyResponse(f, N * noise, A)
+        found = fit(data, di.Dahl(), throw=False).optimum
         return [name for name, _ in _candidates(found, predictive_density(found))]
 
-    assert "LuGre" in tried(LuGre(1.0, 100.0, 1.8, 0.5))
-    assert "LuGre" not in tried(Dahl(1.0, 100.0))
-    assert "LuGre" not in tried(Dahl(1.0, 100.0) + Damper(0.5))
+    assert "LuGre" in tried(di.LuGre(1.0, 100.0, 1.8, 0.5))
+    assert "LuGre" not in tried(di.Dahl(1.0, 100.0))
+    assert "LuGre" not in tried(di.Dahl(1.0, 100.0) + di.Damper(0.5))
 
 
 def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl():
     A = np.geomspace(1e-3, 1.0, 12)
     rng = np.random.default_rng(4)
     noise = 1.0 + 0.01 * rng.standard_normal((12, 2)) @ [1.0, 1.0j]
-    law = LuGre(1.0, 100.0, 1.8, 0.5)
+    law = di.LuGre(1.0, 100.0, 1.8, 0.5)
 
     def sentences(frequency):
         N = law.dynamic_stiffness(A, 2.0 * np.pi * frequency) * noise
-        given = fit(FrequencyResponse(np.full(12, frequency), N, A), Dahl(), throw=False)
-        asked = LuGre(static_ratio=1.8, stribeck_speed=0.5)
+        given = fit(di.FrequencyResponse(np.full(12, frequency), N, A), di.Dahl(), throw=False)
+        asked = di.LuGre(static_ratio=1.8, stribeck_speed=0.5)
         (_, lugre) = compare_models(given, {"LuGre": asked}).models
         return lugre.resemblances
 
@@ -110,8 +98,8 @@ def test_lugre_says_where_sines_cannot_distinguish_it_from_dahl():
 
 
 def test_the_model_that_was_fitted_stands_with_what_it_states():
-    result = fit(table(noise=1e-3), Dahl() + Mass(0.01))
-    found = compare_models(result, {"spring": Dahl() + Spring()})
+    result = fit(table(noise=1e-3), di.Dahl() + di.Mass(0.01))
+    found = compare_models(result, {"spring": di.Dahl() + di.Spring()})
     f_max = result.params["f_max"]
     assert found.models[0].meaning["force limit"] == pytest.approx(f_max.value, rel=1e-12)
     assert [row[0] for row in found.meanings] == ["as fitted", "spring"]
@@ -124,7 +112,7 @@ def test_the_model_that_was_fitted_stands_with_what_it_states():
 def test_what_runs_away_is_not_determined():
     """Microslip: any limit of the force would do."""
     data = table(beta=(1e-4, 1e-3), noise=0.01)
-    found = compare_models(fit(data, Dahl(), throw=False), {"gap": Backlash(Dahl())})
+    found = compare_models(fit(data, di.Dahl(), throw=False), {"gap": di.Backlash(di.Dahl())})
     assert {row[1] for row in found.meanings} == {"not determined"}
     assert {row[5] for row in found.rows} == {"-"}
 
@@ -132,11 +120,11 @@ def test_what_runs_away_is_not_determined():
 def test_a_damper_is_told_from_another_loop_at_one_frequency():
     """Without a damper among the candidates, Bouc-Wen's law took its place."""
     A = np.geomspace(3e-4, 3e-2, 12)
-    truth = Dahl(0.1, 30.0, alpha=1.0) + PowerDamper(0.02, 0.5)
+    truth = di.Dahl(0.1, 30.0, alpha=1.0) + di.PowerDamper(0.02, 0.5)
     exact = truth.dynamic_stiffness(A, np.full(A.size, 2.0 * np.pi))
     noise = 0.01 * np.random.default_rng(0).standard_normal((2, A.size)).T @ [1.0, 1.0j]
-    data = FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
-    comparison = compare_models(fit(data, Dahl(alpha=1.0), throw=False))
+    data = di.FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
+    comparison = compare_models(fit(data, di.Dahl(alpha=1.0), throw=False))
     assert comparison.best.name == "power damper added"
     assert comparison.best.meaning["force limit"] == pytest.approx(0.1, rel=0.03)
     assert "of the fundamental, and how much of that is noise is not known" in comparison.headline
@@ -145,9 +133,9 @@ def test_a_damper_is_told_from_another_loop_at_one_frequency():
 def test_models_whose_parameters_are_open_are_not_recommended():
     """In gross slip one of two elements is as stiff as one likes, however well both predict."""
     A = np.geomspace(0.5, 5.0, 12)
-    exact = Dahl(0.1, 30.0, alpha=1.0).describing_function(A) * (1.0 + 0.05 * np.sin(9.0 * A))
-    data = FrequencyResponse(np.ones(A.size), exact, A)
-    comparison = compare_models(fit(data, Dahl(alpha=1.0), throw=False))
+    exact = di.Dahl(0.1, 30.0, alpha=1.0).describing_function(A) * (1.0 + 0.05 * np.sin(9.0 * A))
+    data = di.FrequencyResponse(np.ones(A.size), exact, A)
+    comparison = compare_models(fit(data, di.Dahl(alpha=1.0), throw=False))
     first, *others = comparison.models
     two = next(m for m in others if m.name == "two Dahl elements")
     better = replace(two.density, tests=two.density.tests + 10.0)
@@ -162,10 +150,10 @@ def test_models_whose_parameters_are_open_are_not_recommended():
 def test_two_jenkins_elements_are_maxwell_slip():
     """Not the law of a free exponent that leaves ten times as much."""
     A = np.geomspace(0.1, 10.0, 12) / 300.0
-    exact = MaxwellSlip([1e-3, 8e-3], [20.0, 10.0]).describing_function(A)
+    exact = di.MaxwellSlip([1e-3, 8e-3], [20.0, 10.0]).describing_function(A)
     noise = 0.01 * np.random.default_rng(0).standard_normal((2, A.size)).T @ [1.0, 1.0j]
     comparison = compare_models(
-        fit(FrequencyResponse(np.ones(12), exact * np.exp(noise), A), Dahl())
+        fit(di.FrequencyResponse(np.ones(12), exact * np.exp(noise), A), di.Dahl())
     )
     assert "Maxwell slip" in comparison.headline
     assert comparison.best.name in ("Maxwell slip", "as fitted")
@@ -191,9 +179,9 @@ def loop(x):
 def test_the_law_of_a_record_is_recognised():
     noise = 2e-4 * np.random.default_rng(0).standard_normal(T.size)
     force = loop(X) + noise
-    record = Record(T, displacement=X, force=force)
-    laws = {"Bouc-Wen": BoucWen(), "Maxwell slip": MaxwellSlip(3)}
-    comparison = compare_models(fit(record, Dahl(alpha=1.0), throw=False), laws)
+    record = di.Record(T, displacement=X, force=force)
+    laws = {"Bouc-Wen": di.BoucWen(), "Maxwell slip": di.MaxwellSlip(3)}
+    comparison = compare_models(fit(record, di.Dahl(alpha=1.0), throw=False), laws)
     first, true, slips = comparison.models
     assert comparison.best is true
     assert true.density.misfit == pytest.approx(2e-4 / np.std(force), rel=0.05)
@@ -213,7 +201,7 @@ def test_the_density_of_a_record_is_that_of_blocks_left_out():
     """A spring, an offset and a drift: linear regression, repeated without each block."""
     rng = np.random.default_rng(2)
     force = 3.0 * X + 1e-3 * rng.standard_normal(T.size)
-    found = predictive_density(fit(Record(T, displacement=X, force=force), Spring()).optimum)
+    found = predictive_density(fit(di.Record(T, displacement=X, force=force), di.Spring()).optimum)
     columns = np.column_stack([X, np.ones(T.size), T])
     y = force / np.std(force)
     left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
@@ -231,30 +219,30 @@ def test_a_power_damper_is_found_where_dahl_alone_slips_at_once():
     """Friction small against a damper of exponent 0.47, as of magneto-rheological dampers."""
     rng = np.random.default_rng(2)
     A, f = np.geomspace(5.7e-3, 12.6e-3, 20), np.tile([0.84, 1.0, 1.2, 0.9], 5)
-    law = Dahl(23.0, 1700.0, alpha=1.0) + PowerDamper(380.0, 0.47)
+    law = di.Dahl(23.0, 1700.0, alpha=1.0) + di.PowerDamper(380.0, 0.47)
     noise = np.exp(0.01 * (rng.standard_normal(20) + 1j * rng.standard_normal(20)))
-    data = FrequencyResponse(f, law.dynamic_stiffness(A, 2 * np.pi * f) * noise, amplitude=A)
-    compared = compare_models(fit(data, Dahl(), throw=False))
+    data = di.FrequencyResponse(f, law.dynamic_stiffness(A, 2 * np.pi * f) * noise, amplitude=A)
+    compared = compare_models(fit(data, di.Dahl(), throw=False))
     assert compared.best.name == "power damper added"
     values = dict(zip(compared.best.optimum.names, compared.best.optimum.values, strict=True))
     assert values["exponent"] == pytest.approx(0.47, abs=0.1)
     assert compared.best.density.misfit < 0.02
     rates = [m for m in compared.models if "Bouc-Wen" in m.name]
     assert all(abs(v) < 1e8 for m in rates for v in m.optimum.values)  # not 1e13 per metre
-    again = compare_models(fit(data, Dahl() + PowerDamper(), throw=False))
+    again = compare_models(fit(data, di.Dahl() + di.PowerDamper(), throw=False))
     assert again.best is again.models[0]
     assert "share the parameter names exponent" in str(again)
 
 
 def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere():
     A = np.geomspace(1e-3, 1e-1, 12)
-    exact = Dahl(0.1, 30.0, alpha=30.0).describing_function(A)
+    exact = di.Dahl(0.1, 30.0, alpha=30.0).describing_function(A)
     noise = 0.003 * np.random.default_rng(1).standard_normal((2, A.size)).T @ [1.0, 1.0j]
-    data = FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
-    alone = compare_models(fit(data, Dahl(alpha=None), throw=False), {})
+    data = di.FrequencyResponse(np.ones(A.size), exact * np.exp(noise), A)
+    alone = compare_models(fit(data, di.Dahl(alpha=None), throw=False), {})
     assert not alone.best.is_physical  # an exponent of 30
     assert alone.best is alone.models[0]
-    optimum = fit(data, BoucWen(), throw=False).optimum
+    optimum = fit(data, di.BoucWen(), throw=False).optimum
     wild = replace(optimum, theta=optimum.problem.to_search([30.0, -1e6, 300.0]))
     with pytest.raises(FitError, match="no finite response"):
         predictive_density(wild)
@@ -263,9 +251,9 @@ def test_a_fit_that_is_not_physical_and_a_search_that_ended_nowhere():
 def test_a_model_that_spoils_the_fundamental_is_not_better():
     """Fundamentals of Dahl's law, third harmonics of tiny covariance that only a gap explains."""
     data = table(noise=0.01, seed=23)
-    third = Backlash(FRICTION, 2e-3).dynamic_stiffness(data.amplitude, harmonic=3)
+    third = di.Backlash(FRICTION, 2e-3).dynamic_stiffness(data.amplitude, harmonic=3)
     size = np.abs(data.response)
-    both = FrequencyResponse(
+    both = di.FrequencyResponse(
         np.ones(60),
         np.concatenate([data.response, third]),
         np.tile(data.amplitude, 2),
@@ -273,7 +261,7 @@ def test_a_model_that_spoils_the_fundamental_is_not_better():
         covariance=np.concatenate([0.01 * size, 1e-5 * size])[:, None, None] ** 2 * np.eye(2),
     )
     comparison = compare_models(
-        fit(both, Dahl(alpha=1), throw=False), {"gap": Backlash(Dahl(alpha=1))}
+        fit(both, di.Dahl(alpha=1), throw=False), {"gap": di.Backlash(di.Dahl(alpha=1))}
     )
     plain, gap = comparison.models
     assert gap.density.gain_over(plain.density)[0] > 20.0
@@ -283,7 +271,7 @@ def test_a_model_that_spoils_the_fundamental_is_not_better():
 
 def test_a_force_that_falls_with_the_speed_asks_for_lugre():
     """From no guess, next to harmonics that say nothing."""
-    law, n = LuGre(0.1, 350.0, 1.94, 0.01), 10
+    law, n = di.LuGre(0.1, 350.0, 1.94, 0.01), 10
     A = np.tile(np.repeat(0.1 / 350.0 * np.geomspace(0.1, 10.0, n), 2), 3)
     f, rng, parts = np.tile([1.0, 3.0], 3 * n), np.random.default_rng(3), []
     size = 0.01 * np.abs(law.dynamic_stiffness(A, 2.0 * np.pi * f))
@@ -291,8 +279,8 @@ def test_a_force_that_falls_with_the_speed_asks_for_lugre():
         N = law.dynamic_stiffness(A, 2.0 * np.pi * f, harmonic=order)
         N = N + size * (rng.standard_normal((len(A), 2)) @ [1.0, 1.0j])
         noise, which = size[:, None, None] ** 2 * np.eye(2), np.full(len(A), order)
-        parts.append(FrequencyResponse(f, N, A, harmonic=which, covariance=noise))
-    given = fit(FrequencyResponse.concatenate(parts), Dahl(), throw=False)
+        parts.append(di.FrequencyResponse(f, N, A, harmonic=which, covariance=noise))
+    given = fit(di.FrequencyResponse.concatenate(parts), di.Dahl(), throw=False)
     best = compare_models(given).best
     assert best.name == "LuGre"
     assert best.optimum.values[:3] == pytest.approx([0.1, 350.0, 1.94], rel=0.05)

@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 from scipy import special
 
-from dahl_ident import (
-    Dahl,
-    Damper,
-    FrequencyResponse,
-    Mass,
-    Sensors,
-    Spring,
-    extract,
-    fit,
-    load_dataset,
-)
+import dahl_ident as di
+from dahl_ident import extract, fit, load_dataset
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.steady_state import Steady
 from tests.friction_tables import F_MAX, X_C, amplitudes, plant_table, table
@@ -30,7 +21,7 @@ GRID = np.geomspace(0.05, 20.0, 15) * X_C
 def result():
     """Data of a given exponent whose residuals ask for nothing but noise of one size."""
     for seed in range(1, 20):
-        found = fit(table(seed=seed), Dahl(alpha=1.0))
+        found = fit(table(seed=seed), di.Dahl(alpha=1.0))
         if not found.errors.sources and list(found.errors.contributions) == ["noise"]:
             return found
     pytest.fail("every table asks for more than noise")
@@ -45,7 +36,7 @@ class TestBands:
         f_max, sigma = np.exp(drawn).T
         N = np.array(
             [
-                Dahl(1.0, s / f).describing_function(GRID) * f
+                di.Dahl(1.0, s / f).describing_function(GRID) * f
                 for f, s in zip(f_max[:4000], sigma[:4000], strict=True)
             ]
         )
@@ -68,10 +59,10 @@ class TestBands:
         np.testing.assert_allclose(high - low, 2.0 * t * band.phase_std)
 
     def test_cover_the_true_curve(self):
-        truth = Dahl(0.1, 30.0).describing_function(GRID)
+        truth = di.Dahl(0.1, 30.0).describing_function(GRID)
         inside = []
         for seed in range(60):
-            found = fit(table(seed=seed, n=8), Dahl())
+            found = fit(table(seed=seed, n=8), di.Dahl())
             low, high = found.predict(1.0, amplitude=GRID, noise=False).gain(0.9545)
             inside.append((low <= np.abs(truth)) & (np.abs(truth) <= high))
         cover = np.mean(inside, axis=0)  # the size of a model error is known badly from 8 rows
@@ -79,7 +70,7 @@ class TestBands:
         assert 0.89 < cover.mean() < 0.99
 
     def test_plant_at_drives(self):
-        model = Dahl(alpha=1.0) + Mass() + Damper() + Spring()
+        model = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
         result = fit(plant_table(), model, method="ipopt", constraints=lambda p: [p["mass"] >= 0.1])
         assert result.errors is None  # noise alone
         band = result.predict(result.data.frequency_hz, drive=result.data.drive, noise=False)
@@ -104,9 +95,9 @@ class TestBands:
 
     def test_friction_of_a_plant(self):
         sine: Steady = "describing function"
-        model = Dahl() + Mass() + Damper() + Spring()
+        model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
         result = fit(plant_table(steady=sine), model, steady=sine)
-        law = Dahl(*(result.errors.values[name] for name in ("f_max", "sigma", "alpha")))
+        law = di.Dahl(*(result.errors.values[name] for name in ("f_max", "sigma", "alpha")))
         band = result.describing_function(GRID)
         np.testing.assert_allclose(band.response, law.describing_function(GRID))
         noise = np.sqrt(result.optimum.covariance[0, 0])
@@ -114,7 +105,7 @@ class TestBands:
 
     def test_what_is_determined_has_a_band_where_parameters_have_none(self, result):
         known = result.predict(1.0, amplitude=GRID)
-        lost = fit(result.data, Dahl(), sensors=Sensors(force_gain=None), throw=False)
+        lost = fit(result.data, di.Dahl(), sensors=di.Sensors(force_gain=None), throw=False)
         band = lost.predict(1.0, amplitude=GRID)
         np.testing.assert_allclose(band.log_gain_std, known.log_gain_std, rtol=0.05)
         assert np.isinf(lost.describing_function(GRID).log_gain_std).all()
@@ -128,7 +119,7 @@ class TestBands:
         with pytest.raises(ValidationError, match=shapes):
             result.predict([1.0, 2.0, 3.0], amplitude=[1e-3, 1e-2])
         with pytest.raises(ModelError, match="no friction law"):
-            fit(table(), Spring(), throw=False).describing_function(GRID)
+            fit(table(), di.Spring(), throw=False).describing_function(GRID)
 
 
 class TestMeasured:
@@ -136,10 +127,10 @@ class TestMeasured:
 
     @needs_data
     def test_bands_hold_what_was_left_out(self):
-        data = FrequencyResponse.concatenate(
+        data = di.FrequencyResponse.concatenate(
             [extract(crank(f".A.{i}"), harmonics=[1]) for i in range(1, 11)]
         )
-        model = Dahl() + Spring() + Damper()
+        model = di.Dahl() + di.Spring() + di.Damper()
         assert "The extraction flagged every point" in fit(data, model).verdict
         data = replace(data, quality={})  # taken as it is
         whole = fit(data, model)
@@ -164,7 +155,7 @@ class TestHarmonics:
         """A driven plant read as one whose displacement was controlled: its harmonics are wrong."""
         record: Any = load_dataset("plant_recording")
         data = extract(record)
-        model = Dahl() + Mass() + Damper() + Spring()
+        model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
         found = fit(data, model, throw=False)
         alone = fit(data.select(rows=data.harmonic == 1), model, throw=False)
         for name, truth in (("f_max", 0.1), ("sigma", 30.0)):
@@ -178,7 +169,7 @@ class TestHarmonics:
         A = np.geomspace(3e-4, 3e-2, 12)
         own = [np.asarray(v) for v in (0.1, 30.0, 1.0)]
         rows = [
-            Dahl().stiffness(own, A, np.zeros(()), k)
+            di.Dahl().stiffness(own, A, np.zeros(()), k)
             * (1.0 + 0.01 * rng.standard_normal((12, 2)) @ [1.0, 1.0j])
             for k in (1, 3)
         ]
@@ -186,11 +177,11 @@ class TestHarmonics:
         stds = []
         for factor in (1.0, 3.0):
             rows[1][5] *= factor
-            data = FrequencyResponse(
+            data = di.FrequencyResponse(
                 np.ones(24), np.concatenate(rows), np.tile(A, 2), harmonic=np.repeat([1, 3], 12),
                 covariance=1e-4 * size[:, None, None] ** 2 * np.eye(2),
             )  # fmt: skip
-            found = fit(data, Dahl(), throw=False)
+            found = fit(data, di.Dahl(), throw=False)
             stds.append(found.predict(1.0, amplitude=A).log_gain_std)
         assert "suspicious points" in found.errors.contributions
         np.testing.assert_allclose(stds[1], stds[0], rtol=0.05)
@@ -231,12 +222,12 @@ class TestDerived:
         return 4.0 * f_max * A * (1.0 - float(np.tanh(beta)) / beta)
 
     def test_names_of_elements_and_units_of_rotation(self):
-        data = table(model=Dahl(F_MAX, 30.0) + Dahl(F_MAX, 3.0, name="other"))
-        found = fit(data, Dahl(name="early") + Dahl(name="late")).derived([1e-3])
+        data = table(model=di.Dahl(F_MAX, 30.0) + di.Dahl(F_MAX, 3.0, name="other"))
+        found = fit(data, di.Dahl(name="early") + di.Dahl(name="late")).derived([1e-3])
         assert [q.name for q in found[:2]] == ["early_x_c", "late_x_c"]
         assert str(found[2]).startswith("energy lost in a cycle at amplitude 0.001 = ")
 
     def test_no_x_c_where_it_is_infinite(self):
-        results = (fit(table(beta=(1e-4, 1e-3), seed=s), Dahl(), throw=False) for s in range(10))
+        results = (fit(table(beta=(1e-4, 1e-3), seed=s), di.Dahl(), throw=False) for s in range(10))
         (first, *_) = (r for r in results if not r.success)
         assert first.derived() == ()

@@ -7,21 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import dahl_ident as di
 from benchmarks.measured import BEAM
-from dahl_ident import (
-    Dahl,
-    Damper,
-    FrequencyResponse,
-    Iwan,
-    Mass,
-    PowerDamper,
-    Spring,
-    compare_models,
-    extract,
-    fit,
-    read_frequency_response,
-    read_record,
-)
+from dahl_ident import compare_models, extract, fit, read_frequency_response, read_record
 from dahl_ident.diagnostics import Verdict
 from dahl_ident.diagnostics.slip_density import slip_density
 
@@ -42,7 +30,7 @@ def tests():
 @pytest.fixture(scope="module")
 def damper(tests):
     """Their fundamentals."""
-    data = FrequencyResponse.concatenate(tests)
+    data = di.FrequencyResponse.concatenate(tests)
     return data.select(rows=data.harmonic == 1)
 
 
@@ -56,11 +44,11 @@ def beam(tmp_path_factory):
 
 class TestDamper:
     def test_numbers_of_the_hand_fit(self, damper):
-        found = fit(damper, Dahl(), noise="relative")
+        found = fit(damper, di.Dahl(), noise="relative")
         assert found.optimum.values[0] == pytest.approx(9.7e3, rel=0.02)
         assert found.optimum.values[1] == pytest.approx(2.5e6, rel=0.05)
         assert found.goodness.rms_misfit == pytest.approx(0.09, abs=0.005)
-        slow = fit(damper.select(rows=damper.frequency_hz < 0.6), Dahl(), noise="relative")
+        slow = fit(damper.select(rows=damper.frequency_hz < 0.6), di.Dahl(), noise="relative")
         assert slow.optimum.values[0] == pytest.approx(1.02e4, rel=0.02)
         assert slow.goodness.rms_misfit == pytest.approx(0.035, abs=0.002)
 
@@ -71,13 +59,13 @@ class TestDamper:
         if kept == "covariance":
             data = damper.select(rows=damper.quality["verdict"] == "good")
         if kept == "neither":
-            data = FrequencyResponse(damper.frequency_hz, damper.response, damper.amplitude)
-        found = fit(data, Dahl())
+            data = di.FrequencyResponse(damper.frequency_hz, damper.response, damper.amplitude)
+        found = fit(data, di.Dahl())
         assert not found.trusted
         assert "over frequency friction's stiffness falls by" in found.verdict
         assert any("over frequency, from 0.25 to 2 Hz" in text for text in found.goodness.details)
         assert "which no rate-independent model can describe" in found.verdict
-        linear = fit(data, Dahl(alpha=1.0)).goodness
+        linear = fit(data, di.Dahl(alpha=1.0)).goodness
         (trend,) = (t for t in linear.trends if t.covariate == "frequency")
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
 
@@ -91,11 +79,13 @@ class TestDamper:
             )
             for f in files
         ]
-        found = fit(FrequencyResponse.concatenate(every), Dahl() + PowerDamper(), throw=False)
+        found = fit(
+            di.FrequencyResponse.concatenate(every), di.Dahl() + di.PowerDamper(), throw=False
+        )
         assert str(found.status) == "not determined"
 
     def test_other_models_are_compared_as_well(self, damper):
-        found = fit(damper.select(rows=np.arange(damper.n) % 3 == 0), Dahl())
+        found = fit(damper.select(rows=np.arange(damper.n) % 3 == 0), di.Dahl())
         report = found.fit_report()
         assert "Other models, for comparison" in report
         names = [model.name for model in compare_models(found).models]
@@ -108,8 +98,8 @@ class TestStill:
 
     @staticmethod
     def of(tests, harmonics):
-        data = FrequencyResponse.concatenate(tests)
-        return fit(data.select(rows=data.harmonic <= harmonics), Dahl())
+        data = di.FrequencyResponse.concatenate(tests)
+        return fit(data.select(rows=data.harmonic <= harmonics), di.Dahl())
 
     @pytest.mark.parametrize("harmonics", [1, 3])
     def test_when_a_test_is_left_out(self, tests, harmonics):
@@ -142,7 +132,7 @@ class TestBeam:
         data = beam.select(level=[label for label in beam.levels if controlled in label])
         if controlled == "Force":  # exact motions, row by row
             data = data.select(rows=np.arange(data.n) % 24 == 0)
-        return fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
+        return fit(data, di.Dahl() + di.Mass() + di.Damper() + di.Spring(), throw=False)
 
     @pytest.mark.parametrize(
         "controlled",
@@ -180,14 +170,14 @@ class TestBeam:
         levels = [label for label in beam.levels if label.startswith("Response")]
         data = beam.select(level=levels)
         data = data.select(rows=np.arange(data.n) % 8 == 0)
-        found = fit(data, Iwan(ratio=1.0) + Mass() + Damper(), throw=False)
+        found = fit(data, di.Iwan(ratio=1.0) + di.Mass() + di.Damper(), throw=False)
         assert found.verdict.startswith("Not described.")  # a misfit of 37 %
         assert re.search(
             "chi: .*, not determined, because of (model error|jackknife over tests)", found.verdict
         )
         check = found.cross_validation
         assert check.inside >= 0.88 * check.count  # of 95 %: less happens once in 200 times
-        chi, bound = found.params["chi"], slip_density(data, Mass() + Damper()).least_misfit
+        chi, bound = found.params["chi"], slip_density(data, di.Mass() + di.Damper()).least_misfit
         assert -1.0 < chi.value <= 3.0
         assert chi.stderr is not None
         assert 0.2 < bound < found.goodness.rms_misfit < 0.4

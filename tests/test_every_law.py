@@ -5,32 +5,21 @@ import json
 import numpy as np
 import pytest
 
-from dahl_ident import (
-    Backlash,
-    BoucWen,
-    Dahl,
-    Element,
-    Experiment,
-    Iwan,
-    LuGre,
-    MaxwellSlip,
-    Model,
-    PowerDamper,
-    simulate,
-)
+import dahl_ident as di
+from dahl_ident import simulate
 from dahl_ident.elements import KINDS, describe_model, model_from_description
 from dahl_ident.synthetic import SteppedSine
 from tests.test_generic_friction import Jenkins
 
 LINEAR = {"mass", "damper", "spring", "linear_system"}
-LAWS: dict[str, list[Element]] = {
-    "dahl": [Dahl(1.0, 3.0), Dahl(1.0, 3.0, 0.5), Dahl(1.0, 3.0, 2.0, asymmetry=0.3)],
-    "bouc_wen": [BoucWen(3.0, 1.3, 0.5), BoucWen(2.0, 0.7, 0.0), BoucWen(1.0, 0.0, 2.0)],
-    "backlash": [Backlash(Dahl(1.0, 3.0), 0.5)],
-    "iwan": [Iwan(1.0, 3.0, -0.5, 0.7)],
-    "lugre": [LuGre(1.0, 3.0, 1.5, 0.7, 0.1, 0.2)],
-    "maxwell_slip": [MaxwellSlip([0.1, 0.4, 0.9], [3.0, 2.0, 1.0])],
-    "power_damper": [PowerDamper(2.0, 0.5)],
+LAWS: dict[str, list[di.Element]] = {
+    "dahl": [di.Dahl(1.0, 3.0), di.Dahl(1.0, 3.0, 0.5), di.Dahl(1.0, 3.0, 2.0, asymmetry=0.3)],
+    "bouc_wen": [di.BoucWen(3.0, 1.3, 0.5), di.BoucWen(2.0, 0.7, 0.0), di.BoucWen(1.0, 0.0, 2.0)],
+    "backlash": [di.Backlash(di.Dahl(1.0, 3.0), 0.5)],
+    "iwan": [di.Iwan(1.0, 3.0, -0.5, 0.7)],
+    "lugre": [di.LuGre(1.0, 3.0, 1.5, 0.7, 0.1, 0.2)],
+    "maxwell_slip": [di.MaxwellSlip([0.1, 0.4, 0.9], [3.0, 2.0, 1.0])],
+    "power_damper": [di.PowerDamper(2.0, 0.5)],
     "jenkins": [Jenkins(3.0, 0.3)],
 }
 EVERY = [law for laws in LAWS.values() for law in laws]
@@ -57,7 +46,7 @@ def test_the_force_over_time_has_the_harmonics(law):
 
 @every_law
 def test_derivatives_are_differences(law):
-    model = Model(law).with_free([p.name for p in law.parameters])
+    model = di.Model(law).with_free([p.name for p in law.parameters])
     values, A, w = model.known_values(), np.array([0.7, 2.0]), np.array(2.0)
     for k in (0, 1, 2, 3):
         found = model.stiffness_gradient(values, A, w, k)
@@ -74,10 +63,10 @@ def test_derivatives_are_differences(law):
 
 
 UNKNOWN = [
-    Dahl(asymmetry=None, name="pivot"),
-    Backlash(Dahl(1.0, None, name="pivot"), 0.1),
-    Backlash(Dahl(asymmetry=None)),
-    PowerDamper(2.0, 0.5, name="oil"),
+    di.Dahl(asymmetry=None, name="pivot"),
+    di.Backlash(di.Dahl(1.0, None, name="pivot"), 0.1),
+    di.Backlash(di.Dahl(asymmetry=None)),
+    di.PowerDamper(2.0, 0.5, name="oil"),
 ]
 
 
@@ -92,5 +81,5 @@ def test_description_comes_back(law):
 @every_law
 def test_it_is_simulated_under_a_prescribed_displacement(law):
     steps = SteppedSine((0.2, 1.0), (1.0,), num_periods=2, settling_periods=1)
-    record = simulate(Experiment(law, steps), seed=1)
+    record = simulate(di.Experiment(law, steps), seed=1)
     assert np.all(np.isfinite(np.asarray(record.force)))

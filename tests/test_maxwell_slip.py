@@ -7,22 +7,14 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.optimize import lsq_linear
 
-from dahl_ident import (
-    Backlash,
-    Dahl,
-    Damper,
-    FrequencyResponse,
-    Mass,
-    MaxwellSlip,
-    PowerDamper,
-    fit,
-)
+import dahl_ident as di
+from dahl_ident import fit
 from dahl_ident.diagnostics.slip_density import slip_density
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from tests.test_generic_friction import Jenkins
 
 SLIPS, STIFF = np.array([0.1, 0.3, 1.0]), np.array([3.0, 2.0, 1.0])
-LAW = MaxwellSlip(SLIPS, STIFF)
+LAW = di.MaxwellSlip(SLIPS, STIFF)
 
 
 def sliders(x, start):
@@ -80,11 +72,11 @@ def test_facts_and_refusals():
     with pytest.raises(ModelError, match="remembers more than its present force"):
         LAW.slope(0.0, 1.0, None, values)
     with pytest.raises(ModelError, match="Backlash got"):
-        Backlash(LAW, 0.1)
+        di.Backlash(LAW, 0.1)
     with pytest.raises(ValidationError, match="rising"):
-        MaxwellSlip([0.2, 0.1])
+        di.MaxwellSlip([0.2, 0.1])
     with pytest.raises(ValidationError, match="one for each of 2"):
-        MaxwellSlip([0.1, 0.2], [1.0])
+        di.MaxwellSlip([0.1, 0.2], [1.0])
     with pytest.raises(ValidationError, match="initial_force"):
         LAW.force([0.0, 1.0], 2.0)
 
@@ -94,33 +86,33 @@ def table(law, *, noise=0.0, seed=1):
     rng = np.random.default_rng(seed)
     Z = law.dynamic_stiffness(A, 2.0 * np.pi * f)
     Z = Z * (1.0 + noise * (rng.normal(size=24) + 1j * rng.normal(size=24)) / np.sqrt(2.0))
-    return FrequencyResponse(f, Z, A)
+    return di.FrequencyResponse(f, Z, A)
 
 
 def test_stiffnesses_are_estimated_at_given_and_at_free_slips():
-    found = fit(table(LAW, noise=0.003), MaxwellSlip(SLIPS))
+    found = fit(table(LAW, noise=0.003), di.MaxwellSlip(SLIPS))
     for name, true in zip(("stiffness_1", "stiffness_2", "stiffness_3"), STIFF, strict=True):
         estimate = found.params[name]
         assert abs(estimate.value - true) < 4.0 * estimate.stderr < 0.2
-    two = MaxwellSlip([0.1, 1.0], [3.0, 1.0])
+    two = di.MaxwellSlip([0.1, 1.0], [3.0, 1.0])
     exchanged = {"slip_1": 1.0, "slip_2": 0.1, "stiffness_1": 1.0, "stiffness_2": 3.0}
     for start in (None, exchanged):  # slips rise, wherever the search began
-        free = fit(table(two, noise=0.001), MaxwellSlip(2), start=start)
+        free = fit(table(two, noise=0.001), di.MaxwellSlip(2), start=start)
         assert [p.value for p in free.params.values()] == pytest.approx(
             [3.0, 1.0, 0.1, 1.0], rel=0.02
         )
 
 
 def test_the_least_misfit_is_least():
-    data = table(LAW + Mass(0.1) + Damper(0.2), noise=0.01)
-    found = slip_density(data, Mass(0.1) + Damper())
+    data = table(LAW + di.Mass(0.1) + di.Damper(0.2), noise=0.01)
+    found = slip_density(data, di.Mass(0.1) + di.Damper())
     assert 0.003 < found.least_misfit < 0.0101
     assert found.least_misfit <= found.misfit <= 1.05 * found.least_misfit
     assert found.stiffness.sum() + found.spring == pytest.approx(6.0, rel=0.05)
     assert found.parallel["damping"] == pytest.approx(0.2, rel=0.2)
     # another solver over the same laws, and random laws, leave no less
     A, Z = np.asarray(data.amplitude), data.response + 0.1 * data.omega**2
-    jenkins = [MaxwellSlip([d], [1.0]).describing_function(A) for d in found.slip.tolist()]
+    jenkins = [di.MaxwellSlip([d], [1.0]).describing_function(A) for d in found.slip.tolist()]
     columns = np.column_stack([*jenkins, 1.0 + 0j * A, 1j * data.omega])
     weights = 1.0 / np.abs(data.response)[:, None]
     matrix, right = columns * weights, Z * weights[:, 0]
@@ -130,14 +122,14 @@ def test_the_least_misfit_is_least():
     )  # fmt: skip
     assert np.sqrt(2.0 * other.cost / 24) == pytest.approx(found.least_misfit, rel=1e-3)
     assert "leaves less than" in found.statement
-    law = found.law() + Mass(0.1) + Damper(found.parallel["damping"])
+    law = found.law() + di.Mass(0.1) + di.Damper(found.parallel["damping"])
     left = np.abs(1.0 - law.dynamic_stiffness(A, data.omega) / data.response)
     assert np.sqrt(np.mean(left**2)) == pytest.approx(found.misfit, rel=1e-9)
 
 
 def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements():
-    assert slip_density(table(Dahl(1.0, 6.0))).least_misfit > 0.05
-    assert slip_density(table(Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
+    assert slip_density(table(di.Dahl(1.0, 6.0))).least_misfit > 0.05
+    assert slip_density(table(di.Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
     assert slip_density(table(LAW)).least_misfit < 0.003
 
 
@@ -145,12 +137,15 @@ def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements():
     ("truth", "said"),
     [
         (LAW, r"The best symmetric .* leaves 0\.\d+ % "),
-        (Dahl(1.0, 6.0) + PowerDamper(0.5, 0.5), r"leaves less than \d+ % .*: the rest is noise"),
+        (
+            di.Dahl(1.0, 6.0) + di.PowerDamper(0.5, 0.5),
+            r"leaves less than \d+ % .*: the rest is noise",
+        ),
     ],
 )
 def test_the_verdict_says_what_such_laws_leave(truth, said):
     data = table(truth, noise=0.01)
-    found = fit(data, Dahl(), throw=False)
+    found = fit(data, di.Dahl(), throw=False)
     assert re.search(said, found.verdict)
     bound = slip_density(data).least_misfit
     assert f"{100.0 * bound:.2g} % (rms of the fundamental)" in found.verdict
@@ -159,14 +154,14 @@ def test_the_verdict_says_what_such_laws_leave(truth, said):
 def test_the_density_is_refused():
     data = table(LAW)
     with pytest.raises(ModelError, match="expected linear elements"):
-        slip_density(data, Dahl())
+        slip_density(data, di.Dahl())
     with pytest.raises(DataError, match="at least three"):
         slip_density(data.select(rows=np.arange(24) < 2))
 
 
 def test_the_verdict_is_silent_where_such_laws_leave_more_than_the_model():
-    data = table(Dahl(1.0, 6.0, alpha=2.0), noise=0.01)
-    found = fit(data, Dahl(), throw=False)
+    data = table(di.Dahl(1.0, 6.0, alpha=2.0), noise=0.01)
+    found = fit(data, di.Dahl(), throw=False)
     assert found.goodness.objections
     assert slip_density(data).least_misfit > found.goodness.rms_misfit
     assert "Jenkins" not in found.verdict

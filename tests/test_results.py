@@ -11,21 +11,8 @@ import pytest
 from matplotlib.axes import Axes
 from scipy import optimize, stats
 
-from dahl_ident import (
-    Backlash,
-    Dahl,
-    Damper,
-    FitResult,
-    FrequencyResponse,
-    Mass,
-    Sensors,
-    Spring,
-    compare_models,
-    fit,
-    fit_many,
-    load_dataset,
-    posterior,
-)
+import dahl_ident as di
+from dahl_ident import compare_models, fit, fit_many, load_dataset, posterior
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status
 from dahl_ident.problem import TableProblem
@@ -34,17 +21,17 @@ from tests.friction_tables import FRICTION, amplitudes, plant_table, table
 
 @pytest.fixture(scope="module")
 def result():
-    return fit(table(), Dahl())
+    return fit(table(), di.Dahl())
 
 
 @pytest.fixture(scope="module")
 def plant():
-    return fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
+    return fit(plant_table(), di.Dahl() + di.Mass() + di.Damper() + di.Spring())
 
 
 @pytest.fixture(scope="module")
 def microslip():
-    return fit(table(beta=(1e-4, 1e-3)), Dahl(), throw=False)
+    return fit(table(beta=(1e-4, 1e-3)), di.Dahl(), throw=False)
 
 
 class TestFit:
@@ -71,18 +58,18 @@ class TestFit:
         assert result.nfev >= 1
         assert result.method == "lm"
         A = amplitudes(result.data)
-        plain = Dahl(*optimum.values).dynamic_stiffness(A)
+        plain = di.Dahl(*optimum.values).dynamic_stiffness(A)
         searched = result.problem.predict(optimum.theta)
         np.testing.assert_allclose(searched, plain, rtol=1e-12)
         combined = result.predict(1.0, amplitude=A).response
         np.testing.assert_allclose(combined, result.best_fit, rtol=1e-12)
-        stated = Dahl(*(p.value for p in result.params.values()))
+        stated = di.Dahl(*(p.value for p in result.params.values()))
         np.testing.assert_allclose(combined, stated.dynamic_stiffness(A), rtol=1e-12)
         np.testing.assert_allclose(combined, result.model.dynamic_stiffness(A), rtol=1e-12)
 
     def test_residuals_and_their_squares(self, result):
         alpha = result.params["alpha"].value
-        friction = Dahl(result.params["f_max"].value, result.params["sigma"].value, alpha)
+        friction = di.Dahl(result.params["f_max"].value, result.params["sigma"].value, alpha)
         y = np.log(result.data.response / friction.describing_function(result.data.amplitude))
         range_of_alpha = np.log(4.0) / np.sqrt(12.0)  # uniform in ln alpha, from 0.5 to 2
         prior = result.scale * np.log(alpha) / range_of_alpha
@@ -105,7 +92,7 @@ class TestFit:
     def test_criteria_of_a_robust_fit_are_those_of_its_density(self):
         """Student's t with 4 degrees of freedom in (ln gain, phase), by scipy."""
         data = table(n=12)
-        result = fit(data, Dahl(), loss="student_t")
+        result = fit(data, di.Dahl(), loss="student_t")
         searched = result.problem.predict(result.optimum.theta)
         y = np.log(data.response / searched)
         pairs = np.column_stack([y.real, y.imag])
@@ -120,35 +107,35 @@ class TestFit:
 
     def test_rotation_has_its_units_everywhere(self):
         data = table()
-        turned = FrequencyResponse(
+        turned = di.FrequencyResponse(
             data.frequency_hz, data.response, data.amplitude, motion="rotation"
         )
-        result = fit(turned, Dahl() + Mass(1e-6))
+        result = fit(turned, di.Dahl() + di.Mass(1e-6))
         units = {name: p.unit for name, p in result.params.items()}
         assert units == {"f_max": "N m", "sigma": "N m/rad", "alpha": "", "mass": "kg m^2"}
         assert " N m, sigma = " in repr(result)
         assert list(result.summary()["unit"]) == list(units.values())
         assert "f_max [N m]" in str(result.conf_interval("wald"))
-        grid = posterior(turned, Dahl(alpha=1.0), method="grid")
+        grid = posterior(turned, di.Dahl(alpha=1.0), method="grid")
         assert grid.units[:2] == ("N m", "N m/rad")
         assert " N m (from" in grid.priors["f_max"]
 
     def test_free_fixed_and_start(self):
         data = table()
-        freed = fit(data, Dahl(0.1, 30.0), free=["f_max"], fixed={"sigma": 29.0})
+        freed = fit(data, di.Dahl(0.1, 30.0), free=["f_max"], fixed={"sigma": 29.0})
         assert freed.var_names == ["f_max"]
         assert freed.params["sigma"].value == 29.0
         assert freed.params["f_max"].init_value == 0.1
-        started = fit(data, Dahl(), start={"f_max": 0.3})
+        started = fit(data, di.Dahl(), start={"f_max": 0.3})
         assert started.params["f_max"].value == pytest.approx(
-            fit(data, Dahl()).params["f_max"].value
+            fit(data, di.Dahl()).params["f_max"].value
         )
 
     def test_no_optimum_is_raised_with_what_was_found(self):
         tables = (table(beta=(1e-4, 1e-3), seed=seed) for seed in range(10))
-        data = next(d for d in tables if not fit(d, Dahl(), throw=False).success)
+        data = next(d for d in tables if not fit(d, di.Dahl(), throw=False).success)
         with pytest.raises(FitError, match="f_max grows without bound at constant sigma") as caught:
-            fit(data, Dahl())
+            fit(data, di.Dahl())
         assert caught.value.result.optimum.status is Status.NO_LOSS
         assert caught.value.result.combinations[0].expression == "sigma"
 
@@ -156,7 +143,7 @@ class TestFit:
         def tie(p):
             return [p["sigma"] == 290.0 * p["f_max"]]
 
-        tied = fit(table(), Dahl(), method="ipopt", constraints=tie)
+        tied = fit(table(), di.Dahl(), method="ipopt", constraints=tie)
         ratio = tied.params["sigma"].value / tied.params["f_max"].value
         assert ratio == pytest.approx(290.0, rel=1e-8)
         found = tied.conf_interval()
@@ -165,7 +152,7 @@ class TestFit:
         assert tied.stated_budget is None
         with pytest.raises(FitError, match="no uncertainty budget: the fit had constraints"):
             tied.budget()
-        again = FitResult.from_json(tied.to_json())
+        again = di.FitResult.from_json(tied.to_json())
         assert again.conf_interval().note == found.note
 
     @pytest.mark.parametrize(
@@ -183,7 +170,7 @@ class TestFit:
     )
     def test_unknown_options(self, options, message):
         with pytest.raises(ValidationError, match=message):
-            fit(table(), Dahl(), **options)
+            fit(table(), di.Dahl(), **options)
 
     def test_nothing_free(self):
         with pytest.raises(ModelError, match="no free parameter"):
@@ -193,10 +180,10 @@ class TestFit:
 class TestMany:
     def test_is_each_fit(self):
         tables = [table(seed=s) for s in range(4)] + [table(beta=(1e-4, 1e-3), seed=5)]
-        many = fit_many(tables, Dahl())
+        many = fit_many(tables, di.Dahl())
         assert len(many) == 5
         for i, one in enumerate(many):
-            alone = fit(tables[i], Dahl(), throw=False)
+            alone = fit(tables[i], di.Dahl(), throw=False)
             assert one.status is alone.status
             assert one.optimum.status is alone.optimum.status is many.status[i]
             np.testing.assert_allclose(one.optimum.values, alone.optimum.values, rtol=1e-6)
@@ -206,14 +193,14 @@ class TestMany:
         assert [r.data for r in many[1:3]] == tables[1:3]
 
     def test_frame_and_text(self):
-        many = fit_many([table(seed=s) for s in range(3)], Dahl())
+        many = fit_many([table(seed=s) for s in range(3)], di.Dahl())
         frame = many.to_frame()
         columns = "f_max f_max_stderr_noise sigma sigma_stderr_noise scale status"
         assert list(frame) == columns.split()
         np.testing.assert_array_equal(frame["sigma"], many.values[:, 1])
         np.testing.assert_array_equal(frame["sigma_stderr_noise"], many.stderr_noise[:, 1])
         combined = many.to_frame(combined=True)
-        own = [fit(one, Dahl()).params["sigma"] for one in many.tables]
+        own = [fit(one, di.Dahl()).params["sigma"] for one in many.tables]
         np.testing.assert_allclose(combined["sigma_estimate"], [p.value for p in own], rtol=1e-4)
         np.testing.assert_allclose(
             combined["sigma_stderr"], [p.stderr or 0.0 for p in own], rtol=1e-3
@@ -222,7 +209,7 @@ class TestMany:
 
     def test_tables_must_agree(self):
         with pytest.raises(DataError, match="table 1 has 8 rows"):
-            fit_many([table(), table(n=8)], Dahl())
+            fit_many([table(), table(n=8)], di.Dahl())
 
 
 class TestReport:
@@ -257,7 +244,7 @@ class TestReport:
         assert "at least" in microslip.fit_report()
 
     def test_a_wrong_model_is_compared_with_others(self):
-        wrong = fit(table(model=FRICTION + Spring(1.0)), Dahl())
+        wrong = fit(table(model=FRICTION + di.Spring(1.0)), di.Dahl())
         assert not wrong.trusted
         text = wrong.fit_report()
         assert "Other models, for comparison" in text
@@ -270,17 +257,17 @@ class TestReport:
         assert plant.trusted
 
     def test_priors_losses_and_units_are_told(self):
-        sensors = Sensors(force_gain=stats.norm(1.0, 0.005))
-        told = fit(table(), Dahl(), sensors=sensors).fit_report()
+        sensors = di.Sensors(force_gain=stats.norm(1.0, 0.005))
+        told = fit(table(), di.Dahl(), sensors=sensors).fit_report()
         assert "prior of force_gain: 1 ± 0.005" in told
-        assert "robust loss: huber" in fit(table(), Dahl(), loss="huber").fit_report()
-        absolute = fit(table(), Dahl(), noise="absolute").fit_report()
+        assert "robust loss: huber" in fit(table(), di.Dahl(), loss="huber").fit_report()
+        absolute = fit(table(), di.Dahl(), noise="absolute").fit_report()
         assert "N/m, estimated with" in absolute
         data = table()
-        turned = FrequencyResponse(
+        turned = di.FrequencyResponse(
             data.frequency_hz, data.response, data.amplitude, motion="rotation"
         )
-        assert "N m/rad" in fit(turned, Dahl()).fit_report()
+        assert "N m/rad" in fit(turned, di.Dahl()).fit_report()
 
     def test_html_is_escaped_and_has_the_same_words(self, result):
         page = result._repr_html_()
@@ -312,13 +299,13 @@ class TestStorage:
 
     def test_round_trip(self, result, plant, microslip):
         for one in (result, plant, microslip):
-            self.check_same(one, FitResult.from_json(one.to_json()))
+            self.check_same(one, di.FitResult.from_json(one.to_json()))
 
     def test_everything_a_table_can_hold(self, tmp_path):
         data = table(n=9)
         A = amplitudes(data)
         C = (0.01 * data.gain)[:, None, None] ** 2 * np.array([[1.0, 0.2], [0.2, 1.0]])
-        full = FrequencyResponse(
+        full = di.FrequencyResponse(
             data.frequency_hz,
             data.response,
             A,
@@ -331,11 +318,11 @@ class TestStorage:
             quality={"settled": np.array([True] * 9)},
             provenance={"file": "a.csv", "size": np.int64(3), "path": Path("a")},
         )
-        sensors = Sensors(force_gain=stats.norm(1.0, 0.005), delay=1e-5)
-        one = fit(full, Dahl(alpha=None) + Spring(0.0), sensors=sensors, throw=False)
+        sensors = di.Sensors(force_gain=stats.norm(1.0, 0.005), delay=1e-5)
+        one = fit(full, di.Dahl(alpha=None) + di.Spring(0.0), sensors=sensors, throw=False)
         one.save(tmp_path / "fit.json")
-        self.check_same(one, FitResult.load(tmp_path / "fit.json"))
-        back = FitResult.load(tmp_path / "fit.json").data
+        self.check_same(one, di.FitResult.load(tmp_path / "fit.json"))
+        back = di.FitResult.load(tmp_path / "fit.json").data
         assert back.provenance == {"file": "a.csv", "size": 3, "path": "a"}
         np.testing.assert_array_equal(back.dof, full.dof)
         assert back.levels == ["low"]
@@ -353,25 +340,25 @@ class TestStorage:
     def test_what_is_no_fit(self, result, tmp_path):
         content = json.loads(result.to_json())
         with pytest.raises(DataError, match="is not JSON"):
-            FitResult.from_json("{")
+            di.FitResult.from_json("{")
         with pytest.raises(DataError, match="has the schema None"):
-            FitResult.from_json("[]")
+            di.FitResult.from_json("[]")
         with pytest.raises(DataError, match="schema version 5; this version of dahl_ident reads 4"):
-            FitResult.from_json(json.dumps({**content, "schema_version": 5}))
+            di.FitResult.from_json(json.dumps({**content, "schema_version": 5}))
         del content["optimum"]["theta"]
         facts = {k: v for k, v in content.items() if k != "digest"}
         text = json.dumps(facts, sort_keys=True, separators=(",", ":"))
         content["digest"] = hashlib.sha256(text.encode()).hexdigest()
         (tmp_path / "cut.json").write_text(json.dumps(content))
         with pytest.raises(DataError, match=r"cut.json says .* lacks or garbles 'theta'"):
-            FitResult.load(tmp_path / "cut.json")
+            di.FitResult.load(tmp_path / "cut.json")
         with pytest.raises(DataError, match=r"lost\.json: the file cannot be read: No such file"):
-            FitResult.load(tmp_path / "lost.json")
+            di.FitResult.load(tmp_path / "lost.json")
         (tmp_path / "image.json").write_bytes(b"\x89PNG")
         with pytest.raises(
             DataError, match=r"image\.json: the file cannot be read: it is not text"
         ):
-            FitResult.load(tmp_path / "image.json")
+            di.FitResult.load(tmp_path / "image.json")
 
     @pytest.mark.parametrize(
         "change",
@@ -386,18 +373,18 @@ class TestStorage:
     )
     def test_what_was_edited_is_refused(self, result, tmp_path, change):
         content = json.loads(result.to_json())
-        assert FitResult.from_json(json.dumps(content, indent=4, sort_keys=True)).trusted
+        assert di.FitResult.from_json(json.dumps(content, indent=4, sort_keys=True)).trusted
         change(content)
         (tmp_path / "edited.json").write_text(json.dumps(content))
         with pytest.raises(DataError, match=r"edited.json was changed after the fit was saved"):
-            FitResult.load(tmp_path / "edited.json")
+            di.FitResult.load(tmp_path / "edited.json")
 
     def test_priors_that_no_file_can_hold(self):
-        result = fit(table(), Dahl())
-        sensors = Sensors(force_gain=stats.uniform(0.9, 0.2))
-        odd = replace(result.optimum, problem=TableProblem(table(), Dahl(), sensors=sensors))
+        result = fit(table(), di.Dahl())
+        sensors = di.Sensors(force_gain=stats.uniform(0.9, 0.2))
+        odd = replace(result.optimum, problem=TableProblem(table(), di.Dahl(), sensors=sensors))
         with pytest.raises(DataError, match="prior of kind uniform"):
-            FitResult(odd).to_json()
+            di.FitResult(odd).to_json()
 
 
 def xy(line):
@@ -452,14 +439,14 @@ class TestPictures:
         data = table()
         R = data.response.copy()
         R[7] *= 1.2
-        axis = fit(replace(data, response=R), Dahl()).plot_residuals()
+        axis = fit(replace(data, response=R), di.Dahl()).plot_residuals()
         rings = [x for x in axis.lines if x.get_markerfacecolor() == "none"]
         assert len(rings) == 2
 
     def test_measured_errors_become_error_bars(self):
         data = table()
         C = (0.02 * data.gain)[:, None, None] ** 2 * np.eye(2)
-        top, _ = fit(replace(data, covariance=C), Dahl()).plot_fit()
+        top, _ = fit(replace(data, covariance=C), di.Dahl()).plot_fit()
         segments = top.collections[-1].get_segments()  # error bars
         heights = [np.ptp(s[:, 1]) for s in segments]
         np.testing.assert_allclose(heights, 0.04 * data.gain, rtol=1e-6)
@@ -468,13 +455,13 @@ class TestPictures:
 def test_a_pandas_table_is_fitted_as_it_is_read():
     data = load_dataset("noisy")
     frame = data.to_frame()
-    assert fit(frame, Dahl()).params["f_max"].value == pytest.approx(
-        fit(data, Dahl()).params["f_max"].value, rel=1e-12
+    assert fit(frame, di.Dahl()).params["f_max"].value == pytest.approx(
+        fit(data, di.Dahl()).params["f_max"].value, rel=1e-12
     )
 
 
 def test_a_list_of_fits_is_sent_to_the_report():
-    found = fit(load_dataset("noisy"), Dahl())
+    found = fit(load_dataset("noisy"), di.Dahl())
     with pytest.raises(
         ValidationError, match=r"got several fits; .* di\.report\(\[fit, \.\.\.\]\)"
     ):
@@ -486,10 +473,10 @@ def test_values_beyond_any_parameter_stand_for_infinity_and_zero(ln_f_max):
     """Where a gap swallows the motion, a search may end at a force limit of 1e191."""
     A = np.geomspace(2e-5, 4.5e-4, 10)
     noise = 0.01 * np.random.default_rng(0).standard_normal(10)
-    data = FrequencyResponse(np.ones(10), 10.0 * np.exp(noise), A)
-    found = fit(data, Backlash(Dahl(alpha=1.0), 1e-3) + Spring(), throw=False)
+    data = di.FrequencyResponse(np.ones(10), 10.0 * np.exp(noise), A)
+    found = fit(data, di.Backlash(di.Dahl(alpha=1.0), 1e-3) + di.Spring(), throw=False)
     far = replace(found.optimum, theta=np.array([ln_f_max, -5.0, np.log(10.0)]))
-    ended = FitResult(far)
+    ended = di.FitResult(far)
     assert ended.status == "not determined"
     assert "f_max=1e+90" in repr(ended.model) or "f_max=1e-90" in repr(ended.model)
     assert "model compared is" in str(compare_models(ended))
