@@ -201,18 +201,6 @@ def test_values_and_all_derivatives_against_30_digits(element, harmonic):
             )
 
 
-@every_element
-def test_linear_elements_answer_no_harmonic(element):
-    friction = [e for e in Model(element).elements if isinstance(e, Dahl)]
-    third = element.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3)
-    expected = sum(
-        (e.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=3) for e in friction), np.zeros((3, 4))
-    )
-    np.testing.assert_array_equal(third, expected)
-    assert third.any() == bool(friction)
-    assert not element.dynamic_stiffness(AMPLITUDE, OMEGA, harmonic=2).any()
-
-
 # units
 
 
@@ -273,20 +261,6 @@ def test_force_over_time_has_the_harmonics_of_the_describing_function(element, A
 
 
 # bookkeeping
-
-
-def test_a_sum_is_the_sum_of_its_parts():
-    parts = [Dahl(0.5, 30.0), Mass(0.3), base()]
-    total = all_free(parts[0] + parts[1] + parts[2])
-    ours = total.stiffness_gradient(total.known_values(), AMPLITUDE, OMEGA)
-    alone = [
-        all_free(part).stiffness_gradient(part.known_values(), AMPLITUDE, OMEGA) for part in parts
-    ]
-    np.testing.assert_allclose(ours.value, sum(g.value for g in alone), rtol=1e-14)
-    np.testing.assert_allclose(ours.by_amplitude, sum(g.by_amplitude for g in alone), rtol=1e-14)
-    columns = [d for g in alone for d in g.by_parameter]
-    for mine, theirs in zip(ours.by_parameter, columns, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
 
 
 @every_element

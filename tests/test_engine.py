@@ -350,22 +350,6 @@ def test_where_no_motion_settles_none_is_found():
         march(system, knots, np.ones((1, 10)), knots, np.zeros(2), np.array([1.0, -200.0, 1.0]))
 
 
-def test_units_do_not_matter():
-    """Forces of 1e-15 and 1e15 N, periods of a picosecond and of a year."""
-    system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))
-    values = cases.all_values(cases.Drawn(0, di.Dahl(), [1.0, 3.0], 1, 1), 1.0, 0.1, 1.0)
-    unit = settled(system, np.array([2.0]), np.array([1.3]), values[None], harmonics=(1, 3))
-    for F, x, T in ((1e-15, 1e-9, 1e-12), (1e15, 1e-3, 3e7), (1e9, 1e12, 1.0)):
-        k = F / x
-        values = cases.all_values(
-            cases.Drawn(0, di.Dahl(), [F, 3.0 * k], 1, 1), k * T**2, 0.1 * k * T, k
-        )
-        result = settled(system, np.array([2.0 * F]), np.array([1.3 / T]), values[None],
-                         harmonics=(1, 3))  # fmt: skip
-        difference = result.coefficients[0] / x - unit.coefficients[0]
-        assert np.max(np.abs(difference)) < 1e-9 * np.max(np.abs(unit.coefficients))
-
-
 def test_floquet_maps_are_those_of_an_independent_integrator():
     values = cases.all_values(cases.Drawn(0, di.Dahl(), [0.1, 30.0], 1, 1), 0.3, 0.24, 0.3)
     system = translate(plant_equations(di.Dahl() + di.Mass() + di.Damper() + di.Spring()))

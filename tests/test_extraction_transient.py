@@ -42,17 +42,6 @@ def estimated(fit):
 
 
 @pytest.mark.parametrize("cycles", [3, 10, 40])
-@pytest.mark.parametrize("beta", [0.02, 0.1, 0.3, 1.0])
-def test_departure_and_rate_are_found_in_the_mean_of_the_force(beta, cycles):
-    fit, _ = departing(beta, cycles, 0.9, noise=1e-5)
-    loop_force = steady(beta, np.array([1.1, 1.2]))[1][0]
-    transient, _ = estimated(fit)
-    assert transient.significant
-    assert transient.rate == pytest.approx(4.0 * beta, rel=0.05)
-    assert transient.departure == pytest.approx(0.9 - loop_force, rel=0.05)
-
-
-@pytest.mark.parametrize("cycles", [3, 10, 40])
 @pytest.mark.parametrize("beta", [0.02, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0])
 def test_bias_of_the_response_is_predicted(beta, cycles):
     fit, exact = departing(beta, cycles, 0.9, noise=1e-6)

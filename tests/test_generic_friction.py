@@ -100,15 +100,6 @@ def test_the_force_over_time_agrees_with_the_exact_one(alpha, scale):
     assert np.max(np.abs(ours - exact)) < 2e-7 * np.max(np.abs(exact))
 
 
-def test_the_elastoplastic_force_over_time():
-    t = np.linspace(0.0, 10.0, 1500)
-    x = 3.0 * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
-    force = [0.0]
-    for step in np.diff(x):
-        force.append(float(np.clip(force[-1] + 3.0 * step, -3.0, 3.0)))
-    np.testing.assert_allclose(Jenkins(3.0, 1.0).force(x), force, atol=1e-12)
-
-
 def test_facts_follow_from_the_slope():
     values = [np.asarray(v) for v in (1.3, 7.0, 2.0)]
     law = SlopeOfDahl(1.3, 7.0, 2.0)

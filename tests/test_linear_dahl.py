@@ -133,13 +133,6 @@ def test_shapes_and_blocks(shape):
         np.testing.assert_allclose([v[index] for v in values], one_by_one, rtol=1e-12)
 
 
-def test_the_first_harmonic_is_beta_times_h(betas):
-    h, _, by_ln_sigma = describing_function_gradient(betas)
-    c, by_ln_beta = harmonic_gradient(betas, 1)
-    np.testing.assert_array_equal(c, betas * h)
-    np.testing.assert_array_equal(by_ln_beta, betas * by_ln_sigma)
-
-
 @pytest.mark.parametrize("k", [2, 4, 14, 100])
 def test_even_harmonics_are_exactly_zero(k):
     for value in harmonic_gradient(np.array([0.0, 1e-12, 1.0, 1e3, 1e12]), k):

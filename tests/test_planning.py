@@ -89,18 +89,6 @@ class TestContinuousDesign:
             (up, _), (down, _) = objective.at(cycles + step), objective.at(cycles - step)
             assert gradient[k] == pytest.approx((up - down) / 2e-5, rel=1e-5)
 
-    def test_scatter_of_a_run_is_two_more_parameters(self):
-        rng = np.random.default_rng(8)
-        rows = rng.standard_normal((1, 5, 2, 3))
-        packed = packed_information(rows, np.broadcast_to(np.eye(2), (1, 5, 2, 2)), 0.4)
-        cycles = rng.uniform(1.0, 5.0, 5)
-        found, _ = Term(packed, np.zeros((1, 3, 3)), 0.4).of_run(cycles)
-        # generalised least squares with the covariance of all rows written out
-        J = rows[0].reshape(10, 3)
-        shared = np.tile(np.eye(2), (5, 1))
-        V = np.diag(np.repeat(1.0 / cycles, 2)) + 0.4**2 * shared @ shared.T
-        assert found[0] == pytest.approx(J.T @ np.linalg.inv(V) @ J, rel=1e-9)
-
 
 class TestModelError:
     def _fit(self):
@@ -163,20 +151,6 @@ class TestLevelsWithFixedCosts:
         assert bench.seconds(found.levels, found.cycles) <= time + 1e-9
         best = _brute_force(objective, bench, time, most=3)
         assert found.value >= best - 0.01
-
-    @pytest.mark.parametrize("seed", range(6))
-    def test_rising_force_is_the_cheapest_order(self, seed):
-        beta = np.random.default_rng(seed).uniform(0.05, 3.0, 5)
-        bench = BenchTime(np.ones(5), np.exp(-4.0 * beta), np.tanh(beta), 0.0, 0.01)
-        least = min(
-            bench.settling_cycles(np.array(order)).sum()
-            for order in itertools.permutations(range(5))
-        )
-        assert bench.settling_cycles(bench.order(range(5))).sum() <= least + 1  # rounding
-
-    def test_the_fixed_times_of_many_sets_are_those_of_each(self):
-        bench, sets = _bench(4, 6), np.array([[0, 3, 5], [4, 1, 2], [5, 0, 1]])
-        assert bench.fixed(sets) == pytest.approx([float(bench.fixed(one)) for one in sets])
 
     def test_settling_follows_the_transient(self):
         beta = 0.1
