@@ -39,14 +39,11 @@ def optimum_of(problem: Problem, tell: Tell | None = None) -> Optimum | None:
 
 def _with_normal_priors(problem: Any) -> Any:
     """Return the problem with priors of the sensors replaced by normal ones, for least squares."""
-    sensed = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
     from scipy import stats
 
+    sensed = {p.name: getattr(problem.sensors, p.name) for p in problem.sensors.parameters}
     normal = {n: stats.norm(p.mean(), p.std()) for n, p in problem.priors.items()}
-    if not normal:
-        return problem
-    sensors = Sensors(**{**sensed, **normal})
-    return problem.like(sensors=sensors)
+    return problem.like(sensors=Sensors(**sensed | normal)) if normal else problem
 
 
 def starting_points(
@@ -143,8 +140,8 @@ def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
     for position in positions if len(problem.names) > 1 else ():
         candidate = nearest.copy()
         candidate[first] = position
-        value = float(problem.to_values(candidate)[first])
-        reduced = optimum_of(problem.like(fixed={problem.names[first]: value}))
+        value = {problem.names[first]: float(problem.to_values(candidate)[first])}
+        reduced = optimum_of(problem.like(fixed=value))
         if reduced is not None:
             candidate[[problem.names.index(name) for name in reduced.names]] = reduced.theta
             candidates.append(np.clip(candidate, low, high))

@@ -88,13 +88,13 @@ def predictive_checks(
     noise = replicated_noise(density, y.shape, random)
     checks = []
     for name, statistic in _STATISTICS.items():
-        if name == "size" and density.has_scale:
-            continue
-        observed, replicated = statistic(y[:, order]), statistic(noise[:, order])
-        share = float(np.mean(replicated >= observed))
-        checks.append(
-            PredictiveCheck(name, float(observed.mean()), float(replicated.mean()), share)
-        )
+        if name != "size" or not density.has_scale:
+            observed, replicated = statistic(y[:, order]), statistic(noise[:, order])
+            means, share = (
+                (float(observed.mean()), float(replicated.mean())),
+                replicated >= observed,
+            )
+            checks.append(PredictiveCheck(name, *means, float(np.mean(share))))
     return tuple(checks)
 
 
@@ -266,61 +266,41 @@ def to_arviz(density: Density, sample: ChainSample, seed: int) -> Any:
         warnings.simplefilter("ignore", FutureWarning)  # ArviZ 0.23 announces 1.0 at import
         arviz = library("arviz", "arviz")
     random = np.random.default_rng(seed)
-    kept = _thinned(sample)
+    # coordinates by ensemble, (ensembles, draws, D), about independent
+    ensembles, convergence = sample.settings.ensembles, sample.convergence
+    thin = max(1, int(np.ceil(convergence.tau.max())))
+    kept = sample.chain.points[convergence.discard :: thin]
+    steps, walkers, D = kept.shape
+    kept = kept.reshape(steps, ensembles, walkers // ensembles, D)
+    kept = kept.transpose(1, 0, 2, 3).reshape(ensembles, -1, D)
+    prior = density.problem.in_order(density.prior.draw(random, _PRIOR_DRAWS))
     groups: dict[str, dict[str, Any]] = {
         "posterior": _by_name(density, density.to_values(kept)),
-        "prior": _by_name(density, _prior(density, random)),
+        "prior": _by_name(density, density.problem.to_values(prior)[None]),  # not of the scale
     }
     if density.likelihood != "none":
-        flat = kept.reshape(-1, kept.shape[-1])
-        observed, replicated = _residuals(density, flat, random)
-        shape = (*kept.shape[:2], -1)
+        flat, shape = kept.reshape(-1, D), (*kept.shape[:2], -1)
+        theta, scale = density.split(flat)
+        observed, at_point = (_whitened(density, x) for x in (theta.mean(axis=0)[None], theta))
+        noise = scale[:, None] * replicated_noise(density, at_point.shape, random)
+        replicated = (observed - at_point + noise).reshape(shape)
         rows = pointwise_log_likelihood(density, flat).reshape(shape)
         groups["log_likelihood"] = {"row": rows}
-        groups["observed_data"] = {"real": observed.real, "imag": observed.imag}
-        groups["posterior_predictive"] = {
-            "real": replicated.real.reshape(shape),
-            "imag": replicated.imag.reshape(shape),
-        }
+        groups["observed_data"] = {"real": observed[0].real, "imag": observed[0].imag}
+        groups["posterior_predictive"] = {"real": replicated.real, "imag": replicated.imag}
     if int(arviz.__version__.split(".")[0]) >= 1:
         return arviz.from_dict(groups)
     return arviz.from_dict(**groups)
 
 
-def _thinned(sample: ChainSample) -> FloatArray:
-    """Return coordinates by ensemble, (ensembles, draws, D), about independent."""
-    ensembles, convergence = sample.settings.ensembles, sample.convergence
-    thin = max(1, int(np.ceil(convergence.tau.max())))
-    kept = sample.chain.points[convergence.discard :: thin]
-    steps, walkers, D = kept.shape
-    by_ensemble = kept.reshape(steps, ensembles, walkers // ensembles, D)
-    return by_ensemble.transpose(1, 0, 2, 3).reshape(ensembles, -1, D)
+def _whitened(density: Density, theta: FloatArray) -> ComplexArray:
+    """Return the data's residuals, real and imaginary part of each row as one number."""
+    return np.ascontiguousarray(density.problem.whitened(theta)).view(np.complex128)
 
 
 def _by_name(density: Density, values: FloatArray) -> dict[str, FloatArray]:
     names = density.names[: values.shape[-1]]
     return {name: values[..., i] for i, name in enumerate(names)}
-
-
-def _prior(density: Density, random: np.random.Generator) -> FloatArray:
-    """Return values drawn from the prior, (1, draws, P); the scale's prior cannot be drawn."""
-    theta = density.prior.draw(random, _PRIOR_DRAWS)
-    return density.problem.to_values(density.problem.in_order(theta))[None]
-
-
-def _residuals(
-    density: Density, points: FloatArray, random: np.random.Generator
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return whitened residuals at the posterior mean, and replicated ones at each point."""
-    theta, scale = density.split(points)
-    observed, at_point = _whitened(density, theta.mean(axis=0)[None]), _whitened(density, theta)
-    noise = scale[:, None] * replicated_noise(density, at_point.shape, random)
-    return observed[0], observed - at_point + noise
-
-
-def _whitened(density: Density, theta: FloatArray) -> ComplexArray:
-    """Return the data's residuals, real and imaginary part of each row as one number."""
-    return np.ascontiguousarray(density.problem.whitened(theta)).view(np.complex128)
 
 
 @dataclass(frozen=True)

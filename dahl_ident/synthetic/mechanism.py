@@ -165,24 +165,20 @@ class EngineMotion:
 
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the output at any times; that of the ends outside."""
-        t = np.clip(time, 0.0, self._waveform.duration)
-        starts = np.array([segment.start for segment in self._waveform.segments])
-        which = np.searchsorted(starts, t, side="right") - 1
-        output = np.empty(t.shape)
-        for i in np.unique(which).tolist():
-            here = which == i
-            segment = self._waveform.segments[i]
-            output[here], _ = self._along(segment, self._first[i], t[here])
+        output = np.empty(np.shape(time))
+        for i, here, t in self._waveform.by_segment(time):
+            output[here], _ = self._along(self._waveform.segments[i], self._first[i], t)
         return output
 
     def _jump(self, before: SineStep, after: SineStep, damping: float) -> None:
         """Take the states at the start of a segment over the jump of the force there."""
         at = np.array([before.stop])
-        jump = after.value(at) - before.value(at)
+        value = before.motion(at).value
+        jump = after.motion(at).value - value
         if damping:
             self._first[-1][1] += jump[0] / damping
         elif jump[0]:
-            ends, signal = np.array([0.0, 1.0]), np.array([before.value(at), jump])
+            ends, signal = np.array([0.0, 1.0]), np.array([value, jump])
             first = np.append([signal[0, 0], 0.0], self._first[-1][2:])
             moved = march(self._system, ends, signal, ends, first, self._values, finer=_FINER)
             self._first[-1] = moved.states[-1]

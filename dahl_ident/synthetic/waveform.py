@@ -8,10 +8,12 @@ both ends: the acceleration has no jumps.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 
@@ -51,24 +53,14 @@ class SineStep:
         """End of the segment, s."""
         return self.start + self.duration
 
-    @property
-    def final_phase(self) -> float:
-        """Phase at the end, rad."""
-        return float(self._phase(np.asarray(1.0)))
-
-    def value(self, time: FloatArray) -> FloatArray:
-        """Return the waveform at times within the segment."""
-        tau = (time - self.start) / self.duration
-        return np.asarray(_between(*self.amplitude, self.course, tau) * np.sin(self._phase(tau)))
-
     def motion(self, time: FloatArray) -> WaveValues:
         """Return the waveform and its derivatives at times within the segment."""
         T = self.duration
         tau = (time - self.start) / T
-        a, a1, a2 = _between_with_slopes(*self.amplitude, self.course, tau)
-        f, f1, _ = _between_with_slopes(*self.frequency_hz, self.course, tau)
+        a, a1, a2 = _between(*self.amplitude, self.course, tau)
+        f, f1, _ = _between(*self.frequency_hz, self.course, tau)
         w, w1 = 2.0 * np.pi * f, 2.0 * np.pi * f1 / T
-        phase = self._phase(tau)
+        phase = self.phase_at(tau)
         sin, cos = np.sin(phase), np.cos(phase)
         return WaveValues(
             a * sin,
@@ -76,11 +68,10 @@ class SineStep:
             (a2 / T**2 - a * w**2) * sin + (2.0 * a1 / T * w + a * w1) * cos,
         )
 
-    def _phase(self, tau: FloatArray) -> FloatArray:
-        return np.asarray(
-            self.phase
-            + 2.0 * np.pi * self.duration * _integral(*self.frequency_hz, self.course, tau)
-        )
+    def phase_at(self, tau: FloatArray) -> FloatArray:
+        """Return the phase, rad, as tau goes from 0 to 1."""
+        cycles = self.duration * _integral(*self.frequency_hz, self.course, tau)
+        return np.asarray(self.phase + 2.0 * np.pi * cycles)
 
 
 @dataclass(frozen=True)
@@ -102,15 +93,20 @@ class Waveform:
 
     def motion(self, time: FloatArray) -> WaveValues:
         """Return value and derivatives at any times; constant outside, at the end values."""
+        parts = np.zeros((3, *np.shape(time)))
+        for i, here, t in self.by_segment(time):
+            parts[:, here] = self.segments[i].motion(t)
+        outside = (np.asarray(time) < 0.0) | (np.asarray(time) > self.duration)
+        parts[1:, outside] = 0.0
+        return WaveValues(*parts)
+
+    def by_segment(self, time: FloatArray) -> Iterator[tuple[int, NDArray[np.bool_], FloatArray]]:
+        """Yield the number of each segment, which times it covers, and these, within the whole."""
         t = np.clip(np.asarray(time), 0.0, self.duration)
         starts = np.array([s.start for s in self.segments])
         which = np.searchsorted(starts, t, side="right") - 1
-        parts = np.zeros((3, *t.shape))
-        for i in np.unique(which):
-            here = which == i
-            parts[:, here] = self.segments[i].motion(t[here])
-        parts[1:, t != time] = 0.0
-        return WaveValues(*parts)
+        for i in np.unique(which).tolist():
+            yield i, which == i, t[which == i]
 
     def value(self, time: FloatArray) -> FloatArray:
         """Return the waveform at any times."""
@@ -137,17 +133,11 @@ class WaveformBuilder:
     ) -> None:
         """Move to an amplitude and a frequency within `duration`; at once where that is 0."""
         if duration > 0.0:
-            segment = SineStep(
-                self._time,
-                duration,
-                (self._amplitude, amplitude),
-                (self._frequency, frequency_hz),
-                self._phase,
-                course,
-            )
+            amplitudes, frequencies = (self._amplitude, amplitude), (self._frequency, frequency_hz)
+            segment = SineStep(self._time, duration, amplitudes, frequencies, self._phase, course)
             self._segments.append(segment)
             self._time = segment.stop
-            self._phase = segment.final_phase if amplitude > 0.0 else 0.0
+            self._phase = float(segment.phase_at(np.asarray(1.0))) if amplitude > 0.0 else 0.0
         self._amplitude, self._frequency = amplitude, frequency_hz
 
     def stay(self, duration: float) -> None:
@@ -165,14 +155,7 @@ class WaveformBuilder:
         return Waveform(tuple(self._segments), tuple(self._windows))
 
 
-def _between(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArray | float:
-    """Return the course from q0 to q1 as tau goes from 0 to 1."""
-    if q0 == q1:
-        return q0
-    return _between_with_slopes(q0, q1, course, tau)[0]
-
-
-def _between_with_slopes(
+def _between(
     q0: float, q1: float, course: Course, tau: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the course from q0 to q1, with two derivatives with respect to tau."""
