@@ -84,7 +84,7 @@ def _maxwell(rng: np.random.Generator) -> di.Element:
 
 LAWS: dict[str, tuple[str, Maker]] = {
     "linear Dahl": ("as fitted", _dahl),
-    "Dahl, other exponent": ("exponent free", _exponent),
+    "Dahl, other exponent": ("as fitted", _exponent),
     "two limits": ("two limits", _two_limits),
     "gap": ("gap", _gap),
     "Bouc-Wen": ("Bouc-Wen", _bouc_wen),

@@ -89,7 +89,7 @@ class TestDamper:
         report = found.fit_report()
         assert "Other models, for comparison" in report
         names = [model.name for model in compare_models(found).models]
-        assert names[:3] == ["as fitted", "exponent free", "two Dahl elements"]
+        assert names[:3] == ["as fitted", "two Dahl elements", "gap"]
         assert all(name in report for name in names)
 
 

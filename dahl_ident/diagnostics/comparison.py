@@ -5,11 +5,11 @@ with frequency for a damper, a force that falls with it for LuGre's law, any oth
 another shape of loop. Each is judged by how it predicts tests that it was not fitted to
 (:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
 error of the highest the simplest is the best; so is the one fitted while nothing is higher than it
-by more than chance among many candidates makes. A model that describes the fundamentals worse than
-the fit, by more than chance, is not better, however well it predicts harmonics.
-AIC and BIC are stated as well, and decide nothing: over harmonics whose covariance is tiny they
-prefer a model that spoils the fundamental. If no model describes the data, the best of them does
-not either, and one of negative damping is not a mechanism's.
+by more than chance among many candidates makes.
+AIC and BIC do not count: over harmonics whose covariance is tiny they prefer a model that spoils
+the fundamental. If no model describes the data, the best of them does not either, and one of
+negative damping is not a mechanism's. Each model is fitted as :func:`dahl_ident.fit` fits it, an
+exponent that nobody gave with its range included.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ from dahl_ident.problem import Problem
 from dahl_ident.units import percent, si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
-_WORSE = 2.0  # loss of the log likelihood of fundamentals at two standard errors
 _RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
 _SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
 _UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
-_DISAGREE = 0.2  # of a force limit: what else friction is then depends on the choice
+_DISAGREE = 0.2  # of a force limit or a stiffness: what friction is then depends on the choice
 _PLACES = 6  # of a change: less is rounding
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
+_OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
@@ -100,14 +100,10 @@ class ComparedModel:
     stated: Mapping[str, Any] | None = None
 
     @property
-    def aic(self) -> float:
-        """Akaike's criterion; parameters at infinity do not count."""
-        return self.optimum.aic
-
-    @property
-    def bic(self) -> float:
-        """Schwarz's criterion; parameters at infinity do not count."""
-        return self.optimum.bic
+    def complexity(self) -> int:
+        """Free parameters; an exponent that nobody gave, estimated with its range, is none."""
+        problem = self.optimum.problem
+        return len(problem.names) - (len(problem.ranges) if problem.kind == "table" else 0)
 
     @property
     def estimates(self) -> str:
@@ -134,9 +130,7 @@ class ComparedModel:
         By every source of error of a table's fit. Not each of a law's like parts, as Maxwell slip
         has them: their sums are what it says.
         """
-        is_table = self.optimum.problem.kind == "table"
-        errors = error_model(self.optimum) if is_table else None
-        stderr = self.optimum.stderr if errors is None else errors.stderr
+        stderr = self.optimum.stderr
         parts = set[str]()
         for element in self.optimum.problem.model.elements:
             labels = {label for part in element.like_parts for label in part}
@@ -208,7 +202,7 @@ class ModelComparison:
     Examples
     --------
     >>> import dahl_ident as di
-    >>> comparison = di.compare_models(di.fit(di.load_dataset("alpha_2"), di.Dahl()))
+    >>> comparison = di.compare_models(di.fit(di.load_dataset("alpha_2"), di.Dahl(alpha=1.0)))
     >>> comparison.best.name
     'exponent free'
     """
@@ -221,8 +215,8 @@ class ModelComparison:
         """The simplest model within one standard error of the highest predictive density.
 
         Apart from the one that was fitted, only models count whose parameters are determined and
-        physical, whose force limit and stiffness are not a hundred times those of the fit, and
-        which describe the fundamentals no worse than the fit does. It is the one that was fitted
+        physical, and whose force limit and stiffness are not a hundred times those of the fit. It
+        is the one that was fitted
         where models that are alike disagree (`undecided`), and where one that the data do not
         determine leaves far less (`undetermined`).
         """
@@ -240,14 +234,16 @@ class ModelComparison:
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
-        """The simplest and the likeliest of models that these data do not distinguish.
+        """The simplest of models that these data do not distinguish, and one that disagrees.
 
-        Empty where they agree on the force limit, or are one model.
+        The likeliest of those that disagree, on the force limit or on the stiffness at zero force.
+        Empty where none does, or where the simplest is the one that was fitted.
         """
-        both = (self._simplest, self._likeliest)
-        a, b = (model.meaning["force limit"] for model in both)
-        agree = not abs(a - b) > _DISAGREE * max(a, b)
-        return () if agree or self.models[0] in both else both
+        one = self._simplest
+        others = [m for m in self._alike if m is not self.models[0] and _disagreement(one, m)]
+        if one is self.models[0] or not others:
+            return ()
+        return one, max(others, key=lambda model: model.density.total)
 
     @cached_property
     def _likeliest(self) -> ComparedModel:
@@ -255,21 +251,27 @@ class ModelComparison:
         return next(m for m in falling if m is self.models[0] or self._is_sound(m))
 
     @cached_property
-    def _simplest(self) -> ComparedModel:
+    def _alike(self) -> list[ComparedModel]:
+        """The sound models that these data do not distinguish from the likeliest."""
         alike = []
         for model in self.models:
             gain, error = self._likeliest.density.gain_over(model.density)
             near = gain <= max(error, _BY_CHANCE)
             if near and (model is self.models[0] or self._is_sound(model)):
                 alike.append(model)
-        return min(alike, key=lambda model: (len(model.optimum.names), -model.density.total))
+        return alike
+
+    @property
+    def _simplest(self) -> ComparedModel:
+        def complexity(model: ComparedModel) -> tuple[int, float]:
+            return model.complexity, -model.density.total
+
+        return min(self._alike, key=complexity)
 
     def _is_sound(self, model: ComparedModel) -> bool:
-        keys = ("force limit", "stiffness at zero force")
-        sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in keys]
+        sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in _OF_FRICTION]
         absurd = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
-        worse = model.density.loss_of_fundamentals(self.models[0].density) > _WORSE
-        return model.is_physical and not absurd and not worse and model.is_determined
+        return model.is_physical and not absurd and model.is_determined
 
     @property
     def headline(self) -> str:
@@ -278,11 +280,11 @@ class ModelComparison:
         output = first.optimum.problem.output_in_words
         if self.undecided:
             one, other = self.undecided
-            limits = [f"{m.meaning['force limit']:.3g}" for m in self.undecided]
+            key = _disagreement(one, other)
+            sizes = listed([f"{m.meaning[key]:.3g}" for m in self.undecided])
             return (
                 f"{one.name} and {other.name} would both be better, and these data do not "
-                f"distinguish them: their force limits are {listed(limits)}. Neither is "
-                "recommended."
+                f"distinguish them: {key} {sizes}. Neither is recommended."
             )
         if self.undetermined is not None:
             one = self.undetermined
@@ -319,10 +321,7 @@ class ModelComparison:
         lines = []
         for m in self.models:
             gain, error = m.density.gain_over(first.density)
-            changes = [
-                _change(m.meaning[key], first.meaning[key])
-                for key in ("force limit", "stiffness at zero force")
-            ]
+            changes = [_change(m.meaning[key], first.meaning[key]) for key in _OF_FRICTION]
             mark = " (best)" if m is self.best else ""
             lines.append([
                 m.name, m.reason, percent(m.density.misfit), percent(m.density.harmonic_misfit),
@@ -353,8 +352,6 @@ class ModelComparison:
                     "density": m.density.total,
                     "misfit": m.density.misfit,
                     "harmonic_misfit": m.density.harmonic_misfit,
-                    "aic": m.aic,
-                    "bic": m.bic,
                     "status": m.optimum.status.name,
                     **m.meaning,
                     **dict(zip(m.optimum.names, m.optimum.values.tolist(), strict=True)),
@@ -412,6 +409,15 @@ def _undetermined(optimum: Optimum, every: Mapping[str, float]) -> list[str]:
     return [n for n, u in zip(names, stds.tolist(), strict=True) if not u <= NOT_IDENTIFIED_ABOVE]
 
 
+def _disagreement(one: ComparedModel, other: ComparedModel) -> str:
+    """Return what of friction two models state differently; "" where they agree."""
+    for key in _OF_FRICTION:
+        a, b = one.meaning[key], other.meaning[key]
+        if abs(a - b) > _DISAGREE * max(a, b):
+            return key
+    return ""
+
+
 def _number(value: float) -> str:
     return "not determined" if np.isnan(value) else f"{value:.3g}"
 
@@ -466,7 +472,8 @@ def compare_models(
     >>> A = np.geomspace(1e-4, 1e-2, 20)
     >>> N = di.Dahl(f_max=0.1, sigma=30.0, alpha=2.0).describing_function(A)
     >>> noise = np.exp(0.01 * rng.standard_normal((2, 20)).T @ [1.0, 1.0j])
-    >>> result = di.fit(di.FrequencyResponse(np.ones(20), N * noise, A), di.Dahl())
+    >>> data = di.FrequencyResponse(np.ones(20), N * noise, A)
+    >>> result = di.fit(data, di.Dahl(alpha=1.0), throw=False)
     >>> compare_models(result).best.name
     'exponent free'
     """
@@ -480,15 +487,18 @@ def compare_models(
             f"models is a {type(models).__name__}; expected a mapping of names to models, such as "
             "{'stiff': Dahl() + Spring()}"
         )
-    optimum, failed = fit.optimum, {}
+    failed: dict[str, str] = {}
+    optimum, problem = fit.assessment.estimate, fit.optimum.problem
     fitted = [ComparedModel("as fitted", optimum, predictive_density(optimum), stated=fit.params)]
     if models is None:
-        offered = dict(_candidates(optimum, fitted[0].density))
+        offered = dict(_candidates(optimum, problem, fitted[0].density))
     else:
         offered = {name: ("", (model,)) for name, model in models.items()}
     for name, (reason, elements) in offered.items():
         try:
-            other = _solved(optimum, Model(*elements), own=models is not None)
+            other = _solved(problem, optimum.loss, Model(*elements), limits=models is not None)
+            errors = error_model(other) if other.problem.kind == "table" else None
+            other = other if errors is None else errors.at_estimate
             density = predictive_density(other, optimum)
             fitted.append(ComparedModel(name, other, density, reason))
         except DahlIdentError as exc:
@@ -496,16 +506,15 @@ def compare_models(
     return ModelComparison(tuple(fitted), failed)
 
 
-def _solved(optimum: Optimum, model: Model, *, own: bool) -> Optimum:
-    """Return a candidate's optimum; limits at infinity are those of simpler candidates."""
-    return solve(optimum.problem.like(model=model), loss=optimum.loss, limits=own)
+def _solved(problem: Problem, loss: str, model: Model, *, limits: bool) -> Optimum:
+    """Return a candidate's optimum; `limits` at infinity are those of simpler candidates."""
+    return solve(problem.like(model=model), loss=loss, limits=limits)
 
 
 def _candidates(
-    optimum: Optimum, left: PredictiveDensity
+    optimum: Optimum, problem: Problem, left: PredictiveDensity
 ) -> Iterator[tuple[str, tuple[str, Sequence[Element]]]]:
     """Yield the name of each candidate, its reason and the model's elements."""
-    problem = optimum.problem
     model = problem.model
     values = parameter_values(optimum)
     misfit = f"{percent(left.misfit)} of {problem.output_in_words} left"
@@ -525,7 +534,10 @@ def _candidates(
             "speed": _falling_force(optimum),
             "masing": _jenkins(optimum, left),
         }
+    exponents = [p.name for e in model.elements for p in e.parameters if p.assumed]
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
+        if name == "exponent free" and exponents:
+            continue  # the fit estimates it
         taken = [offered[name] for _, offered in offers if name in offered]
         if len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken):
             continue  # more elements of one law in place of several would share their names

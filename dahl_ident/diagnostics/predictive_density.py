@@ -49,20 +49,11 @@ class PredictiveDensity:
     harmonic_misfit: float
     # of an average over all fundamentals; NaN of records
     noise: float = float("nan")
-    fundamentals: int = 0  # how many rows; none of records
 
     @property
     def total(self) -> float:
         """The sum over the tests."""
         return float(self.tests.sum())
-
-    def loss_of_fundamentals(self, other: PredictiveDensity) -> float:
-        """Return how much less likely the fundamentals are than by another, scatter unknown.
-
-        In units of the log likelihood; zero of records, which have none.
-        """
-        sizes = np.maximum([self.misfit, other.misfit], _EXACT)
-        return 2.0 * self.fundamentals * float(np.log(sizes[0] / sizes[1]))
 
     def gain_over(self, other: PredictiveDensity) -> tuple[float, float]:
         """Return how much higher the density is than another's, and its standard error.
@@ -124,18 +115,14 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     state = model.reml(np.ones(len(Z)))
     tests = _densities(state, np.repeat(test, 2)[keep], unit, robust=optimum.loss != "linear")
     first = np.unique(test, return_index=True)[1]
-    square, count, misfit, of_harmonics = (
-        np.abs(missed) ** 2,
-        int(fundamental.sum()),
-        np.nan,
-        np.nan,
-    )
+    square, count = np.abs(missed) ** 2, int(fundamental.sum())
+    misfit = of_harmonics = np.nan
     if count:
         misfit = float(np.sqrt(square[fundamental].mean()))
     if not fundamental.all():
         of_harmonics = float(np.sqrt(square[~fundamental].sum() / max(count, 1)))
     noise = misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan))
-    return PredictiveDensity(tests, run[first], misfit, of_harmonics, noise, count)
+    return PredictiveDensity(tests, run[first], misfit, of_harmonics, noise)
 
 
 def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:
