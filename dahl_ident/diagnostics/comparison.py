@@ -70,6 +70,10 @@ class ComparableFit(Protocol):
         """The solver's result."""
 
     @property
+    def assessment(self) -> Any:
+        """The estimate, as an optimum."""
+
+    @property
     def params(self) -> Mapping[str, Any]:
         """Every parameter with its estimate, which counts every source of error."""
 
