@@ -69,8 +69,7 @@ def test_lugre_is_tried_where_the_force_falls_with_the_frequency():
     def tried(law):
         N = law.dynamic_stiffness(A, 2.0 * np.pi * f)
         data = di.FrequencyResponse(f, N * noise, A)
-        found = fit(data, di.Dahl(), throw=False).optimum
-        return [name for name, _ in _candidates(found, predictive_density(found))]
+        return [m.name for m in compare_models(fit(data, di.Dahl(), throw=False)).models]
 
     assert "LuGre" in tried(di.LuGre(1.0, 100.0, 1.8, 0.5))
     assert "LuGre" not in tried(di.Dahl(1.0, 100.0))
