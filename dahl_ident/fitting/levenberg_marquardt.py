@@ -325,12 +325,15 @@ def minimise_by_scipy(
             at[0] = np.nan  # a step that scipy takes back
         return at
 
+    def jacobian(at: FloatArray) -> FloatArray:
+        return rows(at)[1:].T
+
     bounds = problem.bounds() if chart is None else (-np.inf, np.inf)
     phi, converged, nfev = start, False, 1
     if np.isfinite(rows(start)[0]).all():
         with np.errstate(all="ignore"):
             end = optimize.least_squares(
-                lambda phi: rows(phi)[0], start, lambda phi: rows(phi)[1:].T, bounds=bounds,
+                lambda at: rows(at)[0], start, jacobian, bounds=bounds,
                 x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
         phi, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
