@@ -25,7 +25,7 @@ import numpy as np
 import dahl_ident as di
 from benchmarks.harness import Row, print_table, seconds
 from dahl_ident.arrays import FloatArray
-from dahl_ident.bayes.convergence import judge
+from dahl_ident.bayes.chain import judge
 from dahl_ident.elements import linear_dahl
 
 TITLE = "Bayesian estimation"

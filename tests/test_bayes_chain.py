@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import dahl_ident as di
-from dahl_ident.bayes.convergence import autocorrelation_time, judge, r_hat
+from dahl_ident.bayes.chain import autocorrelation_time, judge, r_hat
 from dahl_ident.bayes.moves import EnsembleMove, differential_evolution, independent, snooker
 from dahl_ident.errors import ModelError, SamplingError, ValidationError
 from dahl_ident.problem import TableProblem

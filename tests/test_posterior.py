@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import dahl_ident as di
-from dahl_ident.bayes.convergence import autocorrelation_time
+from dahl_ident.bayes.chain import autocorrelation_time
 from dahl_ident.bayes.density import Density
 from dahl_ident.bayes.moves import EnsembleMove
 from dahl_ident.bayes.priors import joint_prior

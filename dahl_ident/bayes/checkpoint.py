@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.bayes.chain import Chain, ChainSettings
-from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.chain import Chain, ChainSettings, Convergence
 from dahl_ident.bayes.density import LogDensity
 from dahl_ident.data.storage import library, locked, plain_data, put_in_place
 from dahl_ident.elements.description import describe_model

@@ -14,8 +14,12 @@ elements; this subpackage goes in the other direction.
 
 from __future__ import annotations
 
-from dahl_ident.control_interop.branches import Branches, response_branches
-from dahl_ident.control_interop.levels import LevelResponses, level_responses
+from dahl_ident.control_interop.levels import (
+    Branches,
+    LevelResponses,
+    level_responses,
+    response_branches,
+)
 from dahl_ident.control_interop.limit_cycles import LimitCycle, LimitCycles, limit_cycles
 from dahl_ident.control_interop.linear_part import closed_loop_response
 from dahl_ident.control_interop.linearization import LoopMargins, equivalent_plant, loop_margins

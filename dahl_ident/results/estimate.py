@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike
 from dahl_ident.bayes.chain import ChainSettings, Pool
 from dahl_ident.bayes.density import Density, LogDensity, RecordDensity
 from dahl_ident.bayes.priors import PriorLike, joint_prior
-from dahl_ident.bayes.sample import sample_chain, sample_points
-from dahl_ident.bayes.walker_start import (
+from dahl_ident.bayes.sample import (
     centre_and_covariance,
     optimum_of,
+    sample_chain,
+    sample_points,
     starting_points,
 )
 from dahl_ident.data.columns import one_of

@@ -19,7 +19,7 @@ from dahl_ident.arrays import (
     positive_array,
     whole_number,
 )
-from dahl_ident.bayes.convergence import Convergence
+from dahl_ident.bayes.chain import Convergence
 from dahl_ident.bayes.density import SCALE, LogDensity
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.bayes.sample import ChainSample, PointSample, Sample

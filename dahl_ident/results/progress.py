@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from dahl_ident.bayes.chain import Chain, ChainSettings, Listener
-from dahl_ident.bayes.convergence import LENGTH, Convergence
+from dahl_ident.bayes.chain import LENGTH, Chain, ChainSettings, Convergence, Listener
 from dahl_ident.progress import spinner
 from dahl_ident.units import percent
 
