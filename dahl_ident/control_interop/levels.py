@@ -1,5 +1,4 @@
-r"""Frequency responses of a plant with friction at several drives or amplitudes (Fig. 7), and
-every steady response of a driven plant with its stability.
+r"""Responses of a plant with friction: at several levels (Fig. 7), and all, with their stability.
 
 Of an exact steady motion Floquet's multipliers are known, and a disturbance grows by ln of the
 largest one each cycle. For the describing function an average over a cycle says as much: near a
