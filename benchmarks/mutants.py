@@ -28,7 +28,7 @@ from coverage import CoverageData
 ROOT = Path(__file__).resolve().parent.parent
 RESPONSIBLE = {
     "diagnostics": ("diagnostics_*", "verdicts", "intervals", "held_out", "comparison"),
-    "problem": ("problem", "prediction_derivatives", "sensors", "noise", "record_*"),
+    "problem": ("problem", "sensors", "noise", "record_*"),
     "engine": ("engine", "forced_motion", "steady_state", "every_law"),
     "fitting": ("fitting*", "cold_records", "ipopt", "record_fit"),
     "extraction": ("extraction_*",),

@@ -146,6 +146,47 @@ def test_jacobian_is_the_residuals_derivative(quantity, controlled, noise, stead
     np.testing.assert_allclose(problem.information(theta), J.T @ J, rtol=same)
 
 
+def test_with_a_free_exponent_and_two_friction_elements():
+    plant = Dahl(name="a", alpha=None) + Dahl(name="b") + Mass() + Damper()
+    table = FrequencyResponse(
+        [0.2, 1.0, 2.0] * 3, np.ones(9), drive=[0.3] * 3 + [1.1] * 3 + [4.0] * 3,
+        controlled="force", quantity="receptance",
+    )  # fmt: skip
+    problem = TableProblem(table, plant, noise="absolute", steady="describing function")
+    values = {
+        "a_f_max": 1.0, "a_sigma": 5.0, "a_alpha": 1.7, "b_f_max": 0.2, "b_sigma": 9.0,
+        "mass": 0.1, "damping": 0.05,
+    }  # fmt: skip
+    theta = problem.to_search([values[name] for name in problem.names])
+    ours = problem.prediction_jacobian(theta)
+    for i in range(theta.size):
+        step = np.zeros(theta.size)
+        step[i] = 1e-5
+        numerical = (problem.predict(theta + step) - problem.predict(theta - step)) / 2e-5
+        np.testing.assert_allclose(ours[:, i], numerical, atol=1e-7 * np.abs(numerical).max())
+
+
+def test_by_level():
+    """Of drives and amplitudes, against responses at levels a little higher and lower."""
+    levels = np.geomspace(1e-3, 0.1, 6)
+    controlled = ["force", "displacement"] * 3
+
+    def at(factor):
+        table = FrequencyResponse(
+            np.full(6, 0.3),
+            np.ones(6),
+            factor * levels,
+            drive=factor * levels,
+            controlled=controlled,
+        )
+        model = Dahl() + Mass() + Damper()
+        return TableProblem(table, model, noise="absolute", steady="describing function")
+
+    theta = at(1.0).to_search([0.1, 30.0, 0.3, 0.24])
+    change = at(np.exp(1e-5)).predict(theta) - at(np.exp(-1e-5)).predict(theta)
+    np.testing.assert_allclose(at(1.0).level_slope(theta), change / 2e-5, rtol=1e-6)
+
+
 @pytest.mark.parametrize("controlled", ["displacement", "force"])
 def test_many_vectors_at_once_equal_one_at_a_time(controlled):
     problem = TableProblem(data("mobility", controlled), FREE)
