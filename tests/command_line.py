@@ -27,11 +27,11 @@ class Runner:
     def __init__(self, capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> None:
         self._capsys, self._patch = capsys, patch
 
-    def __call__(self, *arguments: str, stdin: str = "") -> Outcome:
+    def __call__(self, *arguments: object, stdin: str = "") -> Outcome:
         self._patch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin.encode())))
         self._capsys.readouterr()
         with pytest.raises(SystemExit) as ended:
-            main(list(arguments))
+            main([str(word) for word in arguments])
         out, err = self._capsys.readouterr()
         code = ended.value.code
         return Outcome(code if isinstance(code, int) else 0, out, err)

@@ -1,6 +1,5 @@
 """Records of any motion on the command line: what is read, refused and printed."""
 
-import io
 import json
 import re
 from pathlib import Path
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli import main
 from dahl_ident.errors import DataError
 from tests.test_record_fit import DAHL, recorded
 
@@ -38,51 +36,53 @@ def odd_columns(tmp_path):
     return place
 
 
-def told(monkeypatch, capsys, *words):
-    monkeypatch.setattr("sys.argv", ["dahl-ident", *map(str, words)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    return int(end.value.code or 0), *capsys.readouterr()
+@pytest.fixture
+def told(run):
+    """Return what runs a command, and returns its status and what it printed."""
+
+    def call(*words, stdin=""):
+        done = run(*words, stdin=stdin)
+        return done.status, done.out, done.err
+
+    return call
 
 
-def test_a_column_map_is_used(odd_columns, monkeypatch, capsys):
+def test_a_column_map_is_used(odd_columns, told):
     words = ("fit", odd_columns, "--record")
-    code, _, why = told(monkeypatch, capsys, *words)
+    code, _, why = told(*words)
     assert code == 1
     assert "Name it with --force ..." in why
     mapped = (*words, "--columns", odd_columns.with_name("columns.toml"))
-    code, out, _ = told(monkeypatch, capsys, *mapped)
+    code, out, _ = told(*mapped)
     assert code == 0
     assert "f_max" in out
     (line,) = (line for line in out.splitlines() if line.split()[:1] == ["sigma"])
     assert float(line.split()[1]) == pytest.approx(30.0, rel=0.01)
     assert "Uncertainty budget" not in out
-    code, out, _ = told(monkeypatch, capsys, *mapped, "-v")
+    code, out, _ = told(*mapped, "-v")
     assert "Uncertainty budget" in out
     assert "offset" in out
 
 
-def test_waveforms_need_no_option(tmp_path, monkeypatch, capsys):
+def test_waveforms_need_no_option(tmp_path, told):
     for seed in (1, 2):
         recorded(DAHL, "random", 600, 1e-3, seed).save(tmp_path / f"sweep{seed}.csv")
     pattern = tmp_path / "sweep*.csv"
-    code, out, why = told(monkeypatch, capsys, "fit", pattern)
+    code, out, why = told("fit", pattern)
     assert code == 0
     assert "the files hold waveforms: fitted sample by sample, as with --record" in why
-    assert out == told(monkeypatch, capsys, "fit", pattern, "--record")[1]
-    text = (tmp_path / "sweep1.csv").read_bytes()
-    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text)))
-    code, _, why = told(monkeypatch, capsys, "fit", "-")
+    assert out == told("fit", pattern, "--record")[1]
+    code, _, why = told("fit", "-", stdin=(tmp_path / "sweep1.csv").read_text())
     assert code == 1
     assert "fitted as a record: dahl-ident fit --record" in why
 
 
-def test_a_fast_sweep_is_told_how_to_be_fitted(tmp_path, monkeypatch, capsys):
+def test_a_fast_sweep_is_told_how_to_be_fitted(tmp_path, told):
     t = np.arange(12_000) / 1000.0
     x = 0.02 * np.exp(-t / 6.0) * np.sin(2.0 * np.pi * 5.0 * t)
     path = di.Record(t, displacement=x, force=DAHL.force(x)).save(tmp_path / "a run.csv")
     words = ("extract", path, "--time", "time [s]")
-    code, out, why = told(monkeypatch, capsys, *words)
+    code, out, why = told(*words)
     assert code == 3
     assert "biased by about" in " ".join(out.split())
     assert f"dahl-ident fit --record '{path}' --time 'time [s]'" in why
@@ -90,40 +90,36 @@ def test_a_fast_sweep_is_told_how_to_be_fitted(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("command", ["fit", "sample"])
 @pytest.mark.parametrize("words", [("--level", "1"), ("--noise", "relative")])
-def test_options_of_tables_are_refused(command, words, odd_columns, monkeypatch, capsys):
+def test_options_of_tables_are_refused(command, words, odd_columns, told):
     place = odd_columns.with_name("columns.toml")
-    code, _, why = told(
-        monkeypatch, capsys, command, odd_columns, "--record", "--columns", place, *words
-    )
+    code, _, why = told(command, odd_columns, "--record", "--columns", place, *words)
     assert code == 1
     assert re.search(rf"{words[0]} (is )?given (together )?with .*record", why)
 
 
-def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, monkeypatch, capsys):
+def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, told):
     place = odd_columns.with_name("columns.toml")
     words = ("fit", odd_columns, "--record", "--columns", place, "--mass", "free")
-    _, out, _ = told(monkeypatch, capsys, *words, "--predicted", "force")
+    _, out, _ = told(*words, "--predicted", "force")
     assert "of the measured force" in out
-    code, _, why = told(monkeypatch, capsys, "fit", odd_columns, "--predicted", "force")
+    code, _, why = told("fit", odd_columns, "--predicted", "force")
     assert code == 1
     assert "--record" in why
 
 
 @pytest.mark.parametrize("words", [("--loss", "huber"), ("--method", "scipy")])
-def test_losses_and_methods_are_taken_with_records(words, odd_columns, monkeypatch, capsys):
+def test_losses_and_methods_are_taken_with_records(words, odd_columns, told):
     place = odd_columns.with_name("columns.toml")
     base = ("fit", odd_columns, "--record", "--columns", place, "--json")
-    plain, other = (
-        json.loads(told(monkeypatch, capsys, *base, *more)[1])["params"] for more in ((), words)
-    )
+    plain, other = (json.loads(told(*base, *more)[1])["params"] for more in ((), words))
     for name in ("f_max", "sigma"):
         assert other[name]["value"] == pytest.approx(plain[name]["value"], rel=0.01)
 
 
-def test_models_of_records_are_compared(odd_columns, monkeypatch, capsys):
+def test_models_of_records_are_compared(odd_columns, told):
     place = odd_columns.with_name("columns.toml")
     words = ("fit", odd_columns, "--record", "--columns", place, "--compare")
-    _, out, _ = told(monkeypatch, capsys, *words)
+    _, out, _ = told(*words)
     assert "No model compared is better" in out
     assert "of the force left" in out
 
@@ -166,18 +162,18 @@ def test_two_days_of_waveforms_are_compared(run):
     assert "Changes from each measurement" in Path("r.html").read_text(encoding="utf-8")
 
 
-def test_waveforms_are_read_alike_by_every_command(tmp_path, monkeypatch, capsys):
+def test_waveforms_are_read_alike_by_every_command(tmp_path, told):
     recorded(DAHL, "random", 600, 1e-3).save(tmp_path / "run.csv")
     file, note = tmp_path / "run.csv", "the files hold waveforms: fitted sample by sample"
-    code, _, why = told(monkeypatch, capsys, "fit", file, "--predicted", "force")
+    code, _, why = told("fit", file, "--predicted", "force")
     assert (code, note in why) == (0, True)
-    code, out, why = told(monkeypatch, capsys, "sample", file, "--steps", 20, "--max-steps", 20)
+    code, out, why = told("sample", file, "--steps", 20, "--max-steps", 20)
     assert (code, note in why) == (3, True)
     assert "f_max" in out
     page = tmp_path / "page.md"
-    code, _, why = told(monkeypatch, capsys, "report", file, "-o", page)
+    code, _, why = told("report", file, "-o", page)
     assert (code, note in why) == (0, True)
     assert "sigma" in page.read_text()
-    code, _, why = told(monkeypatch, capsys, "fit", file, "--levels", 1)
+    code, _, why = told("fit", file, "--levels", 1)
     assert code == 1
     assert "--levels is given together with records of waveforms" in why

@@ -450,9 +450,8 @@ def test_one_bad_stretch_is_left_out_with_a_warning():
 )
 @settings(max_examples=150)
 def test_any_record_gives_points_or_a_named_error(
-    seed, samples, steps, motion, force, frequency,
-    mode, min_share
-):  # fmt: skip
+    seed, samples, steps, motion, force, frequency, mode, min_share
+):
     rng = np.random.default_rng(seed)
     step = {
         "even": np.ones(samples),

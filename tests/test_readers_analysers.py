@@ -1,6 +1,7 @@
 """Files of dynamic signal analysers, made here byte by byte from their manuals."""
 
 import importlib
+import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli import main
 from dahl_ident.data import inspect, read_frequency_response
 from dahl_ident.errors import DataError, DataWarning, UnitError
 
@@ -103,21 +103,18 @@ class TestSr785:
         with pytest.raises(DataError, match=f"first line says 21 points, and {21 + by} follow"):
             self.read(path)
 
-    def test_one_file_for_each_level(self, tmp_path, capsys):
+    def test_one_file_for_each_level(self, run):
         for force in LEVELS:
-            path = tmp_path / f"pivot_{1000 * force:g}mN.asc"
-            path.write_text(trace(1e3 * receptance(force)))
-        (tmp_path / "columns.toml").write_text('[real]\nunit = "mm/N"\n')
-        with pytest.raises(SystemExit) as end:
-            main(["fit", str(tmp_path / "*.asc"), "--columns", str(tmp_path / "columns.toml"),
-                  "--sweep", "1:100Hz log", "--level-from-name", "([0-9]+)mN",
-                  "--drive", "{level} mN", "--mass", "0.01", "--damping", "free",
-                  "--noise", "relative"])  # fmt: skip
-        out = capsys.readouterr().out
-        assert not end.value.code, out
-        value = next(line.split()[1] for line in out.splitlines() if line.split()[:1] == ["f_max"])
-        assert float(value) == pytest.approx(0.1, rel=0.02)
-        assert "runs differ" not in out
+            Path(f"pivot_{1000 * force:g}mN.asc").write_text(trace(1e3 * receptance(force)))
+        Path("columns.toml").write_text('[real]\nunit = "mm/N"\n')
+        done = run(
+            "fit", "*.asc", "--columns", "columns.toml", "--sweep", "1:100Hz log",
+            "--level-from-name", "([0-9]+)mN", "--drive", "{level} mN", "--mass", "0.01",
+            "--damping", "free", "--noise", "relative", "--json",
+        )  # fmt: skip
+        told = json.loads(done.out)
+        assert told["params"]["f_max"]["value"] == pytest.approx(0.1, rel=0.02)
+        assert "runs differ" not in told["verdict"]
 
 
 def unit(label):

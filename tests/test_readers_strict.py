@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 import dahl_ident as di
-from dahl_ident.cli import main
 from dahl_ident.data import inspect, read_frequency_response, read_record
 from dahl_ident.errors import DataError, DataWarning, ValidationError
 from tests import reader_fuzz
@@ -42,12 +41,6 @@ def place(folder, name, content):
 def csv(columns, header="time [s],x [m],F [N]"):
     rows = (",".join(map(repr, row)) for row in np.asarray(columns).T.tolist())
     return "\n".join([header, *rows]) + "\n"
-
-
-def told(capsys, *words):
-    with pytest.raises(SystemExit) as end:
-        main([str(word) for word in words])
-    return int(end.value.code or 0), *capsys.readouterr()
 
 
 class TestSecondHeaders:
@@ -114,10 +107,7 @@ class TestOtherFiles:
                 found.bind(str(path))
         return path
 
-    def test_are_refused_at_once(
-        self, irregular, request, tmp_path,
-        capsys
-    ):  # fmt: skip
+    def test_are_refused_at_once(self, irregular, request, tmp_path, run):
         kind = request.node.callspec.params["irregular"]
         good = place(tmp_path, "good.csv", csv(COLUMNS))
         ways: list[Callable[[], Any]] = [
@@ -128,9 +118,9 @@ class TestOtherFiles:
         for way in ways:
             with pytest.raises(DataError, match=f"is a {kind}; expected a file"):
                 way()
-        code, _, why = told(capsys, "fit", good, "--record", "--config", irregular)
-        assert code == 1
-        assert f"is a {kind}" in why
+        done = run("fit", good, "--record", "--config", irregular)
+        assert done.status == 1
+        assert f"is a {kind}" in done.err
 
 
 class TestHdf5:
@@ -236,14 +226,14 @@ class TestSize:
         with pytest.raises(DataError, match="takes more memory than there is"):
             inspect(place(tmp_path, "run.csv", text))
 
-    def test_no_memory_is_one_line(self, tmp_path, monkeypatch, capsys):
+    def test_no_memory_is_one_line(self, tmp_path, monkeypatch, run):
         def full(*_, **__):
             raise MemoryError
 
         path = place(tmp_path, "run.csv", csv(COLUMNS))
         monkeypatch.setattr(di.data.record.Record, "__init__", full)
-        code, _, why = told(capsys, "fit", path, "--record")
-        assert (code, why.count("\n")) == (1, 1)
+        done = run("fit", path, "--record")
+        assert (done.status, done.err.count("\n")) == (1, 1)
         monkeypatch.setattr("dahl_ident.data.readers.text_table.read_text_table", full)
         with pytest.raises(DataError, match="takes more memory than there is"):
             read_record(path)
@@ -412,15 +402,15 @@ class TestUnderstood:
         found = inspect(place(tmp_path, "run.csv", text)).column_map
         assert '[force]\ncolumn = "Friction Force"' in found
 
-    def test_two_columns_without_a_header(self, tmp_path, capsys):
+    def test_two_columns_without_a_header(self, tmp_path, run):
         path = place(tmp_path, "run.csv", csv(COLUMNS[1:]).partition("\n")[2])
         words = ("--displacement", "column 1 [m]", "--force", "column 2 [N]", "--sample-rate", 128)
-        code, out, _ = told(capsys, "fit", path, "--record", "--alpha", "1", *words)
-        assert code == 0
-        assert "f_max" in out
-        code, _, why = told(capsys, "fit", path, *words[:2])
-        assert code == 1
-        assert "--displacement is given without --record" in why
+        done = run("fit", path, "--record", "--alpha", "1", *words)
+        assert done.status == 0
+        assert "f_max" in done.out
+        done = run("fit", path, *words[:2])
+        assert done.status == 1
+        assert "--displacement is given without --record" in done.err
 
     def test_uneven_records_are_cut_and_resampled(self, tmp_path):
         t = np.arange(600) / 100.0
@@ -443,7 +433,7 @@ class TestUnderstood:
         assert [part.n for part in parts] == [99, 458]
         assert di.fit(record, di.Spring(), throw=False).data[0].n == kept.size
 
-    def test_a_table_without_a_frequency(self, tmp_path, capsys):
+    def test_a_table_without_a_frequency(self, tmp_path, run):
         A = np.geomspace(1e-4, 4e-3, 8)
         N = np.array([complex(DAHL.describing_function(a)) for a in A])
         columns = [A, np.abs(N), np.degrees(np.angle(N))]
@@ -457,8 +447,8 @@ class TestUnderstood:
         known = read_frequency_response(path, frequency=2.0)
         assert (known.frequency_hz == 2.0).all()
         assert di.fit(known, di.Dahl() + di.Damper(), throw=False).success
-        assert told(capsys, "fit", path, "--damping", "free")[0] == 1
-        assert "f_max" in told(capsys, "fit", path, "--damping", "free", "--frequency", 2.0)[1]
+        assert run("fit", path, "--damping", "free").status == 1
+        assert "f_max" in run("fit", path, "--damping", "free", "--frequency", 2.0).out
         with pytest.raises(DataError, match="holds the frequency too"):
             read_frequency_response(tmp_path / "saved.csv", frequency=1.0)
 

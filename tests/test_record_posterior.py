@@ -2,6 +2,7 @@
 
 import json
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,28 +90,21 @@ def test_a_stopped_chain_goes_on_as_if_it_had_not_been(tmp_path):
         di.posterior(other, seed=3, steps=120, walkers=32, resume=place)
 
 
-def test_command_line_and_report(tmp_path, monkeypatch, capsys):
-    from dahl_ident.cli import main
-
-    place, told = tmp_path / "run.csv", tmp_path / "run.json"
-    recorded(DAHL, "random", 200, 1e-3).to_frame().to_csv(place, index=False)
-    words = ["dahl-ident", "sample", str(place), "--record", "--steps", "40", "--walkers", "64"]
-    monkeypatch.setattr("sys.argv", [*words, "--report", str(told)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code in (0, 3)  # too few steps to trust, perhaps
-    assert "f_max" in capsys.readouterr().out
-    facts = json.loads(told.read_text("utf-8"))
+def test_command_line_and_report(run):
+    recorded(DAHL, "random", 200, 1e-3).to_frame().to_csv("run.csv", index=False)
+    words = ("sample", "run.csv", "--record", "--steps", "40", "--walkers", "64")
+    done = run(*words, "--report", "run.json")
+    assert done.status in (0, 3)  # too few steps to trust, perhaps
+    assert "f_max" in done.out
+    facts = json.loads(Path("run.json").read_text("utf-8"))
     schema = files("dahl_ident.reporting") / "report.schema.json"
     pytest.importorskip("jsonschema").validate(facts, json.loads(schema.read_text("utf-8")))
     assert facts["record_fits"][0]["parameters"]["sigma"]["value"] == pytest.approx(30.0, rel=0.05)
     assert len(facts["posteriors"]) == 1
     assert any(line.startswith("Posterior: ") for line in facts["verdict"])
-    monkeypatch.setattr("sys.argv", [*words, "--likelihood", "student_t"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 1
-    assert "--likelihood is given with records" in capsys.readouterr().err
+    refused = run(*words, "--likelihood", "student_t")
+    assert refused.status == 1
+    assert "--likelihood is given with records" in refused.err
 
 
 def test_data_that_the_model_misses_are_said():

@@ -4,10 +4,8 @@ import re
 from typing import Any
 
 import numpy as np
-import pytest
 
 import dahl_ident as di
-from dahl_ident.cli import main
 from dahl_ident.synthetic import Acquisition, Channel, Experiment, FrequencySweep, SteppedSine
 
 PLANT = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
@@ -43,30 +41,22 @@ def test_a_sweep_says_how_far_its_points_are_from_settled():
     assert np.median(bias / error) < 5.0  # a bound that says something
 
 
-def test_sweeps_of_one_level_each_are_one_run(tmp_path, monkeypatch, capsys):
+def test_sweeps_of_one_level_each_are_one_run(tmp_path, run):
     sweeps = [sweep(level, seed) for seed, level in enumerate((0.05, 0.2, 1.0))]
     for record, level in zip(sweeps, (50, 200, 1000), strict=True):
         record.save(tmp_path / f"sweep{level}mN.csv")
-    words = ["fit", str(tmp_path / "sweep*.csv"), "--mass", "free", "--damping", "free"]
-    monkeypatch.setattr("sys.argv", ["dahl-ident", *words, "--stiffness", "free"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    told = " ".join(capsys.readouterr().out.split())
-    assert end.value.code in (0, None)
+    free = ("--mass", "free", "--damping", "free", "--stiffness", "free")
+    done = run("fit", str(tmp_path / "sweep*.csv"), *free)
+    told = " ".join(done.out.split())
+    assert done.status == 0
     assert "Trusted." in told
     assert "a single run" in told
     assert "runs differ" not in told
 
 
-def test_extraction_of_a_sweep_says_its_bias_and_the_command_for_waveforms(
-    tmp_path, monkeypatch, capsys
-):
+def test_extraction_of_a_sweep_says_its_bias_and_the_command_for_waveforms(tmp_path, run):
     sweep(0.3, 1).save(tmp_path / "sweep.csv")
-    words = ["extract", str(tmp_path / "sweep.csv"), "--controlled", "force"]
-    monkeypatch.setattr("sys.argv", ["dahl-ident", *words])
-    with pytest.raises(SystemExit):
-        main()
-    told = capsys.readouterr()
+    told = run("extract", str(tmp_path / "sweep.csv"), "--controlled", "force")
     text = " ".join((told.out + told.err).split())
     bias = re.findall(r"biased by about ([0-9.]+) % \(median\), at most ([0-9.]+) %", text)
     ((median, most),) = bias
