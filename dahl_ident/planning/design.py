@@ -218,8 +218,7 @@ class Design:
     ratio: float = np.nan  # the largest one of an uncertainty to its target
 
 
-@dataclass(frozen=True)
-class Coverage:
+class Coverage(NamedTuple):
     """What levels need so that their data can be judged."""
 
     fewest: int  # number of levels, at least
@@ -227,14 +226,8 @@ class Coverage:
     amplitude: FloatArray  # (K,) ln of the displacement amplitude of every candidate
 
     def wide(self, levels: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which sets of levels, (..., m), span enough; one alone can still be added to."""
-        enough = np.ptp(self.amplitude[levels], axis=-1) >= self.span
-        return np.asarray(enough | (levels.shape[-1] < 2))
-
-    def holds(self, design: Design) -> bool:
-        """Return whether the data of a design can be judged."""
-        span = float(np.ptp(self.amplitude[design.levels]))
-        return design.runs * len(design.levels) >= self.fewest and bool(span >= self.span)
+        """Return which sets of levels, (..., m), span enough."""
+        return np.asarray(np.ptp(self.amplitude[levels], axis=-1) >= self.span)
 
 
 class Exchange:
@@ -298,7 +291,9 @@ class Exchange:
             same = np.flatnonzero(sizes == size)
             levels = np.array([trials[i] for i in same], dtype=np.intp)
             sub, cycles = self._share(levels, time, 15)
-            enough = np.isfinite(cycles).all(axis=-1) & self._coverage.wide(levels)
+            # a single level can still be added to
+            wide = self._coverage.wide(levels) | (size < 2)
+            enough = np.isfinite(cycles).all(axis=-1) & wide
             value, _ = sub.at(np.where(enough[:, None], cycles, 1.0))
             result[same] = np.where(enough, value, -np.inf)
         return result
@@ -309,7 +304,7 @@ class Exchange:
         joined = np.column_stack([np.tile(chosen, (others.size, 1)), others]).astype(np.intp)
         least = (LEAST_CYCLES / self._bench.frequency_hz[joined]).sum(axis=-1)
         rooms = time - self._bench.fixed(joined) - least
-        fits = (rooms >= 0.0) & self._coverage.wide(joined)
+        fits = (rooms >= 0.0) & (self._coverage.wide(joined) | (joined.shape[1] < 2))
         if not fits.any():
             return []
         joined, rooms = joined[fits], rooms[fits] / joined.shape[1]

@@ -280,12 +280,8 @@ def forecast_of_suspects(
     for prior, name in zip(knowledge.prior, knowledge.names, strict=True):
         i = names.index(name)
         searched[:, i, i] += prior * units[i] ** 2
-    directions = {
-        name: np.broadcast_to(
-            (np.eye(units.size) * units)[:, [names.index(name)]], (S, units.size, 1)
-        )
-        for name in suspects
-    }
+    scaled = np.broadcast_to(np.diag(units), (S, *2 * units.shape))
+    directions = {name: scaled[..., [names.index(name)]] for name in suspects}
     candidates = replace(candidates, rows=np.concatenate(rows, axis=2))
     return Forecast(
         knowledge, candidates, known, searched, directions, question.scatter, "none", departures=0

@@ -79,18 +79,15 @@ class Search:
 
     def solve(self, time: float, start: Sequence[int] = ()) -> Design | None:
         """Return the best levels and runs for a time; None where it is too short."""
-        best: Design | None = None
-        least = np.inf
+        ratios: list[tuple[float, Design]] = []
         for weight in (0.0,) if self._suspects is None else _WEIGHTS:
             design = self._solve(time, weight, start)
             if design is None:
                 return None
-            ratio = self.suspect_ratio(design)
-            if best is None or ratio < least:
-                best, least = design, ratio
-            if ratio <= 1.0:
+            ratios.append((self.suspect_ratio(design), design))
+            if ratios[-1][0] <= 1.0:
                 break
-        return best
+        return min(ratios, key=lambda one: one[0])[1]
 
     def _solve(self, time: float, weight: float, start: Sequence[int]) -> Design | None:
         q, best = self.question, None
@@ -123,7 +120,8 @@ class Search:
 
     def can_be_judged(self, design: Design) -> bool:
         """Return whether the data of a design alone can tell a wrong model from noise."""
-        return self._coverage.holds(design)
+        enough = design.runs * len(design.levels) >= self._coverage.fewest
+        return enough and bool(self._coverage.wide(design.levels))
 
     def reached(self, design: Design) -> bool:
         """Return whether a design reaches every target, with data that can be judged."""
