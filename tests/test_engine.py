@@ -387,6 +387,34 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, home):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize(("installation", "said"), [("another", 1), ("this", 0)])
+def test_compiling_is_announced_once_whatever_another_installation_has(
+    tmp_path, installation, said
+):
+    code = (
+        "from pathlib import Path; import sys; from dahl_ident.engine import motion\n"
+        "names = ('cycle', 'samples', 'loop')\n"
+        "sys.modules |= {f'dahl_ident.engine.{name}': sys for name in (*names, 'radau')}\n"
+        "motion._say_that_it_compiles = lambda: None\n"
+        "motion.kernels('radau')\n"  # makes the cache's folder
+        "from importlib import reload; reload(motion)\n"
+        "from numba.core.caching import _CacheLocator\n"
+        "own = _CacheLocator.get_suitable_cache_subpath(motion.__file__)\n"
+        f"folder = own if {installation == 'this'} else own[:-1] + 'x'\n"
+        f"folder = next(Path({str(tmp_path)!r}).glob('dahl_ident/engine-*')) / folder\n"
+        "folder.mkdir()\n"
+        "for name in names:\n"
+        "    (folder / f'{name}.kernel-1.py312.nbi').touch()\n"
+        "    motion.kernels(name)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    message = "compiling the engine, once (one to two minutes) ...\n"
+    assert done.stderr == said * message
+
+
 def test_importing_the_package_does_not_import_numba():
     code = "import dahl_ident, sys; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

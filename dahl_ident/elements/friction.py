@@ -34,7 +34,7 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     Values,
 )
-from dahl_ident.elements.held_motion import force_along, loops_of, system_of
+from dahl_ident.elements.held_motion import force_along, loops_of, same_both_ways
 from dahl_ident.elements.law_checks import check_declarations, check_slope, scaling_the_force
 from dahl_ident.errors import ModelError, ValidationError
 
@@ -291,7 +291,7 @@ class Friction(Element):
 
     def answers(self, harmonic: int) -> bool:
         """Return whether the force may have this harmonic: even ones where directions differ."""
-        return harmonic % 2 == 1 or not system_of(self, [p.value for p in self.parameters]).odd
+        return harmonic % 2 == 1 or not same_both_ways(self)
 
     def transient_decay(
         self, values: Values, amplitude: FloatArray, omega: FloatArray

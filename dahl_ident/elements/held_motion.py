@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _SYSTEMS: dict[Hashable, System] = {}
 """Compiled equations by law; not kept on the laws, which are sent to other processes."""
+_BOTH_WAYS: dict[Hashable, bool] = {}
 _FIRST: dict[Hashable, FirstState] = {}
 """How first states follow from what is unknown there, by law."""
 
@@ -44,6 +45,16 @@ def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -
 
         _SYSTEMS[form] = translate(law_equations(law))
     return _SYSTEMS[form]
+
+
+def same_both_ways(law: Element) -> bool:
+    """Return whether a law is the same in both directions, without compiling it."""
+    form = form_of(law)
+    if form not in _BOTH_WAYS:
+        from dahl_ident.engine.translate import is_odd
+
+        _BOTH_WAYS[form] = is_odd(law_equations(law))
+    return _BOTH_WAYS[form]
 
 
 def _first_of(law: Element) -> FirstState:

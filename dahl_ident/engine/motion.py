@@ -265,6 +265,11 @@ def _numbers(array: FloatArray) -> FloatArray:
 
 
 @cache
+def _say_that_it_compiles() -> None:
+    print("compiling the engine, once (one to two minutes) ...", file=sys.stderr)  # noqa: T201 - users wait
+
+
+@cache
 def kernels(name: str) -> ModuleType:
     """Return the module of a compiled kernel, from a cache on disk where that can be written.
 
@@ -275,7 +280,7 @@ def kernels(name: str) -> ModuleType:
 
     from numba import __version__, config
 
-    here = Path(__file__).parent
+    here = Path(__file__).absolute().parent  # as numba names it
     source = b"".join((here / f"{n}.py").read_bytes() for n in _KERNELS)
     key = hashlib.sha256(source + __version__.encode()).hexdigest()[:16]
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -288,8 +293,10 @@ def kernels(name: str) -> ModuleType:
     if not writable:
         folder = Path(tempfile.mkdtemp(prefix="dahl_ident-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    if not any(folder.rglob(f"{name}.*.nbi")):
-        print("compiling the engine, once (half a minute) ...", file=sys.stderr)  # noqa: T201 - users wait
+    # numba has one folder in it for each installation
+    kept = folder / f"{here.name}_{hashlib.sha1(str(here).encode()).hexdigest()}"
+    if not any(kept.glob(f"{name}.*.nbi")):
+        _say_that_it_compiles()
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
         return import_module(f"dahl_ident.engine.{name}")

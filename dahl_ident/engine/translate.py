@@ -128,14 +128,13 @@ def translate(equations: Equations) -> System:
     if steps not in _COMPILED:
         _COMPILED[steps] = compiled(steps)
     solved = [i for i in range(1 + equations.held, order) if i not in followers]
-    function = ca.Function("f", inputs, [whole])
-    rated = equations.held and not _goes_with_speed(function, order, len(parameters))
+    rated = equations.held and not _goes_with_speed(equations)
     return System(
         _COMPILED[steps],
         np.array([order, len(switches), len(parameters), equations.held, rated], dtype=np.int64),
         np.array(solved, dtype=np.int64),
         np.array(followers, dtype=np.int64),
-        _is_odd(function, order, len(parameters)),
+        is_odd(equations),
     )
 
 
@@ -163,12 +162,16 @@ _ODD = (
 _EVEN = (ca.OP_COS, ca.OP_COSH)
 
 
-def _factors(function: ca.Function, inputs: Sequence[float]) -> list[float]:
-    """Return by which factors outputs change where the inputs change by theirs.
+def _factors(equations: Equations, states: Sequence[float], others: float) -> list[float]:
+    """Return by which factors rates and output change where states, drive and direction do.
 
     That is read from the expression, whatever the numbers: NaN where it is not a factor, or does
     not show as one; 0 where the output is zero.
     """
+    symbols = [*equations.states, equations.drive, equations.direction, *equations.parameters]
+    outputs = ca.vertcat(equations.rates, equations.output)
+    function = ca.Function("f", symbols, [outputs])
+    inputs = [*states, others, others, *[1.0] * len(equations.parameters)]
     work: dict[int, float] = {}
     power: dict[int, float] = {}  # constants
     found = [0.0] * function.nnz_out(0)
@@ -223,15 +226,15 @@ def _factors(function: ca.Function, inputs: Sequence[float]) -> list[float]:
     return found
 
 
-def _is_odd(function: ca.Function, order: int, parameters: int) -> bool:
+def is_odd(equations: Equations) -> bool:
     """Return whether rates and output change sign with states, drive and direction."""
-    factors = _factors(function, [-1.0] * (order + 2) + [1.0] * parameters)
+    factors = _factors(equations, [-1.0] * len(equations.states), -1.0)
     return all(factor in (-1.0, 0.0) for factor in factors)
 
 
-def _goes_with_speed(function: ca.Function, order: int, parameters: int) -> bool:
+def _goes_with_speed(equations: Equations) -> bool:
     """Return whether rates are in proportion to the speed, and the output does not depend on it."""
-    *rates, output = _factors(function, [1.0, 2.0] + [1.0] * (order + parameters))
+    *rates, output = _factors(equations, [1.0, 2.0] + [1.0] * (len(equations.states) - 2), 1.0)
     return output in (0.0, 1.0) and all(rate in (2.0, 0.0) for rate in rates)
 
 
