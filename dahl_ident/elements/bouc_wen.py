@@ -117,10 +117,12 @@ class BoucWen(Friction):
         sigma, q, p, *exponent = values
         ahead = direction * force
         if not exponent:
-            return sigma - 0.5 * ((q + p) * ahead + (q - p) * np.fabs(ahead))
+            size = np.fabs(ahead)  # each side's sum or difference is exact: q is not lost beside p
+            return sigma - 0.5 * (q * (ahead + size) + p * (ahead - size))
         (n,) = exponent
         softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))
-        rate = 0.5 * ((softening - stiffening) + (softening + stiffening) * np.sign(ahead))
+        side = np.sign(ahead)
+        rate = 0.5 * (softening * (1.0 + side) - stiffening * (1.0 - side))
         return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
 
     def _loops(
