@@ -23,6 +23,7 @@ __all__ = [
     "MissingDependencyError",
     "ModelError",
     "MultipleSolutionsWarning",
+    "NoSteadyMotionWarning",
     "SamplingError",
     "UnitError",
     "ValidationError",
@@ -228,6 +229,24 @@ class MultipleSolutionsWarning(UserWarning):
     >>> found = di.response(plant, 0.16, 0.02, all_roots=True)
     >>> int((found.amplitude > 0.0).sum())
     3
+    """
+
+
+class NoSteadyMotionWarning(UserWarning):
+    """Points of a response have no steady motion, or none that is stable, and hold NaN.
+
+    Examples
+    --------
+    An undamped resonance, driven by more than friction can take up:
+
+    >>> import warnings
+    >>> import dahl_ident as di
+    >>> plant = di.Dahl(1.0, 1.0) + di.Mass(1.0) + di.Spring(1.0)
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", di.errors.NoSteadyMotionWarning)
+    ...     found = di.response(plant, 0.5 / 3.141592653589793, 2.0).found
+    >>> bool(found)
+    False
     """
 
 

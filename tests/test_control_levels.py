@@ -15,7 +15,7 @@ from dahl_ident.control_interop import (
     limit_cycles,
     loop_margins,
 )
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, NoSteadyMotionWarning, ValidationError
 from dahl_ident.units import QUANTITIES
 
 FIG_7 = Dahl(0.1, 30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
@@ -68,7 +68,8 @@ def test_held_amplitude_gives_the_describing_function(quantity):
 def test_points_without_an_amplitude_are_left_out():
     undamped = Dahl(1.0, 1.0) + Mass(1.0) + Spring(1.0)
     f = np.array([0.5, 1.0, 2.0]) / (2.0 * np.pi)
-    result = level_responses(undamped, f, [3.0])
+    with pytest.warns(NoSteadyMotionWarning):
+        result = level_responses(undamped, f, [3.0])
     assert np.isnan(result.response[0, 1])
     assert result.to_control()[3.0].omega.tolist() == pytest.approx([0.5, 2.0])
 

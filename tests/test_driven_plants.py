@@ -8,6 +8,8 @@ import pytest
 
 import dahl_ident as di
 from benchmarks.driven_plants import PLANTS, scored, simulated, table
+from dahl_ident.engine import band_limited, march
+from dahl_ident.steady_state import Shooting
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(2, marks=pytest.mark.long)])
@@ -93,13 +95,62 @@ def test_a_force_that_is_not_a_sine_is_named_with_the_command_for_its_waveforms(
     assert "dahl-ident fit --record 'run 7.csv' --mass free" in fit.verdict
 
 
-def test_points_without_a_stable_motion_are_named():
+def test_a_motion_between_two_stops_settles_on_one_side():
+    """Harmonics of 400 cycles from rest, by the last one's Fourier transform."""
     law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
     plant = law + di.Mass(0.3) + di.Damper(0.3) + di.Spring(8.0)
-    steady = di.response(plant, [0.4, 0.58, 2.6], [0.05, 0.05, 0.6])
-    assert steady.found.tolist() == steady.stable.tolist() == [False, False, True]
-    assert np.isfinite(steady.amplitude).tolist() == [False, False, True]
-    assert steady.message.startswith("2 of 3 points: no stable motion of the drive's period")
+    with pytest.warns(di.errors.MultipleSolutionsWarning, match="2 of 3 points"):
+        steady = di.response(plant, [0.4, 0.58, 2.6], [0.05, 0.05, 0.6])
+    assert steady.found.tolist() == steady.stable.tolist() == [True, True, True]
+    expected = [[5.64893e-3, 1.25497e-3, 1.47644e-3], [6.22328e-3, 1.06179e-3, 0.56e-3]]
+    np.testing.assert_allclose(abs(steady.harmonics[:2, 1:4]), expected, rtol=1e-3)
+
+
+class TwoSlopes(di.Friction):
+    """A law that goes on at a fifth of its slope beyond half of f_max."""
+
+    parameters = di.Dahl.parameters[:2]
+
+    def slope(self, force, direction, velocity, values):
+        f_max, sigma = values
+        return sigma * (1.0 - 0.8 * (direction * force >= 0.5 * f_max))
+
+
+def test_motions_that_differ_in_both_directions_are_found_where_the_law_does_not():
+    """Between two drives the motion that is alike in both directions is not stable."""
+    plant = TwoSlopes(0.25, 16.4) + di.Mass(1.0) + di.Damper(0.045) + di.Spring(2.37)
+    drive = 0.25 * np.geomspace(0.05, 30.0, 57)
+    with pytest.warns(di.errors.MultipleSolutionsWarning):  # the other one is returned on request
+        steady = di.response(plant, 0.165, drive[35:45])
+    assert steady.found.all()
+    assert steady.stable.all()
+    one_sided = abs(steady.harmonics[:, 2]) > 0.01 * steady.amplitude
+    assert 3 <= one_sided.sum() <= 6
+    row = int(np.flatnonzero(one_sided)[1])
+    t = np.arange(300 * 64 + 1) / (0.165 * 64)
+    shooting = Shooting(plant)
+    wave = band_limited(drive[35 + row] * np.cos(2.0 * np.pi * 0.165 * t), t[1])
+    values = np.array([float(v) for v in plant.known_values()])
+    x = march(shooting.system, t, wave, t, np.zeros(3), values).output[-64:]
+    X = np.fft.rfft(x)[1:3] / 32.0
+    np.testing.assert_allclose(abs(X), abs(steady.harmonics[row, 1:3]), rtol=1e-3)
+
+
+def test_instant_unloading_in_a_plant_is_a_limit():
+    """Friction stays, and the motion no longer changes: it once vanished beyond p A = 1e11."""
+    rest = di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+    drive = [0.02, 0.05, 0.2, 1.0]
+    exact, far, farther = (
+        di.response(di.BoucWen(30.0, 300.0, p) + rest, 1.0, drive).amplitude
+        for p in (1e10, 1e13, 1e17)
+    )
+    np.testing.assert_allclose(far, exact, rtol=2e-4)
+    np.testing.assert_allclose(farther, exact, rtol=2e-4)
+    steep, steeper = (
+        di.response(di.BoucWen(30.0, 300.0, p, exponent=2.0) + rest, 1.0, drive).amplitude
+        for p in (1e8, 1e10)
+    )
+    np.testing.assert_allclose(steeper, steep, rtol=1e-4)
 
 
 def test_a_response_follows_its_sweep_to_the_jump():
@@ -115,12 +166,13 @@ def test_a_response_follows_its_sweep_to_the_jump():
         np.testing.assert_allclose(one.amplitude, last(amplitude, axis=1)[order], rtol=1e-6)
 
 
-def test_rows_without_a_stable_motion_are_named_and_do_not_stop_the_search():
+def test_rows_on_one_side_of_a_gap_do_not_stop_the_search():
     law = di.Backlash(di.Dahl(0.1, 30.0, 1.0), 0.01)
     known = di.Mass(0.3) + di.Spring(8.0)
     f, u = np.tile(np.linspace(0.4, 2.6, 8), 2), np.repeat([0.05, 0.6], 8)
-    steady = di.response(law + known + di.Damper(0.3), f, u)
-    assert not steady.found[0]
+    with pytest.warns(di.errors.MultipleSolutionsWarning):
+        steady = di.response(law + known + di.Damper(0.3), f, u)
+    assert steady.found.all()
     X = np.where(steady.found, steady.displacement, 0.0061 - 0.0012j)
     random = np.random.default_rng(0).standard_normal((2, f.size))
     R = X / u * np.exp(0.003 * (random[0] + 1j * random[1]))

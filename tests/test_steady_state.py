@@ -11,7 +11,12 @@ from scipy.optimize import brentq
 from scipy.special import i1e
 
 from dahl_ident.elements import Dahl, Damper, Mass, Model, Spring
-from dahl_ident.errors import ModelError, MultipleSolutionsWarning, ValidationError
+from dahl_ident.errors import (
+    ModelError,
+    MultipleSolutionsWarning,
+    NoSteadyMotionWarning,
+    ValidationError,
+)
 from dahl_ident.steady_state import response as any_response
 from dahl_ident.steady_state import solve
 
@@ -196,7 +201,8 @@ RESONANT = Dahl(1.0, 1.0) + Mass(1.0) + Spring(1.0)
 
 def test_undamped_resonance_has_no_amplitude_above_the_friction_limit():
     drive = np.array([0.5, 1.27, 4.0 / np.pi, 2.0])
-    result = response(RESONANT, 0.5 / np.pi, drive)
+    with pytest.warns(NoSteadyMotionWarning):
+        result = response(RESONANT, 0.5 / np.pi, drive)
     assert result.found.tolist() == [True, True, False, False]
     assert result.number_of_solutions.tolist() == [1, 1, 0, 0]
     assert np.isnan(result.amplitude[2:]).all()
@@ -212,19 +218,22 @@ def test_resonance_that_rounding_hides_has_no_amplitude_either():
     plant = Dahl(1.0, 1.0) + Mass(0.3) + Spring(0.1)
     omega = np.sqrt(0.1 / 0.3)
     assert 0.1 - 0.3 * omega**2 != 0.0
-    assert not response(plant, omega / (2.0 * np.pi), 2.0).found
+    with pytest.warns(NoSteadyMotionWarning):
+        assert not response(plant, omega / (2.0 * np.pi), 2.0).found
     assert response(plant, 1.0000001 * omega / (2.0 * np.pi), 2.0).found
 
 
-def test_a_point_without_amplitude_has_no_stiffness_and_no_warning():
-    result = response(RESONANT, [0.5 / np.pi, 1.0], 2.0)
+def test_a_point_without_amplitude_has_no_stiffness():
+    with pytest.warns(NoSteadyMotionWarning, match="1 of 2 points have no steady motion"):
+        result = response(RESONANT, [0.5 / np.pi, 1.0], 2.0)
     for part in (result.dynamic_stiffness, result.receptance, result.phase):
         assert np.isfinite(part).tolist() == [False, True]
 
 
 def test_linear_plant_alone():
     plant = Mass(2.0) + Spring(8.0)
-    result = response(plant, np.array([0.0, 1.0]) / np.pi, 4.0)
+    with pytest.warns(NoSteadyMotionWarning):
+        result = response(plant, np.array([0.0, 1.0]) / np.pi, 4.0)
     assert result.amplitude[0] == pytest.approx(0.5)
     assert not result.found[1]
 

@@ -189,6 +189,10 @@ class Backlash(Friction):
         """Return those of the element."""
         return self.element.combinations()
 
+    def resolved(self, values: Values, amplitude: FloatArray) -> Values:
+        """Return those of the element."""
+        return [*self.element.resolved(values[:-1], amplitude), values[-1]]
+
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of the element."""
         return self.element.physics(values[:-1])

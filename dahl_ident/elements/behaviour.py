@@ -279,6 +279,10 @@ class Behaviour(ABC):
         """
         return None
 
+    def resolved(self, values: Values, amplitude: FloatArray) -> Values:
+        """Return the values with those that no longer matter at an amplitude held where they do."""
+        return values
+
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return what speaks against the values physically, in words; empty where nothing."""
         return ()

@@ -125,19 +125,22 @@ class BoucWen(Friction):
         rate = 0.5 * (softening * (1.0 + side) - stiffening * (1.0 - side))
         return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
 
-    def _loops(
-        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
-    ) -> Loops:
-        """Return settled loops; p times amplitude counts as at most `_AT_ONCE`.
+    def resolved(self, values: Values, amplitude: FloatArray) -> Values:
+        """Return the values with p times amplitude at most `_AT_ONCE`.
 
         Data of gross slip leave p open, and searches let it grow without end.
         """
-        most = _AT_ONCE / at[:, 0]
-        beyond, at = at[:, _P] > most, at.copy()
-        at[:, _P] = np.minimum(at[:, _P], most)
-        loops = super()._loops(at, orders, chosen)
+        sigma, q, p, *exponent = values
+        return sigma, q, np.minimum(p, _AT_ONCE / amplitude), *exponent
+
+    def _loops(
+        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+    ) -> Loops:
+        """Return settled loops; p times amplitude counts as at most `_AT_ONCE`."""
+        resolved = np.stack([*at[:, :2].T, *self.resolved(list(at[:, 2:].T), at[:, 0])], axis=-1)
+        loops = super()._loops(resolved, orders, chosen)
         if _P - 2 in chosen:
-            loops.by_parameter[beyond, :, chosen.index(_P - 2)] = 0.0
+            loops.by_parameter[resolved[:, _P] < at[:, _P], :, chosen.index(_P - 2)] = 0.0
         return loops
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:

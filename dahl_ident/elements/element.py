@@ -398,6 +398,10 @@ class Model(Element):
             slowest = np.maximum(slowest, element.transient_decay(own, amplitude, omega))
         return slowest
 
+    def resolved(self, values: Values, amplitude: FloatArray) -> Values:
+        """Return the values of all elements, those that no longer matter held where they do."""
+        return [v for element, own in self.of(values) for v in element.resolved(own, amplitude)]
+
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of all elements to their values."""
         return tuple(text for element, own in self.of(values) for text in element.physics(own))

@@ -77,7 +77,7 @@ def exact_motions(
     def solved(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> SteadyMotion:
         return shooting(
             np.tile(values, (rows.size, 1)), omega[rows], drive[rows], harmonics=HARMONICS,
-            starts=starts, stable=False, **how,
+            starts=starts, **({"stable": False} | how),
         )  # fmt: skip
 
     def kept(rows: NDArray[np.intp], solution: SteadyMotion) -> NDArray[np.intp]:
@@ -99,19 +99,24 @@ def exact_motions(
     starts = np.zeros((rows.size, shooting.system.order))
     starts[:, 0] = near[rows, column].real
     starts[:, 1] = -omega[rows] * near[rows, column].imag
-    settling: dict[str, Any] = {"cycles": _CYCLES}  # leads to what is stable
-    directly: dict[str, Any] = {"again": False}
-    fronts = [(rows, starts, settling), (rows, starts, directly)]
-    while fronts:
-        rows, starts, how = fronts.pop(0)
-        if not rows.size:
-            continue
-        solution = solved(rows, starts, **how)
-        new = kept(rows, solution)
-        nearby = np.concatenate([rows[new] - 1, rows[new] + 1])
-        inside = (nearby >= 0) & (nearby < omega.size)
-        inside[inside] &= ~unique[nearby[inside]]
-        fronts.append((nearby[inside], np.tile(solution.starts[new], (2, 1))[inside], directly))
+
+    def follow(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> None:
+        """Keep the motions to which starts lead, and those of the neighbouring points."""
+        while rows.size:
+            solution = solved(rows, starts, **how)
+            new = kept(rows, solution)
+            nearby = np.concatenate([rows[new] - 1, rows[new] + 1])
+            inside = (nearby >= 0) & (nearby < omega.size)
+            inside[inside] &= open_to[nearby[inside]]
+            rows, starts = nearby[inside], np.tile(solution.starts[new], (2, 1))[inside]
+            how |= {"again": False, "cycles": None, "stable": False}
+
+    open_to = ~unique
+    follow(rows, starts, cycles=_CYCLES)  # leads to what is stable
+    follow(rows, starts, again=False)
+    open_to = np.array([bool(m) and not any(one.stable for one in m) for m in motions])
+    if shooting.system.odd:
+        follow(np.flatnonzero(open_to), None, one_sided=True, stable=True)
     for one in motions:
         one.sort(key=lambda motion: abs(motion.fundamental))
     begins = np.zeros(along.size, dtype=np.bool_)

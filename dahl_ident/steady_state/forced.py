@@ -22,7 +22,7 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements.element import Element, Model, as_model
-from dahl_ident.errors import MultipleSolutionsWarning, ValidationError
+from dahl_ident.errors import MultipleSolutionsWarning, NoSteadyMotionWarning, ValidationError
 from dahl_ident.steady_state.exact_response import HARMONICS, exact_motions
 from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
 from dahl_ident.steady_state.roots import find_roots
@@ -161,6 +161,8 @@ def response(
     -----
     MultipleSolutionsWarning
         If a point has several amplitudes and `all_roots` is off.
+    NoSteadyMotionWarning
+        If a point has no steady motion, or none that is stable, and `all_roots` is off.
 
     Raises
     ------
@@ -247,6 +249,10 @@ def response(
         rows = np.arange(chosen.size)
         harmonics, multiplier = harmonics[rows, chosen], multiplier[rows, chosen]
         harmonics[chosen < 0], multiplier[chosen < 0] = np.nan, np.nan
+        lost = np.isnan(harmonics[:, 1]).sum()
+        if lost:
+            text = f"{lost} of {chosen.size} points have no steady motion and hold NaN: {message}"
+            warnings.warn(text, NoSteadyMotionWarning, stacklevel=2)
     harmonics = harmonics.reshape(*shape, len(HARMONICS))
     X = harmonics[..., 1]
     return SteadyResponse(

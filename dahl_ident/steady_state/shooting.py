@@ -9,7 +9,8 @@ comes back.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ LINEAR = "the model is linear"
 NEUTRAL = 1e-6  # beyond 1: the multiplier of a motion that may lie anywhere is 1, to rounding
 _FINER = 10.0  # times: a motion that hardly turns is lost where steps pass over its two turns
 _LONG = 30  # cycles by which a motion leaves an unstable branch for a stable one
+_PATIENT, _ALONE = 3, 1000  # runs of cycles without Newton's method, each until the kernel ends it
 
 
 class SteadyMotion(NamedTuple):
@@ -130,8 +132,9 @@ class Shooting:
         cycles: int | None = None,
         again: bool = True,
         stable: bool = True,
+        one_sided: bool = False,
     ) -> SteadyMotion:
-        """Return the steady motions of many rows.
+        """Return the steady motions of many rows, with values that the engine can resolve.
 
         Parameters
         ----------
@@ -151,14 +154,50 @@ class Shooting:
             Whether a row that leads nowhere from its start is started from rest.
         stable : bool, default True
             Whether a motion that is not stable counts as none.
+        one_sided : bool, default False
+            Whether to seek motions that differ in both directions even if the law does not. They
+            come in pairs, of one fundamental, where the motion between them is not stable.
         """
+        how: dict[str, Any] = {
+            "chosen": chosen, "harmonics": harmonics, "again": again, "stable": stable,
+            "one_sided": one_sided,
+        }  # fmt: skip
+        result = self._motions(values, omega, drive, starts=starts, cycles=cycles, **how)
+        with np.errstate(all="ignore"):
+            A = np.hypot(result.starts[:, 0], result.starts[:, 1] / omega)
+            resolved = np.stack(self._model.resolved(list(values.T), A), axis=-1)
+            beyond = (resolved < values) & result.found[:, None]
+        rows = np.flatnonzero(beyond.any(axis=1))
+        if rows.size:
+            near = result.starts[rows]
+            other = self._motions(resolved[rows], omega[rows], drive[rows], starts=near, **how)
+            other.by_parameter.swapaxes(1, 2)[beyond[rows][:, list(chosen)]] = 0.0
+            for part, new in zip(result, other, strict=True):
+                part[rows] = new
+        return result
+
+    def _motions(
+        self,
+        values: FloatArray,
+        omega: FloatArray,
+        drive: FloatArray,
+        *,
+        chosen: Sequence[int],
+        harmonics: Sequence[int],
+        again: bool,
+        stable: bool,
+        one_sided: bool,
+        starts: FloatArray | None = None,
+        cycles: int | None = None,
+    ) -> SteadyMotion:
+        """Return the steady motions of many rows at these very values."""
         slopes = None
         if not self._coefficients.are_values:
             wanted = tuple(chosen)
             values, slopes = self._coefficients(values)
             slopes = slopes[:, :, wanted]
             chosen = np.flatnonzero(slopes.any(axis=(0, 2))).tolist()
-        ask = _Ask(values, omega, drive, tuple(chosen), tuple(harmonics), stable)
+        ask = _Ask(values, omega, drive, tuple(chosen), tuple(harmonics), stable, one_sided)
         result = _empty(omega.size, len(harmonics), len(chosen), self.system.order)
         possible = np.isfinite(values).all(axis=1) & np.isfinite(omega) & np.isfinite(drive)
         if starts is not None:
@@ -172,6 +211,10 @@ class Shooting:
         if stable or np.all(values == values[0]) or _FINER * lost.sum() <= omega.size:
             self._solve(result, lost, ask, finer=_FINER)
         self._solve(result, possible & ~result.found & unstable, ask, cycles=_LONG)
+        if stable and self.system.odd:
+            unstable = np.isfinite(result.multiplier)
+            which, runs = possible & ~result.found & unstable, _PATIENT if one_sided else 0
+            self._solve(result, which, ask._replace(one_sided=True), cycles=_LONG, runs=runs)
         if slopes is not None:
             result = result._replace(by_parameter=result.by_parameter @ slopes[:, chosen])
         return result
@@ -184,24 +227,27 @@ class Shooting:
         starts: FloatArray | None = None,
         cycles: int | None = None,
         finer: float = 1.0,
+        runs: int = 0,
     ) -> None:
-        """Put the motions of some rows into the result."""
+        """Put the motions of some rows into the result, each after some `runs` of cycles alone."""
         from dahl_ident.engine import settled
 
         rows = np.flatnonzero(which)
         if not rows.size:
             return
-        with np.errstate(all="ignore"):
-            found = settled(
-                self.system, ask.drive[rows], ask.omega[rows], ask.values[rows],
-                chosen=ask.chosen, harmonics=ask.harmonics,
-                starts=None if starts is None else starts[rows], cycles=cycles,
-                finer=finer,
-            )  # fmt: skip
+        system = replace(self.system, odd=self.system.odd and not ask.one_sided)
+        begin = None if starts is None else starts[rows]
+        for count in (*[_ALONE] * runs, cycles):
+            with np.errstate(all="ignore"):
+                found = settled(
+                    system, ask.drive[rows], ask.omega[rows], ask.values[rows], chosen=ask.chosen,
+                    harmonics=ask.harmonics, starts=begin, cycles=count, finer=finer,
+                )  # fmt: skip
+            begin = found.starts
         multiplier = np.full(rows.size, np.nan)
         ok = found.found & np.isfinite(found.maps).all(axis=(1, 2))
         sizes = np.abs(np.linalg.eigvals(found.maps[ok])).max(axis=1, initial=0.0)
-        multiplier[ok] = sizes**2 if self.system.odd else sizes  # the map of half a cycle
+        multiplier[ok] = sizes**2 if system.odd else sizes  # the map of half a cycle
         with np.errstate(invalid="ignore"):
             good = ok & (multiplier <= 1.0 + NEUTRAL) if ask.stable else ok
         put, at = np.flatnonzero(good), rows[good]
@@ -222,6 +268,7 @@ class _Ask(NamedTuple):
     chosen: tuple[int, ...]
     harmonics: tuple[int, ...]
     stable: bool
+    one_sided: bool
 
 
 def _empty(rows: int, harmonics: int, chosen: int, order: int) -> SteadyMotion:
