@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, NoSteadyMotionWarning, ValidationError
 from dahl_ident.steady_state import response
 from dahl_ident.synthetic.acquisition import Draws, Table
 from dahl_ident.synthetic.excitation import SteppedSine
@@ -116,7 +117,9 @@ def _table(
     errors = {"displacement": table.displacement_std, "force": table.force_std}
     (held_name, held_std), (name, std) = sorted(errors.items(), reverse=forced)
     if forced:
-        steady = response(experiment.plant, frequency_hz, level, steady=table.steady)
+        with warnings.catch_warnings():  # they are an error here
+            warnings.simplefilter("ignore", NoSteadyMotionWarning)
+            steady = response(experiment.plant, frequency_hz, level, steady=table.steady)
         if not steady.found.all():
             raise ModelError(steady.message)
         every = np.asarray(steady.harmonics)
