@@ -30,7 +30,7 @@ finite. The chart (kappa, x_c, sigma + stiffness) straightens it; where f_max is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -253,41 +253,31 @@ def microslip_charts(problem: TableProblem) -> list[Chart]:
     Their coordinates stand in the places of theta's: the determined combination in that of the
     parameter that adds to the spring, and the logarithm of the ratio that runs away.
     """
-    charts = []
-    for element, asymptote, spring in _tied(problem):
-        if asymptote.follows is None or asymptote.adds_to_spring is None:
-            continue
-        names = [element.parameter(label).name for label in asymptote.follows[:2]]
-        if any(name not in problem.names for name in names) or len(asymptote.kept) != 1:
-            continue
-        leading, other = (problem.names.index(name) for name in names)
-        P = len(problem.parameters)
-        powers = _powers(element, asymptote.kept[0][1], problem)[[leading, other]]
-        inner = np.linalg.inv(np.array([[1.0, -1.0], powers]))  # of (ln ratio, ln combination)
-        matrix = np.eye(P)
-        matrix[np.ix_([leading, other], [leading, other])] = inner
-        tied = element.parameter(asymptote.adds_to_spring).name
-        charts.append(_straightened(matrix, spring, problem.names.index(tied)))
-    return charts
+    return [chart for chart, whole in _straight_charts(problem) if whole]
 
 
 def stiffness_charts(problem: TableProblem) -> list[Chart]:
     """Return the same for laws whose other scale parameter is given: ln sigma, the sum."""
-    charts = []
+    return [chart for chart, whole in _straight_charts(problem) if not whole]
+
+
+def _straight_charts(problem: TableProblem) -> Iterator[tuple[Chart, bool]]:
+    """Yield the charts, and whether both parameters of the combination are free."""
     for element, asymptote, spring in _tied(problem):
         if asymptote.follows is None or asymptote.adds_to_spring is None:
             continue
         tied = element.parameter(asymptote.adds_to_spring)
-        others = [element.parameter(label) for label in asymptote.follows[:2]]
-        if tied.free and not all(p.free for p in others):
-            place = problem.names.index(tied.name)
-            charts.append(_straightened(np.eye(len(problem.parameters)), spring, place))
-    return charts
-
-
-def _straightened(matrix: FloatArray, spring: int, sigma: int) -> Chart:
-    back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-    return Chart(matrix, np.zeros(len(matrix)), back, (spring, sigma))
+        both = [element.parameter(label) for label in asymptote.follows[:2]]
+        matrix, whole = np.eye(len(problem.parameters)), all(p.free for p in both)
+        if not tied.free or (whole and len(asymptote.kept) != 1):
+            continue
+        if whole:
+            pair = [problem.names.index(p.name) for p in both]
+            powers = _powers(element, asymptote.kept[0][1], problem)[pair]
+            matrix[np.ix_(pair, pair)] = np.linalg.inv(np.array([[1.0, -1.0], powers]))
+        sigma = problem.names.index(tied.name)
+        back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+        yield Chart(matrix, np.zeros(len(matrix)), back, (spring, sigma)), whole
 
 
 def limits(problem: TableProblem) -> list[Limit]:

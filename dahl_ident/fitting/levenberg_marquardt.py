@@ -325,6 +325,9 @@ def minimise_by_scipy(
             at[0] = np.nan  # a step that scipy takes back
         return at
 
+    def residuals(at: FloatArray) -> FloatArray:
+        return np.asarray(rows(at)[0])
+
     def jacobian(at: FloatArray) -> FloatArray:
         return rows(at)[1:].T
 
@@ -333,7 +336,7 @@ def minimise_by_scipy(
     if np.isfinite(rows(start)[0]).all():
         with np.errstate(all="ignore"):
             end = optimize.least_squares(
-                lambda at: rows(at)[0], start, jacobian, bounds=bounds,
+                residuals, start, jacobian, bounds=bounds,
                 x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
         phi, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)

@@ -95,7 +95,8 @@ def solve_repetitions(
     for row in range(count):
         drawn = [size * rng.standard_normal(y.size + _SETTLING) for y in outputs]
         errors = [lfilter([1.0], noise, e)[_SETTLING:] for e in drawn]
-        again = problem.measuring([y + e for y, e in zip(outputs, errors, strict=True)])
+        noisy = tuple(y + e for y, e in zip(outputs, errors, strict=True))
+        again = problem.altered(sizes=problem.sizes, measured=noisy)
         end = search.descend(again, optimum.theta, STEPS)
         if end.converged[0]:
             theta[row] = end.theta[0]

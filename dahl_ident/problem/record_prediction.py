@@ -82,7 +82,7 @@ def motion_of(
     of_record, free = problem.own(values, number), values[: len(problem.free)]
     starts = of_record.size - 1
     at, slopes = (part[0] for part in problem.coefficients(np.array([problem.full_values(values)])))
-    slopes = slopes[:, problem.chosen]
+    slopes = slopes[:, [p.free for p in problem.model.parameters]]
     chosen = np.flatnonzero(slopes.any(axis=1)).tolist()
     first, by_start, by_value = problem.first(of_record[:starts], at)
     time, drive = problem.drives[number]

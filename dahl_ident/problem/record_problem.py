@@ -210,10 +210,6 @@ class RecordProblem(Problem):
         """Return the same problem with filtered residuals."""
         return self.altered(whitening=whitening)
 
-    def measuring(self, outputs: Sequence[FloatArray]) -> RecordProblem:
-        """Return the same problem with other measured outputs, in the same unit."""
-        return self.altered(sizes=self.sizes, measured=tuple(outputs))
-
     def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
         """Return the same problem with other values of parameters that are fixed."""
         model = self.model.with_values(values)  # equations are shorter where a value is 0 or 1
@@ -274,7 +270,7 @@ class RecordProblem(Problem):
         parameters = (*free, *self.parameters[self.n_reported :])
         inside = np.array([p.name not in ranges for p in parameters])
         space = Space(parameters, bends(free, len(parameters), self.records), inside=inside)
-        stale = ("system", "coefficients", "first", "chosen")
+        stale = ("system", "coefficients", "first")
         changes = {"free": free, "space": space, "ranges": ranges, "latest": dict(self.latest)}
         return self.altered(*stale, model=model, **changes)
 
@@ -365,11 +361,6 @@ class RecordProblem(Problem):
         return self.n_samples - len(self.records) * (self.whitening.size - 1)
 
     n_numbers = n_residuals
-
-    @cached_property
-    def rates(self) -> tuple[float, ...]:
-        """Sampling rates, Hz."""
-        return tuple(record.sample_rate for record in self.records)
 
     @cached_property
     def measured(self) -> tuple[FloatArray, ...]:
@@ -515,11 +506,6 @@ class RecordProblem(Problem):
         It is asked for more than once, also by problems in which other parameters are free.
         """
         return {}
-
-    @cached_property
-    def chosen(self) -> list[int]:
-        """Places of the free parameters among all."""
-        return [i for i, p in enumerate(self.model.parameters) if p.free]
 
     @cached_property
     def coefficients(self) -> Coefficients:
