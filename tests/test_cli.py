@@ -22,14 +22,14 @@ COMMANDS = (
     "demo", "app", "inspect", "extract", "fit", "sample", "plan", "campaign", "report", "export",
     "simulate", "datasets", "template",
 )  # fmt: skip
+NOISY = (Path(__file__).parents[1] / "datasets/synthetic/noisy.csv").read_text("utf-8")
 PROGRAM = Path(sys.executable).with_name("dahl-ident")
 
 
 def test_command_line_and_python_give_the_same_numbers(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    whole = json.loads(run("fit", "-", "--json", stdin=table).out)
+    whole = json.loads(run("fit", "-", "--json", stdin=NOISY).out)
     told = whole["params"]
-    Path("noisy.csv").write_text(table, encoding="utf-8")
+    Path("noisy.csv").write_text(NOISY, encoding="utf-8")
     fit = di.fit(di.read_frequency_response("noisy.csv"), di.Dahl())
     for name in ("f_max", "sigma"):
         assert told[name]["value"] == fit.params[name].value
@@ -59,8 +59,7 @@ def test_command_line_and_python_give_the_same_numbers(run):
     ],
 )
 def test_bad_input_says_what_was_expected(run, arguments, message):
-    table = run("datasets", "noisy", "-o", "-").out
-    outcome = run(*arguments, stdin=table)
+    outcome = run(*arguments, stdin=NOISY)
     assert outcome.status == 1
     assert outcome.err.startswith("error: ")
     assert outcome.err.count("\n") == 1
@@ -241,46 +240,42 @@ def test_no_good_point_is_an_error_of_its_own(run):
 
 
 def test_sample_integrates_at_once_where_asked(run):
-    table = run("datasets", "noisy", "-o", "-").out
     options = ("sample", "-", "--prior", "f_max=0.01:1", "--alpha", "1")
-    told = json.loads(run(*options, "--method", "grid", "--json", stdin=table).out)
+    told = json.loads(run(*options, "--method", "grid", "--json", stdin=NOISY).out)
     assert told["converged"]
     assert told["error"] < 1e-3
-    chain = json.loads(run(*options, "--json", stdin=table).out)
+    chain = json.loads(run(*options, "--json", stdin=NOISY).out)
     for name in ("f_max", "sigma"):
         exact, drawn = told["summary"][name], chain["summary"][name]
         assert abs(exact["median"] - drawn["median"]) < 0.1 * exact["std"]
-    text = run(*options, "--method", "grid", stdin=table)
+    text = run(*options, "--method", "grid", stdin=NOISY)
     assert text.status == 0
     assert text.out.startswith("Converged: error ")
     assert "ln evidence: " in text.out
-    refused = run(*options, "--method", "grid", "--max-steps", "30", stdin=table)
+    refused = run(*options, "--method", "grid", "--max-steps", "30", stdin=NOISY)
     assert refused.status == 1
     assert "--max-steps is given together with --method grid, which runs no" in refused.err
 
 
 def test_a_chain_that_is_too_short_ends_with_3(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("sample", "-", "--steps", "20", "--alpha", "1", stdin=table)
+    outcome = run("sample", "-", "--steps", "20", "--alpha", "1", stdin=NOISY)
     assert outcome.status == 3
     assert outcome.out.startswith("NOT CONVERGED after 20 steps")
 
 
 def test_a_prior_that_keeps_the_data_out_ends_with_3(run):
-    table = run("datasets", "noisy", "-o", "-").out
     options = ("--method", "grid", "--prior", "f_max=1:2", "--uncertainty", "noise")
-    outcome = run("sample", "-", *options, stdin=table)
+    outcome = run("sample", "-", *options, stdin=NOISY)
     assert outcome.status == 3
     assert outcome.err.startswith("not to be trusted: PRIOR AGAINST DATA: f_max lies beyond 99 %")
     assert "MISFIT: the residuals are larger than the noise that the data state" in outcome.out
 
 
 def test_report_writes_every_format_asked_for(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("report", "-", "-o", "a.html", "-o", "a.json", stdin=table)
+    outcome = run("report", "-", "-o", "a.html", "-o", "a.json", stdin=NOISY)
     assert outcome.out.split() == ["a.html", "a.json"]
     assert json.loads(Path("a.json").read_text(encoding="utf-8"))["trusted"] is True
-    assert run("report", "-", "-o", "a.doc", stdin=table).status == 1
+    assert run("report", "-", "-o", "a.doc", stdin=NOISY).status == 1
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -296,7 +291,7 @@ def test_every_help_has_an_example_that_runs(run, command):
             '[files]\npattern = "{device}.csv"\nkind = "response"\n[[model]]\nkind = "dahl"\n'
         )
     if command == "export":
-        run("fit", "-", "--save", "fit.json", stdin=run("datasets", "noisy", "-o", "-").out)
+        run("fit", "-", "--save", "fit.json", stdin=NOISY)
     run.line(found[1].strip(), *(("--alpha", "1") if command == "sample" else ()))
 
 
@@ -352,8 +347,7 @@ def test_a_fit_of_a_small_table_loads_nothing_that_takes_long(tmp_path, *, extra
 
 
 def test_a_saved_fit_is_reported_with_its_posterior(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=table).status == 0
+    assert run("fit", "-", "--alpha", "1", "--save", "fit.json", stdin=NOISY).status == 0
     assert run("report", "fit.json", "--posterior", "-o", "r.json").status == 0
     told = json.loads(Path("r.json").read_text(encoding="utf-8"))
     assert told["posteriors"][0]["converged"] is True
@@ -435,8 +429,7 @@ def test_a_closed_standard_input_is_named(monkeypatch):
 
 
 def test_a_bootstrap_from_a_negative_seed_is_refused(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    outcome = run("report", "-", "--bootstrap", "--seed", "-2", stdin=table)
+    outcome = run("report", "-", "--bootstrap", "--seed", "-2", stdin=NOISY)
     assert outcome.status == 1
     assert outcome.err == "error: seed is -2; expected a whole number >= 0\n"
 
@@ -576,15 +569,14 @@ def test_an_input_is_never_written_over(run, option):
     ],
 )
 def test_bad_options_are_refused_before_anything_is_written(run, arguments, message):
-    outcome = run(*arguments, stdin=run("datasets", "noisy", "-o", "-").out)
+    outcome = run(*arguments, stdin=NOISY)
     assert (outcome.status, outcome.out) == (1, "")
     assert message in outcome.err
     assert list(Path().iterdir()) == []
 
 
 def test_a_report_goes_to_standard_output(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    out = run("fit", "-", "--report", "-", stdin=table).out
+    out = run("fit", "-", "--report", "-", stdin=NOISY).out
     assert out.startswith("<!doctype html>")
     assert out.rstrip().endswith("</html>")
     assert list(Path().iterdir()) == []
@@ -607,20 +599,18 @@ def test_sensors_are_fixed_free_or_have_a_prior(run):
 
 
 def test_priors_come_from_a_calibration_sheet(run):
-    table = run("datasets", "noisy", "-o", "-").out
     Path("lab.toml").write_text(
         "[sample]\nsteps = 30\n[sample.prior]\nf_max = ['10mN', '1N']\n"
         'sigma = "lognorm(s=0.1, scale=30)"\n',
         encoding="utf-8",
     )
-    told = json.loads(run("sample", "-", "--json", "--config", "lab.toml", stdin=table).out)
+    told = json.loads(run("sample", "-", "--json", "--config", "lab.toml", stdin=NOISY).out)
     assert told["priors"]["f_max"].startswith("log-uniform from 0.01 to 1 N")
     assert told["priors"]["sigma"].startswith("lognorm, mean 30.15")
 
 
 def test_a_saved_fit_takes_no_other_model(run):
-    table = run("datasets", "noisy", "-o", "-").out
-    assert run("fit", "-", "--save", "fit.json", stdin=table).status == 0
+    assert run("fit", "-", "--save", "fit.json", stdin=NOISY).status == 0
     outcome = run("report", "fit.json", "--mass", "free", "-o", "r.html")
     assert outcome.status == 1
     assert "saved fits are reported unchanged" in outcome.err

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dahl_ident import Dahl, FrequencyResponse, LinearSystem, fit
+from dahl_ident import Dahl, LinearSystem, fit
 from dahl_ident.control_interop import closed_loop_response, level_responses
 from dahl_ident.errors import ValidationError
 
@@ -46,55 +46,6 @@ def simulated(frequency_hz, drive, gains=(0.0, 0.0), cycles=12):
 def table(points, **options):
     rows = [simulated(f, u, **options) for f, u in points]
     return np.array([r for r, _ in rows]), np.array([A for _, A in rows])
-
-
-POINTS = [(f, u) for u in (0.05, 0.15, 0.4, 1.0) for f in (1.0, 2.2, 3.1)]
-
-
-@pytest.fixture(scope="module")
-def open_loop():
-    return table(POINTS)
-
-
-def test_given_linear_part_force_controlled(open_loop):
-    f, u = np.array(POINTS).T
-    data = FrequencyResponse(
-        f, open_loop[0], drive=u, controlled="force", quantity="receptance", level=u
-    )
-    for system in (
-        LINEAR_PART,
-        control.ss(LINEAR_PART),
-        control.frd(LINEAR_PART, np.geomspace(1, 50, 300)),
-    ):
-        model = Dahl() + LinearSystem(system, quantity="receptance")
-        result = fit(data, model)
-        # the least-squares optimum: 3 % is what the describing function itself is off by here
-        f_max, sigma = result.optimum.values
-        assert f_max == pytest.approx(F_MAX, rel=0.03)
-        assert sigma == pytest.approx(SIGMA, rel=0.03)
-
-
-def test_given_linear_part_displacement_controlled(open_loop):
-    f, u = np.array(POINTS).T
-    data = FrequencyResponse(f, 1.0 / open_loop[0], amplitude=open_loop[1], level=u)
-    result = fit(data, Dahl() + LinearSystem(LINEAR_PART, quantity="receptance"))
-    assert result.params["f_max"].value == pytest.approx(F_MAX, rel=0.03)
-    assert result.params["sigma"].value == pytest.approx(SIGMA, rel=0.03)
-
-
-def test_free_linear_part_is_found_with_the_friction(open_loop):
-    def mode(mass, damping):
-        return 1 / (mass * s**2 + damping * s + STIFFNESS)
-
-    f, u = np.array(POINTS).T
-    data = FrequencyResponse(f, open_loop[0], drive=u, controlled="force", quantity="receptance")
-    linear = LinearSystem(
-        mode, quantity="receptance", parameters={"mass": 0.2, "damping": 0.5}, name="stage"
-    )
-    result = fit(data, Dahl() + linear, free=["stage_mass", "stage_damping"])
-    truth = {"f_max": F_MAX, "sigma": SIGMA, "stage_mass": MASS, "stage_damping": DAMPING}
-    found = {name: result.params[name].value for name in truth}
-    assert found == pytest.approx(truth, rel=0.05)
 
 
 def test_plant_measured_under_feedback_with_a_known_controller():

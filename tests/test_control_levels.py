@@ -24,12 +24,6 @@ U0 = np.geomspace(1e-4, 10.0, 51)
 s = control.tf("s")
 
 
-@pytest.fixture(autouse=True)
-def _close_figures():
-    yield
-    plt.close("all")
-
-
 def test_fig_7_in_one_call():
     fig_7 = level_responses(FIG_7, F, U0, steady="describing function")
     truth = response(FIG_7, F, U0[:, None], steady="describing function").receptance

@@ -465,7 +465,6 @@ class TestTelling:
         assert top is axes[0]
         assert bottom.get_xlabel() == "displacement amplitude [m]"
         assert len(top.get_lines()[0].get_xdata()) == 5
-        plt.close("all")
 
 
 def test_errors_of_the_drive_are_kept_in_files(tmp_path):

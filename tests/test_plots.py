@@ -224,7 +224,6 @@ def test_records_draw_themselves():
         record.plot("bode")  # type: ignore[arg-type]
     with pytest.raises(ValidationError, match="ax holds 1 axes; expected 2"):
         record.plot(ax=[loop])
-    plt.close("all")
 
 
 def test_margins_that_are_infinite_everywhere_are_drawn():
@@ -237,7 +236,6 @@ def test_margins_that_are_infinite_everywhere_are_drawn():
     top, _ = LoopMargins(A, np.full(12, 10.0), np.full(12, 60.0), np.ones(12)).plot()
     np.testing.assert_allclose(np.asarray(top.lines[0].get_ydata()), 20.0)
     assert (top.get_yscale(), top.get_ylabel()) == ("linear", "gain margin [dB]")
-    plt.close("all")
 
 
 AWKWARD = {  # name, centre, spread, logarithmic
@@ -270,7 +268,6 @@ def test_labels_of_corner_and_trace_do_not_collide(count):
     assert colliding_labels(grid[0, 0].figure) == []
     rows = plots.plot_trace(names, draws.reshape(100, 32, count), log=log, discard=20)
     assert colliding_labels(rows[0].figure) == []
-    plt.close("all")
 
 
 @pytest.mark.parametrize("name", AWKWARD)
@@ -286,7 +283,6 @@ def test_labels_of_profiles_do_not_collide(name, width):
     assert colliding_labels(axis.figure) == []
     ticks = set(axis.get_xticklabels())
     assert len(ticks.intersection(_drawn(axis.figure))) >= 2
-    plt.close("all")
 
 
 def _amplitude(ax):
@@ -318,7 +314,6 @@ def test_residuals_are_joined_along_each_curve_only():
     assert [1, 2] in joined
     assert [3, 4] in joined
     assert [1, 2, 3, 4] not in joined
-    plt.close("all")
 
 
 def test_a_fitted_phase_lies_on_the_turn_of_its_points():
@@ -328,7 +323,6 @@ def test_a_fitted_phase_lies_on_the_turn_of_its_points():
     _, bottom = plots.plot_frequency_response([("a", x, measured)], fitted=[fitted])
     (curve,) = (line for line in bottom.lines if line.get_linestyle() == "-")
     np.testing.assert_allclose(np.asarray(curve.get_ydata()), [178.5, 180.5, 182.5])
-    plt.close("all")
 
 
 @pytest.mark.parametrize("draw", SINGLES.values(), ids=SINGLES.keys())
@@ -366,7 +360,6 @@ def test_only_wide_ranges_are_drawn_over_their_logarithm():
     assert (grid[1, 0].get_xscale(), grid[1, 0].get_yscale()) == ("linear", "log")
     rows = plots.plot_trace(["narrow", "wide"], draws.reshape(100, 30, 2), log=[True, True])
     assert [axis.get_yscale() for axis in rows] == ["linear", "log"]
-    plt.close("all")
 
 
 SEEN_BY = {  # matrices of Machado, Oliveira and Fernandes 2009, for missing receptors
@@ -427,7 +420,6 @@ def test_repeated_measurements_of_a_level_are_not_joined():
         [("curve", [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]), ("repeats", [1.0, 1.0, 2.0], [1.0, 3.0, 2.0])]
     )
     assert [line.get_linestyle() for line in top.lines] == ["-", "None"]
-    plt.close("all")
 
 
 @pytest.mark.parametrize(
@@ -445,7 +437,6 @@ def test_the_house_style_stays_in_its_figures():
     before = dict(mpl.rcParams)
     plots.plot_residuals(A, A, A)
     assert dict(mpl.rcParams) == before
-    plt.close("all")
 
 
 def test_axes_of_the_user_are_drawn_on_in_the_house_style():
@@ -492,4 +483,3 @@ def test_residuals_of_a_fit_over_amplitude_frequency_and_velocity():
         np.testing.assert_allclose(np.asarray(drawn.get_xdata()), x)
     with pytest.raises(ValidationError, match="against is 'time'; expected one of amplitude"):
         fit.plot_residuals(against="time")
-    plt.close("all")

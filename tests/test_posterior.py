@@ -292,7 +292,5 @@ def test_arviz_gets_every_group(posterior):
 
 
 def test_pictures(posterior):
-    plt = import_module("matplotlib.pyplot")
     assert posterior.plot_corner().shape == (3, 3)
     assert len(posterior.plot_trace()) == 3
-    plt.close("all")

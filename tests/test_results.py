@@ -398,11 +398,6 @@ def lines(axis, points):
 
 
 class TestPictures:
-    @pytest.fixture(autouse=True)
-    def _close(self):
-        yield
-        plt.close("all")
-
     def test_over_amplitude_with_a_band(self, result):
         top, bottom = result.plot_fit()
         (line,) = lines(top, 200)
