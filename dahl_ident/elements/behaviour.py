@@ -291,11 +291,6 @@ class Behaviour(ABC):
         """Return numerator and denominator of Z(s), from the highest power of s down.
 
         None for an element that is not linear.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value, or Z is not a rational function of s.
         """
         return None
 

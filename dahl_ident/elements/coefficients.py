@@ -20,10 +20,6 @@ class Coefficients:
 
     They are the values themselves, except for linear systems that have free parameters.
 
-    Parameters
-    ----------
-    model : Model
-
     Attributes
     ----------
     model : Model

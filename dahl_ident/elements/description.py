@@ -13,22 +13,8 @@ from dahl_ident.errors import ModelError, choices
 def describe_model(model: Element) -> list[dict[str, Any]]:
     """Return a model as a list of plain dicts, ready for JSON or TOML.
 
-    Parameters
-    ----------
-    model : Element
-        One element or a sum.
-
-    Returns
-    -------
-    list of dict
-        One an element: its kind, its name if it has one, and its parameters; a number is a
-        fixed value, {"assumed": number} a default that nobody gave, "free" a parameter to
-        estimate, a table a free one with its start.
-
-    Raises
-    ------
-    ModelError
-        If the model holds a linear system built by a function, which no file can hold.
+    A number is a fixed value, {"assumed": number} a default that nobody gave, "free" a parameter
+    to estimate, a table a free one with its start.
 
     Examples
     --------
@@ -42,21 +28,6 @@ def describe_model(model: Element) -> list[dict[str, Any]]:
 
 def model_from_description(description: list[Mapping[str, Any]]) -> Model:
     """Return the model that :func:`describe_model` described.
-
-    Parameters
-    ----------
-    description : list of mapping
-        Elements as plain data; the kind of a law may also be the name of its class.
-
-    Returns
-    -------
-    Model
-        Equal in every parameter.
-
-    Raises
-    ------
-    ModelError
-        If a kind or a key is unknown.
 
     Examples
     --------

@@ -56,21 +56,7 @@ def law_equations(element: Element) -> Equations:
 def plant_equations(
     model: Model, excitation: Excitation = "force", channel: Channel = "displacement"
 ) -> Equations:
-    """Return the equation of motion of a model, driven by a force or by its base.
-
-    Parameters
-    ----------
-    model : Model
-        Elements in parallel, at least one of them a mass.
-    excitation : {"force", "base"}
-        What the drive is: a force, N, or the acceleration of the base, m/s^2.
-    channel : {"displacement", "velocity", "acceleration"}
-        What the output is.
-
-    Raises
-    ------
-    ModelError
-        If nothing has inertia, or an element has no equation of motion.
+    """Return the equation of motion of a model, driven by a force or by its base's acceleration.
 
     Examples
     --------
@@ -127,13 +113,7 @@ def _pairs(element: Element, values: list[ca.SX]) -> Iterator[tuple[Parameter, c
 
 
 class FirstState:
-    """The first state of a driven plant, from what a record leaves unknown there.
-
-    Parameters
-    ----------
-    model : Model
-        Elements in parallel.
-    """
+    """The first state of a driven plant, from what a record leaves unknown there."""
 
     def __init__(self, model: Model) -> None:
         import casadi as ca
@@ -154,15 +134,6 @@ class FirstState:
     def __call__(
         self, starts: FloatArray, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the first state and its derivatives with respect to starts and parameters.
-
-        Parameters
-        ----------
-        starts : ndarray, shape (m,)
-            Displacement, velocity, the starts of each element with memory, and the states of those
-            without.
-        values : ndarray, shape (P,)
-            Of all parameters.
-        """
+        """Return the first state and its derivatives with respect to starts and parameters."""
         first, by_start, by_value = (part.full() for part in self._function(starts, values))
         return first[:, 0], by_start, by_value

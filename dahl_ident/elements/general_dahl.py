@@ -75,17 +75,6 @@ def stiffness(
     and dN_k/d alpha = dh/dalpha. All are 0 for even k. A block of loops at a time has the nodes of
     its highest harmonic.
 
-    Parameters
-    ----------
-    beta : ndarray
-        sigma A / f_max >= 0; unchecked, broadcast with `alpha`.
-    alpha : ndarray
-        Exponent of Eqn. 2, > 0; unchecked.
-    k : int or ndarray of int, default 1
-        Harmonic; broadcast with `beta`.
-    derivatives : int, default 0
-        0, 1 or 2, see above.
-
     Examples
     --------
     >>> h, by_f_max, by_sigma, by_alpha = stiffness(np.array(1.0), np.array(2.0), 1, 2)

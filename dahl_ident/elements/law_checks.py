@@ -55,14 +55,7 @@ def is_of_package(law: type) -> bool:
 
 
 def check_declarations(law: type[Element]) -> None:
-    """Refuse parameters that are not declared as they should be.
-
-    Raises
-    ------
-    ValidationError
-        If one is not a parameter, two have one name, a name is not an identifier, bounds are the
-        wrong way round, a unit is unknown, or several states are declared.
-    """
+    """Refuse parameters that are not declared as they should be."""
     if is_of_package(law):
         return
     name = law.__name__
@@ -124,14 +117,7 @@ def check_declarations(law: type[Element]) -> None:
 
 
 def check_slope(law: Friction) -> None:
-    """Refuse a law whose slope cannot be that of a friction law.
-
-    Raises
-    ------
-    ModelError
-        If the slope fails on arrays, is not an array of numbers of the right shape, is not finite
-        or not positive up to full slip, is the same everywhere, or if the law creates energy.
-    """
+    """Refuse a law whose slope cannot be that of a friction law."""
     if is_of_package(type(law)) or not law.one_state:
         return
     declared = tuple(law.parameters)
@@ -506,13 +492,7 @@ def _shown(found: Any) -> str:
 def traced(
     element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
 ) -> Mechanics:
-    """Return an element's part in an equation of motion, in symbols.
-
-    Raises
-    ------
-    ModelError
-        If the slope of a user's law fails with symbols, or is another one than with numbers.
-    """
+    """Return an element's part in an equation of motion, in symbols."""
     if is_of_package(type(element)):
         return element.mechanics(values, x, v, s, states)
     try:

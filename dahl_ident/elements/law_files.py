@@ -205,13 +205,7 @@ def describe_laws(elements: Iterable[Element]) -> list[dict[str, Any]]:
 
 
 def require_laws(laws: Sequence[Mapping[str, Any]], holder: str) -> None:
-    """Refuse to go on without the laws that :func:`describe_laws` described.
-
-    Raises
-    ------
-    ModelError
-        If one is not known here; it names the file that defines it.
-    """
+    """Refuse to go on without the laws that :func:`describe_laws` described."""
     for law in laws:
         if law["kind"] not in KINDS:
             file = law["file"] or "an interactive session, which no file holds"

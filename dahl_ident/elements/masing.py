@@ -227,19 +227,6 @@ class _Paths:
 def jenkins(ratio: FloatArray, harmonic: int) -> tuple[ComplexArray, ComplexArray]:
     """Return N_k of a Jenkins element of unit stiffness, and its derivative.
 
-    Parameters
-    ----------
-    ratio : ndarray
-        m = d/A > 0, the slip displacement over the amplitude. At exactly 1, where N has a kink,
-        the derivative is that of the element that does not slip.
-    harmonic : int
-        k >= 0; even harmonics vanish.
-
-    Returns
-    -------
-    value, by_ratio : ndarray of complex
-        For k = 1, (t - sin t cos t)/pi + 4j m (1 - m)/pi with t = arccos(1 - 2 m) for m < 1.
-
     Examples
     --------
     >>> print(f"{3.0 * jenkins(np.asarray(1.0 / 1.3), 1)[0]:.7f}")

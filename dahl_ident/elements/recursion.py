@@ -42,15 +42,6 @@ def stretches(displacement: FloatArray) -> Stretches:
     A step of 0 goes on as the motion before it. A turning point belongs to the stretch that it
     begins.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (n,)
-        m.
-
-    Returns
-    -------
-    Stretches
-
     Examples
     --------
     >>> cut = stretches(np.array([0.0, 1.0, 3.0, 2.0]))
@@ -74,19 +65,6 @@ def stretches(displacement: FloatArray) -> Stretches:
 def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
     """Return y with y[0] = first and y[i + 1] = keep[i] y[i] + term[i].
 
-    Parameters
-    ----------
-    keep : ndarray, shape (n,)
-        Factors.
-    term : ndarray, shape (n, c)
-        c recursions with the same factors.
-    first : ndarray, shape (c,)
-        Their first values.
-
-    Returns
-    -------
-    ndarray, shape (n + 1, c)
-
     Notes
     -----
     One forward substitution in a banded triangular matrix, by LAPACK.
@@ -107,16 +85,6 @@ def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> F
 
 def matrix_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
     """Return y with y[0] = first and y[i + 1] = keep[i] y[i] + term[i].
-
-    Parameters
-    ----------
-    keep : ndarray, shape (n, order, order)
-    term : ndarray, shape (n, order, c)
-    first : ndarray, shape (order, c)
-
-    Returns
-    -------
-    ndarray, shape (n + 1, order, c)
 
     Examples
     --------

@@ -21,20 +21,6 @@ def differentiated(
     band, about (degree + 1)/(3.2 half-width - 4.6) of half the sampling rate, holds four times that
     below which 99.99 % of the velocity's power lies.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (n,)
-        Values.
-    interval : float
-        Between samples, s.
-    stretch : float, default 1
-        Factor on the window's half-width, to see what depends on it.
-
-    Returns
-    -------
-    first, second : ndarray, shape (n,)
-        Per s and per s^2.
-
     Examples
     --------
     >>> t = np.arange(400) / 100.0

@@ -19,18 +19,6 @@ def band_limited(samples: FloatArray, interval: float) -> FloatArray:
     ends where it began, such as whole periods of a multisine, is continued periodically; any
     other is mirrored at its ends. Whichever leaves less above the band is taken.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (n,)
-        Drive at even intervals.
-    interval : float
-        Between samples, s.
-
-    Returns
-    -------
-    ndarray, shape (10, n - 1)
-        Coefficients of powers 0 to 9 of the place, 0 to 1, in each interval.
-
     Examples
     --------
     >>> t = np.arange(32) / 32.0

@@ -44,20 +44,7 @@ class Step(NamedTuple):
 
 
 def steps_of(graph: ca.Function, places: Sequence[Sequence[int]]) -> tuple[Step, ...]:
-    """Return the operations of a function of one vector, whose outputs are levels.
-
-    Parameters
-    ----------
-    graph : casadi.Function
-        Of one vector of inputs.
-    places : sequence of sequence of int
-        Where the nonzeros of each output go in the array.
-
-    Raises
-    ------
-    ModelError
-        If an operation has no translation.
-    """
+    """Return the operations of a function of one vector, whose outputs are levels."""
     found: list[Step] = []
     latest: dict[int, int] = {}  # step that set a place of casadi's memory
     level = 0

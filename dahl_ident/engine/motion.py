@@ -56,19 +56,10 @@ class Settled(NamedTuple):
 
 
 class Loops(NamedTuple):
-    """Settled loops of a law; one row each.
+    """Settled loops of a law, as :class:`Settled`; one row each.
 
-    Attributes
-    ----------
-    found : ndarray of bool, shape (rows,)
-    coefficients : ndarray of complex, shape (rows, harmonics)
-        c_k of the output, sum of Re c_k exp(j k theta); c_0 is its mean. NaN where not found.
-    by_amplitude : ndarray of complex, shape (rows, harmonics)
-    by_parameter : ndarray of complex, shape (rows, harmonics, chosen)
-    tops : ndarray, shape (rows,)
-        Forces at the largest displacement.
-    decays : ndarray, shape (rows,)
-        Factors by which a deviation shrinks in a cycle.
+    `tops` are the forces at the largest displacement, `decays` the factors by which a deviation
+    shrinks in a cycle, (rows,).
     """
 
     found: NDArray[np.bool_]
@@ -115,26 +106,11 @@ def settled(
     cycles: int | None = None,
     finer: float = 1.0,
 ) -> Settled:
-    """Return the settled motions of a system under sines, by shooting.
+    """Return the settled motions of a system under sines, one for each row, by shooting.
 
-    Parameters
-    ----------
-    system : System
-        A law whose displacement, or a plant whose drive, is the sine.
-    amplitude, omega : ndarray, shape (rows,)
-        Of the sine; rad/s.
-    parameters : ndarray, shape (rows, P)
-    chosen : sequence of int
-        Parameters whose derivatives are wanted.
-    harmonics : sequence of int
-        k of the output's harmonics.
-    starts : ndarray, shape (rows, order), optional
-        Guesses of the states at t = 0, such as those of nearby parameters; from rest without.
-    cycles : int, optional
-        How many the motion goes through before Newton's method, which a guess does not need. After
-        many it is near a stable motion.
-    finer : float, default 1
-        How many times smaller the error of a step is than usual.
+    With derivatives with respect to the parameters `chosen`. They begin from `starts`, such as
+    those of nearby parameters, else from rest, and go through some `cycles` before Newton's method.
+    The error of a step is as many times smaller than usual as `finer` says.
     """
     rows = amplitude.size
     plain = (1 if system.held else _CYCLES) if starts is None else 0
@@ -165,21 +141,8 @@ def loops(
 ) -> Loops:
     """Return the settled loops of a law with one state under sines of displacement.
 
-    Parameters
-    ----------
-    system : System
-    amplitude, omega : ndarray, shape (rows,)
-        Of the displacement; rad/s.
-    parameters : ndarray, shape (rows, P)
-        Of the law; then, if `gap`, the gap in the link to it.
-    chosen : sequence of int
-        Parameters whose derivatives are wanted.
-    harmonics : sequence of int
-        Rising k of the output's harmonics.
-    gap : bool, default False
-        Whether the last parameter is a gap.
-    finer : float, default 1
-        How many times smaller the error of a step is than usual.
+    As :func:`settled`, for rising harmonics. With a `gap` in the link to the law, that is the last
+    of the parameters.
     """
     found, result, tops, decays = kernels("loop").loops(
         system.function, system.sizes, system.odd, gap, _numbers(amplitude), _numbers(omega),
@@ -206,29 +169,9 @@ def march(
 ) -> Marched:
     """Return the motion of a system whose drive, or held displacement, is polynomials in time.
 
-    Parameters
-    ----------
-    system : System
-    knots : ndarray, shape (m + 1,)
-        Rising times between which the signal is one polynomial, s.
-    coefficients : ndarray, shape (degree + 1, m)
-        Of its powers of the place, from 0 to 1, between two knots.
-    samples : ndarray, shape (n,)
-        Rising times at which the motion is wanted, the first one being that of `first`.
-    first : ndarray, shape (order,)
-        States at the first sample.
-    parameters : ndarray, shape (P,)
-    chosen : sequence of int
-        Parameters whose derivatives are wanted.
-    derivatives : bool, default False
-        Whether any are.
-    finer : float, default 1
-        How many times smaller the error of a step is than usual.
-
-    Raises
-    ------
-    FitError
-        If the motion grows beyond all bounds.
+    `coefficients`, (degree + 1, m), are those of powers of the place, 0 to 1, between two of the
+    `knots`, (m + 1,). The motion starts from the states `first` at the first of the `samples`.
+    FitError where it grows beyond all bounds.
     """
     found, output, by, states, last = _run(
         kernels("samples").march,

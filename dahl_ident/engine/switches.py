@@ -22,24 +22,6 @@ def on_one_branch(
 ) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
     """Return an expression with every switch held, its switching functions and their sides.
 
-    Parameters
-    ----------
-    inputs : sequence of SX
-        Scalar symbols on which the switches may depend.
-    outputs : SX
-        A vector.
-    motion : (SX, SX), optional
-        The velocity and the symbol for its sign, which is then its side.
-
-    Returns
-    -------
-    held : SX
-        The vector, each switch replaced by a symbol for its side.
-    functions : list of SX
-        What passes through zero where the branch changes.
-    sides : list of SX
-        Symbols: +1 where the function is positive, -1 where it is negative.
-
     Examples
     --------
     >>> x = ca.SX.sym("x")

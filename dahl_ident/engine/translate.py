@@ -100,11 +100,6 @@ class System:
 def translate(equations: Equations) -> System:
     """Return the compiled system of some equations; the same equations are compiled once.
 
-    Raises
-    ------
-    ModelError
-        If the equations use a function that has no translation.
-
     Examples
     --------
     >>> x, v, F, u, s, k = (ca.SX.sym(name) for name in "xvFusk")

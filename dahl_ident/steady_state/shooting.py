@@ -90,11 +90,6 @@ def obstacle(model: Element) -> str:
 class Shooting:
     """The steady motions of one model, its equations compiled when first asked for one.
 
-    Parameters
-    ----------
-    model : Element
-        With an equation of motion, see :func:`obstacle`.
-
     Examples
     --------
     >>> import numpy as np
@@ -136,27 +131,11 @@ class Shooting:
     ) -> SteadyMotion:
         """Return the steady motions of many rows, with values that the engine can resolve.
 
-        Parameters
-        ----------
-        values : ndarray, shape (rows, parameters)
-            In the order of the model's parameters.
-        omega, drive : ndarray, shape (rows,)
-            rad/s, and N; above zero.
-        chosen : sequence of int
-            Parameters whose derivatives are wanted.
-        harmonics : sequence of int
-            k of those wanted.
-        starts : ndarray, shape (rows, order), optional
-            States at t = 0 to start from; NaN stands for rest.
-        cycles : int, optional
-            That the motion goes through from these states before it is solved for.
-        again : bool, default True
-            Whether a row that leads nowhere from its start is started from rest.
-        stable : bool, default True
-            Whether a motion that is not stable counts as none.
-        one_sided : bool, default False
-            Whether to seek motions that differ in both directions even if the law does not. They
-            come in pairs, of one fundamental, where the motion between them is not stable.
+        They begin from the states `starts` at t = 0, NaN for rest, and go through some `cycles`
+        before they are solved for; a row that leads nowhere is started `again`, from rest. If
+        `stable`, a motion that is not stable counts as none. If `one_sided`, motions are sought
+        that differ in both directions even if the law does not: they come in pairs, of one
+        fundamental, where the motion between them is not stable.
         """
         how: dict[str, Any] = {
             "chosen": chosen, "harmonics": harmonics, "again": again, "stable": stable,
