@@ -57,17 +57,7 @@ SI_UNITS: dict[str, tuple[str, str]] = {
     "number": ("1", "1"),
 }
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
-_ROTATION = {
-    "N": "N m",
-    "m": "rad",
-    "N/m": "N m/rad",
-    "N/m^2": "N m/rad^2",
-    "N s/m": "N m s/rad",
-    "N/s": "N m/s",
-    "m/s": "rad/s",
-    "m/s^2": "rad/s^2",
-    "kg": "kg m^2",
-}
+_ROTATION = {"N/m^2": "N m/rad^2", "N/s": "N m/s"} | dict(SI_UNITS.values())
 QUANTITIES: tuple[Quantity, ...] = tuple(q for q in get_args(Quantity) if q != "backbone")
 """The six standard quantities, each a quotient of force and motion; a backbone is none."""
 MOTION_KINDS = ("displacement", "velocity", "acceleration")

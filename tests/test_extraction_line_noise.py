@@ -3,8 +3,7 @@ import pytest
 
 from benchmarks.extraction_validation import steady
 from dahl_ident.arrays import FloatArray
-from dahl_ident.extraction.line_noise import line_noise
-from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
+from dahl_ident.extraction.sine_fit import line_noise, sine_fit, steady_segment
 
 PER_CYCLE = 50
 

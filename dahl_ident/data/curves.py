@@ -66,7 +66,7 @@ def draw(
             errors=[errors(part) for _, part in parts],
             fitted=[] if fitted is None else [fitted(part, over_frequency) for _, part in parts],
             gain_label=gain_label(data),
-            x_label=abscissa_label(fundamental),
+            x_label="frequency [Hz]" if over_frequency else held_label(fundamental),
             marker="." if fitted is None else "",
             ax=ax,
         )
@@ -153,11 +153,6 @@ def curve_of_row(data: Table) -> FloatArray:
 def abscissa(part: Table, over_frequency: bool) -> FloatArray:
     """Return the places of some rows on the axis."""
     return part.frequency_hz if over_frequency else held_amplitude(part)
-
-
-def abscissa_label(data: Table) -> str:
-    """Return the label of the axis that suits the table."""
-    return "frequency [Hz]" if is_over_frequency(data) else held_label(data)
 
 
 def _level(label: Any, part: Table) -> str:

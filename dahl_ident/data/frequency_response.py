@@ -271,26 +271,20 @@ class FrequencyResponse(Tabular):
             lines.append((f"{len(self.levels)} levels", listed(self.levels)))
         if self.runs:
             lines.append((f"{len(self.runs)} run{'s'[: len(self.runs) > 1]}", listed(self.runs)))
-        for field, kind in (("amplitude", "displacement"), ("drive", "force")):
+        for field in ("amplitude", "drive"):
             values = getattr(self, field)
             if values is not None:
-                unit = si_unit(kind, self.motion)
-                lines.append((field, f"{extent(values, unit)}, zero to peak"))
+                lines.append((field, f"{extent(values, self.units[field])}, zero to peak"))
         if self.quantity == "backbone":
             lines.append(("damping ratio", extent(self.response.imag, "1")))
         else:
-            lines += [
-                ("gain", extent(self.gain, self.unit)),
-                ("phase", extent(np.degrees(self.phase), "deg")),
-            ]
+            lines.append(("gain", extent(self.gain, self.unit)))
+            lines.append(("phase", extent(np.degrees(self.phase), "deg")))
         lines.append(("controlled", listed(distinct(self.controlled))))
         if (self.harmonic != 1).any():
             lines.append(("harmonics", listed(distinct(self.harmonic))))
-        if self.covariance is None:
-            lines.append(("covariance", "unknown"))
-        else:
-            dof = "" if self.dof is None else f", {extent(self.dof, 'degrees of freedom')}"
-            lines.append(("covariance", f"known{dof}"))
+        dof = "" if self.dof is None else f", {extent(self.dof, 'degrees of freedom')}"
+        lines.append(("covariance", "unknown" if self.covariance is None else f"known{dof}"))
         if self.quality:
             lines.append(("quality", listed(self.quality)))
         if self.drive_factor_uncertainty:

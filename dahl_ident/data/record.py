@@ -153,8 +153,7 @@ class Record(Tabular):
     @property
     def motion_samples(self) -> FloatArray:
         """The samples of :attr:`motion_channel`."""
-        samples = getattr(self, self.motion_channel)
-        return np.asarray(samples)
+        return np.asarray(getattr(self, self.motion_channel))
 
     @property
     def force_samples(self) -> FloatArray:
@@ -227,16 +226,11 @@ class Record(Tabular):
         """Return a title, and sampling, ranges and units."""
         kind = self.motion_channel
         spacing = "even" if self.uniform else "uneven"
-        lines = [
-            ("sampling", f"{self.sample_rate:.6g} Hz, {spacing}, {self.duration:.6g} s"),
-            (kind, extent(self.motion_samples, si_unit(kind, self.motion))),
-        ]
+        lines = [("sampling", f"{self.sample_rate:.6g} Hz, {spacing}, {self.duration:.6g} s")]
         if len(self.gaps):
-            lines.insert(1, ("gaps", str(len(self.gaps))))
-        if self.force is not None:
-            lines.append(("force", extent(self.force, si_unit("force", self.motion))))
-        if self.drive is not None:
-            lines.append(("drive", extent(self.drive, self.drive_unit)))
+            lines.append(("gaps", str(len(self.gaps))))
+        units = self._units
+        lines += [(n, extent(getattr(self, n), unit)) for n, unit in units.items() if n != "time"]
         if self.drive_unit in ("V", "A") and self.drive_factor is not None:
             unit = f"{si_unit('force', self.motion)}/{self.drive_unit}"
             uncertain = f" within {percent(self.drive_factor_uncertainty)}"
@@ -270,10 +264,11 @@ class Record(Tabular):
         sampling: dict[str, Any] = {"time": self.time}
         if self.uniform and self.time[0] == 0.0:
             sampling["fs"] = self.sample_rate
+        units = self._units
+        del units["time"]
         return [
             {"name": name, "data": getattr(self, name), "unit_str": unit, **sampling}
-            for name, unit in self._units.items()
-            if name != "time"
+            for name, unit in units.items()
         ]
 
     def to_frame(self) -> pd.DataFrame:
@@ -313,14 +308,14 @@ def unbroken(record: Record, shortest: int) -> list[Record]:
     kept = [slice(a, b) for a, b in pairwise(edges.tolist()) if b - a >= shortest]
     if not after.size or not kept or after.size > _MOST_GAPS * record.n:
         return [record]
-    named = [f"{record.time[a - 1]:.6g} to {record.time[a]:.6g} s" for a in after.tolist()]
-    shown = [*named[:_SHOWN_GAPS], *["others"][: len(named) > _SHOWN_GAPS]]
+    shown = [f"{record.time[a - 1]:.6g} to {record.time[a]:.6g} s" for a in after.tolist()]
+    shown[_SHOWN_GAPS:] = ["others"][: len(shown) > _SHOWN_GAPS]
     parts = "one part is used" if len(kept) == 1 else f"{len(kept)} parts are fitted"
+    lost = record.n - sum(part.stop - part.start for part in kept)
     message = (
         f"nothing is known from {', '.join(shown)}; {parts}, each from a first state of its own"
+        + (f"; {lost} samples in shorter parts are left out" if lost else "")
     )
-    lost = record.n - sum(part.stop - part.start for part in kept)
-    message += f"; {lost} samples in shorter parts are left out" if lost else ""
     known = _doubted(record, message)
     return [replace(cut(record, part), provenance=known) for part in kept]
 
@@ -328,7 +323,7 @@ def unbroken(record: Record, shortest: int) -> list[Record]:
 def at_even_times(record: Record) -> Record:
     """Return a record at even times, and warn where it is resampled, by cubic splines."""
     time = record.time
-    if record.uniform or time.size <= 3 or is_even(time):
+    if time.size <= 3 or record.uniform:
         return record
     from scipy.interpolate import make_interp_spline
 
@@ -338,11 +333,10 @@ def at_even_times(record: Record) -> Record:
         f"the samples from {time[0]:.6g} to {time[-1]:.6g} s are not evenly spaced; resampled at "
         f"{1.0 / usual:.6g} Hz"
     )
-    names = [name for name in record._units if name != "time"]
     columns: dict[str, Any] = {
-        name: make_interp_spline(time, getattr(record, name))(grid) for name in names
+        name: make_interp_spline(time, getattr(record, name))(grid) for name in record._units
     }
-    return replace(record, time=grid, **columns, provenance=_doubted(record, message))
+    return replace(record, **columns | {"time": grid}, provenance=_doubted(record, message))
 
 
 def _doubted(record: Record, message: str) -> dict[str, Any]:

@@ -32,21 +32,18 @@ from dahl_ident.extraction.cycles import (
     Cycles,
     find_cycles,
 )
-from dahl_ident.extraction.line_noise import CYCLES_FOR_SCATTER, LineNoise
 from dahl_ident.extraction.phasors import Phasors, Settings, without
 from dahl_ident.extraction.segment_quality import fundamental_share, sensor_step
 from dahl_ident.extraction.segments import record_spans, segment_of
 from dahl_ident.extraction.sine_fit import (
+    CYCLES_FOR_SCATTER,
     FEWEST_CYCLES,
     HARMONICS,
+    LineNoise,
     Samples,
     Segment,
     SineFit,
-    first_cycles,
-    last_cycles,
     sine_fit,
-    thinned,
-    whole_cycles,
 )
 from dahl_ident.extraction.transient import MOST_CYCLES, estimate_transient
 from dahl_ident.units import percent
@@ -102,7 +99,7 @@ def measure(
             f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "
             f"out of {argument('harmonics')}"
         )
-    available = whole_cycles(segment)
+    available = segment.whole_cycles
     if available < FEWEST_CYCLES:
         raise ExtractionError(
             f"{available} whole cycles {_where(segment)}; expected at least {FEWEST_CYCLES}: "
@@ -115,11 +112,11 @@ def measure(
             f"settling; expected {FEWEST_CYCLES} more than for settling: record longer, or lower "
             f"{argument('settling_periods')}"
         )
-    whole = last_cycles(segment, cycles)
-    first = first_cycles(whole, MOST_CYCLES)
+    whole = segment.last_cycles(cycles)
+    first = whole.first_cycles(MOST_CYCLES)
     recorded = samples.of(whole)
     steps = np.array([sensor_step(channel) for channel in recorded.channels])
-    rough = sine_fit(thinned(first), trend=sweep, most=HARMONICS)
+    rough = sine_fit(first.thinned(), trend=sweep, most=HARMONICS)
     names = (settings.motion_channel, "force")
     for name, amplitude, step in zip(names, np.abs(rough.phasors(1)), steps, strict=True):
         if amplitude <= step or amplitude == 0.0:
@@ -143,7 +140,7 @@ def measure(
         dropped = _settling_periods(
             Phasors.of(rough.segment, transient, looked_at, fundamental, steps, recorded), cycles
         )
-    used = last_cycles(whole, cycles - dropped)
+    used = whole.last_cycles(cycles - dropped)
     phasors = Phasors.of(
         used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep
     )
@@ -406,29 +403,21 @@ def _table(
     def per_row(name: str) -> Any:
         """Return a field or a verdict of the points, one for each row."""
         values = [getattr(p, name) if hasattr(p, name) else p.quality[name] for p in points]
-        each = [
-            np.asarray(v) if np.ndim(v) else np.full(n, v)
-            for v, n in zip(values, rows, strict=True)
-        ]
-        return np.concatenate(each)
+        pairs = zip(values, rows, strict=True)
+        return np.concatenate([v if np.ndim(v) else np.full(n, v) for v, n in pairs])
 
+    names = ("frequency_hz", "response", "amplitude", "drive", "dof", "harmonic")
     joint, held = per_row("joint"), "drive" if settings.of_displacement else "amplitude"
+    uncertainty = 0.0 if record.force is not None else record.drive_factor_uncertainty
     return FrequencyResponse(
-        per_row("frequency_hz"),
-        per_row("response"),
-        amplitude=per_row("amplitude"),
-        drive=per_row("drive"),
+        **{name: per_row(name) for name in names},
         covariance=joint[:, 1:, 1:],
-        dof=per_row("dof"),
         **{f"{held}_std": np.sqrt(joint[:, 0, 0]), f"{held}_covariance": joint[:, 0, 1:]},
         **labels,
         controlled=settings.controlled,
-        harmonic=per_row("harmonic"),
         quantity="receptance" if settings.of_displacement else "dynamic_stiffness",
         motion=record.motion,
-        drive_factor_uncertainty=0.0
-        if record.force is not None
-        else record.drive_factor_uncertainty,
+        drive_factor_uncertainty=uncertainty,
         quality={name: per_row(name) for name in points[0].quality},
         provenance=provenance,
     )
@@ -453,11 +442,11 @@ def joined(points: list[Point], further: list[Point]) -> list[Point]:
 def _both(a: Point, b: Point) -> Point:
     """Return one point for two parts of a level."""
     periods = a.quality["num_periods"] + b.quality["num_periods"]
+    settling = a.quality["settling_periods"] + b.quality["settling_periods"]
     if b.quality["settled"].all() and not a.quality["settled"].all():
         left_out = a.quality["num_periods"] + b.quality["settling_periods"]
-        return replace(
-            b, quality={**b.quality, "num_periods": periods, "settling_periods": left_out}
-        )
+        counts = {"num_periods": periods, "settling_periods": left_out}
+        return replace(b, quality=b.quality | counts)
     used = [p.quality["num_periods"] - p.quality["settling_periods"] for p in (a, b)]
     weights = np.array(used, dtype=np.float64) / sum(used)
 
@@ -476,16 +465,14 @@ def _both(a: Point, b: Point) -> Point:
         "settled": a.quality["settled"] & b.quality["settled"],
         "more_periods": np.maximum(a.quality["more_periods"], b.quality["more_periods"]),
         "num_periods": periods,
-        "settling_periods": a.quality["settling_periods"] + b.quality["settling_periods"],
+        "settling_periods": settling,
         "end_time": b.quality["end_time"],
         "verdict": [_verdict(*both) for both in verdicts],
     }
+    means = ("frequency_hz", "amplitude", "drive", "response")
     return replace(
         a,
-        frequency_hz=mean(a.frequency_hz, b.frequency_hz),
-        amplitude=mean(a.amplitude, b.amplitude),
-        drive=mean(a.drive, b.drive),
-        response=mean(a.response, b.response),
+        **{name: mean(getattr(a, name), getattr(b, name)) for name in means},
         joint=separate[0] + separate[1] + repeating,
         repeating=repeating,
         dof=np.asarray(1.0 / spread),

@@ -25,7 +25,6 @@ from dahl_ident.data.columns import CONTROLLED, one_of, set_checked
 from dahl_ident.data.plausibility import creates_energy
 from dahl_ident.errors import ValidationError
 from dahl_ident.extraction.cycles import MODES, Mode, scattered
-from dahl_ident.extraction.line_noise import LineNoise, line_noise
 from dahl_ident.extraction.segment_quality import (
     BY_CHANCE,
     EVEN,
@@ -41,10 +40,12 @@ from dahl_ident.extraction.segment_quality import (
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     HARMONICS,
+    LineNoise,
     Samples,
     Segment,
     SineFit,
     columns,
+    line_noise,
     sine_fit,
 )
 from dahl_ident.extraction.transient import SIGNIFICANT, Transient

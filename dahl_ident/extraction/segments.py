@@ -36,9 +36,7 @@ from dahl_ident.extraction.sine_fit import (
     normal_equations,
     solvable_inverse,
     steady_segment,
-    thinned,
     track_phase,
-    whole_cycles,
 )
 
 _PLATEAU_CYCLES = 3  # fewer only where no plateau has so many ...
@@ -129,7 +127,7 @@ def segment_of(
     segment = steady_segment(time[first:last], channels[:, first:last], omega, block)
     if span.sweep:
         return track_phase(segment, _SWEEP_DEGREE)
-    if frequency is not None and whole_cycles(segment) < FEWEST_CYCLES:
+    if frequency is not None and segment.whole_cycles < FEWEST_CYCLES:
         return segment  # which whoever measures it will refuse
     if frequency is None:
         segment = estimate_frequency(track_phase(segment, 1))
@@ -146,7 +144,7 @@ def segment_of(
 
 def _refuse_drift(segment: Segment) -> None:
     """Refuse a given frequency at which the motion's phase drifts from cycle to cycle."""
-    few = thinned(segment)
+    few = segment.thinned()
     cuts = np.searchsorted(few.time, _cycle_edges(segment))
     counts = np.diff(cuts)
     cycle = np.flatnonzero(counts >= _FEWEST_SAMPLES)
@@ -224,7 +222,7 @@ def _cycle_edges(segment: Segment) -> FloatArray:
     """Return the bounds of the whole cycles; a partial one is before the first."""
     end = segment.time[-1] + 0.5 * segment.sample_phase / segment.omega
     cycle = 2.0 * np.pi / segment.omega
-    return np.asarray(end - cycle * np.arange(whole_cycles(segment), -1.0, -1.0))
+    return np.asarray(end - cycle * np.arange(segment.whole_cycles, -1.0, -1.0))
 
 
 @dataclass(frozen=True)
@@ -296,7 +294,7 @@ def _extended(
     inside: _Inside | None,
 ) -> slice:  # fmt: skip
     """Return the slice with the cycles before and after it that the segment's sine fits as well."""
-    few = thinned(segment)
+    few = segment.thinned()
     basis = columns(few.theta, few.tau, 1)
     fitted = solvable_inverse(basis @ basis.T, few) @ (basis @ few.channels[0])
     cycle = 2.0 * np.pi / segment.omega

@@ -20,14 +20,13 @@ import numpy as np
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.elements import Dahl
-from dahl_ident.extraction.line_noise import powers
 from dahl_ident.extraction.sine_fit import (
     HARMONICS,
     Segment,
     SineFit,
     columns,
+    powers,
     resolvable_orders,
-    thinned,
 )
 
 SIGNIFICANT = 3.0  # standard deviations of D_0
@@ -81,7 +80,7 @@ def estimate_transient(
     The phase of the response, a dynamic stiffness, determines the rate if the decay does not.
     """
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
-    few = thinned(replace(fit.segment, channels=drifting[None]))
+    few = replace(fit.segment, channels=drifting[None]).thinned()
     # the harmonics that a departure is distinguished from
     basis = columns(few.theta, few.tau, min(HARMONICS, resolvable_orders(few)))
     steady = np.delete(basis, 1, axis=0)
@@ -89,9 +88,19 @@ def estimate_transient(
     path = _path(few.theta + displacement_phase)
     start = float(_path(fit.segment.theta[:1] + displacement_phase)[0])
 
-    slow = _SlowLines.of(few)
-    unsteady = few.channels[0] - steady.T @ (steady @ few.channels[0])
-    seen = slow.tones @ unsteady
+    angle = few.theta - few.theta[0]
+    cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
+    p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))  # the lines p/T below the fundamental
+    tones = powers(np.exp(-1j / cycles * angle), p.size)[1:]
+    seen = tones @ (few.channels[0] - steady.T @ (steady @ few.channels[0]))
+
+    def variance_of(departure: float, decay: FloatArray) -> float:
+        """Return the variance of white noise that moves D_0 as much as the slow noise does."""
+        decaying = tones @ decay
+        power = np.abs(decaying) ** 2
+        level = float(np.mean(p * np.abs(seen - departure * decaying) ** 2)) / decay.size
+        return max(level * float(np.sum(power / p) / np.sum(power)), TINY)
+
     rates = _RATES
     friction_rates, phases = _friction_phases()
     centre = np.log(np.interp(np.angle(response), phases, friction_rates))
@@ -102,7 +111,7 @@ def estimate_transient(
         sizes = decays @ few.channels[0] / power
         gain = sizes**2 * power
         best = int(np.argmax(gain))
-        variance = slow.variance(seen, sizes[best], decays[best])
+        variance = variance_of(sizes[best], decays[best])
         i = int(np.argmin(((np.log(rates) - centre) / _RATE_SPREAD) ** 2 - gain / variance))
         departure, std, rate = sizes[i], np.sqrt(variance / power[i]), rates[i]
         rates = np.geomspace(rates[max(i - 1, 0)], rates[min(i + 1, rates.size - 1)], 11)
@@ -113,28 +122,6 @@ def _path(theta: FloatArray) -> FloatArray:
     """Return the path of cos(theta) from theta = 0 on, in amplitudes: 4 a cycle."""
     strokes = np.floor(theta / np.pi)
     return 2.0 * strokes + 1.0 - np.cos(theta - np.pi * strokes)
-
-
-@dataclass(frozen=True)
-class _SlowLines:
-    """The lines p/T below the fundamental, and their tones at the samples of a segment."""
-
-    p: FloatArray
-    tones: ComplexArray
-
-    @classmethod
-    def of(cls, segment: Segment) -> _SlowLines:
-        angle = segment.theta - segment.theta[0]
-        cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
-        p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))
-        return cls(p, powers(np.exp(-1j / cycles * angle), p.size)[1:])
-
-    def variance(self, lines: ComplexArray, departure: float, decay: FloatArray) -> float:
-        """Return the variance of white noise that moves D_0 as much as the slow noise does."""
-        decaying = self.tones @ decay
-        power = np.abs(decaying) ** 2
-        level = float(np.mean(self.p * np.abs(lines - departure * decaying) ** 2)) / decay.size
-        return max(level * float(np.sum(power / self.p) / np.sum(power)), TINY)
 
 
 @cache

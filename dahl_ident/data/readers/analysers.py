@@ -89,18 +89,12 @@ def read_uff(file: File) -> RawFile:
             f"1); the file holds data sets {sorted({int(s.get('type', 0)) for s in sets})}"
             + (f" with function types {others}" if others else "")
         )
-    channels: list[RawChannel] = []
-    notes: list[str] = []
-    for function in wanted:
-        channels += _uff_channels(file, function, units, notes)
+    channels = [c for function in wanted for c in _uff_channels(file, function, units)]
     texts = [str(function.get(f"id{i}", "")) for function in wanted for i in range(1, 6)]
     return file.source(
-        "universal file",
-        merged_axes(channels),
-        row_name=lambda i: f"sample {i}",
-        notes=tuple(notes),
+        "universal file", merged_axes(channels), row_name="sample {}".format,
         stated=stated_levels(texts),
-    )
+    )  # fmt: skip
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
@@ -144,7 +138,7 @@ def _uff_text(text: bytes) -> bytes:
 
 
 def _uff_channels(
-    file: File, function: dict[str, Any], units: tuple[str, str] | None, notes: list[str]
+    file: File, function: dict[str, Any], units: tuple[str, str] | None
 ) -> Iterator[RawChannel]:
     """Yield the axis and the values of a data set 58, positive in its directions."""
     direction = {side: int(function[f"{side}_dir"]) for side in ("rsp", "ref")}
@@ -183,7 +177,7 @@ def _uff_channels(
         unit = f"({unit})/({denominator})" if unit and denominator else unit
     yield RawChannel(f"{abscissa} {where}", np.asarray(function["x"], dtype=float), step, abscissa)
     if turned:
-        notes.append(f"{name}: sign turned, as its directions say")
+        file.notes.append(f"{name}: sign turned, as its directions say")
     yield RawChannel(name, -values if turned else values, unit, role)
 
 
@@ -205,10 +199,10 @@ def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | N
 def merged_axes(channels: list[RawChannel]) -> list[RawChannel]:
     """Merge the axes of all functions into one where they are the same."""
     axes = [c for c in channels if c.role in ("time", "frequency")]
-    if not axes:
-        return channels
-    first = axes[0]
-    if any(c.role != first.role or not np.array_equal(c.values, first.values) for c in axes):
+    first = axes[0] if axes else None
+    if first is None or any(
+        c.role != first.role or not np.array_equal(c.values, first.values) for c in axes
+    ):
         return channels
     others = [c for c in channels if c.role not in ("time", "frequency")]
     return [RawChannel(str(first.role), first.values, first.unit, first.role), *others]
@@ -238,12 +232,9 @@ class _Sdf:
 
     def fields(self, record: bytes, kind: int) -> SimpleNamespace:
         """Return the fields of a record by their names."""
-        return SimpleNamespace(
-            **{
-                name: np.ndarray((), form, record, place).tolist()
-                for name, (form, place) in _FIELDS[kind].items()
-            }
-        )
+        fields = _FIELDS[kind].items()
+        values = {n: np.ndarray((), f, record, at).tolist() for n, (f, at) in fields}
+        return SimpleNamespace(**values)
 
     def records(self, kind: int) -> Iterator[bytes]:
         """Yield all records of a kind: results, vectors or channels."""
@@ -268,34 +259,27 @@ class _Sdf:
                 "of several scans are not read)"
             )
         read: list[RawChannel] = []
-        doubts: list[str] = []
-        notes: list[str] = []
         at = 0
         for result, size in zip(results, expected, strict=True):
-            whole = np.frombuffer(numbers, _NUMBERS[result.y_number], offset=at, count=-1)
-            with np.errstate(invalid="ignore"):  # of a NaN that signals
-                whole = whole[: result.count * result.size].astype(np.float64)
-            at += size
             axis = self.axis(result)
             if not result.valid:
-                doubts.append(f"the analyser says that {result.title!r} is not valid")
-            for k, part in enumerate(whole.reshape(result.count, result.size)):
+                self.file.doubts.append(f"the analyser says that {result.title!r} is not valid")
+            stored = np.frombuffer(numbers[at : at + size], _NUMBERS[result.y_number])
+            at += size
+            with np.errstate(invalid="ignore"):  # of a NaN that signals
+                parts = stored.astype(np.float64).reshape(result.count, result.size)
+            for k, part in enumerate(parts):
                 values: NDArray[Any] = part[0::2] + 1j * part[1::2] if result.complex == 1 else part
                 number = result.vector + k
                 vector = vectors[number] if 0 <= number < len(vectors) else None
-                factor, unit = self.scale(vector, channels, doubts)
+                factor, unit = self.scale(vector, channels)
                 if result.unit is not None:
                     factor, unit = 1.0, result.unit
-                is_response = result.kind == _RESPONSE
                 name = result.title + (f" {k + 1}" if result.count > 1 else "")
-                read.append(axis)
-                role = "response" if is_response else None
-                read.append(RawChannel(name, factor * values, unit if is_response else None, role))
-        read += self.deviations(results, read, notes)
-        return self.file.source(
-            "SDF", merged_axes(read), row_name=lambda i: f"sample {i}",
-            notes=tuple(notes), doubts=tuple(doubts),
-        )  # fmt: skip
+                role, unit = ("response", unit) if result.kind == _RESPONSE else (None, None)
+                read += [axis, RawChannel(name, factor * values, unit, role)]
+        read += self.deviations(results, read)
+        return self.file.source("SDF", merged_axes(read), row_name="sample {}".format)
 
     def result(self, record: bytes) -> SimpleNamespace:
         """Read the header of a result, whose numbers are `count` vectors of `size`."""
@@ -335,17 +319,15 @@ class _Sdf:
                 )
             values = np.frombuffer(stored, dtype).astype(np.float64)
         else:
-            logarithmic = result.spacing == _LOGARITHMIC
+            start, step = result.start, result.step
             with np.errstate(over="ignore", invalid="ignore"):
-                values = (
-                    result.start * result.step**n if logarithmic else result.start + result.step * n
-                )
+                values = start * step**n if result.spacing == _LOGARITHMIC else start + step * n
         if not np.isfinite(values).all():
             raise ValueError("an axis that is not finite")
         return RawChannel(f"{role or 'x'} of {result.title}", values, result.x_unit, role)
 
     def scale(
-        self, vector: SimpleNamespace | None, channels: list[SimpleNamespace], doubts: list[str]
+        self, vector: SimpleNamespace | None, channels: list[SimpleNamespace]
     ) -> tuple[float, str | None]:
         """Return the factor from internal to engineering units, and the unit."""
         factor, units = 1.0, ["", ""]
@@ -354,7 +336,7 @@ class _Sdf:
                 continue
             channel = channels[number]
             if channel.overloaded == 1:
-                doubts.append(f"channel {number + 1} was overloaded")
+                self.file.doubts.append(f"channel {number + 1} was overloaded")
             sensitivity = channel.sensitivity
             if not 0.0 < abs(sensitivity) < np.inf or abs(power) not in (_POWER, 2 * _POWER):
                 raise ValueError(f"channel {number + 1} has the sensitivity {sensitivity:g}")
@@ -363,7 +345,7 @@ class _Sdf:
         return factor, f"({units[0]})/({units[1]})" if all(units) else units[0] or None
 
     def deviations(
-        self, results: list[SimpleNamespace], channels: list[RawChannel], notes: list[str]
+        self, results: list[SimpleNamespace], channels: list[RawChannel]
     ) -> Iterator[RawChannel]:
         """Yield the standard deviation that the coherence of averages gives a response."""
         responses = [c for c in channels if c.role == "response"]
@@ -376,7 +358,9 @@ class _Sdf:
         coherence = np.asarray(coherences[0].values, dtype=np.float64)
         if coherence.size != responses[0].size or not ((coherence > 0) & (coherence <= 1)).all():
             return
-        notes.append(f"standard deviations from the coherence of {self.averages} averages")
+        self.file.notes.append(
+            f"standard deviations from the coherence of {self.averages} averages"
+        )
         share = np.sqrt((1.0 - coherence) / (2.0 * self.averages * coherence))
         std = np.maximum(share, np.finfo(np.float32).eps) * np.abs(responses[0].values)
         yield RawChannel("std", std, responses[0].unit, "std")

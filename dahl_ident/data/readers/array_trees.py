@@ -39,7 +39,6 @@ def tree_source(
 ) -> RawFile:
     """Return the numeric vectors and matrices of a tree as channels."""
     channels: list[RawChannel] = []
-    notes: list[str] = []
     for path, value, unit in leaves:
         if unit is None:
             path, unit = split_header(path)
@@ -48,14 +47,12 @@ def tree_source(
         channels += columns
         if not columns:
             dtype = getattr(value, "dtype", type(value).__name__)
-            notes.append(f"{path} ({np.shape(value)}, {dtype}) is not used")
-        refuse_many(file.name, len(channels) + len(notes), "arrays")
+            file.notes.append(f"{path} ({np.shape(value)}, {dtype}) is not used")
+        refuse_many(file.name, len(channels) + len(file.notes), "arrays")
     if not channels:
-        others = f"; {listed(notes, 3)}" if notes else ""
+        others = f"; {listed(file.notes, 3)}" if file.notes else ""
         raise DataError(f"{file.name}: the file holds no vector or matrix of numbers{others}")
-    return file.source(
-        kind, channels, row_name=lambda i: f"index {i}", metadata=metadata or {}, notes=tuple(notes)
-    )
+    return file.source(kind, channels, row_name="index {}".format, metadata=metadata or {})
 
 
 def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:

@@ -24,7 +24,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -104,7 +104,10 @@ _PACKED: tuple[tuple[bytes, Callable[[Any], Any], str], ...] = (
 
 @dataclass(frozen=True)
 class File:
-    """A file that is open to be read; `content` where it is not on the disk as it is."""
+    """A file that is open to be read; `content` where it is not on the disk as it is.
+
+    Its reader leaves what it assumed in `notes`, and what it warns of in `doubts`.
+    """
 
     path: Path | None
     name: str
@@ -112,6 +115,8 @@ class File:
     sha256: str
     format: str
     content: bytes | None = None
+    notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     @property
     def head(self) -> bytes:
@@ -165,7 +170,8 @@ class File:
         channels = tuple(channels)
         if not channels:
             raise DataError(f"{self.name}: the file holds no channels")
-        return RawFile(self.name, kind, channels, self.sha256, **facts)
+        notes, doubts = tuple(self.notes), tuple(self.doubts)
+        return RawFile(self.name, kind, channels, self.sha256, notes=notes, doubts=doubts, **facts)
 
 
 def refuse_many(name: str, count: int, what: str, most: int = MOST_CHANNELS) -> None:

@@ -48,20 +48,19 @@ def read_tdms(file: File) -> RawFile:
         first = min(starts, default=None)
         channels = [c for group in groups for c in _tdms_channels(file, content, group, first)]
         begun = _begun_again(file)
-    doubts = []
     if sum(c.role == "time" for c in channels) > 1 and len(set(starts)) > 1:
         late = (max(starts) - min(starts)) / np.timedelta64(1, "s")
-        doubts.append(
+        file.doubts.append(
             f"the channels start at different times, up to {late:.4g} s apart (wf_start_time); "
             "each has a time of its own"
         )
     if begun:
-        doubts.append(
+        file.doubts.append(
             f"segments {listed([str(i) for i in begun], 5)} of the file state wf_increment again, "
             "as a file that was appended does; time goes on as if no pause were between them. "
             "Split the file where it holds several runs"
         )
-    return file.source("TDMS", channels, row_name=lambda i: f"sample {i}", doubts=tuple(doubts))
+    return file.source("TDMS", channels, row_name="sample {}".format)
 
 
 class _Bounded(io.BufferedReader):
@@ -182,8 +181,8 @@ def read_lvm(file: File) -> RawFile:
     channels: list[RawChannel] = []
     for i, segment in enumerate(segments):
         channels += segment.channels(f"segment {i}/" if len(segments) > 1 else "")
-    doubts = tuple(doubt for segment in segments for doubt in segment.contradictions())
-    return file.source("LVM", channels, row_name=lambda i: f"sample {i}", doubts=doubts)
+        file.doubts.extend(segment.contradictions())
+    return file.source("LVM", channels, row_name="sample {}".format)
 
 
 class _Lvm:

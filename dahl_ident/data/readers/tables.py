@@ -58,17 +58,17 @@ def read_workbook(file: File, sheet: str | None = None) -> RawFile:
         sheets = {sheet: sheets[sheet]}
     tables = {name: _table(file, name, rows) for name, rows in sheets.items()}
     with_table = {name: table for name, table in tables.items() if table is not None}
-    if not with_table:
-        raise DataError(
-            f"{file.name}: no table of numbers on {listed(tables)}; expected at least two columns "
-            "of numbers under a header line"
-        )
-    if len(with_table) > 1:
+    if len(with_table) == 1:
+        return next(iter(with_table.values()))
+    if with_table:
         raise DataError(
             f"{file.name}: sheets {listed(with_table)} hold tables; name one with "
             f"{argument('sheet', next(iter(with_table)))}"
         )
-    return next(iter(with_table.values()))
+    raise DataError(
+        f"{file.name}: no table of numbers on {listed(tables)}; expected at least two columns "
+        "of numbers under a header line"
+    )
 
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:
@@ -143,10 +143,9 @@ def read_parquet(file: File) -> RawFile:
     if not rows:
         raise DataError(f"{file.name}: the table is empty")
     channels: list[RawChannel] = []
-    notes: list[str] = []
     for field in schema:
         if pa.types.is_nested(field.type) or schema.names.count(field.name) > 1:
-            notes.append(f"{field.name} ({field.type}) is not used")
+            file.notes.append(f"{field.name} ({field.type}) is not used")
             continue
         name, unit = split_header(field.name)
         read = functools.partial(_parquet_values, table, field.name)
@@ -155,8 +154,8 @@ def read_parquet(file: File) -> RawFile:
         number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
         channels.append(RawChannel(name, content if number else content.array, unit))
     if not channels:
-        raise DataError(f"{file.name}: no column of numbers or text; {listed(notes, 3)}")
-    return file.source("Parquet", channels, metadata=metadata, notes=tuple(notes))
+        raise DataError(f"{file.name}: no column of numbers or text; {listed(file.notes, 3)}")
+    return file.source("Parquet", channels, metadata=metadata)
 
 
 def _added_bytes(file: File, metadata: Any) -> int:

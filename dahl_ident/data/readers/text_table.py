@@ -112,7 +112,7 @@ def read_text_table(file: File) -> RawFile:
     refuse_second_header(rows, layout.start, layout.mark, lambda i: f"{name}, line {i + 1}")
     refuse_many(name, layout.width, "fields")
     metadata = _metadata(head, name)
-    body, runs, notes = _body(data, offset, layout, name)
+    body, runs = _body(data, offset, layout, file)
     _refuse_cut_end(body, layout, name)
     count = max(body.count(b"\n"), body.count(b"\r"))
     file.refuse_above_limit(8 * count * layout.width, f"a table of {count} by {layout.width}")
@@ -141,7 +141,6 @@ def read_text_table(file: File) -> RawFile:
         decimal=layout.mark,
         row_name=lambda i: f"line {layout.start + 1 + _places(body)[i]}",
         metadata=metadata,
-        notes=tuple(notes),
         runs=tuple(runs),
         stated={} if metadata else stated_levels(head[: layout.start]),
     )
@@ -270,10 +269,8 @@ def _metadata(lines: Iterable[str], name: str) -> Mapping[str, Any]:
     return {}
 
 
-def _body(
-    data: bytes, offset: int, layout: _Layout, name: str
-) -> tuple[bytes, list[int], list[str]]:
-    """Return the lines of numbers, all else blanked; rows at which a run begins; and notes."""
+def _body(data: bytes, offset: int, layout: _Layout, file: File) -> tuple[bytes, list[int]]:
+    """Return the lines of numbers, all else blanked, and the rows at which a run begins."""
     body = data[offset:]
     above = _LINE_END.split(data[:offset])[:-1]
     for i in range(len(above) - 1, -1, -1):  # directly above are comments, by their first sign
@@ -281,17 +278,17 @@ def _body(
         if text.strip() and not _COMMENT.match(text):
             break
         if _looks_like_data(text, layout):
-            raise DataError(f"{name}, line {i + 1}: {_LIKE_DATA.format(text.strip()[:40])}")
+            raise DataError(f"{file.name}, line {i + 1}: {_LIKE_DATA.format(text.strip()[:40])}")
     commented = any(mark in body for mark in (b"#", b"%", b"//", b"!"))
     if commented:
-        _refuse_odd_comments(body, layout, name)
+        _refuse_odd_comments(body, layout, file.name)
     body, footers = _without_footers(body, layout)
-    notes = [f"left out below the table: {text.strip()[:60]!r}" for text in footers]
+    file.notes.extend(f"left out below the table: {text.strip()[:60]!r}" for text in footers)
     body, runs = _without_repeated_headers(body, layout)
     if runs:
         rows = listed([i + 1 for i in runs])
-        notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
-    return _COMMENT_LINE.sub(b"", body) if commented else body, runs, notes
+        file.notes.append(f"the header is repeated in the file: new runs begin at rows {rows}")
+    return _COMMENT_LINE.sub(b"", body) if commented else body, runs
 
 
 def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
@@ -425,18 +422,17 @@ def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] 
     columns: list[NDArray[Any]] = []
     for i, column in enumerate(zip(*rows, strict=True)):
         cells = [cell.strip() for cell in column]
-        plain = cells == list(column)
+        as_they_are = cells == list(column)
         if str(i) in texts:
-            if not plain or any(cell[:1] == "'" for cell in cells):
+            if not as_they_are or any(cell[:1] == "'" for cell in cells):
                 return None
             columns.append(words(cells))
-        elif all(map(_INTEGER.fullmatch, cells)):
-            columns.append(np.array([int(cell) for cell in cells]))
         elif all(map(_FLOAT.fullmatch, cells)):
-            columns.append(np.array([float(cell) for cell in cells]))
-        elif plain and {*cells} <= {"True", "False"}:
+            whole = all(map(_INTEGER.fullmatch, cells))
+            columns.append(np.array([int(cell) if whole else float(cell) for cell in cells]))
+        elif as_they_are and {*cells} <= {"True", "False"}:
             columns.append(np.array([cell == "True" for cell in cells]))
-        elif plain and all(map(_WORD.fullmatch, cells)):
+        elif as_they_are and all(map(_WORD.fullmatch, cells)):
             columns.append(words(cells))
         else:
             return None
