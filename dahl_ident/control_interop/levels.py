@@ -26,12 +26,11 @@ from dahl_ident.control_interop.limit_cycles import stiffness_of, stiffness_slop
 from dahl_ident.control_interop.linear_part import split
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
 from dahl_ident.data.columns import CONTROLLED, one_of
-from dahl_ident.data.quantities import converted
 from dahl_ident.elements.element import Element, Model
 from dahl_ident.errors import ValidationError
 from dahl_ident.steady_state import Steady, SteadyResponse, response
 from dahl_ident.steady_state.shooting import NEUTRAL
-from dahl_ident.units import QUANTITIES, Quantity, si_unit
+from dahl_ident.units import QUANTITIES, Quantity, converted, si_unit
 
 Kind = Literal["bode", "nyquist", "nichols"]
 

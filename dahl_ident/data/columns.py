@@ -19,7 +19,6 @@ from dahl_ident.arrays import (
     real_array,
     refuse_masked,
 )
-from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import UnitError, ValidationError, choices
 from dahl_ident.units import (
     DRIVE_KINDS,
@@ -28,6 +27,7 @@ from dahl_ident.units import (
     Motion,
     kind_of,
     parse_unit,
+    polar_std,
     si_unit,
 )
 

@@ -12,9 +12,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.columns import Table, backbone_std
-from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError
-from dahl_ident.units import engineering, si_unit
+from dahl_ident.units import engineering, polar_std, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd

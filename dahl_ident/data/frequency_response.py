@@ -33,11 +33,19 @@ from dahl_ident.data.columns import (
     plain_values,
     shared_properties,
 )
-from dahl_ident.data.quantities import converted, jacobian
 from dahl_ident.data.storage import plain_data
 from dahl_ident.data.tabular import Lines, Tabular, distinct, extent, listed, noted
 from dahl_ident.errors import ValidationError, spelled
-from dahl_ident.units import MOTIONS, QUANTITIES, Motion, Quantity, percent, si_unit
+from dahl_ident.units import (
+    MOTIONS,
+    QUANTITIES,
+    Motion,
+    Quantity,
+    converted,
+    jacobian,
+    percent,
+    si_unit,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.data.quantities import COMPLIANCES
 from dahl_ident.diagnostics.estimate import WeightedEstimate, tests_of
 from dahl_ident.problem import TableProblem
+from dahl_ident.units import COMPLIANCES
 
 _SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
 _MOST_LEVELS = 50  # with an error each: the cost is cubic in their number

@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.quantities import COMPLIANCES
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import friction_stiffness, is_spring
 from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, ResidualSpace
 from dahl_ident.fitting import Optimum
-from dahl_ident.units import percent, shown_unit
+from dahl_ident.units import COMPLIANCES, percent, shown_unit
 
 _BANDS = 8  # of the range of amplitudes: few, so that each holds rows for a mean
 _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude

@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.quantities import power_of_s
 from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.facts import (
     HistoryGradient,
@@ -19,6 +18,7 @@ from dahl_ident.elements.facts import (
     Values,
 )
 from dahl_ident.elements.parameter import Parameter
+from dahl_ident.units import power_of_s
 
 
 class Lumped(Element):

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
-from dahl_ident.data.quantities import DEFINITIONS, converted
 from dahl_ident.data.record import is_even
 from dahl_ident.elements.element import Element, motion, prefixed
 from dahl_ident.elements.facts import (
@@ -36,7 +35,7 @@ from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.rational import Rational, typical_rate
 from dahl_ident.elements.recursion import matrix_recursion
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.units import QUANTITIES, Quantity
+from dahl_ident.units import DEFINITIONS, QUANTITIES, Quantity, converted
 
 _VANISHES = 1e-12  # of its terms: a sum that is 0 but for rounding
 _UNSTABLE = 1e-9  # of the fastest pole: a real part above grows

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.quantities import DEFINITIONS
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.diagnostics.prediction_error import Departures, departures
 from dahl_ident.errors import ValidationError
@@ -22,6 +21,7 @@ from dahl_ident.planning.candidates import Candidates
 from dahl_ident.planning.design import Design, Term, packed_information
 from dahl_ident.planning.knowledge import Knowledge, spread, units_of
 from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
+from dahl_ident.units import DEFINITIONS
 
 NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
 _ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from dahl_ident import steady_state
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.data.quantities import DEFINITIONS, power_of_s
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.elements.facts import Sine
@@ -40,6 +39,7 @@ from dahl_ident.problem.steady_rows import SteadyRows
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import Sensors, measured_stiffness_factor
 from dahl_ident.steady_state import Shooting
+from dahl_ident.units import DEFINITIONS, power_of_s
 
 _NONE: ComplexArray = np.zeros((), dtype=np.complex128)
 

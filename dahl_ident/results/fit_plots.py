@@ -9,7 +9,6 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record, curves
-from dahl_ident.data.quantities import polar_std
 from dahl_ident.errors import ValidationError, choices
 from dahl_ident.plots import (
     Axes,
@@ -20,7 +19,7 @@ from dahl_ident.plots import (
     plot_sample_residuals,
     plot_waveforms,
 )
-from dahl_ident.units import si_unit
+from dahl_ident.units import polar_std, si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.diagnostics.budget import Budget
