@@ -30,7 +30,6 @@ _GROWTH = 1.25  # from check to check: at most a quarter more steps than are nee
 _ROUND = 50  # steps: checks are at round numbers
 _PIECE = 50  # steps between two calls of the listener, at least
 _PIECES = 20  # one piece adds at most this fraction of the chain
-
 _PARTS = 8  # of the points of one call, distributed over a pool
 
 Pool = Any
@@ -39,32 +38,22 @@ Pool = Any
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """How a chain is run."""
+    """How a chain of so many parameters is run, as :func:`dahl_ident.posterior` takes it."""
 
-    walkers: int  # in all ensembles together
+    dims: int
     ensembles: int  # independent ones
-    seed: int
+    walkers: Any  # in all ensembles together; None for enough of them
+    seed: Any  # None draws one
     steps: int | None  # in total; None runs until convergence
-    most_steps: int  # where to stop without convergence
-    wanted: float  # effective draws of every parameter
+    max_steps: int  # where to stop without convergence
+    ess: float  # effective draws of every parameter
 
-    @classmethod
-    def of(
-        cls,
-        dims: int,
-        *,
-        seed: int | None,
-        steps: int | None,
-        max_steps: int,
-        ess: float,
-        walkers: int | None,
-        ensembles: int,
-    ) -> ChainSettings:
-        """Return checked settings for so many parameters, with a seed."""
+    def __post_init__(self) -> None:
+        ensembles, walkers, seed = self.ensembles, self.walkers, self.seed
         whole_number(ensembles, "ensembles", 2)
         if walkers is None:
-            walkers = ensembles * max(32, 6 * dims)
-        whole_number(walkers, "walkers", ensembles * max(8, 4 * dims))
+            walkers = ensembles * max(32, 6 * self.dims)
+        whole_number(walkers, "walkers", ensembles * max(8, 4 * self.dims))
         if walkers % (2 * ensembles):
             raise ValidationError(
                 f"walkers is {walkers}; expected a multiple of {2 * ensembles}, because each of "
@@ -72,10 +61,12 @@ class ChainSettings:
             )
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
-        steps = None if steps is None else whole_number(steps, "steps", _LEAST_STEPS)
-        most_steps = whole_number(max_steps, "max_steps", _LEAST_STEPS)
-        seed = whole_number(seed, "seed", 0)
-        return cls(walkers, ensembles, seed, steps, most_steps, positive_number(ess, "ess"))
+        object.__setattr__(self, "walkers", walkers)
+        object.__setattr__(self, "seed", whole_number(seed, "seed", 0))
+        if self.steps is not None:
+            whole_number(self.steps, "steps", _LEAST_STEPS)
+        whole_number(self.max_steps, "max_steps", _LEAST_STEPS)
+        positive_number(self.ess, "ess")
 
 
 @dataclass(frozen=True)
@@ -117,7 +108,7 @@ def run(
     """Return the chain, continued until it is long enough, and its convergence verdict."""
     verdict: Convergence | None = None
     sampler = _sampler(density, settings, pool)
-    end = settings.most_steps if settings.steps is None else settings.steps
+    end = settings.max_steps if settings.steps is None else settings.steps
     while True:
         check = _next_check(chain.steps, end) if settings.steps is None else end
         while chain.steps < check:
@@ -125,7 +116,7 @@ def run(
             chain = _continued(sampler, chain, min(piece, check - chain.steps))
             for listener in listeners:
                 listener(chain, verdict)
-        verdict = judge(chain.points, settings.ensembles, settings.wanted)
+        verdict = judge(chain.points, settings.ensembles, settings.ess)
         if chain.steps >= end or verdict.reached:
             return chain, verdict
         # the next check must come after this one

@@ -389,7 +389,7 @@ def posterior(
         with grid_progress() if progress else nullcontext() as told:
             points = sample_points(density, begin, problem.names, tolerance, told)
         return Posterior(density, points, fitted, uncertainty)
-    settings = ChainSettings.of(
+    settings = ChainSettings(
         len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
         walkers=walkers, ensembles=ensembles,
     )  # fmt: skip

@@ -17,8 +17,8 @@ def expected_steps(settings: ChainSettings, verdict: Convergence | None) -> int 
     if verdict is None or not verdict.usable:
         return None
     kept = verdict.steps - verdict.discard
-    most = max(LENGTH * verdict.tau.max(), kept * settings.wanted / verdict.ess.min())
-    return min(int(verdict.discard + most) + 1, settings.most_steps)
+    most = max(LENGTH * verdict.tau.max(), kept * settings.ess / verdict.ess.min())
+    return min(int(verdict.discard + most) + 1, settings.max_steps)
 
 
 @contextmanager
