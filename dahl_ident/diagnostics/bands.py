@@ -190,17 +190,13 @@ def problem_at(
             f"frequency_hz has shape {f.shape} and {name} {given.shape}; expected one shape, or "
             "one number for all"
         ) from None
-    measured = problem.response
+    held_at: dict[str, Any] = {name: given}
+    measured, controlled = problem.response, "displacement" if drive is None else "force"
     usual = "dynamic_stiffness" if measured is None else measured.quantity
     grid = FrequencyResponse(
-        f,
-        np.ones(f.shape),
-        None if amplitude is None else given,
-        None if drive is None else given,
-        controlled="displacement" if drive is None else "force",
-        quantity=quantity or usual,
+        f, np.ones(f.shape), **held_at, controlled=controlled, quantity=quantity or usual,
         motion=problem.motion,
-    )
+    )  # fmt: skip
     return problem.at(grid)
 
 
@@ -278,10 +274,7 @@ def quantities(
 
 
 def quantities_and_slopes(
-    problem: Problem,
-    values: FloatArray,
-    amplitudes: Sequence[float],
-    frequency_hz: float | None,
+    problem: Problem, values: FloatArray, amplitudes: Sequence[float], frequency_hz: float | None
 ) -> Iterator[tuple[str, str, float | None, float, FloatArray]]:
     """Yield the same at one estimate, (P,), with the derivatives with respect to it, (P,)."""
     steps, count = _STEP * np.maximum(np.abs(values), SMALLEST), values.size

@@ -59,10 +59,7 @@ def _replicate(optimum: Optimum, replicates: int | None, seed: int) -> FloatArra
 
 
 def bootstrap_intervals(
-    optimum: Optimum,
-    levels: Sequence[float] = LEVELS,
-    replicates: int | None = None,
-    seed: int = 0,
+    optimum: Optimum, levels: Sequence[float] = LEVELS, replicates: int | None = None, seed: int = 0
 ) -> ConfidenceIntervals:
     """Return studentised bootstrap intervals."""
     array = checked_levels(levels)

@@ -17,14 +17,7 @@ from dahl_ident.data.storage import library as data_library
 from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY, coverage_factor
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import (
-    HARMONICS,
-    LEVELS,
-    MODEL_ERROR,
-    NOISE,
-    RUNS,
-    TESTS,
-)
+from dahl_ident.diagnostics.error_sources import HARMONICS, LEVELS, MODEL_ERROR, NOISE, RUNS, TESTS
 from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import (
     degrees_text,
@@ -95,15 +88,6 @@ class ParameterBudget:
 class Budget(Mapping[str, ParameterBudget]):
     """Uncertainty budgets of every free parameter, by name; printed, a table.
 
-    Attributes
-    ----------
-    parameters : tuple of ParameterBudget
-        In the order of the fit.
-    covariance : ndarray, shape (P, P)
-        Combined covariance of the values.
-    exact : tuple of str
-        Calibrations and other inputs without a stated uncertainty, which are taken as exact.
-
     Examples
     --------
     >>> import dahl_ident as di
@@ -114,9 +98,9 @@ class Budget(Mapping[str, ParameterBudget]):
     1.0
     """
 
-    parameters: tuple[ParameterBudget, ...]
-    covariance: FloatArray
-    exact: tuple[str, ...]
+    parameters: tuple[ParameterBudget, ...]  # in the order of the fit
+    covariance: FloatArray  # (P, P): combined, of the values
+    exact: tuple[str, ...]  # inputs without a stated uncertainty, which are taken as exact
 
     def __getitem__(self, name: str) -> ParameterBudget:
         by_name = {parameter.name: parameter for parameter in self.parameters}

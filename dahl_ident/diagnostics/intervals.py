@@ -49,6 +49,7 @@ from dahl_ident.problem.space import Space
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which an interval is a factor either way
 _LARGE = 0.1  # the same from noise alone, above which a side may be open
+_DISAGREES = 0.2  # half widths between the limits of two methods
 _ROUNDING = 1e-9  # relative difference of limits that no one sees
 METHODS: tuple[Method, ...] = get_args(Method)
 
@@ -162,7 +163,8 @@ def combined_intervals(
     place = [errors.names.index(name) for name in optimum.names]
     u = errors.std(np.eye(len(errors.names)))[place]
     directions = np.eye(len(errors.names))[place]
-    dof = np.where(held, [errors.dof(direction) for direction in directions], np.inf)
+    known = zip(directions, held, strict=True)
+    dof = np.array([errors.dof(d) if is_held else np.inf for d, is_held in known])
     k = coverage_factors(dof, array[:, None])
     positive = optimum.problem.space.positive
     values = errors.problem.to_values(errors.theta)[place]
@@ -280,12 +282,9 @@ class IntervalComparison:
 
 
 def compare(
-    optimum: Optimum,
-    intervals: Sequence[ConfidenceIntervals],
-    stated: ConfidenceIntervals,
-    tolerance: float = 0.2,
+    optimum: Optimum, intervals: Sequence[ConfidenceIntervals], stated: ConfidenceIntervals
 ) -> IntervalComparison:
-    """Return where each method differs from the last by more than `tolerance` half widths."""
+    """Return where each method differs from the last by more than a fifth of a half width."""
     if len(intervals) < 2:
         raise ValidationError(f"{len(intervals)} intervals given; a comparison needs two or more")
     last, found = intervals[-1], []
@@ -298,7 +297,7 @@ def compare(
             a, b = (getattr(one, side)[:, :count] for one in (last, other))
             ours, theirs = (search_coordinates(optimum, one) for one in (a, b))
             with np.errstate(invalid="ignore"):
-                apart = np.abs(ours - theirs) > tolerance * np.abs(ours - theta)
+                apart = np.abs(ours - theirs) > _DISAGREES * np.abs(ours - theta)
             apart |= np.isinf(ours) != np.isinf(theirs)
             apart &= ~np.isclose(a, b, rtol=_ROUNDING, atol=0)
             for row, i in np.argwhere(apart).tolist():

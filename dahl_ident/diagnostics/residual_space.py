@@ -229,7 +229,6 @@ class ResidualSpace(_Complement):
             near = linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
             own = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
-        if runs is not None:
             self.dof -= orthonormal(np.hstack([J[:m], own])).shape[1]
             self.dof += orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])

@@ -118,16 +118,6 @@ class StatedCombination:
 class Identifiability:
     """Which parameters and combinations the data determine.
 
-    Attributes
-    ----------
-    parameters : mapping of str to ParameterVerdict
-        By name.
-    combinations : tuple of StatedCombination
-        Determined combinations of parameters that are not.
-    direction : mapping of str to float
-        Where no combination is known: the least determined direction in the parameters'
-        logarithms (in sizes that matter for those that have none).
-
     Examples
     --------
     >>> import dahl_ident as di
@@ -137,7 +127,9 @@ class Identifiability:
     """
 
     parameters: Mapping[str, ParameterVerdict]
-    combinations: tuple[StatedCombination, ...]
+    combinations: tuple[StatedCombination, ...]  # determined ones, of parameters that are not
+    # where no combination is known: the least determined direction in the parameters' logarithms
+    # (in sizes that matter for those that have none)
     direction: Mapping[str, float]
 
     def named(self, verdict: Verdict) -> list[str]:

@@ -30,8 +30,7 @@ from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
-from dahl_ident.fitting.record_search import Tell
-from dahl_ident.problem import Problem, ProblemBatch, kind_of, problem_of, refuse_options
+from dahl_ident.problem import ProblemBatch, kind_of, problem_of, refuse_options
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
@@ -153,7 +152,7 @@ def fit(
     refuse_options(kind_of(data), locals(), fit)
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
-    by_ipopt = {
+    by_ipopt: dict[str, Any] = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
     }  # fmt: skip
     of_ipopt = [name for name, value in by_ipopt.items() if value is not None]
@@ -162,25 +161,19 @@ def fit(
             f"{' and '.join(of_ipopt)} given; only {argument('method', 'ipopt')} takes that"
         )
 
-    def optimum_of(problem: Problem, tell: Tell | None) -> Optimum:
-        if method != "ipopt":
-            return solve(problem, method=method, loss=loss, start=start, tell=tell)
-        from dahl_ident.fitting.ipopt import solve_ipopt
-
-        return solve_ipopt(
-            problem, start=start, loss=loss, tell=tell, constraints=constraints,
-            drive_std=drive_std, drive_covariance=drive_covariance,
-        )  # fmt: skip
-
     problem = problem_of(
         data, model, free=free, fixed=fixed, sensors=sensors, noise=noise, steady=steady,
         output=output, excitation=excitation,
     )  # fmt: skip
-    first_order = constraints is not None
     try:
         with fit_progress() if progress else nullcontext() as tell:
-            optimum = optimum_of(problem, tell)
-            result = FitResult(optimum, first_order=first_order)
+            if method != "ipopt":
+                optimum = solve(problem, method=method, loss=loss, start=start, tell=tell)
+            else:
+                from dahl_ident.fitting.ipopt import solve_ipopt
+
+                optimum = solve_ipopt(problem, start=start, loss=loss, tell=tell, **by_ipopt)
+            result = FitResult(optimum, first_order=constraints is not None)
     except FitInterrupted as stop:
         raise FitInterrupted(
             f"{stop}; this exception's `result` holds the best values so far",

@@ -95,9 +95,6 @@ class FitResult(Result):
     ndata: int = part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
     nfree: int = part("optimum.dof", "Degrees of freedom.")
     nfev: int = part("optimum.nfev", "Evaluations of the residuals.")
-    provenances: tuple[Mapping[str, Any] | None, ...] = part(
-        "problem.provenances", "Where the table comes from, or each record."
-    )
     combinations: tuple[DeterminedCombination, ...] = part(
         "optimum.combinations", "What the data determine where single parameters run away."
     )

@@ -95,9 +95,6 @@ class Posterior(Result):
 
     problem: Any = part("_density.problem", "Data, model, noise and sensors.")
     data: FrequencyResponse = part("problem.data", "The table.")
-    provenances: tuple[Mapping[str, Any] | None, ...] = part(
-        "problem.provenances", "Where the table comes from, or each record."
-    )
     names: tuple[str, ...] = part(
         "_density.names", "Names of the parameters, the model's first, an unknown noise scale last."
     )

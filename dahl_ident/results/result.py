@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -52,7 +52,7 @@ class Estimate:
         return f"{self.name} = {with_unit(self.value, self.stderr, self.unit)}{assumed}"
 
 
-class Parameters(Mapping[str, Estimate]):
+class Parameters(dict[str, Estimate]):
     r"""The parameters of a result by name; shown as a table, also in notebooks.
 
     Examples
@@ -62,9 +62,6 @@ class Parameters(Mapping[str, Estimate]):
     >>> print(fit.params.to_latex().splitlines()[4])
     $f_\mathrm{max}$ & $0.09982$ & $0.00031$ & N \\
     """
-
-    def __init__(self, estimates: Mapping[str, Estimate]) -> None:
-        self._estimates = dict(estimates)
 
     @classmethod
     def of(
@@ -82,27 +79,16 @@ class Parameters(Mapping[str, Estimate]):
             )  # fmt: skip
         return cls(estimates)
 
-    def __getitem__(self, name: str) -> Estimate:
-        return self._estimates[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._estimates)
-
-    def __len__(self) -> int:
-        return len(self._estimates)
-
     def __repr__(self) -> str:
         return "\n".join(map(str, self.values()))
 
     def _repr_html_(self) -> str:
-        rows = [
-            (
-                p.name,
-                *((f"{p.value:g}", "fixed") if p.stderr is None else rounded(p.value, p.stderr)),
-                p.unit,
+        rows = []
+        for p in self.values():
+            fixed = (f"{p.value:g}", "fixed")
+            rows.append(
+                (p.name, *(fixed if p.stderr is None else rounded(p.value, p.stderr)), p.unit)
             )
-            for p in self.values()
-        ]
         return html_table(("", "value", "u", "unit"), rows)
 
     def to_latex(self) -> str:
@@ -185,9 +171,9 @@ class Result(ABC):
         """Data, model, noise and sensors."""
 
     @property
-    @abstractmethod
     def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
         """Where the data come from: one for the table, or one for each record."""
+        return tuple(self.problem.provenances)
 
     @abstractmethod
     def budget(self) -> Budget:
