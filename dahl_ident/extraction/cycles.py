@@ -175,11 +175,8 @@ def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[Flo
     """Return the rising crossings, split where the motion is quiet, and those found there."""
     if time.size < _FEWEST_SAMPLES or depth > _DEEPEST:
         return []
-    for quantile in _QUANTILES:
-        runs = _runs_at(time, motion, quantile, depth)
-        if runs:
-            return runs
-    return []
+    tried = (_runs_at(time, motion, quantile, depth) for quantile in _QUANTILES)
+    return next(filter(None, tried), [])
 
 
 def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) -> list[FloatArray]:

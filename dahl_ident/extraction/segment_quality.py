@@ -67,11 +67,10 @@ def quantisation_errors(
     step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A).
     """
     sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
-    of_amplitude = (
-        0.04 * step**2 * step / np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
-    )
+    largest = np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
     rounded = (residual > _UNROUNDED * step) & (residual <= _DITHERED * step)
-    return np.asarray(np.where(rounded, np.sqrt(sampled + of_amplitude), 0.0))
+    error = np.sqrt(sampled + 0.04 * step**2 * step / largest)
+    return np.asarray(np.where(rounded, error, 0.0))
 
 
 def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:

@@ -279,13 +279,11 @@ def matching(pattern: str) -> list[str]:
 
 def _labels(sources: Sequence[Record | PathLike]) -> list[str]:
     """Return a run for each: the name of its file, or its number."""
-    files = [(s.provenance or {}).get("file") if isinstance(s, Record) else str(s) for s in sources]
-    labels = [f"record {i + 1}" if file is None else str(file) for i, file in enumerate(files)]
-    if None not in files:
-        labels = run_names(labels)
-    if len(set(labels)) < len(labels):
-        labels = [f"record {i + 1}" for i in range(len(labels))]
-    return labels
+    files = [(s.provenance or {}).get("file") if isinstance(s, Record) else s for s in sources]
+    numbers = [f"record {i + 1}" for i in range(len(files))]
+    labels = [str(file or number) for file, number in zip(files, numbers, strict=True)]
+    labels = run_names(labels) if all(files) else labels
+    return labels if len(set(labels)) == len(labels) else numbers
 
 
 def _without_needless_rows(data: FrequencyResponse) -> FrequencyResponse:
