@@ -3,53 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.resources import files
 from typing import Any
+
+import jinja2
 
 from dahl_ident.errors import ModelError
 from dahl_ident.results.export.device import LUMPED, Law, device
-
-_STEPS = {
-    "dahl": """\
-/* the force after a step dx: the exact solution of dF/dx = sigma |z|^alpha sgn(z) */
-static double friction_dahl(double f, double dx, double limit, double sigma, double alpha)
-{
-    const double d = dx < 0.0 ? -1.0 : 1.0, b = sigma * fabs(dx) / limit, e = alpha - 1.0;
-    const double z = 1.0 - d * f / limit;
-    double size = fabs(z), grown;
-    if (e == 0.0) {
-        size *= exp(-b);
-    } else if (size > 0.0) {
-        grown = e * b * pow(size, e);
-        size *= grown <= -1.0 ? 0.0 : exp(-log1p(grown) / e);
-    }
-    return d * limit * (1.0 - copysign(size, z));
-}
-""",
-    "bouc_wen": """\
-/* exponentials: sigma + p |F| while force and motion are opposite, sigma - q |F| from there on */
-static double friction_bouc_wen(double f, double dx, double sigma, double q, double p)
-{
-    const double d = dx < 0.0 ? -1.0 : 1.0;
-    double u = d * f, path = fabs(dx), zero;
-    if (u < 0.0) {
-        zero = p == 0.0 ? -u / sigma : HUGE_VAL;
-        if (p != 0.0 && p * u < sigma) zero = log1p(-p * u / sigma) / p;
-        if (path < zero && p == 0.0) return d * (u + sigma * path);
-        if (path < zero) return d * (u * exp(-p * path) - sigma * expm1(-p * path) / p);
-        path -= zero;
-        u = 0.0;
-    }
-    if (q == 0.0) return d * (u + sigma * path);
-    return d * (u * exp(-q * path) - sigma * expm1(-q * path) / q);
-}
-""",
-    "maxwell_slip": """\
-static double friction_slip(double f, double dx, double stiffness, double slip)
-{
-    return fmax(-stiffness * slip, fmin(stiffness * slip, f + stiffness * dx));
-}
-""",
-}  # fmt: skip
 
 
 def _dahl(law: Law, state: str) -> list[str]:
@@ -103,53 +63,14 @@ _LINES: dict[str, Callable[[Law, str], list[str]]] = {
 def c_header(result: Any) -> str:
     """Return the header; the mass is a macro, its force is not in the function."""
     parts = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
-    states, body, needed = 0, [], set()
+    body = ["double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
+    states, kinds = 0, set()
     for law in parts.laws:
-        body += [f"    {line}" for line in _LINES[law.kind](law, f"s->f[{states}]")]
+        body += _LINES[law.kind](law, f"s->f[{states}]")
         states += {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
-        needed.add("dahl" if law.kind == "lugre" else law.kind)
-    body += [
-        f"    force += {size!r} * {moved};"
-        for size, moved in ((parts.damping, "v"), (parts.stiffness, "x"))
-        if size
-    ]
-    level = ["    double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
-    notes = "".join(f" * {note}\n" for note in parts.notes)
-    return f"""\
-/*
-{notes} */
-#ifndef IDENTIFIED_FRICTION_H
-#define IDENTIFIED_FRICTION_H
-
-#include <math.h>
-
-#define FRICTION_MASS {parts.mass!r}  /* its force is not in friction_force */
-
-typedef struct {{
-    double x, v;  /* last displacement and velocity, {"rad" if parts.rotation else "m"} */
-    double f[{max(states, 1)}];  /* forces with a memory, {"N m" if parts.rotation else "N"} */
-}} friction_state;
-
-{"".join(text for kind, text in _STEPS.items() if kind in needed)}
-/* Begin at a displacement and a velocity, with no force. */
-static void friction_start(friction_state *s, double x, double v)
-{{
-    unsigned i;
-    s->x = x;
-    s->v = v;
-    for (i = 0; i < sizeof s->f / sizeof s->f[0]; ++i) s->f[i] = 0.0;
-}}
-
-/* The force that moves the device to x at the velocity v; call it once a sample. */
-static double friction_force(friction_state *s, double x, double v)
-{{
-    const double dx = x - s->x;
-    double force = 0.0;
-{chr(10).join([*level, *body])}
-    s->x = x;
-    s->v = v;
-    return force;
-}}
-
-#endif
-"""
+        kinds.add("dahl" if law.kind == "lugre" else law.kind)
+    lumped = ((parts.damping, "v"), (parts.stiffness, "x"))
+    body += [f"force += {size!r} * {moved};" for size, moved in lumped if size]
+    template = (files(__package__) / "friction.h.j2").read_text("utf-8")
+    made = jinja2.Template(template, trim_blocks=True, keep_trailing_newline=True)
+    return made.render(parts=parts, states=max(states, 1), kinds=kinds, body=body)
