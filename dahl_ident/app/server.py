@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import json
 import math
 import secrets
@@ -12,28 +13,38 @@ import webbrowser
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+)
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from dahl_ident import reporting
 from dahl_ident.app import commands
 from dahl_ident.app.commands import JobStep, laws, loop_of
-from dahl_ident.app.guard import Guard
 from dahl_ident.app.preview import NOTHING_FOUND
-from dahl_ident.app.work import Jobs, Work, output
+from dahl_ident.app.work import Jobs, Work, new_folder, output
 from dahl_ident.data.storage import save_frame
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.results import FitResult
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LIMIT = 2_000_000_000
 """Bytes that one upload may have."""
@@ -51,6 +62,69 @@ _OF_REPORT = (
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
 _HERE = Path(__file__).parent
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class Guard:
+    """Refuses requests without the token, by another name of this machine, or from other pages.
+
+    The token is in the address at first, then in a cookie that no other site's requests carry;
+    `limit` is the size of one request's body in bytes.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, port: int, limit: int) -> None:
+        self._app, self._token, self._limit = app, token.encode(), limit
+        self._hosts = {f"127.0.0.1:{port}", f"localhost:{port}"}
+        self._cookie = f"dahl_ident_{port}"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or pass it on."""
+
+        async def answer(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        if scope["type"] == "http":
+            refused = self._answer(Request(scope))
+            await (refused or self._app)(scope, receive, answer)
+        else:
+            await self._app(scope, receive, send)
+
+    def _answer(self, request: Request) -> Response | None:
+        """Return the answer to a request that is not passed on."""
+        if request.headers.get("host") not in self._hosts:
+            return PlainTextResponse("This server answers to 127.0.0.1 alone.", 421)
+        origin, reads = request.headers.get("origin"), request.method in ("GET", "HEAD")
+        if (origin or not reads) and origin not in {f"http://{host}" for host in self._hosts}:
+            return PlainTextResponse("The request comes from another page.", 403)
+        if self._is_token(request.query_params.get("token", "")):
+            response = RedirectResponse(request.url.path, 303)
+            token = self._token.decode()
+            response.set_cookie(self._cookie, token, httponly=True, samesite="strict")
+            return response
+        if not self._is_token(request.cookies.get(self._cookie, "")):
+            text = "Open the address with its token, as the terminal printed it."
+            return PlainTextResponse(text, 403)
+        size = request.headers.get("content-length", "" if not reads else "0")
+        if not size.isdecimal():
+            return PlainTextResponse("The request does not say how long it is.", 411)
+        if int(size) > self._limit:
+            text = f"The files are larger than {self._limit / 1e6:.0f} MB; send fewer at once."
+            return PlainTextResponse(text, 413)
+        return None
+
+    def _is_token(self, text: str) -> bool:
+        return hmac.compare_digest(text.encode(), self._token)
 
 
 class App:
@@ -228,9 +302,7 @@ class App:
             for part in (folder, *folder.glob("*-[0-9]*")):
                 self.jobs.cancel(part)
         elif what in ("compare", "plan") and not self.jobs.is_running(folder):
-            number = 1 + len(list(folder.glob(f"{what}-*")))
-            part = folder / f"{what}-{number}"
-            part.mkdir()
+            part = new_folder(folder, what)
             place = f"{folder.name}/{part.name}"
             step = (
                 commands.plan_step(folder.name, form, place, self.laws)
@@ -261,19 +333,13 @@ class App:
 
     async def export(self, request: Request) -> Response:
         """Return the model as another program reads it."""
-        work, folder = self._run(request)
+        _, folder = self._run(request)
         to = request.path_params["to"]
         if to not in _EXPORTS:
             raise HTTPException(404, "There is no such format.")
-        words = ["export", f"{folder.name}/fit.json", "--to", to, "-o", "-"]
-        made = await run_in_threadpool(
-            subprocess.run, [sys.executable, "-m", "dahl_ident.cli", *words],
-            cwd=work.folder, check=False, capture_output=True,
-        )  # fmt: skip
-        if made.returncode:
-            raise HTTPException(400, made.stderr.decode(errors="replace").strip())
+        text = await run_in_threadpool(lambda: FitResult.load(folder / "fit.json").export(to))
         where = {"Content-Disposition": f'attachment; filename="friction_{to}.txt"'}
-        return Response(made.stdout, headers=where, media_type="text/plain")
+        return Response(str(text), headers=where, media_type="text/plain")
 
     async def of_reports(self, request: Request) -> Response:
         """Return the styles or the script of reports, which the pages share."""

@@ -15,6 +15,7 @@ commands one after the other in child processes, which can be stopped.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -25,6 +26,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -37,6 +39,16 @@ _ENDING = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,2}$")
 _IDENTITY = re.compile(r"\d{4}-\d\d-\d\d-\d+")
 _USABLE = (0, 3)  # exit status of commands whose output says whether the result may be used
 _RUNNING, _ENDED, _FAILED, _CANCELLED = "running", "ended", "failed", "cancelled"
+
+
+def new_folder(root: Path, stem: str, first: int = 1) -> Path:
+    """Make and return the next free folder of a name and a number."""
+    for number in itertools.count(first):
+        folder = root / f"{stem}-{number}"
+        with suppress(FileExistsError):  # of an earlier one, or of another tab
+            folder.mkdir()
+            break
+    return folder
 
 
 class Work:
@@ -61,18 +73,11 @@ class Work:
     @classmethod
     def create(cls, root: Path) -> Work:
         """Make a folder for a new piece of work."""
-        day = time.strftime("%Y-%m-%d")
-        for number in range(1, 10_000):
-            folder = root / f"{day}-{number}"
-            try:
-                folder.mkdir()
-            except FileExistsError:
-                continue
-            (folder / "data").mkdir()
-            work = cls(folder)
-            work.save(title="", files=[], reading={}, model={}, report={}, confirmed=False)
-            return work
-        raise DataError(f"{root}: there are too many folders of {day}; give another folder")
+        folder = new_folder(root, time.strftime("%Y-%m-%d"))
+        (folder / "data").mkdir()
+        work = cls(folder)
+        work.save(title="", files=[], reading={}, model={}, report={}, confirmed=False)
+        return work
 
     @property
     def name(self) -> str:
@@ -142,15 +147,8 @@ class Work:
 
     def new_run(self) -> Path:
         """Make the folder of the next run."""
-        number = 1 + max((int(path.name[4:]) for path in self.folder.glob("run-*")), default=0)
-        while True:
-            folder = self.folder / f"run-{number}"
-            try:
-                folder.mkdir()
-            except FileExistsError:  # of another tab
-                number += 1
-                continue
-            return folder
+        numbers = [int(path.name[4:]) for path in self.folder.glob("run-*")]
+        return new_folder(self.folder, "run", 1 + max(numbers, default=0))
 
 
 class Jobs:

@@ -78,15 +78,10 @@ class Place:
     """An executor that somebody else made and ends; of its state only rows are known."""
 
     connections = 1  # how often it was connected to; what was under way on an earlier one is lost
+    answers_in_between = False  # whether it may be asked while jobs are under way
 
     def __init__(self, workers: int, executor: Executor) -> None:
         self.workers, self._executor = workers, executor
-
-    def __enter__(self) -> Place:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
         """Begin a job."""
@@ -98,10 +93,6 @@ class Place:
     def answers(self) -> bool:
         """Return whether the place is known to work; asked when no row came for a while."""
         return False
-
-    def patience(self, patience: float, seconds: float) -> float:
-        """Return for how long it may not answer while jobs of so many seconds are under way."""
-        return patience + seconds
 
     def close(self) -> None:
         """Give back what the place holds."""
@@ -135,6 +126,8 @@ class Local(Place):
 
 class Scheduler(Place):
     """A Dask scheduler; a lost connection is made again."""
+
+    answers_in_between = True
 
     def __init__(self, address: str, workers: int | None = None) -> None:
         self._address = address
@@ -183,10 +176,6 @@ class Scheduler(Place):
         except Exception:  # whatever a library says about a connection that is broken
             return False
         return bool(cores)
-
-    def patience(self, patience: float, seconds: float) -> float:
-        """Return the time given, because a scheduler answers while jobs are under way."""
-        return patience
 
     def close(self) -> None:
         """End the connection."""
@@ -239,10 +228,12 @@ def run_jobs(
             came = True
             limits.note(row)
             yield one[0], row
-        longest = max((seconds for _, seconds in under_way.values()), default=0.0)
+        most = patience
+        if not place.answers_in_between:
+            most += max((seconds for _, seconds in under_way.values()), default=0.0)
         if came or place.answers():
             heard = time.monotonic()
-        elif time.monotonic() - heard > (most := place.patience(patience, longest)):
+        elif time.monotonic() - heard > most:
             raise LostError(f"{place} has not answered for {most:.3g} s")
         if place.connections != connections:
             connections = place.connections

@@ -522,6 +522,8 @@ def _charts(
     Where devices have several fits, a value is the deviation from the mean of its device, enlarged
     to the variance of a single fit; the scatter is that of successive fits of one device.
     """
+    import pandas as pd
+
     fits = np.bincount(device)[device]
     repeated = bool(fits.max() > 1)
     group = device if repeated else np.zeros_like(device)
@@ -538,10 +540,8 @@ def _charts(
         return charts
     charted = np.flatnonzero(np.isfinite(y))
     ewma, width = np.full((2, y.size), np.nan)
-    mean = centre
-    for step, i in enumerate(charted, start=1):
-        mean += EWMA_WEIGHT * (y[i] - mean)
-        grown = 1.0 - (1.0 - EWMA_WEIGHT) ** (2 * step)
-        ewma[i] = mean
-        width[i] = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * grown)
+    from_centre = pd.Series([centre, *y[charted]]).ewm(alpha=EWMA_WEIGHT, adjust=False)
+    ewma[charted] = from_centre.mean()[1:]
+    grown = 1.0 - (1.0 - EWMA_WEIGHT) ** (2.0 * np.arange(1, charted.size + 1))
+    width[charted] = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * grown)
     return {**charts, "ewma": ewma, "ewma_limit": width}

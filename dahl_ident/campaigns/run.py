@@ -38,6 +38,7 @@ from dahl_ident.data.storage import (
     as_before_inert,
     inert,
     locked,
+    make_folder,
     place_of,
     put_in_place,
     read_text,
@@ -254,10 +255,7 @@ def campaign(
         tasks = _by_key(definition, Limits(timeout, memory))
         agree = _options_agree(definition, redo)
         return _split(definition, tasks, finished(folder / _JOURNAL)[0] if agree else ())
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as exc:
-        raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
+    make_folder(folder)
     lost: LostError | None = None
     with locked(folder / _JOURNAL, DataError):
         agree = _options_agree(definition, redo)
@@ -273,7 +271,7 @@ def campaign(
                 place = Place(workers or default_workers(), executor)
             else:
                 place = Local(workers or default_workers())
-            with place:
+            with closing(place):
                 done = run_jobs(work, place, limits, patience)
                 if not agree:
                     done = _unless_refused(done, min(_TRIALS, len(missing)), definition.source)

@@ -204,14 +204,6 @@ def written(write: Callable[[str | Path], Path], output: str, ending: str) -> st
     return output
 
 
-def make_folder(place: Path) -> None:
-    """Make a folder if it does not exist."""
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as exc:
-        raise DataError(f"{place}: the folder cannot be made: {exc.strerror or exc}") from exc
-
-
 def write_picture(axes: Any, path: str, *, overwrite: bool) -> None:
     """Write the figure of some axes in the format given by the file name."""
     from dahl_ident.data.storage import write_whole

@@ -14,7 +14,6 @@ from dahl_ident.cli import console
 from dahl_ident.cli.console import (
     STANDARD,
     changed,
-    make_folder,
     option_name,
     write_data,
     write_picture,
@@ -210,6 +209,7 @@ def demo(
 
     Example: dahl-ident demo
     """
+    from dahl_ident.data.storage import make_folder
     from dahl_ident.synthetic.shipped import load_dataset
 
     table, page = output / "levels.csv", output / "report.html"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -92,11 +92,8 @@ def export(
         raise ValidationError(f"{len(files)} files are given; expected one saved fit")
     writing.check([output], files)
     fit = saved_fit(files[0])
-
-    def write(place: str | Path) -> Path:
-        return Path(fit.export(to, place, overwrite=writing.overwrite, size=size, seed=seed))
-
-    written(write, output, ".csv")
+    how: dict[str, Any] = {"overwrite": writing.overwrite, "size": size, "seed": seed}
+    written(lambda place: Path(fit.export(to, place, **how)), output, ".csv")
     finish(fit)
 
 
@@ -178,11 +175,10 @@ def template(
     writing.check([output])
     content = (Path(__file__).parent / "templates" / f"{name}.toml").read_bytes()
 
-    def write(place: str | Path) -> Path:
-        write_whole(Path(place), content, overwrite=writing.overwrite)
-        return Path(place)
-
-    written(write, output, ".toml")
+    if output == STANDARD:
+        console.write(content.decode().removesuffix("\n"))
+    else:
+        write_whole(Path(output), content, overwrite=writing.overwrite)
 
 
 @with_option_groups

@@ -101,6 +101,14 @@ def refuse_existing(path: Path) -> None:
         )
 
 
+def make_folder(folder: Path, *, parents: bool = True) -> None:
+    """Make a folder if it does not exist."""
+    try:
+        folder.mkdir(parents=parents, exist_ok=True)
+    except OSError as exc:
+        raise DataError(f"{folder}: the folder cannot be made: {exc.strerror or exc}") from exc
+
+
 def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
     """Write a file so that it is there whole or not at all."""
     if not overwrite:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
-from dahl_ident.plots.corner import plot_corner, plot_trace
 from dahl_ident.plots.fit_diagnostics import (
     plot_bench_time,
     plot_budget,
     plot_control_charts,
+    plot_corner,
     plot_correlation,
     plot_devices,
     plot_information,
     plot_profile,
     plot_residuals,
+    plot_trace,
 )
 from dahl_ident.plots.responses import (
     Curve,

@@ -143,30 +143,44 @@ class Document:
         """The status, as a heading."""
         return MARKS[self.status]
 
-    def numbered(self) -> Document:
-        """Return the document with numbers before the captions of figures and tables.
+    @property
+    def pictures(self) -> list[Picture]:
+        """All pictures, in reading order."""
+        blocks = (block for section in self.sections for block in section.blocks)
+        return [block for block in blocks if isinstance(block, Picture)]
 
-        Pictures of one name, such as those of two fits, get numbers after it too.
+    def finished(self, title: str, progress: Callable[[int, int], None] | None) -> Document:
+        """Return the document with a title and numbers before captions of figures and tables.
+
+        Pictures of one name, such as those of two fits, get numbers after it too; each tells
+        `progress` when it is drawn for the first time.
         """
-        counts = {"Figure": 0, "Table": 0}
+        counts = {Picture: 0, TextTable: 0}
         names: dict[str, int] = {}
+        total, drawn = len(self.pictures), set[str]()
 
-        def numbered(block: Block) -> Block:
+        def finished(block: Block) -> Block:
             if not isinstance(block, TextTable | Picture):
                 return block
-            kind = "Figure" if isinstance(block, Picture) else "Table"
-            counts[kind] += 1
-            if isinstance(block, Picture):
-                names[block.name] = same = names.get(block.name, 0) + 1
-                block = replace(block, name=f"{block.name}_{same}") if same > 1 else block
-            return replace(block, caption=f"{kind} {counts[kind]}. {block.caption}")
+            counts[type(block)] += 1
+            kind = "Table" if isinstance(block, TextTable) else "Figure"
+            caption = f"{kind} {counts[type(block)]}. {block.caption}"
+            if isinstance(block, TextTable):
+                return replace(block, caption=caption)
+            names[block.name] = same = names.get(block.name, 0) + 1
+            name = f"{block.name}_{same}" if same > 1 else block.name
 
-        return self.mapped(numbered)
+            def draw() -> Any:
+                axes = block.draw()
+                drawn.add(name)
+                if progress is not None:
+                    progress(len(drawn), total)
+                return axes
 
-    def mapped(self, change: Callable[[Block], Block]) -> Document:
-        """Return the document with every block changed."""
-        changed = (replace(s, blocks=tuple(map(change, s.blocks))) for s in self.sections)
-        return replace(self, sections=tuple(changed))
+            return replace(block, name=name, caption=caption, draw=draw)
+
+        changed = (replace(s, blocks=tuple(map(finished, s.blocks))) for s in self.sections)
+        return replace(self, title=title, sections=tuple(changed))
 
 
 def words(*texts: str) -> tuple[Cell, ...]:

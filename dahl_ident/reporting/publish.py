@@ -1,28 +1,38 @@
-"""``report(results, path)``: writes results to a file that others can read and reproduce."""
+"""``report(results, path)``: writes results as HTML, PDF, Markdown or JSON."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import jinja2
 import numpy as np
 
 from dahl_ident.data import Record
 from dahl_ident.data.laboratory import Metadata, metadata_of
-from dahl_ident.data.storage import place_of, plain_data, refuse_existing, write_whole
-from dahl_ident.errors import DataError, ValidationError, argument
+from dahl_ident.data.storage import make_folder, place_of, plain_data, refuse_existing, write_whole
+from dahl_ident.errors import ValidationError, argument
 from dahl_ident.reporting.comparison import of_kind
-from dahl_ident.reporting.document import Block, Document, Picture
-from dahl_ident.reporting.pages import html, markdown
+from dahl_ident.reporting.document import (
+    Block,
+    Bullets,
+    Cell,
+    Document,
+    Listing,
+    Paragraph,
+    Picture,
+    Section,
+    TextTable,
+)
 from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import FitResult, Posterior
 
+BLANK = "________________"
 SCHEMA = 2  # of the JSON report: it rises when readers have to change
 _LONGEST_TITLE = 200  # characters
 FORMATS = (".html", ".pdf", ".md", ".json")
@@ -117,9 +127,7 @@ def report(
     whole = document(
         listed, title=title, command=command, record=record, metadata=known, apart=apart
     )
-    whole = replace(whole.numbered(), title=_one_line(whole.title))
-    if progress is not None:
-        whole = _counted(whole, progress)
+    whole = whole.finished(_one_line(whole.title), progress)
     kind = place.suffix.lower()
     if kind == ".md":
         folder = place.with_name(f"{place.stem}_pictures")
@@ -129,25 +137,6 @@ def report(
         content = content_of(whole, kind)
     write_whole(place, content, overwrite=overwrite)
     return place
-
-
-def _counted(whole: Document, progress: Callable[[int, int], None]) -> Document:
-    """Return the document with pictures that tell when they are drawn."""
-    total, drawn = len(_pictures(whole)), iter(range(1, sys.maxsize))
-
-    def counted(block: Block) -> Block:
-        if not isinstance(block, Picture):
-            return block
-        draw = block.draw
-
-        def count() -> Any:
-            axes = draw()
-            progress(min(next(drawn), total), total)
-            return axes
-
-        return replace(block, draw=count)
-
-    return whole.mapped(counted)
 
 
 def _check(results: Sequence[object]) -> None:
@@ -193,14 +182,11 @@ def content_of(whole: Document, kind: str) -> bytes:
 
 
 def _write_pictures(whole: Document, folder: Path, overwrite: bool) -> None:
-    places = {folder / f"{picture.name}.png": picture for picture in _pictures(whole)}
+    places = {folder / f"{picture.name}.png": picture for picture in whole.pictures}
     if not overwrite:
         for place in places:
             refuse_existing(place)
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as exc:
-        raise DataError(f"{folder}: cannot be made: {exc.strerror or exc}") from exc
+    make_folder(folder, parents=False)
     for place, picture in places.items():
         write_whole(place, picture.rendered("png"), overwrite=overwrite)
 
@@ -219,6 +205,79 @@ def machine_readable(whole: Document) -> bytes:
     return json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False).encode(errors="replace")
 
 
-def _pictures(whole: Document) -> list[Picture]:
-    blocks = (block for section in whole.sections for block in section.blocks)
-    return [block for block in blocks if isinstance(block, Picture)]
+def html(document: Document) -> bytes:
+    """Return the page; text is escaped, and the page's security policy forbids network access."""
+    room = files("dahl_ident.reporting")
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    page = environment.from_string((room / "page.html.j2").read_text(encoding="utf-8"))
+    return page.render(
+        document=document,
+        foot=_css_text(f"{document.title} {document.identity}".strip()),
+        style=(room / "page.css").read_text(encoding="utf-8"),
+        script=(room / "page.js").read_text(encoding="utf-8"),
+    ).encode(errors="replace")
+
+
+def _css_text(text: str) -> str:
+    """Return a string of a style sheet that holds nothing but letters, digits and escapes."""
+    return '"' + "".join(c if c.isalnum() else f"\\{ord(c):x} " for c in text) + '"'
+
+
+def markdown(document: Document, folder: str) -> bytes:
+    """Return the text, with links to the pictures as PNG files in `folder`."""
+    lines = [f"# {_escaped(document.title)}", f"**{document.mark}.**"]
+    lines += [_escaped(line) for line in document.verdict]
+    if document.header:
+        rows = [
+            f"| {name} | {_escaped('; '.join(given)) or BLANK} |" for name, given in document.header
+        ]
+        lines.append("\n".join(("| | |", "| --- | --- |", *rows)))
+    if document.identity:
+        lines.append(_escaped(document.identity))
+    for section in _with_signature(document):
+        lines.append(f"## {_escaped(section.title)}")
+        lines += [text for block in section.blocks if (text := _block(block, folder))]
+    return ("\n\n".join(lines) + "\n").encode(errors="replace")
+
+
+def _with_signature(document: Document) -> Iterator[Section]:
+    """Yield the sections, and before the details a field for the signature."""
+    sections, name = document.sections, ", ".join(document.signatory) or BLANK
+    signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {name} Signature {BLANK}"),))
+    for before, section in zip((None, *sections), sections, strict=False):
+        if section.details and not (before and before.details):
+            yield signature
+        yield section
+
+
+def _block(block: Block, folder: str) -> str:
+    match block:
+        case Paragraph(text):
+            return _escaped(text)
+        case Bullets(items):
+            return "\n".join(f"- {_escaped(item)}" for item in items)
+        case Listing(text):
+            return "\n".join(f"    {line}" for line in text.splitlines())
+        case Picture():
+            caption = _escaped(block.caption)
+            return f"![{_escaped(block.alt)}](<{folder}/{block.name}.png>)\n\n*{caption}*"
+        case TextTable():
+            return _table(block)
+
+
+def _table(table: TextTable) -> str:
+    rows = [table.header, tuple("---" for _ in table.header)]
+    lines = [" | ".join(map(_escaped, rows[0])), " | ".join(rows[1])]
+    lines += [" | ".join(map(_cell, row)) for row in table.rows]
+    return f"**{_escaped(table.caption)}**\n\n" + "\n".join(f"| {line} |" for line in lines)
+
+
+def _cell(cell: Cell) -> str:
+    return f"~~{_escaped(cell.text)}~~" if cell.struck else _escaped(cell.text)
+
+
+def _escaped(text: str) -> str:
+    """Return text with all markup characters escaped."""
+    return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(text.split()))

@@ -12,7 +12,7 @@ from typing import Any
 
 from dahl_ident.data.storage import write_whole
 from dahl_ident.errors import ValidationError, choices
-from dahl_ident.results.export import c_header, numbers, simulators
+from dahl_ident.results.export import numbers, simulators
 
 FORMATS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "mujoco": ("joint with LuGre friction, MJCF", simulators.mujoco),
@@ -20,7 +20,7 @@ FORMATS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "urdf": ("joint dynamics: friction limit and damping", simulators.urdf),
     "modelica": ("model of the friction, Modelica", simulators.modelica),
     "matlab": ("struct of parameters for Simulink, MATLAB", simulators.matlab),
-    "c": ("friction force as a function for feed-forward, C99 header", c_header.c_header),
+    "c": ("friction force as a function for feed-forward, C99 header", simulators.c_header),
     "gtc": ("uncertain numbers with their influences, archive of GTC", numbers.gtc_archive),
     "ufloat": ("correlated numbers of the package uncertainties, Python", numbers.ufloat),
     "latex": ("table of parameters", numbers.latex),

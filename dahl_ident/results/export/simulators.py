@@ -1,13 +1,107 @@
-"""Parameter files of simulators: MuJoCo, URDF, Modelica, MATLAB."""
+"""Parameter files of simulators and controllers: MuJoCo, URDF, Modelica, MATLAB, C."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any
 
-from dahl_ident.errors import FitError, ModelError
-from dahl_ident.results.export.device import LUMPED, Device, Law, device, linear, short
+import jinja2
+import numpy as np
+
+from dahl_ident.errors import FitError, ModelError, argument
 from dahl_ident.results.export.numbers import uncertain
+from dahl_ident.units import percent
+from dahl_ident.version import __version__
+
+LUMPED = {"mass": "mass", "damper": "damping", "spring": "stiffness"}
+_EXPONENT_MATTERS = 0.02  # of f_max
+
+
+@dataclass(frozen=True)
+class Law:
+    """A friction element: its kind, its equation, and its values by the names of its class."""
+
+    kind: str
+    equation: str
+    values: Mapping[str, float]
+
+    def __getitem__(self, name: str) -> float:
+        return self.values[name]
+
+
+@dataclass(frozen=True)
+class Device:
+    """The elements of a fit."""
+
+    laws: tuple[Law, ...]  # all but masses, viscous dampers and springs
+    mass: float  # sums, as are damping and stiffness
+    damping: float
+    stiffness: float
+    rotation: bool  # whether forces are torques
+    notes: tuple[str, ...]  # origin and verdict, and what the format leaves out
+
+
+def device(result: Any, form: str, carried: Mapping[str, str]) -> Device:
+    """Return the device of a fit."""
+    laws, lumped = [], dict.fromkeys(LUMPED.values(), 0.0)
+    notes = [f"made by dahl_ident {__version__}, SI units; the fit is {result.status.value}"]
+    lost = [name for name, p in result.params.items() if not math.isfinite(p.value)]
+    if lost:
+        raise FitError(
+            f"{', '.join(lost)} has no finite estimate, so there is no model to export; see the "
+            "verdict"
+        )
+    for element in result.model.elements:
+        values = _values(element)
+        if element.kind in LUMPED and element.kind in carried:
+            lumped[LUMPED[element.kind]] += values[LUMPED[element.kind]]
+        elif element.kind in carried:
+            laws.append(Law(element.kind, element.equation, values))
+        else:
+            raise ModelError(
+                f"{form} carries {', '.join(carried)}, and the model has {element.kind}; fit "
+                "without it, or export to another format, such as matlab"
+            )
+        if carried[element.kind]:
+            notes.append(f"{element.kind}: {carried[element.kind]}")
+    units = {p.unit for p in result.params.values()}
+    rotation = any("rad" in unit or unit.startswith("N m") for unit in units)
+    return Device(tuple(laws), **lumped, rotation=rotation, notes=tuple(notes))
+
+
+def short(value: float) -> float:
+    """Return a number of at most ten digits, more than any measurement has."""
+    return float(f"{value:.10g}")
+
+
+def _values(element: Any) -> dict[str, float]:
+    """Return the values by the names that the class of the element has for them."""
+    prefix = f"{element.name}_" if getattr(element, "name", None) else ""
+    return {p.name.removeprefix(prefix): short(p.value) for p in element.parameters}
+
+
+def linear(law: Law, form: str) -> tuple[str, ...]:
+    """Return what to say where a format takes the exponent of Dahl for 1 and has one limit."""
+    if law.values.get("asymmetry"):
+        raise ModelError(f"{form} has one limit of friction for both directions, and the model two")
+    a = law["alpha"] - 1.0
+    if a == 0.0:
+        return ()
+    path = np.geomspace(1e-3, 1e3, 2001)  # from full slip the other way: 1 - s F/f_max = 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = np.maximum(2.0**-a + a * path, 0.0) ** (-1.0 / a)
+    worst = float(np.max(np.abs(z - 2.0 * np.exp(-path))))
+    if not worst <= _EXPONENT_MATTERS:
+        raise ModelError(
+            f"{form} carries Dahl with the exponent 1, and alpha is {1.0 + a:.4g}: the force would "
+            f"differ by {percent(worst)} of f_max; fit with {argument('alpha', 1)} if that "
+            "describes the data"
+        )
+    return (f"alpha = {1.0 + a:.5g} is taken as 1: within {percent(worst)} of f_max",)
+
 
 _COULOMB = {
     "dahl": "as a friction limit; the contact stiffness sigma is left out",
@@ -170,3 +264,68 @@ def _matlab(value: float | None) -> str:
 
 def _numbers(*values: float) -> str:
     return " ".join(repr(float(value)) for value in values)
+
+
+def _dahl(law: Law, state: str) -> list[str]:
+    limit = repr(law["f_max"])
+    if asymmetry := law.values.get("asymmetry"):
+        limit += f" * (1.0 + (dx < 0.0 ? -1.0 : 1.0) * {asymmetry!r})"
+    step = f"friction_dahl({state}, dx, {limit}, {law['sigma']!r}, {law['alpha']!r})"
+    return [f"if (dx != 0.0) {state} = {step};", f"force += {state};"]
+
+
+def _bouc_wen(law: Law, state: str) -> list[str]:
+    if "exponent" in law.values:
+        raise ModelError("c has Bouc-Wen of exponent 1 alone; modelica has any exponent")
+    values = ", ".join(repr(law[name]) for name in ("sigma", "q", "p"))
+    return [f"{state} = friction_bouc_wen({state}, dx, {values});", f"force += {state};"]
+
+
+def _lugre(law: Law, state: str) -> list[str]:
+    f_max, sigma, ratio, speed, micro, viscous = law.values.values()
+    level = f"{f_max!r} * (1.0 + {ratio - 1.0!r} * exp(-pow({{}} / {speed!r}, 2.0)))"
+    slope = f"{sigma!r} * (1.0 - (v < 0.0 ? -1.0 : 1.0) * {state} / level)"
+    return [
+        f"level = {level.format('(0.5 * (s->v + v))')};",
+        f"if (dx != 0.0) {state} = friction_dahl({state}, dx, level, {sigma!r}, 1.0);",
+        f"level = {level.format('v')};",
+        f"force += {state} + ({micro / sigma!r} * {slope} + {viscous!r}) * v;",
+    ]
+
+
+def _slips(law: Law, state: str) -> list[str]:
+    count = len(law.values) // 2
+    first = int(state.partition("[")[2].rstrip("]"))
+    return [
+        f"force += (s->f[{first + i}] = friction_slip(s->f[{first + i}], dx, "
+        f"{law[f'stiffness_{i + 1}']!r}, {law[f'slip_{i + 1}']!r}));"
+        for i in range(count)
+    ]
+
+
+def _power(law: Law, _: str) -> list[str]:
+    c, p, speed = (law[name] for name in ("coefficient", "exponent", "reference_speed"))
+    return [f"force += v == 0.0 ? 0.0 : copysign({c!r} * pow(fabs(v) / {speed!r}, {p!r}), v);"]
+
+
+_LINES: dict[str, Callable[[Law, str], list[str]]] = {
+    "dahl": _dahl, "bouc_wen": _bouc_wen, "lugre": _lugre, "maxwell_slip": _slips,
+    "power_damper": _power,
+}  # fmt: skip
+
+
+def c_header(result: Any) -> str:
+    """Return the header; the mass is a macro, its force is not in the function."""
+    parts = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
+    body = ["double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
+    states, kinds = 0, set()
+    for law in parts.laws:
+        body += _LINES[law.kind](law, f"s->f[{states}]")
+        states += {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
+        kinds.add("dahl" if law.kind == "lugre" else law.kind)
+    lumped = ((parts.damping, "v"), (parts.stiffness, "x"))
+    body += [f"force += {size!r} * {moved};" for size, moved in lumped if size]
+    template = (files(__package__) / "friction.h.j2").read_text("utf-8")
+    made = jinja2.Template(template, trim_blocks=True, keep_trailing_newline=True)
+    text: str = made.render(parts=parts, states=max(states, 1), kinds=kinds, body=body)
+    return text
