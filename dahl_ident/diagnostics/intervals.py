@@ -156,7 +156,8 @@ def combined_intervals(
     """Return intervals that count every source of error: value -+ k u.
 
     Of a positive parameter whose u is above 20 %, value times or over exp(k u). Of one with an open
-    side, the profile's, widened by the sources that it does not count.
+    side, the profile's, widened by the sources that it does not count. What was assumed follows the
+    parameters that were fitted.
     """
     array = checked_levels(levels)
     held = np.array([errors.holds(name) for name in optimum.names])
@@ -192,8 +193,22 @@ def combined_intervals(
     shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"
-    units = tuple(p.unit for p in optimum.problem.parameters)
-    return ConfidenceIntervals("combined", array, optimum.names, units, values, lower, upper, note)
+    every, assumed = errors.problem, [name for name in errors.assumed if errors.holds(name)]
+    also = [errors.names.index(name) for name in assumed]
+    estimates, directions = every.to_values(errors.theta), np.eye(len(errors.names))
+    u = errors.std(directions) * every.space.slopes(estimates)
+    dof = np.array([errors.dof(direction) for direction in directions])
+    ends = around(every.space, estimates, u, coverage_factors(dof, array[:, None]))
+    lower, upper = (
+        np.hstack([part, end[:, also]]) for part, end in zip((lower, upper), ends, strict=True)
+    )
+    units = tuple(
+        p.unit for p in (*optimum.problem.parameters, *(every.parameters[i] for i in also))
+    )
+    return ConfidenceIntervals(
+        "combined", array, (*optimum.names, *assumed), units,
+        np.append(values, estimates[also]), lower, upper, note,
+    )  # fmt: skip
 
 
 def around(

@@ -168,14 +168,21 @@ class RecordAssessment(Assessment):
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
-        array, values = checked_levels(levels), self.optimum.values
+        array, values, assumed = checked_levels(levels), self.optimum.values, self.errors.assumed
         dof = [self.errors.dof_for(place) for place in range(values.size)]
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
+        # of what was assumed, in the logarithm
+        more = coverage_factors(self.errors.dof, array[:, None]) * [one.std for one in assumed]
+        held = np.array([one.value for one in assumed])
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
-        names, units = self.problem.names, tuple(p.unit for p in self.problem.parameters)
-        return ConfidenceIntervals("combined", array, names, units, values, lower, upper, note)
+        return ConfidenceIntervals(
+            "combined", array, (*self.problem.names, *(one.name for one in assumed)),
+            tuple(one.unit for one in (*self.problem.parameters, *assumed)),
+            np.append(values, held), np.hstack([lower, held * np.exp(-more)]),
+            np.hstack([upper, held * np.exp(more)]), note,
+        )  # fmt: skip
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -183,7 +190,7 @@ class RecordAssessment(Assessment):
         lost = {finding.values["name"]: str(finding) for finding in undetermined(self)}
         limits = self.intervals("combined")
         verdicts: dict[str, ParameterVerdict] = {}
-        for name, unit in zip(limits, limits.units, strict=True):
+        for name, unit in zip(self.problem.names, limits.units, strict=False):
             verdict = Verdict.NOT_IDENTIFIED if name in lost else Verdict.IDENTIFIED
             reason = lost.get(name, verdict.value)
             verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], reason)

@@ -39,7 +39,9 @@ def answer(fit: FitResult) -> TextTable:
     for name, p in fit.params.items():
         value, error = rounded(p.value, p.stderr)
         if name in fit.assumed and p.stderr is not None:
-            lost, within, reason = False, Cell("-", struck=not described), _ASSUMED
+            limit = limits[name]
+            within = Cell(interval(limit.lower, limit.upper, ""), struck=not described)
+            lost, reason = False, _ASSUMED
         elif name in of_device:
             verdict, reason = fit.verdict_on(name)
             lost, limit = not verdict.known, limits[name]
