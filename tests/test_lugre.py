@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dahl_ident import Dahl, Damper, Friction, LuGre
+from dahl_ident import Dahl, Damper, Friction, LuGre, Record, fit
 from dahl_ident.errors import ModelError, ValidationError
 
 LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
@@ -92,3 +92,13 @@ def test_the_force_along_a_sampled_motion_is_that_of_the_motion(uneven):
     assert np.abs(exact - whole).max() < (1e-7 if not uneven else 1e-6)
     if not uneven:
         assert np.abs(law.force(x, 0.3, velocity=v) - whole).max() < 2e-5
+
+
+def test_a_record_of_it_is_fitted():
+    t = np.arange(2000) / 200.0
+    x = 0.01 * np.sin(2.0 * np.pi * 0.5 * t) * np.sin(2.0 * np.pi * 0.05 * t)
+    law = LuGre(1.0, 300.0, 1.6, 0.02)
+    force = law.force(x, velocity=np.gradient(x, t)) + 1e-3 * np.random.default_rng(0).standard_normal(2000)
+    found = fit(Record(t, displacement=x, force=force), LuGre())
+    for name, truth in (("f_max", 1.0), ("sigma", 300.0), ("static_ratio", 1.6)):
+        assert found.params[name].value == pytest.approx(truth, rel=0.02)

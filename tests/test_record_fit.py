@@ -460,6 +460,6 @@ def test_results_of_records_are_copied_and_pickled():
         ):
             for name, p in copied.params.items():
                 assert p.value == expected[name].value
-                assert p.stderr == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)
+                assert (p.stderr or 0.0) == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)
             assert copied.statements == result.statements
             assert str(copied.budget()) == str(result.budget())

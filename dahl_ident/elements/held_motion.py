@@ -147,7 +147,7 @@ def _in_time(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     x, v = path.displacement, np.asarray(path.velocity)
     if path.time is not None or x.size < 2:
-        times = np.zeros(x.size) if path.time is None else path.time
+        times = np.zeros(x.size) if path.time is None else np.array(path.time)
         return times, times, path.polynomials(np.diff(times))
     from scipy.interpolate import CubicSpline
 
