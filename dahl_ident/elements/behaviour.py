@@ -14,8 +14,6 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.facts import (
-    STENCIL,
-    STEP,
     Alternative,
     Asymptote,
     Combination,
@@ -135,8 +133,7 @@ class Behaviour(ABC):
         """Return the force at every sample with its derivatives, unchecked.
 
         `state` is the unknown at the first sample: the force there, in most laws. Without `slopes`
-        the derivatives are not looked at. An element that has none of its own may leave them to
-        :meth:`_differences`.
+        the derivatives are not looked at.
         """
         raise ModelError(f"{self!r} has no force over time")
 
@@ -167,27 +164,6 @@ class Behaviour(ABC):
         """Return the force at every sample with its derivatives, unchecked."""
         path = Path(displacement, velocity, acceleration, time)
         return self.history(values, path, state, slopes=True)
-
-    def _differences(self, values: Sequence[Any], path: Path, state: float) -> HistoryGradient:
-        """Return the force with central differences of fourth order."""
-        at = [float(v) for v in values]
-
-        def slope(index: int, step: float) -> FloatArray:
-            """Return the derivative with respect to a value, or after these the state."""
-            total = np.zeros(path.displacement.shape)
-            for place, weight in STENCIL:
-                moved = [*at, state]
-                moved[index] += place * step
-                total += weight / step * self.history(moved[:-1], path, moved[-1], slopes=False)[0]
-            return total
-
-        value = self.history(at, path, state, slopes=False).value
-        by_state = np.zeros(value.shape)
-        if self.has_memory:
-            largest = self.start_with(at, float(np.max(np.abs(value), initial=0.0)))
-            by_state = slope(len(at), STEP * largest or 1.0)
-        by = tuple(slope(i, STEP * (abs(size) or 1.0)) for i, size in enumerate(at))
-        return HistoryGradient(value, by_state, by)
 
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]

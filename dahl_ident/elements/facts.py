@@ -238,20 +238,12 @@ class Alternative(NamedTuple):
     shows: str = "shape"
 
 
-def central_differences(
-    function: Callable[..., NDArray[Scalar]],
-    arguments: Sequence[FloatArray],
-    index: int,
-    shape: tuple[int, ...],
-) -> NDArray[Scalar]:
-    """Return the derivative of a function of arrays by one of them, to fourth order."""
-    size = np.asarray(arguments[index], dtype=np.float64)
-    step = STEP * np.where(size == 0.0, 1.0, np.abs(size))
-    places = [place for place, _ in STENCIL]
-    ndim = len(shape)
-    stacked = size.reshape((1,) * (ndim - size.ndim) + size.shape)
-    by = np.asarray(places).reshape((-1,) + (1,) * ndim) * step.reshape(stacked.shape)
-    moved = [*arguments[:index], stacked + by, *arguments[index + 1 :]]
-    values = np.broadcast_to(function(*moved), (len(places), *shape))
-    weights = np.asarray([weight for _, weight in STENCIL])
-    return np.asarray(np.tensordot(weights, values, axes=1) / step)
+def difference(function: Callable[[Any], Any], at: Any, step: Any) -> Any:
+    """Return the derivative of a function of one number, or of each of an array, to fourth order.
+
+    Examples
+    --------
+    >>> print(difference(np.exp, 0.0, STEP).round(12))
+    1.0
+    """
+    return sum(weight * function(at + place * step) for place, weight in STENCIL) / step

@@ -21,7 +21,6 @@ from dahl_ident.data.columns import one_of
 from dahl_ident.data.record import is_even
 from dahl_ident.elements.element import Element, motion, prefixed
 from dahl_ident.elements.facts import (
-    STENCIL,
     STEP,
     HistoryGradient,
     Mechanics,
@@ -29,6 +28,7 @@ from dahl_ident.elements.facts import (
     Sine,
     StiffnessGradient,
     Values,
+    difference,
     each_harmonic,
 )
 from dahl_ident.elements.parameter import Parameter
@@ -555,11 +555,8 @@ def differences(
                 f"{label} is exactly 0, which gives its derivative no step; start it from a small "
                 "number, or write the function with an offset"
             )
-        step = STEP * value
-        yield np.sum(
-            [
-                weight / step * function((*vector[:i], value + place * step, *vector[i + 1 :]))
-                for place, weight in STENCIL
-            ],
-            axis=0,
-        )
+
+        def moved(number: float, i: int = i) -> NDArray[Any]:
+            return function((*vector[:i], number, *vector[i + 1 :]))
+
+        yield difference(moved, value, STEP * value)

@@ -20,12 +20,21 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.facts import HistoryGradient, Mechanics, Path, Values, clipped
+from dahl_ident.elements.facts import (
+    STEP,
+    HistoryGradient,
+    Mechanics,
+    Path,
+    Values,
+    clipped,
+    difference,
+)
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import ModelError
@@ -114,6 +123,22 @@ class Masing(Friction):
             first = stop
         force = np.append(begun, paths.force(lambda x: self.backbone(at, x)))
         return HistoryGradient(force, force, ())
+
+    def _differences(self, values: Sequence[Any], path: Path, state: float) -> HistoryGradient:
+        """Return the force with central differences by the state and every value."""
+        numbers = [state, *(float(v) for v in values)]
+
+        def force(i: int, number: float) -> FloatArray:
+            moved = [*numbers[:i], number, *numbers[i + 1 :]]
+            return self.history(moved[1:], path, moved[0], slopes=False).value
+
+        value = force(0, state)
+        largest = self.start_with(numbers[1:], float(np.max(np.abs(value), initial=0.0)))
+        by_state, *by = (
+            difference(partial(force, i), number, STEP * ((abs(number) if i else largest) or 1.0))
+            for i, number in enumerate(numbers)
+        )
+        return HistoryGradient(value, by_state, tuple(by))
 
     def _loaded_to(self, values: Values, force: float) -> float:
         """Return where the backbone curve has a force, by bisection."""

@@ -22,13 +22,14 @@ from scipy.special import gamma, rgamma
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.element import Element, motion
 from dahl_ident.elements.facts import (
+    STEP,
     HistoryGradient,
     Mechanics,
     Path,
     Sine,
     StiffnessGradient,
     Values,
-    central_differences,
+    difference,
     each_harmonic,
 )
 from dahl_ident.elements.parameter import Parameter
@@ -119,7 +120,7 @@ class PowerDamper(Element):
             logarithm = np.log(A * omega / speed)
             by_p = np.where(np.isfinite(logarithm), logarithm * N, 0.0)
         if k % 2:
-            by_share = central_differences(lambda q: _share(q, k), [p], 0, p.shape)
+            by_share = difference(lambda q: _share(q, k), p, STEP * p)
             by_p = by_p + 1j * np.where(np.isfinite(size), c * size * by_share, 0.0)
         return StiffnessGradient(N, by_amplitude, (unit, by_p, -p / speed * N))
 
