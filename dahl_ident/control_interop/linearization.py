@@ -145,17 +145,12 @@ class LoopMargins:
         """
         from dahl_ident.plots import plot_margins
 
-        gain, phase = self.gain_margin, self.phase_margin_deg
-        if gain.ndim == 1:
-            return plot_margins(self.amplitude, gain, phase, ax=ax)
-        return plot_margins(
-            self.amplitude,
-            self.band("gain_margin", 0.0)[0],
-            self.band("phase_margin_deg", 0.0)[0],
-            gain_band=self.band("gain_margin"),
-            phase_band=self.band("phase_margin_deg"),
-            ax=ax,
-        )
+        if self.gain_margin.ndim == 1:
+            return plot_margins(self.amplitude, self.gain_margin, self.phase_margin_deg, ax=ax)
+        names = "gain_margin", "phase_margin_deg"
+        gain, phase = (self.band(name) for name in names)
+        medians = (self.band(name, 0.0)[0] for name in names)
+        return plot_margins(self.amplitude, *medians, gain_band=gain, phase_band=phase, ax=ax)
 
 
 def loop_margins(

@@ -146,11 +146,10 @@ def evaluate_motions(
         sizes["frequency_hz"] = np.array([[one.fastest_hz for one in resolved]])
     kept = np.flatnonzero(allowed(limits, sizes, len(resolved)))
     period = np.array([one.period for one in resolved])[kept]
-    repeats = [
-        _REPEATS if lasting is None else max(int(lasting / seconds), LEAST_CYCLES)
-        for seconds in period.tolist()
+    rows = [
+        sums[k].rows(_REPEATS if lasting is None else max(int(lasting / T), LEAST_CYCLES))
+        for k, T in zip(kept.tolist(), period.tolist(), strict=True)
     ]
-    rows = [sums[k].rows(count) for k, count in zip(kept.tolist(), repeats, strict=True)]
     S, level = len(knowledge.theta), peaks[kept, 0]
     return Candidates(
         "displacement", level, 1.0 / period, np.broadcast_to(level, (S, kept.size)),

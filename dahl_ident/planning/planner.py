@@ -183,18 +183,16 @@ def plan(
             "runs": runs not in (None, 1),
             argument("controlled", "force"): controlled == "force",
         }
-        for name in (name for name, there in of_sines.items() if there):
+        if any(of_sines.values()):
+            name = next(name for name, stated in of_sines.items() if stated)
             raise ValidationError(
                 f"plan: {name} is planned with settled sines only; leave it out for motions in "
                 "time, or leave candidates out"
             )
         known = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
         recorded = recorded_force(noise, sample_rate, knowledge)
-        return _of_motions(
-            PlanRequest(
-                known, bench, wanted, has_numbers, costs, recorded=recorded, motions=motions
-            )
-        )
+        arguments = (known, bench, wanted, has_numbers, costs)
+        return _of_motions(PlanRequest(*arguments, recorded=recorded, motions=motions))
     if sample_rate is not None:
         raise ValidationError(
             "plan: sample_rate is that of records of motions in time; leave it out for settled "

@@ -21,6 +21,7 @@ from dahl_ident.arrays import (
 )
 from dahl_ident.bayes.chain import Convergence
 from dahl_ident.bayes.density import SCALE, LogDensity
+from dahl_ident.bayes.importance import WeightedDraws
 from dahl_ident.bayes.priors import PriorLike
 from dahl_ident.bayes.sample import ChainSample, PointSample, Sample
 from dahl_ident.data import FrequencyResponse, Record
@@ -160,10 +161,9 @@ class Posterior(Result):
         """Values of all draws that count, shape (N, D), SI units."""
         return self._density.to_values(self.sample.draws.theta)
 
-    @property
-    def weights(self) -> FloatArray:
-        """Probabilities of the draws, shape (N,), which sum to 1."""
-        return self.sample.draws.weights
+    weights: FloatArray = part(
+        "sample.draws.weights", "Probabilities of the draws, shape (N,), which sum to 1."
+    )
 
     @property
     def points(self) -> tuple[FloatArray, FloatArray]:
@@ -251,9 +251,9 @@ class Posterior(Result):
                 f"{name} has shape {x.shape}; expected one number a draw, {weights.shape}"
             )
         mean = float(weights @ x)
-        moments = {"mean": mean, "std": float(np.sqrt(weights @ (x - mean) ** 2))}
-        quantiles = type(self.sample.draws)(x[:, None], weights).quantiles(0, _LEVELS).tolist()
-        return moments | dict(zip(QUANTILES, quantiles, strict=True))
+        quantiles = WeightedDraws(x[:, None], weights).quantiles(0, _LEVELS).tolist()
+        of_levels = dict(zip(QUANTILES, quantiles, strict=True))
+        return {"mean": mean, "std": float(np.sqrt(weights @ (x - mean) ** 2)), **of_levels}
 
     def summary(self) -> pd.DataFrame:
         """Return one row a parameter: moments, quantiles, and the errors of a chain.
