@@ -82,11 +82,11 @@ def response_from(
         first, second = map(source.numbers, source.channels[:2])
         reach = np.abs(second).max()  # above zero, and degrees
         if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
-            polar = {"gain": {"column": "real", "unit": ANY}, "phase": {"column": "imag"}}
-            polar["phase"]["unit"] = "deg"
+            gain, phase = {"column": "real", "unit": ANY}, {"column": "imag", "unit": "deg"}
+            polar = column_map_of({"gain": gain, "phase": phase})
             whole.doubt(
                 "the columns of the trace are taken as real and imaginary part, but look like "
-                f"magnitude and phase in degrees; if they are, give {column_map_of(polar)}"
+                f"magnitude and phase in degrees; if they are, give {polar}"
             )
     parts = []
     for label, one in by_level(source, columns).items():
