@@ -405,13 +405,12 @@ def by_level(source: RawFile, columns: ColumnMap) -> dict[str | None, ColumnMap]
     if not starred:
         return {None: columns}
     levels = {role: source.matching(str(mapped.column)) for role, mapped in starred.items()}
-    first = next(iter(levels))
-    for role, matches in levels.items():
-        if matches.keys() != levels[first].keys():
-            odd = sorted(matches.keys() ^ levels[first].keys())
+    first, *others = levels
+    for role in others:
+        if odd := levels[role].keys() ^ levels[first].keys():
             raise DataError(
                 f"{source.name}: {starred[first].column!r} and {starred[role].column!r} do not "
-                f"match the same levels; only one of them has {listed(odd)}"
+                f"match the same levels; only one of them has {listed(sorted(odd))}"
             )
     maps: dict[str | None, ColumnMap] = {}
     for label in levels[first]:

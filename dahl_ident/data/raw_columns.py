@@ -206,10 +206,8 @@ class RawFile:
         expression = re.compile(f"{before}({varying}){after}")
         channels = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}
         if not channels:
-            raise DataError(
-                f"{self.name}: nothing matches {pattern!r}; there are "
-                f"{listed([c.name for c in self.channels], 20)}"
-            )
+            names = listed([c.name for c in self.channels], 20)
+            raise DataError(f"{self.name}: nothing matches {pattern!r}; there are {names}")
         return channels
 
     def numbers(self, channel: RawChannel, *, infinite: bool = False) -> FloatArray:
@@ -336,15 +334,13 @@ def split_header(text: str) -> tuple[str, str | None]:
     if len(text) > _LONGEST_HEADER:
         return text.strip(), None
     square = re.fullmatch(r"\s*(.*?)(\s*)\[([^\[\]]*)\]\s*", text)
-    if square and square[1] and square[3].strip():
-        unit = square[3].strip()
-        if not _INDEX.fullmatch(unit) or (unit == "1" and square[2]):
-            return square[1], unit
+    unit = square[3].strip() if square else ""
+    index = _INDEX.fullmatch(unit) and not (unit == "1" and square and square[2])
+    if square and square[1] and unit and not index:
+        return square[1], unit
     for match in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
         if match[2].strip() == "dB":
             return match[1], "dB"  # of what, whoever needs the gain will ask
-        try:
+        with contextlib.suppress(UnitError):
             return match[1], parse_unit(match[2]).text
-        except UnitError:
-            continue
     return text.strip(), None

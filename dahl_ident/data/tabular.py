@@ -33,9 +33,9 @@ def as_text(title: str, lines: Lines) -> str:
 
 def as_html(title: str, lines: Lines) -> str:
     """Return the same as a small table."""
+    left = 'style="text-align:left"'
     rows = "".join(
-        f'<tr><th style="text-align:left">{escape(name)}</th>'
-        f'<td style="text-align:left">{escape(value)}</td></tr>'
+        f"<tr><th {left}>{escape(name)}</th><td {left}>{escape(value)}</td></tr>"
         for name, value in lines
     )
     return f"<table><caption>{escape(title)}</caption>{rows}</table>"
