@@ -10,12 +10,11 @@ from typing import Annotated, Any
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.campaign import campaign
 from dahl_ident.cli.estimate import fit, report, sample
 from dahl_ident.cli.experiments import plan, simulate
 from dahl_ident.cli.extract import demo, extract
 from dahl_ident.cli.one_step import app as app_page
-from dahl_ident.cli.one_step import datasets, export, inspect, template
+from dahl_ident.cli.one_step import campaign, datasets, export, inspect, template
 from dahl_ident.errors import DahlIdentError, arguments_as_options
 from dahl_ident.version import __version__
 
