@@ -310,6 +310,7 @@ class ModelComparison:
 
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
+        lines.append("Of friction alone, without other elements:")
         lines.append(table([["", *self.common], *self.meanings]))
         lines += [text for m in self.models for text in m.resemblances]
         lines += [f"{name} could not be fitted: {why}" for name, why in self.failed.items()]
