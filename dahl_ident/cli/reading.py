@@ -80,7 +80,7 @@ class Channels:
 
 
 @dataclass(frozen=True)
-class _Source:
+class _Common:
     """What tables and records are told alike."""
 
     panel: ClassVar[str] = "Reading"
@@ -91,7 +91,7 @@ class _Source:
 
 
 @dataclass(frozen=True)
-class Reading(_Source):
+class Reading(_Common):
     """Reading of tables; the options of ``read_frequency_response``."""
 
     quantity: str | None = setting(
@@ -164,7 +164,7 @@ class Reading(_Source):
 
 
 @dataclass(frozen=True)
-class RecordReading(_Source, Channels):
+class RecordReading(_Common, Channels):
     """Reading of records; the options of ``read_record``."""
 
     drive: str | None = setting(_COLUMN)

@@ -198,10 +198,8 @@ def combined_intervals(
     estimates, directions = every.to_values(errors.theta), np.eye(len(errors.names))
     u = errors.std(directions) * every.space.slopes(estimates)
     dof = np.array([errors.dof(direction) for direction in directions])
-    ends = around(every.space, estimates, u, coverage_factors(dof, array[:, None]))
-    lower, upper = (
-        np.hstack([part, end[:, also]]) for part, end in zip((lower, upper), ends, strict=True)
-    )
+    low, high = around(every.space, estimates, u, coverage_factors(dof, array[:, None]))
+    lower, upper = np.hstack([lower, low[:, also]]), np.hstack([upper, high[:, also]])
     units = tuple(
         p.unit for p in (*optimum.problem.parameters, *(every.parameters[i] for i in also))
     )

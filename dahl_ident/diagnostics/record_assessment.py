@@ -179,7 +179,7 @@ class RecordAssessment(Assessment):
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
         return ConfidenceIntervals(
             "combined", array, (*self.problem.names, *(one.name for one in assumed)),
-            tuple(one.unit for one in (*self.problem.parameters, *assumed)),
+            (*(p.unit for p in self.problem.parameters), *(one.unit for one in assumed)),
             np.append(values, held), np.hstack([lower, held * np.exp(-more)]),
             np.hstack([upper, held * np.exp(more)]), note,
         )  # fmt: skip

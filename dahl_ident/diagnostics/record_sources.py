@@ -28,6 +28,7 @@ BLOCKS = 20
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
 _ROUNDING = 1e-9  # of a logarithm
+_ALONE = 1e-6  # of a direction, determined by others: a group without others shows no misfit there
 _PATHS = 5  # groups of the path since the last reversal, by factors of e
 _LONG = 0.05  # step of an exponent's logarithm, beyond which slopes change
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
@@ -340,10 +341,11 @@ def after_reversals(
 ) -> tuple[FloatArray, int] | None:
     """Return the covariance by what the model misses alike after every reversal.
 
-    Every cycle repeats it, so that blocks in time do not differ by it. The jackknife shows it, over
-    groups of the path since the last reversal: a law's misfit changes over about a factor of e of
-    path, as a table's does with its amplitude. An assumed exponent is estimated with the other
-    values, as it is in the fit.
+    Every cycle repeats it, so that blocks in time do not differ by it. Groups of the path since the
+    last reversal do: a law's misfit changes over about a factor of e of path, as a table's does
+    with its amplitude. Their scatter is that of Bell and McCaffrey, Survey Methodology 28 (2002)
+    169-181, for few groups of which some matter much. An assumed exponent is estimated with the
+    other values, as it is in the fit.
 
     Parameters
     ----------
@@ -381,23 +383,25 @@ def after_reversals(
     path = np.maximum(np.concatenate(ends), farthest * np.exp(1.0 - _PATHS))
     group = np.floor(np.log(farthest / path) + _ROUNDING)
     members = [group == k for k in np.unique(group)]
-    n, whole = len(members), J.T @ J
-    inverse = np.linalg.pinv(whole, hermitian=True)
-    others = [np.linalg.pinv(whole - J[rows].T @ J[rows], hermitian=True) for rows in members]
-    steps = np.array([H @ (J[r].T @ e[r]) for H, r in zip(others, members, strict=True)])
-    between = (n - 1.0) / n * steps.T @ steps
-    # chance makes as much as the variance of the estimate without a group exceeds that of all
-    lost = np.array([np.maximum((H - inverse).diagonal(), 0.0) for H in others])
-    more = np.sqrt((n - 1.0) / n * lost.sum(axis=0) / inverse.diagonal())
-    by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size) * np.outer(more, more)
-    dof = np.maximum(lost.sum(axis=0) ** 2 / (lost**2).sum(axis=0), 1.0)
+    w, V = np.linalg.eigh(J.T @ J)
+    root = (V / np.sqrt(np.maximum(w, w[-1] * np.finfo(float).eps))) @ V.T  # of the inverse
+    steps, shares = [], []
+    for rows in members:
+        share = root @ (J[rows].T @ J[rows]) @ root
+        b, U = np.linalg.eigh(share)
+        larger = (U / np.sqrt(np.maximum(1.0 - b, _ALONE))) @ U.T
+        steps.append(root @ (larger @ (root @ (J[rows].T @ e[rows]))))
+        shares.append((root @ share @ root).diagonal())
+    between, weights = np.array(steps).T @ np.array(steps), np.array(shares)
+    by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size)
+    dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
     ratio = between.diagonal() / by_chance.diagonal()
     judged = (seen < len(problem.free)) | (seen >= count)  # not states and offsets of records
     if not (ratio > special.chdtri(dof, 1.0 - _LEVEL) / dof)[judged].any():
         return None
     variances, vectors = np.linalg.eigh(between - by_chance)
     beyond = (vectors * np.maximum(variances, 0.0)) @ vectors.T * np.outer(size, size)
-    return _embedded(beyond, seen, len(noise))[:count, :count], n
+    return _embedded(beyond, seen, len(noise))[:count, :count], len(members)
 
 
 def _paths(problem: RecordProblem, values: FloatArray) -> list[FloatArray]:
