@@ -176,7 +176,7 @@ class TestAtInfinity:
     def test_what_is_determined_has_budget_and_bands(self):
         truth = 30.0**2 / 0.1
         covered, inside = [], []
-        for seed in range(8):
+        for seed in range(20):
             data = microslip(seed)
             found = fit(data, self.MODEL, throw=False)
             if found.success:
