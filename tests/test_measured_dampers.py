@@ -7,7 +7,19 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from dahl_ident import Backlash, Dahl, Damper, Mass, PowerDamper, Record, Spring, fit, read_record
+from dahl_ident import (
+    Backlash,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    PowerDamper,
+    Record,
+    Spring,
+    extract,
+    fit,
+    read_record,
+)
 
 FOLDER = Path(os.environ.get("DAHL_IDENT_MEASURED_DATA", "absent"))
 pytestmark = pytest.mark.skipif(
@@ -35,15 +47,15 @@ def test_a_friction_damper_with_a_gap():
     assert 3.0e-3 < values["gap"] < 4.5e-3
 
 
-def cranked(pattern):
+def cranked(pattern, step=2):
     """Return a series of the magneto-rheological damper, every second record."""
     records = []
-    for file in sorted((FOLDER / "mr_damper").glob(pattern))[::2]:
+    for file in sorted((FOLDER / "mr_damper").glob(pattern))[::step]:
         content = loadmat(file)
-        columns, step = content["x_F"], float(content["Ts"].squeeze())
+        columns, interval = content["x_F"], float(content["Ts"].squeeze())
         records.append(
             Record(
-                step * np.arange(len(columns)),
+                interval * np.arange(len(columns)),
                 displacement=1e-3 * columns[:, 0],
                 force=columns[:, 2],
             )
@@ -60,3 +72,22 @@ def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     values, share = estimated(cranked(pattern), model)
     assert share < most
     assert 0.1 < values["exponent"] < 1.2
+
+
+@pytest.mark.parametrize("pattern", ["ensaio[0-9]*.1.mat", "ensaio.A.*.mat"])
+def test_an_exponent_with_two_minima_lets_no_estimate_jump(pattern):
+    """Of 1.1 and 2.5 the likelier counts; its distance from the other is in the uncertainty."""
+    tests = [extract(record, harmonics=[1]) for record in cranked(pattern, 1)]
+
+    def estimate(some):
+        data = FrequencyResponse.concatenate(some)
+        return fit(data, Dahl() + Damper(), throw=False).params
+
+    whole = estimate(tests)
+    others = [estimate([*tests[:i], *tests[i + 1 :]]) for i in range(len(tests))]
+    for name in ("f_max", "sigma", "alpha", "damping"):
+        value, u = whole[name].value, whole[name].stderr
+        estimates = np.array([each[name].value for each in others])
+        assert np.abs(estimates - value).max() < 3.0 * u
+        jackknife = float(np.sqrt((len(tests) - 1) * np.var(estimates)))
+        assert 0.5 * jackknife < u < 3.0 * jackknife

@@ -394,6 +394,8 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     if estimate.basis is None and ranged:
         whole, others = (np.asarray(sum(parts.values())) for parts in (every, given))
         every = {**given, EXPONENT: given.get(EXPONENT, 0.0) + _positive(whole - others)}
+    if estimate.second is not None:
+        every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)

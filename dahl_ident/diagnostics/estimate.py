@@ -19,6 +19,7 @@ Journal of Research of the National Bureau of Standards 87 (1982) 377.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -42,6 +43,8 @@ EXPONENT = "exponent"
 DRIVE = "drive factor"
 GAIN = "force_gain"
 _STEPS = 60  # Gauss-Newton steps; five are the rule
+_LITTLE_SAID = 0.25  # of the variance of a range: the data say little more of an exponent
+_APART = 0.1  # standard deviations between two minima
 _SETTLED = 1e-3  # of a standard deviation that a step still moves the estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
 _HALVINGS = 8  # of a step, until the sum of squares falls
@@ -171,6 +174,17 @@ class WeightedEstimate:
     loss: Loss | None
     # changes of theta that the data determine at all; None where that is every one
     basis: Basis | None = None
+    # (Q,): how far a second minimum is, times the root of its probability; None where there is none
+    second: FloatArray | None = None
+
+    @cached_property
+    def deviance(self) -> float:
+        """Minus twice the log likelihood, apart from a constant."""
+        stated = self.factors(self.problem.widened(np.zeros(self.problem.data.n)))
+        r, m = self.residuals, self.problem.n_residuals
+        square = squares_of(r[:m])
+        lost = np.sum(square if self.loss is None else self.loss.rho(square)) + r[m:] @ r[m:]
+        return float(lost - 2.0 * np.linalg.slogdet(stated)[1].sum())
 
     @cached_property
     def y(self) -> FloatArray:
@@ -253,11 +267,43 @@ class WeightedEstimate:
 def weighted_estimate(
     optimum: Optimum, problem: TableProblem, *, determined: bool
 ) -> WeightedEstimate:
-    """Return the estimate, searched from an optimum."""
+    """Return the estimate, searched from an optimum.
+
+    Where the data say little more of an assumed exponent than its range does, there may be a second
+    minimum: it is searched from the ends of the range as well, and the likelier one is taken.
+    """
     known = dict(zip(optimum.names, optimum.theta, strict=True))
     theta = np.array(
         [known[p.name] if p.name in known else np.log(p.value or 1.0) for p in problem.parameters]
     )
+    best = _descended(optimum, problem, theta, determined=determined)
+    if not determined:
+        return best
+    covariance = np.linalg.pinv(best.jacobian.T @ best.jacobian, hermitian=True)
+    minima = [best]
+    for name, (centre, std) in problem.ranges.items():
+        along = covariance[:, problem.names.index(name)]
+        variance = float(along[problem.names.index(name)])
+        if name == GAIN or not variance > _LITTLE_SAID * std**2:
+            continue
+        for end in (centre - 3.0**0.5 * std, centre + 3.0**0.5 * std):
+            change = along / variance * (end - best.theta[problem.names.index(name)])
+            begin = np.clip(best.theta + change, *problem.bounds())
+            with suppress(np.linalg.LinAlgError):
+                minima.append(_descended(optimum, problem, begin, determined=True))
+    best = min(minima, key=lambda minimum: minimum.deviance)
+    apart = [m for m in minima if np.linalg.norm(best.columns @ (m.theta - best.theta)) > _APART]
+    if not apart:
+        return best
+    second = min(apart, key=lambda minimum: minimum.deviance)
+    chance = 1.0 / (1.0 + np.exp(0.5 * (second.deviance - best.deviance)))
+    return replace(best, second=np.sqrt(chance) * (second.theta - best.theta))
+
+
+def _descended(
+    optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
+) -> WeightedEstimate:
+    """Return the minimum where a search ends."""
     stated, basis = problem.widened(np.zeros(problem.data.n)), None
     loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
     if not determined:
