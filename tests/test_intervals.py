@@ -197,7 +197,7 @@ class TestProfile:
         N, m = 10.0**force, 10.0**length
         other = FrequencyResponse(data.frequency_hz, data.response * N / m, data.amplitude * m)
         ours, theirs = (fit(d, Dahl()).conf_interval() for d in (data, other))
-        factor = np.array([N, N / m])
+        factor = np.array([N, N / m, 1.0])
         np.testing.assert_allclose(theirs.lower, ours.lower * factor, rtol=1e-6)
         np.testing.assert_allclose(theirs.upper, ours.upper * factor, rtol=1e-6)
 
@@ -269,12 +269,12 @@ class TestTable:
 
     def test_mapping_and_frame(self):
         found = self.result().conf_interval()
-        assert list(found) == ["f_max", "sigma"]
-        assert len(found) == 2
+        assert list(found) == ["f_max", "sigma", "alpha"]
+        assert len(found) == 3
         assert found.at(0.9545)["sigma"] == found["sigma"][1]
         frame = found.to_frame()
-        assert frame.shape == (6, 6)
-        assert frame["upper"].iloc[-1] == found.upper[-1, 1]
+        assert frame.shape == (9, 6)
+        assert frame["upper"].iloc[-1] == found.upper[-1, -1]
         with pytest.raises(KeyError, match="mass is not a free parameter"):
             found["mass"]
 

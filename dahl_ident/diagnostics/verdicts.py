@@ -192,6 +192,13 @@ def identifiability(fit: Any) -> Identifiability:
     """Return which parameters, or which combinations of them, the data of a fit determine.
 
     The fit is made with ``throw=False`` where there may be no optimum.
+
+    Examples
+    --------
+    >>> import dahl_ident as di
+    >>> known = di.diagnostics.identifiability(di.fit(di.load_dataset("noisy"), di.Dahl()))
+    >>> known.complete
+    True
     """
     judged: Identifiability = fit.identifiability
     return judged

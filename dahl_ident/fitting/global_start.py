@@ -541,8 +541,6 @@ def _computed_table(
 
     Beyond the last amplitude at which the law has a loop there is none.
     """
-    from scipy.interpolate import CubicSpline
-
     low, high = (float(np.asarray(v)) for v in element.knee(values))
     if not 0.0 < low <= high < np.inf:
         low = high = 1.0
@@ -568,7 +566,7 @@ def _computed_table(
     if count < _LEAST:
         return np.full((orders.size, fine.size), np.nan, dtype=np.complex128)
     x, Z, ends = x[:count], Z[:, :count], count < x.size
-    table = CubicSpline(x, Z, axis=1)(np.clip(fine, x[0], x[-1]))
+    table = _between(Z, (np.clip(fine, x[0], x[-1]) - x[0]) / (_COMPUTED * _STEP))
     for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
         for whole, Y in ((table.real, Z.real), (table.imag, Z.imag)):
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -578,6 +576,22 @@ def _computed_table(
     if ends:
         table[:, fine > x[-1]] = np.nan
     return table
+
+
+def _between(Z: ComplexArray, place: FloatArray) -> ComplexArray:
+    """Return columns (K, n) at places from 0 to n - 1, by cubics through the four nearest.
+
+    A spline of scipy takes longer to import than a small fit takes.
+    """
+    first = np.clip(place.astype(np.intp) - 1, 0, Z.shape[1] - 4)
+    u = place - first
+    weights = (
+        (u - 1) * (u - 2) * (3 - u) / 6,
+        u * (u - 2) * (u - 3) / 2,
+        u * (u - 1) * (3 - u) / 2,
+        u * (u - 1) * (u - 2) / 6,
+    )
+    return np.asarray(sum(Z[:, first + i] * w for i, w in enumerate(weights)))
 
 
 def _solve_linear(

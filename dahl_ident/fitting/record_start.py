@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,13 @@ def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
     """
     with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
         return _Scan(problem).starts(count)
+
+
+class _Start(NamedTuple):
+    misfit: float
+    values: list[float]
+    passive: bool
+    """Whether no mass, damping, stiffness or scale is negative."""
 
 
 def _passive(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -86,7 +94,7 @@ class _Scan:
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
-        begin: list[tuple[float, list[float]]] = []
+        begin: list[_Start] = []
         columns: dict[tuple[int, int], list[FloatArray]] = {}
         for places in product(*(range(len(c)) for c in choices)):
             for e, place in enumerate(places):
@@ -96,11 +104,17 @@ class _Scan:
             sets = [columns[e, p] for e, p in enumerate(places)]
             begin += self._solve(elements, shapes, sets)
         if not begin:
-            begin = [(0.0, [p.value if p.value is not None else 1.0 for p in self.problem.free])]
-        chosen: list[list[float]] = []
-        for _, values in sorted(begin, key=lambda start: start[0]):
-            if len(chosen) < count and all(self._apart(values, one) for one in chosen):
-                chosen.append(values)
+            values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
+            begin = [_Start(0.0, values, passive=True)]
+        begin.sort(key=lambda start: start.misfit)
+        ranks = {True: 0, False: 0}
+        kept: dict[tuple[int, bool], list[float]] = {}
+        for start in begin:
+            rank = ranks[start.passive]
+            if rank < count and all(self._apart(start.values, one) for one in kept.values()):
+                kept[rank, not start.passive] = start.values  # by turns, passive ones first
+                ranks[start.passive] += 1
+        chosen = [kept[place] for place in sorted(kept)][:count]
         return np.array([started_at(self.problem, values) for values in chosen])
 
     def _apart(self, one: list[float], other: list[float]) -> bool:
@@ -164,8 +178,8 @@ class _Scan:
         elements: tuple[Element, ...],
         shapes: list[tuple[float, ...]],
         sets: list[list[FloatArray]],
-    ) -> list[tuple[float, list[float]]]:
-        """Return misfit and start with the linear parameters solved for, none of them negative."""
+    ) -> list[_Start]:
+        """Return starts with the linear parameters solved for: best, and best of those above 0."""
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal: FloatArray | None = None
         for i, (_, _, _, force) in enumerate(self.histories):
@@ -180,10 +194,17 @@ class _Scan:
         size = np.sqrt(np.maximum(normal.diagonal()[:-1], 1e-300))
         matrix = normal[:-1, :-1] / np.outer(size, size)
         right = normal[:-1, -1] / size
-        solution = _passive(matrix, right)
-        values = self._values(elements, shapes, scaled, solution / size)
-        misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
-        return [] if values is None else [(float(misfit), values)]
+        free = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
+        solutions = [free] if (free >= 0.0).all() else [free, _passive(matrix, right)]
+        begin = []
+        for solution in solutions:
+            values = self._values(elements, shapes, scaled, solution / size)
+            if values is not None:
+                misfit = normal[-1, -1] - 2.0 * solution @ right + solution @ matrix @ solution
+                begin.append(_Start(float(misfit), values, passive=solution is not free))
+        if len(solutions) == 1:
+            begin = [start._replace(passive=True) for start in begin]
+        return begin
 
     @staticmethod
     def _values(
