@@ -65,9 +65,13 @@ def _of_friction(
     unit = shown_unit("m", optimum.problem.data.motion)
     least, most = f"{amplitude.min():.2g} {unit}", f"{amplitude.max():.2g} {unit}"
     elements = optimum.problem.model.elements
-    for other in elements:  # the same parameter of another element of this law
-        if other is not element and other.kind == element.kind and label in other.labels:
-            rival = other.parameter(label).name
+    for rival_element in elements:  # the same parameter of another element of this law
+        if (
+            rival_element is not element
+            and rival_element.kind == element.kind
+            and label in rival_element.labels
+        ):
+            rival = rival_element.parameter(label).name
             if rival in lost:
                 return f"because {rival} can take its place: leave one of the two elements out"
     values = parameter_values(optimum)
@@ -83,7 +87,8 @@ def _of_friction(
     parallel = f" in parallel with the free {spring}" if spring else ""
     fix = f", or measure the spring and fix {spring}" if spring else ""
     share = f"friction's share of the response from {least} to {most}"
-    no_most, sticks = np.isinf(limits.upper), amplitude.max() < low
+    no_most = np.isinf(limits.upper)
+    sticks = amplitude.max() < low
     is_limit, is_stiffness = scales and dimension == _FORCE, scales and dimension == _STIFFNESS
     limit_lost = any(p.name in lost for p in _scaled(element, _FORCE))
     if spring and limits.lower <= 0.0 and no_most and limit_lost:
@@ -94,7 +99,8 @@ def _of_friction(
         reason = hidden if spring else f"no amplitude up to {most} reaches slip"
         remedy = "drive above that"
     elif is_stiffness and spring and (spring in lost or sticks):
-        reason, remedy = f"the free {spring} can take its place", "drive far into slip"
+        reason = f"the free {spring} can take its place"
+        remedy = "drive far into slip"
     elif is_stiffness and no_most and not limit_lost:
         reason = f"every amplitude from {least} slips and friction's stiffness fades{parallel}"
         remedy = "drive below that"

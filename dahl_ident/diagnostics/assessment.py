@@ -55,7 +55,7 @@ _NOISE = {
 
 
 class Assessment(ABC):
-    """An optimum with what its data tell of it; a ``FitResult`` hands all of it on."""
+    """An optimum, judged with its data; a ``FitResult`` passes all of this on."""
 
     problem: Any
     quick_methods: tuple[Method, ...] = ("wald",)  # that a report has time for
@@ -137,7 +137,8 @@ class Assessment(ABC):
         levels = tuple(checked_levels(levels).tolist())
         key = (method, levels, replicates, seed)
         if key not in self._intervals:
-            made, problem = self._new_intervals(method, levels, replicates, seed), self.problem
+            made = self._new_intervals(method, levels, replicates, seed)
+            problem = self.problem
             units = {p.name: shown_unit(p.unit, problem.motion) for p in problem.every_parameter}
             self._intervals[key] = replace(made, units=tuple(units[n] for n in made.names))
         return self._intervals[key]
@@ -181,14 +182,14 @@ class TableAssessment(Assessment):
 
     @cached_property
     def errors_of_combinations(self) -> ErrorModel | None:
-        """The same; also where only combinations of parameters are determined, for these alone."""
+        """The errors, also where only combinations are determined; then of these alone."""
         if self.first_order:
             return None
         return self.errors or error_model(self.optimum, of_combinations=True)
 
     @property
     def device(self) -> tuple[Optimum, ErrorModel | None, ErrorModel | None]:
-        """What predictions begin from: optimum, errors of its parameters and of combinations."""
+        """The basis of predictions: optimum, errors of its parameters and of combinations."""
         return self.optimum, self.errors, self.errors_of_combinations
 
     @property
@@ -286,7 +287,7 @@ class TableAssessment(Assessment):
 
     @cached_property
     def goodness(self) -> Goodness:
-        """Whether the residuals are noise, and the estimates physically possible."""
+        """Whether residuals are consistent with noise, and estimates physically possible."""
         return goodness(self.optimum, self.errors_of_combinations)
 
     @property
@@ -312,11 +313,12 @@ class TableAssessment(Assessment):
 
     @cached_property
     def with_less(self) -> TableAssessment | None:
-        """The same fit to the fundamentals alone; of these, without a covariance they contradict.
+        """The fit to the fundamentals alone, without a stated covariance that they contradict.
 
         None where there is nothing to leave out.
         """
-        problem, first = self.problem, self.problem.data.harmonic == 1
+        problem = self.problem
+        first = self.problem.data.harmonic == 1
         if self.first_order or not first.any():
             return None
         try:

@@ -182,16 +182,17 @@ def problem_at(
         raise ValidationError("give either amplitude (displacement controlled) or drive (force)")
     name = "drive" if amplitude is None else "amplitude"
     f = np.atleast_1d(positive_array(frequency_hz, "frequency_hz"))
-    given = np.atleast_1d(positive_array(held, name))
+    at_points = np.atleast_1d(positive_array(held, name))
     try:
-        f, given = np.broadcast_arrays(f, given)
+        f, at_points = np.broadcast_arrays(f, at_points)
     except ValueError:
         raise ValidationError(
-            f"frequency_hz has shape {f.shape} and {name} {given.shape}; expected one shape, or "
-            "one number for all"
+            f"frequency_hz has shape {f.shape} and {name} {at_points.shape}; expected one "
+            "shape, or one number for all"
         ) from None
-    held_at: dict[str, Any] = {name: given}
-    measured, controlled = problem.response, "displacement" if drive is None else "force"
+    held_at: dict[str, Any] = {name: at_points}
+    measured = problem.response
+    controlled = "displacement" if drive is None else "force"
     usual = "dynamic_stiffness" if measured is None else measured.quantity
     grid = FrequencyResponse(
         f, np.ones(f.shape), **held_at, controlled=controlled, quantity=quantity or usual,
@@ -228,8 +229,8 @@ def friction_and_slopes(
     if not elements:
         raise ModelError("the model has no friction law, so there is no friction to describe")
     for element in elements:
-        own = [np.asarray(values[p.name]) for p in element.parameters]
-        part = element.stiffness_gradient(own, A, np.zeros(()), 1)
+        law_values = [np.asarray(values[p.name]) for p in element.parameters]
+        part = element.stiffness_gradient(law_values, A, np.zeros(()), 1)
         N += part.value
         for parameter, slope in zip(element.parameters, part.by_parameter, strict=True):
             if parameter.free:
@@ -295,7 +296,8 @@ def derived(
     problem, theta = _estimate(optimum, errors)
     values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
     infinite = np.array([not np.isfinite(values.get(name, 1.0)) for name in problem.names])
-    by_search, std = problem.value_slopes(theta), (errors or Information(optimum)).std
+    by_search = problem.value_slopes(theta)
+    std = (errors or Information(optimum)).std
     A, stds = np.asarray(amplitudes, dtype=np.float64).ravel(), iter(())
     if A.size:
         band = describing_function_band(optimum, A, errors)
@@ -346,12 +348,15 @@ def _combined_band(
     stiffness: ComplexArray | None = None,
     of_a_test: bool = False,
 ) -> ResponseBand:
-    """Return the band of responses (n,); places of the `known` ones, NaN for the others."""
-    found, parts, dof = R[known], np.full((4, R.size), np.nan), np.full((2, R.size), np.nan)
+    """Return the band of responses (n,); NaN where a response is not `known`."""
+    R_known = R[known]
+    parts = np.full((4, R.size), np.nan)
+    dof = np.full((2, R.size), np.nan)
     made = prediction_error(
-        errors, by[known] / found[:, None], amplitude, omega, stiffness, of_a_test=of_a_test
+        errors, by[known] / R_known[:, None], amplitude, omega, stiffness, of_a_test=of_a_test
     )
-    parts[:, known], dof[:, known] = _parts_std(found, made.covariance), made.dof.T
+    parts[:, known] = _parts_std(R_known, made.covariance)
+    dof[:, known] = made.dof.T
     centre = R.copy()
     centre[known] *= np.exp(made.departure @ np.array([1.0, 1.0j]))
     left_out = errors.left_out if of_a_test else None

@@ -63,7 +63,8 @@ def bootstrap_intervals(
 ) -> ConfidenceIntervals:
     """Return studentised bootstrap intervals."""
     array = checked_levels(levels)
-    tail, count = 0.5 * (1.0 - array), optimum.problem.n_reported
+    tail = 0.5 * (1.0 - array)
+    count = optimum.problem.n_reported
     drawn = _replicate(optimum, replicates, seed)[:, :count]
     gone = np.isnan(drawn)
     symmetric = bool(gone.any(axis=1).mean() > _AT_LIMIT)

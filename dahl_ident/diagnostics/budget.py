@@ -36,9 +36,9 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
-# What rounding leaves where a source has no part: variances relative to the combined one.
+# Variance over the combined one below which a source contributes rounding errors alone.
 _ROUNDING = 1e-12
-_SAME = 1e-6  # relative difference of limits that no one sees
+_SAME = 1e-6  # relative difference of limits that counts as none
 _TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, TESTS)
 _COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
 _CHANNELS = {
@@ -226,18 +226,18 @@ def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
     with others have a budget as well, and at infinity they alone.
     """
     errors = errors or error_model(optimum, of_combinations=True)
-    found = [] if errors is None else list(_determined(optimum, errors))
-    if errors is None or not found:
+    entries = [] if errors is None else list(_determined(optimum, errors))
+    if errors is None or not entries:
         raise FitError(
             "no uncertainty budget: a parameter is undetermined, or nothing is left to estimate "
             f"the errors from ({optimum.message}); fix a parameter or measure more points"
         )
-    parameters = [_parameter(errors, *each) for each in found]
-    D = np.array([direction for *_, direction in found])
+    parameters = [_parameter(errors, *each) for each in entries]
+    D = np.array([direction for *_, direction in entries])
     return Budget(tuple(parameters), D @ errors.covariance @ D.T, taken_as_exact(optimum))
 
 
-_Entry = tuple[str, str, float, FloatArray]  # name, unit, value, and its derivatives by theta
+_Entry = tuple[str, str, float, FloatArray]  # name, unit, value, d value/d theta
 
 
 def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
@@ -259,23 +259,23 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
             lost |= {name}
     # an exponent that was assumed is a member as any other
     freed = replace(optimum, problem=problem, theta=errors.theta)
-    own = [names.index(name) for name in optimum.names]
+    of_optimum = [names.index(name) for name in optimum.names]
     kept = {c.expression for c in optimum.combinations}
     left = {tuple(c.direction): c.expression for c in candidates(optimum) if c.expression in kept}
     information = Information(optimum)
-    by_noise = information.std(np.eye(len(own)))
+    by_noise = information.std(np.eye(len(of_optimum)))
     vague = {n for n, std in zip(optimum.names, by_noise, strict=True) if std > _DETERMINED}
     for candidate in candidates(freed):
         direction, value = candidate.direction, candidate.value
         if not (candidate.members & lost and _noticed(errors, direction)):
             continue
-        # what a limit depends on has the name that the fit gives it
-        name = left.get(tuple(direction[own]), candidate.expression)
+        # a combination that a limit depends on keeps the name that the fit gave it
+        name = left.get(tuple(direction[of_optimum]), candidate.expression)
         u = float(errors.std(direction))
-        # what noise alone leaves of parameters that it leaves open is what the verdict names
+        # where noise alone leaves parameters undetermined, the verdict names their combinations
         open_ = candidate.members & vague and not candidate.is_sum
         named = (name in kept and u < _HARDLY) or (
-            open_ and information.std(direction[own]) < _DETERMINED
+            open_ and information.std(direction[of_optimum]) < _DETERMINED
         )
         if u < _DETERMINED or named:
             yield name, candidate.unit, float(value), direction * abs(value)
@@ -299,14 +299,17 @@ def _parameter(
     errors: ErrorModel, name: str, unit: str, value: float, direction: FloatArray
 ) -> ParameterBudget:
     u = float(errors.std(direction))
-    total, rows = u**2, []
+    total = u**2
+    rows = []
     for source, covariance in errors.contributions.items():
-        own = float(direction @ covariance @ direction)
-        own = own if own > _ROUNDING * total else 0.0
+        variance = float(direction @ covariance @ direction)
+        variance = variance if variance > _ROUNDING * total else 0.0
         kind: Literal["A", "B"] = "A" if source in _TYPE_A else "B"
         estimated = source in {*_TYPE_A, EXPONENT}
-        dof = errors.dof(direction, [source]) if estimated and own else np.inf
-        rows.append(BudgetRow(source, kind, own**0.5, dof, own / total if total > 0.0 else 0.0))
+        dof = errors.dof(direction, [source]) if estimated and variance else np.inf
+        rows.append(
+            BudgetRow(source, kind, variance**0.5, dof, variance / total if total > 0.0 else 0.0)
+        )
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)
     dof = dof if dof < MANY else np.inf

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
-_ENOUGH_HELD_OUT = 16  # values, of which 80 % in bands of 95 % happen once in 100 times
+_ENOUGH_HELD_OUT = 16  # held-out values; of so many, 80 % lie in bands of 95 % once in 100 times
 _DOUBTS_SHOWN = 5  # more would hide the verdict
-_CHANCE = 0.0027  # that data contradict a right constraint as much, as for a prior
+_CHANCE = 0.0027  # probability that data contradict a right constraint or prior as much
 _OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 _PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
@@ -55,14 +55,16 @@ def judgement(fit: TableAssessment) -> Judgement:
 
     Neither harmonics nor a covariance hide what the fundamentals show without them.
     """
-    found = [finding for check in CHECKS for finding in check(fit)]
+    findings = [finding for check in CHECKS for finding in check(fit)]
     if fit.with_less is not None:
-        worst = max((f.severity.rank for f in found if f.question is Question.DESCRIBED), default=0)
+        worst = max(
+            (f.severity.rank for f in findings if f.question is Question.DESCRIBED), default=0
+        )
         every = judgement(fit.with_less).findings
         hidden = [f for f in every if f.question is Question.DESCRIBED and f.severity.rank > worst]
         replaced = {"noise", *(f.code for f in hidden)} if hidden else set()
-        found = [f for f in found if f.code not in replaced] + hidden
-    return Judgement(found)
+        findings = [f for f in findings if f.code not in replaced] + hidden
+    return Judgement(findings)
 
 
 # Determined?
@@ -181,7 +183,7 @@ def _slight(fit: TableAssessment) -> Iterator[Finding]:
     if not (fit.goodness.objections and _is_determined(fit) and rows.any()):
         return
     misfit = within = fit.goodness.rms_misfit
-    if fit.errors is not None:  # what runs differ by is not missed
+    if fit.errors is not None:  # differences between runs are not part of the misfit
         within = min(misfit, rms_misfit_of(fit.errors.problem, fit.errors.within_runs))
 
     def share_of(element: Element, value: float) -> float:
@@ -205,7 +207,9 @@ def _contradicted_priors(fit: TableAssessment) -> Iterator[Finding]:
     """Yield every prior that the data contradict."""
     estimates = dict(zip(fit.optimum.names, fit.optimum.values.tolist(), strict=True))
     for name, prior in fit.problem.priors.items():
-        value, mean, std = estimates[name], float(prior.mean()), float(prior.std())
+        value = estimates[name]
+        mean = float(prior.mean())
+        std = float(prior.std())
         if abs(value - mean) > _CONTRADICTED * std:
             yield described("prior", _APPROXIMATE, name=name, value=value, mean=mean, std=std)
 
@@ -253,7 +257,7 @@ def robust_values(
     J, rows = J[:, free], problem.n_residuals // 2
     variance = 1.0 if problem.scale_known else scale**2
     weight = np.ones(len(y))
-    weight[2 * rows :] = variance  # priors have their own
+    weight[2 * rows :] = variance  # priors have a known variance
     known = np.linalg.pinv(J.T @ (weight[:, None] * J) / variance)
     move: FloatArray = np.zeros(len(free))
     for _ in range(_PASSES):
@@ -263,8 +267,9 @@ def robust_values(
         weight[: 2 * rows] = np.repeat(loss.slope(square / variance), 2)
         weight[2 * rows :] = variance
         root = np.sqrt(weight)
-        last, found = move, np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)
-        move = np.asarray(found[0])
+        last = move
+        solution = np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)
+        move = np.asarray(solution[0])
         if np.linalg.norm(J @ (move - last)) < _SETTLED * np.sqrt(variance):
             break
     theta, std = errors.theta.copy(), np.zeros(len(errors.theta))

@@ -32,7 +32,7 @@ _STIFFNESS = (1, -1, 0)  # powers of force, displacement and time
 
 @dataclass(frozen=True)
 class Candidate:
-    """A combination: what it is called, its value, and its logarithm's slope by theta."""
+    """A combination: name, value, and the derivatives of its logarithm with respect to theta."""
 
     expression: str
     unit: str
@@ -51,7 +51,7 @@ def candidates(optimum: Optimum) -> list[Candidate]:
     elements = problem.model.elements
     friction = [e for e in elements if e.has_memory]
     springs = [p for e in elements if is_spring(e) for p in e.parameters if p.free]
-    found: list[Candidate] = []
+    formed: list[Candidate] = []
     for element in friction:
         for combination in element.combinations():
             powers = {element.parameter(n): power for n, power in combination.powers.items()}
@@ -61,23 +61,27 @@ def candidates(optimum: Optimum) -> list[Candidate]:
                     logarithm = sum(power * np.log(theta[n]) for n, power in by_name.items())
                     value = float(np.exp(logarithm))
                 direction = np.array([by_name.get(name, 0.0) for name in names])
-                text, unit = element.named(combination.expression), _unit(powers)
+                text = element.named(combination.expression)
+                unit = _unit(powers)
                 unit = shown_unit(unit, problem.data.motion)
-                found.append(Candidate(text, unit, value, direction, frozenset(by_name)))
+                formed.append(Candidate(text, unit, value, direction, frozenset(by_name)))
     scale = [{n: e.parameter(n) for n in e.scale_parameters} for e in friction]
     stiff = (p for labels in scale for p in labels.values() if p.dimension == _STIFFNESS)
     pairs = [(p, spring) for p in stiff for spring in springs]
-    for (one, first), (other, second) in combinations(zip(friction, scale, strict=True), 2):
-        if one.kind == other.kind:
+    for (first_element, first), (second_element, second) in combinations(
+        zip(friction, scale, strict=True), 2
+    ):
+        if first_element.kind == second_element.kind:
             pairs += [(first[label], second[label]) for label in first if label in second]
     for pair in pairs:
         if all(p.free for p in pair):
             both = [p.name for p in pair]
             value = sum(theta[name] for name in both)
             direction = np.array([slopes[n] / value if n in both else 0.0 for n in names])
-            text, members = " + ".join(both), frozenset(both)
-            found.append(Candidate(text, units[both[0]], value, direction, members, is_sum=True))
-    return found
+            text = " + ".join(both)
+            members = frozenset(both)
+            formed.append(Candidate(text, units[both[0]], value, direction, members, is_sum=True))
+    return formed
 
 
 def stiffness_seen(optimum: Optimum) -> Candidate | None:
@@ -99,11 +103,11 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     N, by = friction_and_slopes(problem, optimum.theta, np.array([A]))
     values = parameter_values(optimum)
     slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
-    own = np.array([slopes[name] if name in free else 0.0 for name in names])
+    of_springs = np.array([slopes[name] if name in free else 0.0 for name in names])
     value = float(N[0].real) + sum(values[name] for name in springs)
     motion = problem.data.motion
     where = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
-    direction = (by[0].real + own) / value
+    direction = (by[0].real + of_springs) / value
     members = free | (frozenset(friction) & frozenset(names))
     return Candidate(where, shown_unit("N/m", motion), value, direction, members)
 

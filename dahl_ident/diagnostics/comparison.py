@@ -4,12 +4,12 @@ Candidates come from what the fit leaves: a mean force asks for two limits, a re
 with frequency for a damper, a force that falls with it for LuGre's law, any other misfit for
 another shape of loop. Each is judged by how it predicts tests that it was not fitted to
 (:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
-error of the highest the simplest is the best; so is the one fitted while nothing is higher than it
-by more than chance among many candidates makes.
-AIC and BIC do not count: over harmonics whose covariance is tiny they prefer a model that spoils
-the fundamental. If no model describes the data, the best of them does not either, and one of
-negative damping is not a mechanism's. Each model is fitted as :func:`dahl_ident.fit` fits it, an
-exponent that nobody gave with its range included.
+error of the highest, the simplest is the best. The model fitted stays the best unless another's
+density exceeds its by more than chance explains among many candidates. AIC and BIC do not count:
+over harmonics whose covariance is tiny they prefer a model that spoils the fundamental. If no model
+describes the data, the best of them does not either; a model with negative damping does not
+describe a mechanism. Each model is fitted as :func:`dahl_ident.fit` fits it, an exponent that
+nobody gave with its range included.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ from dahl_ident.units import percent, si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
-_SMOOTH = 8  # degree over ln A of what the gain may be whatever the frequency
-_FALSE_ALARM = 1e-4  # of a force that falls with the frequency: one more candidate, to no harm
+_SMOOTH = 8  # degree in ln A of the change of gain that is allowed at every frequency
+_FALSE_ALARM = 1e-4  # of a force that falls with the frequency: it only adds a candidate
 _SEEN = 3.0  # rms differences over noise that has been averaged over all rows
 _RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
 _UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
@@ -105,7 +105,7 @@ class ComparedModel:
 
     @property
     def complexity(self) -> int:
-        """Free parameters; an exponent that nobody gave, estimated with its range, is none."""
+        """Number of free parameters, except exponents estimated within an assumed range."""
         problem = self.optimum.problem
         return len(problem.names) - (len(problem.ranges) if problem.kind == "table" else 0)
 
@@ -131,8 +131,8 @@ class ComparedModel:
     def is_determined(self) -> bool:
         """Whether the data determine every parameter to a factor, or how near to zero it is.
 
-        By every source of error of a table's fit. Not each of a law's like parts, as Maxwell slip
-        has them: their sums are what it says.
+        For a table, every source of error counts. The like parts of a law, such as those of Maxwell
+        slip, need not be determined one by one.
         """
         stderr = self.optimum.stderr
         parts = set[str]()
@@ -228,7 +228,7 @@ class ModelComparison:
 
     @cached_property
     def undetermined(self) -> ComparedModel | None:
-        """A physical model that leaves far less than the best, if the data do not determine it."""
+        """A physical model that the data do not determine, of far smaller misfit than the best."""
         best = self._simplest
         every = [model for model in self.models if model.is_physical or model is best]
         likeliest = max(every, key=lambda model: model.density.total)
@@ -283,11 +283,11 @@ class ModelComparison:
         first, best = self.models[0], self.best
         output = first.optimum.problem.output_in_words
         if self.undecided:
-            one, other = self.undecided
-            key = _disagreement(one, other)
+            one, two = self.undecided
+            key = _disagreement(one, two)
             sizes = listed([f"{m.meaning[key]:.3g}" for m in self.undecided])
             return (
-                f"{one.name} and {other.name} would both be better, and these data do not "
+                f"{one.name} and {two.name} would both be better, and these data do not "
                 f"distinguish them: {key} {sizes}. Neither is recommended."
             )
         if self.undetermined is not None:
@@ -337,7 +337,7 @@ class ModelComparison:
 
     @property
     def common(self) -> list[str]:
-        """What means the same in all laws: columns of :attr:`meanings`, after the model."""
+        """Quantities common to all laws: columns of :attr:`meanings`, after the model."""
         return list(self.models[0].meaning)
 
     @property
@@ -414,10 +414,10 @@ def _undetermined(optimum: Optimum, every: Mapping[str, float]) -> list[str]:
     return [n for n, u in zip(names, stds.tolist(), strict=True) if not u <= NOT_IDENTIFIED_ABOVE]
 
 
-def _disagreement(one: ComparedModel, other: ComparedModel) -> str:
-    """Return what of friction two models state differently; "" where they agree."""
+def _disagreement(first: ComparedModel, second: ComparedModel) -> str:
+    """Return the quantity of friction on which two models disagree; "" where they agree."""
     for key in _OF_FRICTION:
-        a, b = one.meaning[key], other.meaning[key]
+        a, b = first.meaning[key], second.meaning[key]
         if abs(a - b) > _DISAGREE * max(a, b):
             return key
     return ""
@@ -501,11 +501,11 @@ def compare_models(
         offered = {name: ("", (model,)) for name, model in models.items()}
     for name, (reason, elements) in offered.items():
         try:
-            other = _solved(problem, optimum.loss, Model(*elements), limits=models is not None)
-            errors = error_model(other) if other.problem.kind == "table" else None
-            other = other if errors is None else errors.at_estimate
-            density = predictive_density(other, optimum)
-            fitted.append(ComparedModel(name, other, density, reason))
+            candidate = _solved(problem, optimum.loss, Model(*elements), limits=models is not None)
+            errors = error_model(candidate) if candidate.problem.kind == "table" else None
+            candidate = candidate if errors is None else errors.at_estimate
+            density = predictive_density(candidate, optimum)
+            fitted.append(ComparedModel(name, candidate, density, reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
     return ModelComparison(tuple(fitted), failed)
@@ -616,10 +616,12 @@ def _falling_force(optimum: Optimum) -> str:
     dof, Q = y.size - X.shape[1], slopes.shape[1]
     if dof < 1 or not np.isfinite(y).all():
         return ""
-    rest = y - smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
+    detrended = y - smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
     solution, _, _, _ = np.linalg.lstsq(X, y, rcond=None)
     left = float(np.sum((y - X @ solution) ** 2))
-    by_chance = float(special.fdtrc(Q, dof, (float(rest @ rest) - left) / Q / (left / dof)))
+    by_chance = float(
+        special.fdtrc(Q, dof, (float(detrended @ detrended) - left) / Q / (left / dof))
+    )
     change = (slopes @ solution[-Q:]) * float(np.ptp(rate))
     fall = -float(change[np.argmax(np.abs(change))])
     if not (by_chance < _FALSE_ALARM and fall > 0.0):

@@ -2,8 +2,8 @@
 
 Where the noise's scale is known, an estimate's error is normal and the rise of -2 ln L follows
 chi-square; where the scale was estimated with nu degrees of freedom, they follow Student's t and
-F(1, nu). Both are said here by one number a level: the threshold q, with ``theta_hat ± q stderr``
-on one side and a rise of the deviance by q^2 on the other.
+F(1, nu). Both are expressed here by one number for each level: the threshold q, with ``theta_hat ±
+q stderr`` on one side and a rise of the deviance by q^2 on the other.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def coverage_factors(dof: ArrayLike, levels: ArrayLike) -> FloatArray:
     >>> coverage_factors([2.0, np.inf], CONFIDENCE).round(2).tolist()
     [4.53, 2.0]
     """
-    upper, nu = 0.5 * (1.0 + np.asarray(levels)), np.asarray(dof, dtype=np.float64)
+    upper = 0.5 * (1.0 + np.asarray(levels))
+    nu = np.asarray(dof, dtype=np.float64)
     t = special.stdtrit(np.where(np.isinf(nu), np.nan, nu), upper)
     return np.where(np.isinf(nu), special.ndtri(upper), t)
 

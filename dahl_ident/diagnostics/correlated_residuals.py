@@ -36,7 +36,7 @@ def sandwich(
     Parameters
     ----------
     jacobians : sequence of ndarray, shape (n_i, P)
-        Derivatives of each record's prediction by the P parameters.
+        Derivatives of each record's prediction with respect to the P parameters.
     residuals : sequence of ndarray, shape (n_i,)
         Measured minus predicted.
     noise : sequence of ndarray, optional
@@ -67,15 +67,16 @@ def sandwich(
     if noise is None:
         noise = noise_in(jacobians, residuals)
     for J, known in zip(jacobians, noise, strict=True):
-        own = np.flatnonzero((J != 0.0).any(axis=0))  # other records' states and offsets are not
-        involved = J if own.size == P else J[:, own]
+        # the states and offsets of other records have zero columns
+        concerned = np.flatnonzero((J != 0.0).any(axis=0))
+        involved = J if concerned.size == P else J[:, concerned]
         smooth = correlated(involved, known)
-        middle[np.ix_(own, own)] += involved.T @ smooth
+        middle[np.ix_(concerned, concerned)] += involved.T @ smooth
     size = np.sqrt(normal.diagonal())
     size = np.where(size > 0.0, size, 1.0)
     normal, middle = normal / np.outer(size, size), middle / np.outer(size, size)
-    found = np.zeros((P, P))
-    found[np.diag_indices(P)] = np.inf
+    covariance_of_theta = np.zeros((P, P))
+    covariance_of_theta[np.diag_indices(P)] = np.inf
     seen = np.flatnonzero(normal.diagonal() > 0.0)
     part = np.ix_(seen, seen)
     values, vectors = np.linalg.eigh(normal[part])
@@ -84,11 +85,11 @@ def sandwich(
     white = inverse * variance
     covariance = inverse @ middle[part] @ inverse
     ratio = float(np.mean(covariance.diagonal() / white.diagonal())) if variance > 0.0 else 1.0
-    found[part] = covariance / np.outer(size[seen], size[seen])
+    covariance_of_theta[part] = covariance / np.outer(size[seen], size[seen])
     lost = seen[(vectors[:, ~shown] ** 2).sum(axis=1) > _INVOLVED]
-    found[lost], found[:, lost] = 0.0, 0.0
-    found[lost, lost] = np.inf
-    return found, samples / max(ratio, 1e-300)
+    covariance_of_theta[lost], covariance_of_theta[:, lost] = 0.0, 0.0
+    covariance_of_theta[lost, lost] = np.inf
+    return covariance_of_theta, samples / max(ratio, 1e-300)
 
 
 def inverse_normal(jacobians: Sequence[FloatArray]) -> FloatArray:

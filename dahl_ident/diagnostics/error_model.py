@@ -82,7 +82,7 @@ _CALIBRATIONS = {
 
 
 class RunJackknife(NamedTuple):
-    """What runs say of the estimate with nothing but their own scatter."""
+    """The covariance of the estimate from the scatter between runs alone (the jackknife)."""
 
     covariance: FloatArray  # (Q, Q): of theta, by leaving out each run
     runs: int
@@ -103,7 +103,7 @@ class ErrorModel:
     # names of parameters that were assumed: exponents, the force gain for a drive factor
     assumed: tuple[str, ...]
     limit: FloatArray
-    """Factor of each parameter's uncertainty by the model error: tests left out limit it."""
+    """Factor of the model error's part in each parameter's uncertainty, from tests left out."""
     by_runs: RunJackknife | None
 
     @property
@@ -177,15 +177,15 @@ class ErrorModel:
 
     @cached_property
     def _levers(self) -> tuple[FloatArray, FloatArray]:
-        """What each variance adds to the covariance of theta at 1, (count, Q, Q).
+        """Covariance of theta from each source at unit variance, (count, Q, Q).
 
-        Also where assumed exponents are taken as given.
+        Then the same with assumed exponents taken as exact.
         """
-        every, given = (
+        every, without_exponents = (
             _limited_shares(self.sources, self.state, one, self.limit)[0]
             for one in _levers(self.estimate, self.assumed)
         )
-        return every, given
+        return every, without_exponents
 
     def dof(self, direction: FloatArray, sources: Sequence[str] | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
@@ -197,18 +197,22 @@ class ErrorModel:
         """
         direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
         names = [NOISE] * self.state.model.noises + [s.name for s in self.sources]
-        every, given = (np.einsum("i,kij,j->k", direction, C, direction) for C in self._levers)
+        every, without_exponents = (
+            np.einsum("i,kij,j->k", direction, C, direction) for C in self._levers
+        )
         slopes = every
         if sources is not None:
             counted = np.array([name in sources for name in names], dtype=bool)
-            slopes = given * counted + (every - given) * (EXPONENT in sources)
+            slopes = without_exponents * counted + (every - without_exponents) * (
+                EXPONENT in sources
+            )
         spread = float(slopes @ self.state.variances_covariance @ slopes)
         total = 0.0
         for name in self.contributions if sources is None else sources:
-            own = float(direction @ self.contributions[name] @ direction)
-            total += own
+            variance_of_source = float(direction @ self.contributions[name] @ direction)
+            total += variance_of_source
             if name == TESTS:
-                spread += 2.0 * own**2 / (self.tests - 1)
+                spread += 2.0 * variance_of_source**2 / (self.tests - 1)
         dof = max(1.0, 2.0 * total**2 / spread) if spread > 0.0 else np.inf
         if self.by_runs is None or sources is not None:
             return dof
@@ -241,7 +245,7 @@ class ErrorModel:
 
     @cached_property
     def by_noise(self) -> Optimum:
-        """The estimate as the optimum that it is, of its own weights; noise is all that it counts.
+        """The estimate as an optimum of the weighted problem; its covariance is from noise alone.
 
         What was assumed is held at its estimate.
         """
@@ -268,7 +272,7 @@ class ErrorModel:
         effects, spread = np.zeros((len(labels), Q + 2)), np.zeros(Q + 2)
         predicted, places = self.state.predicted, [*self.names, "gain", "phase"]
         for k in shown:
-            place = places.index(self.sources[k].own)
+            place = places.index(self.sources[k].per_test)
             effects[:, place] = predicted[self.state.model.columns(k)]
             spread[place] = self.variances[k] ** 0.5
         mean = -self._of_theta(predicted[: self.state.model.parameters])
@@ -284,14 +288,14 @@ class ErrorModel:
 
     @cached_property
     def parallel_to_the_law(self) -> ComplexArray:
-        """Responses (n,) by generalised least squares: parallel forces, rates, levels' own errors.
+        """Responses (n,) by generalised least squares, with forces, rates and errors of levels.
 
         Without the smooth departure from the law itself, which its parameters do not describe.
         """
         model, effects = self.state.model, self.state.predicted.copy()
         for k, source in enumerate(self.sources):
-            beside = source.name == MODEL_ERROR and (source.shapes is None or source.parallel)
-            effects[model.columns(k)] *= beside or source.name == LEVELS
+            counted = source.name == MODEL_ERROR and (source.shapes is None or source.parallel)
+            effects[model.columns(k)] *= counted or source.name == LEVELS
         moved = (model.U @ effects)[: self.problem.n_residuals].reshape(-1, 2)
         relative = np.einsum("nij,nj->ni", self.estimate.relative_units, moved)
         return np.asarray(self.estimate.predicted * np.exp(relative @ np.array([1.0, 1.0j])))
@@ -310,24 +314,24 @@ class ErrorModel:
     @cached_property
     def structure_by_chance(self) -> float:
         """Probability that noise, and what groups of rows share, alone make it as large."""
-        own = [k for k, source in enumerate(self.sources) if source.name == MODEL_ERROR]
-        if not own:
+        of_model = [k for k, source in enumerate(self.sources) if source.name == MODEL_ERROR]
+        if not of_model:
             return 1.0
         model = self.state.model
-        shared = [k for k, source in enumerate(self.sources) if source.own]
+        shared = [k for k, source in enumerate(self.sources) if source.per_test]
         null = model.without(set(range(len(self.sources))) - set(shared))
         variances = np.zeros(model.count)
         kept = [*range(model.noises), *(model.noises + k for k in shared)]
         variances[kept] = null.reml(np.ones(len(shared))).variances
         alone, known = model.at(variances), self.problem.scale_known
-        return min(1.0, _KINDS * min(alone.chance_of(k, known=known) for k in own))
+        return min(1.0, _KINDS * min(alone.chance_of(k, known=known) for k in of_model))
 
     def rms(self, name: str) -> float:
         """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.
 
-        Of what runs have of their own, their gain and phase count.
+        Of the differences between runs, those of gain and phase count.
         """
-        named = [s.name == name and s.own not in self.names for s in self.sources]
+        named = [s.name == name and s.per_test not in self.names for s in self.sources]
         squares = np.array([source.mean_square for source in self.sources])
         total = float(self.variances[named] @ squares[named])
         if name == NOISE:
@@ -380,20 +384,26 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     kept = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in kept)
     state = _mixed(estimate, sources).at(state.variances[[*range(noises), *(noises + kept)]])
-    levers, tests = _levers(estimate, assumed), rows_of_tests(problem.data)
+    levers = _levers(estimate, assumed)
+    tests = rows_of_tests(problem.data)
     by_tests = None if estimate.basis is not None else estimate.jackknife(tests)
     limit = np.ones(len(problem.names))
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
         limit = _limit_of_model_error(sources, state, levers[0], by_tests)
-    every, given = (_by_source(estimate, assumed, sources, state, one, limit) for one in levers)
+    every, without_exponents = (
+        _by_source(estimate, assumed, sources, state, one, limit) for one in levers
+    )
     by_runs = None
     if estimate.basis is None and len(problem.data.runs or ()) > 1:
         runs = rows_of(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
         by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     ranged = any(one.source == EXPONENT for one in assumed.values())
     if estimate.basis is None and ranged:
-        whole, others = (np.asarray(sum(parts.values())) for parts in (every, given))
-        every = {**given, EXPONENT: given.get(EXPONENT, 0.0) + _positive(whole - others)}
+        whole, others = (np.asarray(sum(parts.values())) for parts in (every, without_exponents))
+        every = {
+            **without_exponents,
+            EXPONENT: without_exponents.get(EXPONENT, 0.0) + _positive(whole - others),
+        }
     if estimate.second is not None:
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
@@ -433,7 +443,7 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
 
 
 def _levers(estimate: WeightedEstimate, assumed: Collection[str]) -> tuple[FloatArray, FloatArray]:
-    """Return what the estimate makes of the residuals, (Q, M), exponents estimated and given."""
+    """Return d theta/d residuals, (Q, M), with assumed exponents estimated and with them exact."""
     G = estimate.lever()
     if estimate.basis is not None:
         G = estimate.basis.matrix @ G
@@ -441,9 +451,10 @@ def _levers(estimate: WeightedEstimate, assumed: Collection[str]) -> tuple[Float
     ranged = [name in assumed and name != GAIN for name in estimate.problem.names]
     if not any(ranged):
         return G, G
-    given, kept = np.zeros(G.shape), np.flatnonzero(~np.array(ranged))
-    given[kept] = estimate.lever(estimate.jacobian[:, kept])
-    return G, given
+    kept = np.flatnonzero(~np.array(ranged))
+    without_exponents = np.zeros(G.shape)
+    without_exponents[kept] = estimate.lever(estimate.jacobian[:, kept])
+    return G, without_exponents
 
 
 def _by_source(
@@ -457,15 +468,15 @@ def _by_source(
     """Return the covariance of theta that each source makes by the lever (Q, M) of residuals."""
     problem, noises = estimate.problem, state.model.noises
     each, known = _limited_shares(sources, state, lever, limit)
-    found = {NOISE: known[:noises].sum(axis=0)}
+    by_source = {NOISE: known[:noises].sum(axis=0)}
     names = [NOISE] * noises + [source.name for source in sources]
     for name, part, variance in zip(names, each, state.variances.tolist(), strict=True):
-        found[name] = found.get(name, 0.0) + variance * part
+        by_source[name] = by_source.get(name, 0.0) + variance * part
     priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
     priors += [one.source for one in assumed.values()]
     for row, name in enumerate(priors, start=problem.n_residuals):
-        found[name] = found.get(name, 0.0) + np.outer(lever[:, row], lever[:, row])
-    return found
+        by_source[name] = by_source.get(name, 0.0) + np.outer(lever[:, row], lever[:, row])
+    return by_source
 
 
 def _limited_shares(
@@ -490,7 +501,7 @@ def _limit_of_model_error(
 
 
 def _positive(C: FloatArray) -> FloatArray:
-    """Return the part of a symmetric matrix that is a covariance."""
+    """Return the positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh(C)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
@@ -509,11 +520,11 @@ def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[s
 def no_narrower(
     dof: FloatArray | float, variance: FloatArray | float, of_runs: FloatArray | float, runs: int
 ) -> FloatArray:
-    """Return the degrees of freedom by which an interval is no narrower than that of runs alone.
+    """Return degrees of freedom that make an interval at least as wide as that of runs alone.
 
-    The mean of a few runs has Student's t of one less, whatever their scatter; its variance by
-    `of_runs` is that of their own means. Satterthwaite's formula is too sure of a scatter that
-    happens to be small among few of them.
+    The mean of n runs has Student's t with n - 1 degrees of freedom, whatever their scatter;
+    `of_runs` is its variance. Satterthwaite's formula gives too many degrees of freedom where the
+    scatter of few runs happens to be small.
 
     Examples
     --------

@@ -47,7 +47,7 @@ _SHARED_LEVELS = 0.02  # of three kinds together
 _SELDOM = 0.01  # of suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
 _MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
-_MOST_NOISY = 100  # levels with a noise of their own: the cost is cubic in their number
+_MOST_NOISY = 100  # levels with a noise each: the cost is cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
 _MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
@@ -82,7 +82,7 @@ def _held(data: FrequencyResponse) -> FloatArray:
 def in_order_of_level(data: FrequencyResponse) -> bool:
     """Return whether every run goes from level to level in one direction, the same for all.
 
-    A drift along the rows is then a change with the level, and nothing tells them apart.
+    A drift along the rows then cannot be distinguished from a change with the level.
     """
     runs = np.zeros(data.n) if data.run is None else data.run
     first, held = data.harmonic == 1, _held(data)
@@ -98,9 +98,9 @@ def repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArr
     """
     repeated = np.flatnonzero(np.bincount(level[fundamental], minlength=level.max() + 1) > 1)
     groups = min(len(repeated), _MOST_LEVELS)
-    own = np.full(level.max() + 1, -1)
-    own[repeated] = np.arange(len(repeated)) * groups // max(len(repeated), 1)
-    return np.asarray((np.arange(groups)[:, None] == own[level]) & fundamental, dtype=np.float64)
+    group = np.full(level.max() + 1, -1)
+    group[repeated] = np.arange(len(repeated)) * groups // max(len(repeated), 1)
+    return np.asarray((np.arange(groups)[:, None] == group[level]) & fundamental, dtype=np.float64)
 
 
 def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
@@ -183,9 +183,9 @@ def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
     starts = np.flatnonzero(np.concatenate([[True], breaks]))
     ends = np.append(starts[1:], len(x)) - 1
     wide = (x[order][ends] - x[order][starts] > _SAME_LEVEL)[label[1:]]
-    found = np.empty(len(x), dtype=np.intp)
-    found[order] = labelled(breaks | (wide & (apart > _EQUAL)))
-    return found
+    labels = np.empty(len(x), dtype=np.intp)
+    labels[order] = labelled(breaks | (wide & (apart > _EQUAL)))
+    return labels
 
 
 @dataclass(frozen=True)
@@ -196,9 +196,9 @@ class Source:
     columns: FloatArray  # (M, q): residuals of unit variance that the source makes at unit variance
     mean_square: float  # of ln gain and phase over the rows, at unit variance
     shapes: Shapes | None = None  # extension of the source to other amplitudes and frequencies
-    # what another test has an own draw of: "gain", "phase", "both" or a parameter's name; empty for
-    # noise and model error
-    own: str = ""
+    # what differs from test to test: "gain", "phase", "both" or a parameter's name; empty for noise
+    # and model error
+    per_test: str = ""
     largest: float = np.inf  # variance
     # (Q, q): changes of theta that do the same as each column; taken out of the columns
     absorbed: FloatArray | None = None
@@ -236,11 +236,13 @@ class Source:
         return made if self.absorbed is None else made - parts(slopes) @ self.absorbed
 
     def drawn(self, names: Sequence[str], slopes: ComplexArray) -> FloatArray:
-        """Return the covariance of ln gain and phase by a test's own draw at unit variance."""
-        if self.own in names:
-            part = parts(slopes[:, [names.index(self.own)]])
+        """Return the covariance of ln gain and phase that a new test draws at unit variance."""
+        if self.per_test in names:
+            part = parts(slopes[:, [names.index(self.per_test)]])
             return np.asarray(part @ part.swapaxes(1, 2))
-        return np.diag([float(self.own not in ("", "phase")), float(self.own not in ("", "gain"))])
+        return np.diag(
+            [float(self.per_test not in ("", "phase")), float(self.per_test not in ("", "gain"))]
+        )
 
 
 def parts(relative: ComplexArray) -> FloatArray:
@@ -294,8 +296,9 @@ def error_sources(
 ) -> tuple[Source, ...]:
     """Return the sources that several rows share, and noise of the levels.
 
-    Their shapes are those of the model at the estimate. In measured ones the noise itself would be
-    a shape, and explain itself. `further`, (k, 2), are further places where shapes are needed.
+    Their shapes are those of the model at the estimate. If they were those of the measured
+    responses, noise would explain itself. `further`, (k, 2), are further places where shapes are
+    needed.
     """
     return tuple(
         source
@@ -364,12 +367,12 @@ def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
         return
     share = runs * estimate.predicted
     turned = 1j * problem.data.harmonic * share
-    yield Source(RUNS, estimate.changed(share), 0.5, own="gain", chance=chance)
-    yield Source(RUNS, estimate.changed(turned), 0.5, own="phase", chance=chance)
+    yield Source(RUNS, estimate.changed(share), 0.5, per_test="gain", chance=chance)
+    yield Source(RUNS, estimate.changed(turned), 0.5, per_test="phase", chance=chance)
     each = np.pad(np.repeat(runs, 2, axis=1).T, ((0, problem.n_priors), (0, 0)))
     for i in _scattering_parameters(problem):
         column = -each * estimate.jacobian[:, i : i + 1]
-        yield Source(RUNS, column, 0.0, own=problem.names[i], chance=chance)
+        yield Source(RUNS, column, 0.0, per_test=problem.names[i], chance=chance)
 
 
 def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
@@ -397,12 +400,12 @@ def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
         kinds = (predicted, by_level, by_both)
         for change in kinds:
             columns = estimate.changed(in_common * change)
-            yield Source(LEVELS, columns, 0.5, own="gain", chance=_SHARED_LEVELS / len(kinds))
+            yield Source(LEVELS, columns, 0.5, per_test="gain", chance=_SHARED_LEVELS / len(kinds))
     repeated = repeats(repeated_levels(data), data.harmonic == 1)
     if len(repeated) >= _FEWEST:
         shared = np.concatenate([repeated, 1j * repeated])
         columns = estimate.changed(shared * _sizes(problem, predicted))
-        yield Source(LEVELS, columns, 1.0, own="both")
+        yield Source(LEVELS, columns, 1.0, per_test="both")
 
 
 def own_errors(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Source]:
@@ -426,34 +429,34 @@ def _absorbed(problem: TableProblem, J: FloatArray, columns: FloatArray) -> Floa
     """Return what the model's linear parts take of forces in parallel, as changes of theta."""
     names = {p.name for e in problem.model.elements if e.is_linear for p in e.parameters}
     linear = [i for i, name in enumerate(problem.names) if name in names]
-    found = np.zeros((J.shape[1], columns.shape[1]))
+    changes = np.zeros((J.shape[1], columns.shape[1]))
     if linear:
-        found[linear] = -np.linalg.lstsq(J[:, linear], columns, rcond=None)[0]
-    return found
+        changes[linear] = -np.linalg.lstsq(J[:, linear], columns, rcond=None)[0]
+    return changes
 
 
 def _scattering_parameters(problem: TableProblem) -> list[int]:
     """Return the columns of parameters that may differ from run to run, in addition to the gain."""
-    found = []
+    indices = []
     for element in problem.model.elements:
         if element.is_linear:
             continue
         for label in element.scale_parameters[:-1]:  # all of them together are a gain
             name = element.parameter(label).name
             if name in problem.names:
-                found.append(problem.names.index(name))
-    return found
+                indices.append(problem.names.index(name))
+    return indices
 
 
 def _indicators(labels: NDArray[np.str_]) -> FloatArray:
     return np.asarray(np.unique(labels)[:, None] == labels, dtype=np.float64)
 
 
-def _correlation(one: FloatArray, other: FloatArray, parallel: bool) -> FloatArray:
-    squares = np.zeros((len(one), len(other)))
+def _correlation(first: FloatArray, second: FloatArray, parallel: bool) -> FloatArray:
+    squares = np.zeros((len(first), len(second)))
     for axis in (1,) if parallel else (0, 1):
-        if np.ptp(np.concatenate([one[:, axis], other[:, axis]])) > 0.0:
-            squares += ((one[:, axis, None] - other[:, axis]) / _LENGTH) ** 2
+        if np.ptp(np.concatenate([first[:, axis], second[:, axis]])) > 0.0:
+            squares += ((first[:, axis, None] - second[:, axis]) / _LENGTH) ** 2
     return np.asarray(np.exp(-0.5 * squares))
 
 

@@ -57,16 +57,16 @@ _SAME = 1e-9  # relative change of the misfit's square that no longer counts
 
 @dataclass(frozen=True)
 class Basis:
-    """Orthonormal directions, (C, r), of coordinates over the sizes that residuals notice, (C,)."""
+    """Orthonormal directions, (C, r), of the scaled coordinates that the data determine."""
 
     size: FloatArray
     directions: FloatArray
-    slopes: FloatArray  # (Q, C): of theta by the coordinates
+    slopes: FloatArray  # (Q, C): derivatives of theta with respect to the coordinates
     chart: Chart | None = None  # gives theta at the coordinates; None where they are theta
 
     @classmethod
     def of(cls, J: FloatArray, theta: FloatArray, chart: Chart | None) -> Basis:
-        """Return the directions that residuals with the derivatives J by theta notice."""
+        """Return the directions that residuals with the Jacobian J determine."""
         slopes = np.eye(len(theta)) if chart is None else chart.derivative(theta)
         by_coordinates = J @ slopes
         size = 1.0 / np.maximum(np.linalg.norm(by_coordinates, axis=0), np.finfo(float).tiny)
@@ -93,7 +93,7 @@ class Basis:
         return self.chart.theta(self.chart.phi(theta) + move)
 
     def holds(self, slopes: FloatArray) -> NDArray[np.bool_]:
-        """Return whether numbers with the slopes (..., Q) by theta are determined, shape (...).
+        """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
 
         One that no coordinate changes is infinite in the limit, unless nothing changes it at all.
         """
@@ -118,22 +118,26 @@ def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart | None:
     }
     if not gone:
         return None
-    found = [one for one in limits(optimum.problem) if one.extremes == gone]
-    if not found:
+    reached = [one for one in limits(optimum.problem) if one.extremes == gone]
+    if not reached:
         return None
     chart = min(
-        (one.chart.one for one in found),
+        (one.chart.one for one in reached),
         key=lambda c: float(np.abs(c.theta(c.phi(optimum.theta)) - optimum.theta).max()),
     )
-    own = [problem.names.index(name) for name in optimum.names]
-    others = [i for i in range(len(problem.names)) if i not in own]
+    of_optimum = [problem.names.index(name) for name in optimum.names]
+    others = [i for i in range(len(problem.names)) if i not in of_optimum]
     C, size = chart.matrix.shape[1], len(problem.names)
     matrix, offset = np.zeros((size, C + len(others))), np.zeros(size)
     back = np.zeros((C + len(others), size))
-    matrix[own, :C], offset[own], back[:C, own] = chart.matrix, chart.offset, chart.back
+    matrix[of_optimum, :C], offset[of_optimum], back[:C, of_optimum] = (
+        chart.matrix,
+        chart.offset,
+        chart.back,
+    )
     for k, i in enumerate(others, start=C):
         matrix[i, k] = back[k, i] = 1.0
-    tied = None if chart.tied is None else (own[chart.tied[0]], own[chart.tied[1]])
+    tied = None if chart.tied is None else (of_optimum[chart.tied[0]], of_optimum[chart.tied[1]])
     return Chart(matrix, offset, back, tied)
 
 
@@ -172,7 +176,7 @@ class WeightedEstimate:
     residuals: FloatArray  # (M,): those of data, then of priors, of unit variance
     jacobian: FloatArray  # (M, Q): their derivatives
     loss: Loss | None
-    # changes of theta that the data determine at all; None where that is every one
+    # changes of theta that the data determine; None where they determine all
     basis: Basis | None = None
     # (Q,): how far a second minimum is, times the root of its probability; None where there is none
     second: FloatArray | None = None
@@ -197,15 +201,19 @@ class WeightedEstimate:
         return self.jacobian if self.basis is None else self.jacobian @ self.basis.matrix
 
     def changed(self, changes: ComplexArray) -> FloatArray:
-        """Return what changes (k, n) of the measured responses add to `y`, (M, k)."""
+        """Return the changes of `y`, (M, k), by changes (k, n) of the measured responses."""
         columns = -self.problem.residual_change(self.theta, changes).T / self.scale
         return np.pad(columns, ((0, self.problem.n_priors), (0, 0)))
 
     def factors(self, problem: TableProblem) -> FloatArray:
-        """Return what takes each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
+        """Return the matrices from each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
         sides = np.array([1.0, 1.0j])[:, None] * np.ones(self.problem.data.n, dtype=np.complex128)
-        own, other = (p.residual_change(self.theta, sides) for p in (self.problem, problem))
-        pairs = (each.reshape(2, -1, 2).transpose(1, 2, 0) for each in (own / self.scale, other))
+        change_here, change = (
+            p.residual_change(self.theta, sides) for p in (self.problem, problem)
+        )
+        pairs = (
+            each.reshape(2, -1, 2).transpose(1, 2, 0) for each in (change_here / self.scale, change)
+        )
         ours, theirs = pairs
         return np.asarray(ours @ np.linalg.pinv(theirs))
 
@@ -221,7 +229,7 @@ class WeightedEstimate:
 
     @cached_property
     def relative_units(self) -> FloatArray:
-        """What takes each row of `y` to ln gain and phase, shape (n, 2, 2)."""
+        """The matrices from each row of `y` to ln gain and phase, shape (n, 2, 2)."""
         both = self.changed(np.array([1.0, 1.0j])[:, None] * self.predicted)
         units = np.linalg.pinv(both[: self.problem.n_residuals].reshape(-1, 2, 2))
         return np.asarray(units, dtype=np.float64)
@@ -255,9 +263,9 @@ class WeightedEstimate:
         Q, R = np.linalg.qr(self.jacobian)
         moves = []
         for rows in tests:
-            own = (2 * rows[:, None] + np.arange(2)).ravel()
-            left, turn = np.linalg.eigh(np.eye(len(R)) - Q[own].T @ Q[own])
-            along = turn.T @ (Q[own].T @ self.y[own])
+            of_test = (2 * rows[:, None] + np.arange(2)).ravel()
+            left, turn = np.linalg.eigh(np.eye(len(R)) - Q[of_test].T @ Q[of_test])
+            along = turn.T @ (Q[of_test].T @ self.y[of_test])
             moves.append(turn @ (along / np.sqrt(np.maximum(left, _LEAST_LEFT))))
         each = np.linalg.solve(R, np.array(moves).T).T
         each = np.clip(each, *(bound - self.theta for bound in self.problem.bounds()))
@@ -354,7 +362,7 @@ def _cost(r: FloatArray, m: int, loss: Loss | None, mean: float) -> float:
 
 
 def _further(moved: FloatArray, last: FloatArray | None) -> float:
-    """Return the factor of a step that the one before says is one of a geometric series."""
+    """Return the factor that lengthens a step to the sum of the geometric series it continues."""
     ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
     return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
 
@@ -419,8 +427,10 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
     Both are estimates of the parameters, and the factor is that of Paule and Mandel: the square of
     their distance, over its variance, is the number of directions that harmonics determine.
     """
-    own = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
-    (A, b), (A_h, b_h) = ((J[rows].T @ J[rows], J[rows].T @ y[rows]) for rows in (~own, own))
+    harmonic_rows = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
+    (A, b), (A_h, b_h) = (
+        (J[rows].T @ J[rows], J[rows].T @ y[rows]) for rows in (~harmonic_rows, harmonic_rows)
+    )
     size = np.sqrt(np.maximum(np.diagonal(A + A_h), TINY))
     A, A_h, b, b_h = A / np.outer(size, size), A_h / np.outer(size, size), b / size, b_h / size
     directions = int(np.linalg.matrix_rank(A_h, tol=_NOTICED, hermitian=True))

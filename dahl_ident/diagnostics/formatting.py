@@ -77,7 +77,8 @@ def degrees_text(dof: Iterable[float]) -> str:
     least, most = min(several), max(several)
     if least >= _MANY_DOF:
         return "more than 1000" if math.isfinite(least) else "infinite"
-    text, last = f"{least:.3g}", degrees_text([most]) if most >= _MANY_DOF else f"{most:.3g}"
+    text = f"{least:.3g}"
+    last = degrees_text([most]) if most >= _MANY_DOF else f"{most:.3g}"
     return text if text == last else f"{text} to {last}"
 
 

@@ -1,4 +1,4 @@
-"""Goodness of fit: whether the residuals are noise, and the estimates physically possible.
+"""Goodness of fit: whether residuals are consistent with noise, and estimates physically possible.
 
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
 residuals over amplitude, frequency and drive, a stiffness that rises with amplitude, the
@@ -286,7 +286,7 @@ class Goodness:
 
     @property
     def judged(self) -> bool:
-        """Whether the data test the model, and tell a wrong one from noise."""
+        """Whether the data test the model, and distinguish a wrong one from noise."""
         return not self.untested and self._enough_points
 
     @property
@@ -308,8 +308,8 @@ class Goodness:
         yield from (str(one) for one in self.groups if one.p_value < level)
         if self.runs_differ is not None:
             yield str(self.runs_differ)
-        found = [trend for trend in self.trends if trend.p_value < level]
-        rate = [trend for trend in found if trend.covariate == "frequency"]
+        departing = [trend for trend in self.trends if trend.p_value < level]
+        rate = [trend for trend in departing if trend.covariate == "frequency"]
         yield from (f"{t.brief}, which no rate-independent model can describe" for t in rate)
         if self.stiffening is not None and self.stiffening.p_value < level:
             yield str(self.stiffening)
@@ -319,17 +319,17 @@ class Goodness:
                 "more than any sensor's noise"
             )
         curve = [test for test in (self.exponent,) if test is not None and test.p_value < level]
-        over = [trend for trend in found if trend not in rate]
+        over = [trend for trend in departing if trend not in rate]
         of_curve = [*(trend.brief for trend in over), *map(str, curve)]
         if self.exponent is not None and self.exponent.fixed == 1.0 and of_curve:
             of_curve[0] = f"these data are not linear Dahl: {of_curve[0]}"
         yield from of_curve
-        if self.smooth is not None and self.smooth.p_value < level and not found:
+        if self.smooth is not None and self.smooth.p_value < level and not departing:
             yield str(self.smooth)
         for test in (self.third_harmonic, self.chi_square):
             if test is not None and test.p_value < level:
                 yield str(test)
-        if not found:
+        if not departing:
             yield from (f"{r}" for r in self.runs if r.p_value < level)
 
     @property
@@ -416,23 +416,23 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     The estimate is that of `errors`, if known; a scatter between runs that exceeds the noise is
     taken out first.
     """
-    found = _tested(optimum, errors)
-    if errors is not None and found.objections:
+    tested = _tested(optimum, errors)
+    if errors is not None and tested.objections:
         within, stated = _within_runs(errors), optimum.problem.data.run is not None
         if within is not None:  # labels may say what passes over the levels are
-            found = within if stated else replace(within, groups=found.groups)
+            tested = within if stated else replace(within, groups=tested.groups)
     if optimum.loss != "linear":  # which hides where the model fails
-        found = replace(found, neighbours=_side_by_side(optimum, found))
-    if optimum.method == "ipopt" or (optimum.success and not found.objections):
-        return found  # another solver may have had constraints, which no trial would keep
-    sign = sign_convention(optimum, found.rms_misfit, _tested_estimate)
+        tested = replace(tested, neighbours=_side_by_side(optimum, tested))
+    if optimum.method == "ipopt" or (optimum.success and not tested.objections):
+        return tested  # another solver may have had constraints, which no trial would keep
+    sign = sign_convention(optimum, tested.rms_misfit, _tested_estimate)
     if sign:
-        return replace(found, sign=sign, warnings=(*found.warnings, sign))
-    found = _without_suspicious(optimum, found)
-    differ = found.runs_differ or any(one.p_value < found.level for one in found.groups)
-    if differ or not found.objections:
-        return found  # no law describes several devices at once
-    return replace(found, bound=_bound(optimum, found.rms_misfit))
+        return replace(tested, sign=sign, warnings=(*tested.warnings, sign))
+    tested = _without_suspicious(optimum, tested)
+    differ = tested.runs_differ or any(one.p_value < tested.level for one in tested.groups)
+    if differ or not tested.objections:
+        return tested  # no law describes several devices at once
+    return replace(tested, bound=_bound(optimum, tested.rms_misfit))
 
 
 def _tested_estimate(optimum: Optimum) -> Goodness:
@@ -456,30 +456,36 @@ def _bound(optimum: Optimum, misfit: float) -> float | None:
     return least if helps else None
 
 
-def _without_suspicious(optimum: Optimum, found: Goodness) -> Goodness:
-    """Return `found` with the objections that remain without the suspicious rows."""
-    rows = [point.row for point in found.suspicious]
-    if not (rows and found.objections and not at_an_end(optimum, rows)):
-        return found
-    if not least_misfit_without(optimum, rows) * EXPLAINS < found.rms_misfit:
-        return found
-    other = set_aside(optimum, rows)
-    rest = None if other is None else _tested_estimate(other)
-    if rest is None or rest.objections or rest.hints or rest.untested or not rest.judged:
-        return found
-    if not rest.rms_misfit * EXPLAINS < found.rms_misfit:
-        return found
-    where = _side_by_side(optimum, found)
+def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
+    """Return `tested` with the objections that remain without the suspicious rows."""
+    rows = [point.row for point in tested.suspicious]
+    if not (rows and tested.objections and not at_an_end(optimum, rows)):
+        return tested
+    if not least_misfit_without(optimum, rows) * EXPLAINS < tested.rms_misfit:
+        return tested
+    optimum_without = set_aside(optimum, rows)
+    without = None if optimum_without is None else _tested_estimate(optimum_without)
+    if (
+        without is None
+        or without.objections
+        or without.hints
+        or without.untested
+        or not without.judged
+    ):
+        return tested
+    if not without.rms_misfit * EXPLAINS < tested.rms_misfit:
+        return tested
+    where = _side_by_side(optimum, tested)
     if where:
-        return replace(found, neighbours=where)
-    (remaining,) = (str(f) for f in rest.findings() if f.code == "noise")
-    names = tuple(point.name for point in found.suspicious)
-    return replace(found, apart=names, without_them=remaining, rows=optimum.problem.data.n)
+        return replace(tested, neighbours=where)
+    (remaining,) = (str(f) for f in without.findings() if f.code == "noise")
+    names = tuple(point.name for point in tested.suspicious)
+    return replace(tested, apart=names, without_them=remaining, rows=optimum.problem.data.n)
 
 
-def _side_by_side(optimum: Optimum, found: Goodness) -> str:
+def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
     """Return where suspicious rows lie close together, or at an end; "" where they do not."""
-    rows = [point.row for point in found.suspicious]
+    rows = [point.row for point in tested.suspicious]
     if at_an_end(optimum, rows):
         return "it is the first or the last"
     where = neighbourhood(optimum, rows)
@@ -490,7 +496,7 @@ def _within_runs(errors: ErrorModel) -> Goodness | None:
     """Return the tests of the residuals within runs; None where the runs do not differ.
 
     Where differences between runs take half of the degrees of freedom, as with one point a run,
-    they are not told from a wrong model, which the plain residuals test.
+    they cannot be distinguished from a wrong model, which the plain residuals test.
     """
     runs, optimum = errors.runs, errors.at_estimate
     if runs is None:
@@ -500,15 +506,15 @@ def _within_runs(errors: ErrorModel) -> Goodness | None:
         return None
     explained = float(every.residuals @ every.residuals - within.residuals @ within.residuals)
     p = every.tail(explained, every.dof - within.dof)
-    found = _tested(optimum, errors, within)
-    if not p < found.level:
+    tested = _tested(optimum, errors, within)
+    if not p < tested.level:
         return None
     scatter = {
-        source.own: v**0.5
+        source.per_test: v**0.5
         for source, v in zip(errors.sources, errors.variances.tolist(), strict=True)
         if source.name == RUNS and v > 0.0
     }
-    return replace(found, runs_differ=RunsDiffer(scatter, p))
+    return replace(tested, runs_differ=RunsDiffer(scatter, p))
 
 
 def _tested(
@@ -647,6 +653,6 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
     rows = optimum.problem.data.harmonic == 3
     if not rows.any():
         return None
-    own = rows.astype(np.complex128)
-    ratio, error = space.coefficient(own)
-    return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([own, 1j * own])))
+    third = rows.astype(np.complex128)
+    ratio, error = space.coefficient(third)
+    return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([third, 1j * third])))

@@ -102,7 +102,8 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
         return None
     first = (data.harmonic == 1) | (data.harmonic != 1).all()
     chosen = np.linspace(0, len(tests) - 1, min(len(tests), _MOST_TESTS)).round().astype(int)
-    W, found = state.variances_covariance, []
+    W = state.variances_covariance
+    of_tests = []
     for number, rows in enumerate(tests[i] for i in chosen):
         index = (2 * rows[:, None] + np.arange(2)).ravel()
         refit = estimate.without(index)
@@ -115,21 +116,21 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
         blocks = np.concatenate([D[None], D @ there.block_falls(index) @ D]).reshape(
             -1, len(r), 2, len(r), 2
         )
-        own = np.einsum("rai,rkij,raj->kra", turn, blocks[:, r, :, r], turn)
+        by_source = np.einsum("rai,rkij,raj->kra", turn, blocks[:, r, :, r], turn)
         predicted = refit.y[index] - D @ there.weighted[index]
         missed = turn @ (refit.residuals[index] - predicted).reshape(-1, 2, 1)
-        variance = np.maximum(own[0], 0.0)
-        spread = np.einsum("kra,kl,lra->ra", own[1:], W, own[1:])
+        variance = np.maximum(by_source[0], 0.0)
+        spread = np.einsum("kra,kl,lra->ra", by_source[1:], W, by_source[1:])
         with np.errstate(divide="ignore", invalid="ignore"):
             dof = np.where(spread > 0.0, np.maximum(2.0 * variance**2 / spread, 1.0), np.inf)
         std = np.sqrt(variance)
         std = np.where((std > 0.0) & (std < _WIDEST), std, np.nan)
         kept = first[rows]
         parts = (rows, np.full(len(rows), number), missed[..., 0], std, dof)
-        found.append([part[kept] for part in parts])
-    if not found:
+        of_tests.append([part[kept] for part in parts])
+    if not of_tests:
         return None
-    rows, test, deviation, std, dof = (np.concatenate(one) for one in zip(*found, strict=True))
+    rows, test, deviation, std, dof = (np.concatenate(one) for one in zip(*of_tests, strict=True))
     return HeldOut(rows, test, deviation, std, dof, len(tests))
 
 

@@ -29,7 +29,7 @@ def values_at(problem: TableProblem, theta: FloatArray) -> dict[str, float]:
 class Information:
     """First-order variances of anything that depends on the parameters.
 
-    Where the covariance is finite it is the optimum's own. Where data leave a direction open,
+    Where the optimum's covariance is finite, it is used. Where data leave a direction open,
     what does not depend on that direction still has a finite variance here; NaN where nothing
     is left to estimate the noise's scale by.
     """
@@ -87,8 +87,8 @@ def shares(optimum: Optimum) -> FloatArray:
         others = np.delete(J, i, axis=1)
         size = np.linalg.norm(others, axis=0)
         others = others / np.where(size > 0.0, size, 1.0)
-        own = J[:, i] - others @ np.linalg.lstsq(others, J[:, i], rcond=None)[0]
-        squares = own[0::2] ** 2 + own[1::2] ** 2
+        independent = J[:, i] - others @ np.linalg.lstsq(others, J[:, i], rcond=None)[0]
+        squares = independent[0::2] ** 2 + independent[1::2] ** 2
         total = squares.sum()
         result.append(squares / total if total > 0.0 else np.full(m // 2, np.nan))
     return np.array(result)

@@ -50,7 +50,7 @@ Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which an interval is a factor either way
 _LARGE = 0.1  # the same from noise alone, above which a side may be open
 _DISAGREES = 0.2  # half widths between the limits of two methods
-_ROUNDING = 1e-9  # relative difference of limits that no one sees
+_ROUNDING = 1e-9  # relative difference of limits that counts as none
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
@@ -177,8 +177,8 @@ def combined_intervals(
     if doubtful.any():
         shape = profile()
         values = np.where(held, values, shape.estimate)
-        # with no limit on one side, u says nothing of the other: the profile does, and its
-        # distance from the estimate is wider by all that it does not count
+        # with no limit on one side, u is no measure of the other: that is the profile's limit,
+        # moved away from the estimate by the sources that the profile does not count
         unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))
         by_profile = doubtful & (~held | unlimited.any(axis=0))
         beyond = np.where(held, np.maximum(u**2 - by_noise**2, 0.0), 0.0)
@@ -193,9 +193,11 @@ def combined_intervals(
     shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"
-    every, assumed = errors.problem, [name for name in errors.assumed if errors.holds(name)]
+    every = errors.problem
+    assumed = [name for name in errors.assumed if errors.holds(name)]
     also = [errors.names.index(name) for name in assumed]
-    estimates, directions = every.to_values(errors.theta), np.eye(len(errors.names))
+    estimates = every.to_values(errors.theta)
+    directions = np.eye(len(errors.names))
     u = errors.std(directions) * every.space.slopes(estimates)
     dof = np.array([errors.dof(direction) for direction in directions])
     low, high = around(every.space, estimates, u, coverage_factors(dof, array[:, None]))
@@ -300,24 +302,26 @@ def compare(
     """Return where each method differs from the last by more than a fifth of a half width."""
     if len(intervals) < 2:
         raise ValidationError(f"{len(intervals)} intervals given; a comparison needs two or more")
-    last, found = intervals[-1], []
+    last = intervals[-1]
+    disagreements = []
     count = min(len(one.names) for one in intervals)
     theta = optimum.theta[:count]
-    for other in intervals[:-1]:
-        if not np.array_equal(other.levels, last.levels):
-            raise ValidationError(f"{other.method} and {last.method} intervals differ in level")
+    for earlier in intervals[:-1]:
+        if not np.array_equal(earlier.levels, last.levels):
+            raise ValidationError(f"{earlier.method} and {last.method} intervals differ in level")
         for side in ("lower", "upper"):
-            a, b = (getattr(one, side)[:, :count] for one in (last, other))
+            a, b = (getattr(one, side)[:, :count] for one in (last, earlier))
             ours, theirs = (search_coordinates(optimum, one) for one in (a, b))
             with np.errstate(invalid="ignore"):
                 apart = np.abs(ours - theirs) > _DISAGREES * np.abs(ours - theta)
             apart |= np.isinf(ours) != np.isinf(theirs)
             apart &= ~np.isclose(a, b, rtol=_ROUNDING, atol=0)
             for row, i in np.argwhere(apart).tolist():
-                level, limits = float(last.levels[row]), (b[row, i], a[row, i])
-                methods = (other.method, last.method)
-                found.append(Disagreement(last.names[i], level, side, methods, limits))
-    return IntervalComparison(tuple(intervals), tuple(found), stated)
+                level = float(last.levels[row])
+                limits = (b[row, i], a[row, i])
+                methods = (earlier.method, last.method)
+                disagreements.append(Disagreement(last.names[i], level, side, methods, limits))
+    return IntervalComparison(tuple(intervals), tuple(disagreements), stated)
 
 
 def search_coordinates(optimum: Optimum, values: FloatArray) -> FloatArray:

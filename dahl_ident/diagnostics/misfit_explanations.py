@@ -1,7 +1,7 @@
 """Possible causes of a misfit: a sign convention, or single rows. Nothing is corrected or dropped.
 
-A row is suspicious where a response of its own (the mean-shift test) takes away more of the sum of
-squares than noise would, leverage included. The most deviant row is set aside and the others are
+A row is suspicious where leaving its response free (the mean-shift test) lowers the sum of squares
+by more than noise would, leverage included. The most deviant row is set aside and the others are
 judged without it, so that outliers do not mask one another; up to a tenth of the rows, of more than
 500 several at a time. The level is 1 % for the whole table, divided by the number of rows.
 """
@@ -59,10 +59,13 @@ class SuspiciousPoint:
 
 def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[SuspiciousPoint, ...]:
     """Return the points that stand apart, the most deviant first."""
-    found = _beyond_noise(optimum) if optimum.loss != "linear" else _standing_apart(optimum, space)
+    deviant = (
+        _beyond_noise(optimum) if optimum.loss != "linear" else _standing_apart(optimum, space)
+    )
     data, amplitude = optimum.problem.data, optimum.problem.stiffness_data.amplitude
-    names, points = row_names(data, [row for row, *_ in found]), []
-    for (row, deviation, p), name in zip(found, names, strict=True):
+    names = row_names(data, [row for row, *_ in deviant])
+    points = []
+    for (row, deviation, p), name in zip(deviant, names, strict=True):
         level = None if data.level is None else data.level[row].item()
         place = float(data.frequency_hz[row]), float(amplitude[row]), level
         points.append(SuspiciousPoint(row, name, *place, deviation, p))
@@ -74,15 +77,15 @@ def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, f
     n = optimum.problem.data.n
     at_once = 1 + n // _ONE_BY_ONE
     rows: list[int] = []
-    found: list[tuple[int, float, float]] = []
+    deviant: list[tuple[int, float, float]] = []
     for _ in range(0, max(1, int(_SHARE * n)), at_once):
         worst = _most_deviant(optimum, space, rows, at_once)
         rows += [row for row, *_ in worst]
-        found += worst
+        deviant += worst
         if len(worst) < at_once:
             break
-    significant = [i for i, (*_, p) in enumerate(found, start=1) if p < _LEVEL]
-    return found[: max(significant, default=0)]
+    significant = [i for i, (*_, p) in enumerate(deviant, start=1) if p < _LEVEL]
+    return deviant[: max(significant, default=0)]
 
 
 def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
@@ -115,25 +118,29 @@ def _most_deviant(
     squares = _shifts(r, lever)
     squares[without] = -np.inf
     total = float(r @ r)
-    found: list[tuple[int, float, float]] = []
+    deviant: list[tuple[int, float, float]] = []
     for row in np.argsort(-squares, kind="stable")[:count].tolist():
-        aside = len(without) + len(found)
+        aside = len(without) + len(deviant)
         dof, explained = space.dof - 2 * aside, float(squares[row])
         variance = 1.0 if optimum.scale_known else (total - explained) / max(dof - 2, 1)
         if dof < _LEAST_DOF or not variance > 0.0:
             break
         p = min(1.0, (n - aside) * space.tail_of(explained, 2, total, dof))
-        found.append((row, float(np.sqrt(explained / variance)), p))
+        deviant.append((row, float(np.sqrt(explained / variance)), p))
         total -= explained
-    return found
+    return deviant
 
 
 def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
     """Return by how much the sum of squares falls without each point: r' (I - H)^-1 r."""
     pairs = r.reshape(-1, 2)
     Q = lever.reshape(len(pairs), 2, -1)
-    one, other = Q[:, 0], Q[:, 1]
-    xx, xy, yy = (1.0 - (one * one).sum(1), -(one * other).sum(1), 1.0 - (other * other).sum(1))
+    first, second = Q[:, 0], Q[:, 1]
+    xx, xy, yy = (
+        1.0 - (first * first).sum(1),
+        -(first * second).sum(1),
+        1.0 - (second * second).sum(1),
+    )
     determinant = xx * yy - xy**2
     x, y = pairs.T
     form = yy * x**2 - 2.0 * xy * x * y + xx * y**2
@@ -206,7 +213,7 @@ def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum],
     """
     fitted = optimum.problem.predict(optimum.theta)
     middle = float(np.median(_misfit(optimum.problem, fitted)))
-    found = []
+    promising = []
     for turn in TURNS:
         try:
             problem = optimum.problem.like(data=turn(optimum.problem.data))
@@ -216,10 +223,10 @@ def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum],
         except DahlIdentError:
             continue
         if first * _PROMISING < middle:
-            found.append((first, turn, problem))
-    if not found:
+            promising.append((first, turn, problem))
+    if not promising:
         return ""
-    _, turn, problem = min(found, key=lambda each: each[0])
+    _, turn, problem = min(promising, key=lambda each: each[0])
     turned = tested(solve(problem, loss=optimum.loss))
     if turned.objections or not turned.rms_misfit * EXPLAINS < before:
         return ""
@@ -235,10 +242,10 @@ def set_aside(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
     kept = np.ones(data.n, dtype=np.bool_)
     kept[list(rows)] = False
     try:
-        other = solve(optimum.problem.like(data=data.select(rows=kept)), loss=optimum.loss)
+        refit = solve(optimum.problem.like(data=data.select(rows=kept)), loss=optimum.loss)
     except DahlIdentError:
         return None
-    return None if other.status is Status.NOT_CONVERGED else other
+    return None if refit.status is Status.NOT_CONVERGED else refit
 
 
 def least_misfit_without(optimum: Optimum, rows: Sequence[int]) -> float:

@@ -79,7 +79,8 @@ class MixedModel:
     def elsewhere(self, y: FloatArray, J: FloatArray, left_out: Collection[int] = ()) -> MixedModel:
         """Return the sources with residuals and derivatives at other parameters."""
         kept = [k for k in range(len(self.starts)) if k not in left_out]
-        Z, most = [self.U[:, self.columns(k)] for k in kept], self.most[self.noises :][kept]
+        Z = [self.U[:, self.columns(k)] for k in kept]
+        most = self.most[self.noises :][kept]
         return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
 
     def at(self, variances: FloatArray) -> MixedState:
@@ -111,11 +112,11 @@ class MixedModel:
             return state
         F, sure = state.information, np.flatnonzero(state.variances > 0.0)
         shared = np.linalg.lstsq(F[np.ix_(sure, sure)], F[np.ix_(sure, doubtful)], rcond=1e-12)[0]
-        own = np.diagonal(F)[doubtful] - np.sum(F[np.ix_(sure, doubtful)] * shared, axis=0)
+        unshared = np.diagonal(F)[doubtful] - np.sum(F[np.ix_(sure, doubtful)] * shared, axis=0)
         price = np.zeros(self.count)
         q = state.degrees[doubtful - G]  # a score is distributed nearly as chi-square of q
         beyond = (special.chdtri(q, chance[doubtful - G]) - q) / np.sqrt(2.0 * q)
-        price[doubtful] = beyond * np.sqrt(np.maximum(own, 0.0))
+        price[doubtful] = beyond * np.sqrt(np.maximum(unshared, 0.0))
         if (state.gradient[doubtful] <= price[doubtful]).all():
             return state  # the highest, with or without them
         free = self.most.copy()
@@ -183,11 +184,11 @@ class MixedState:
     @cached_property
     def _by_noise(self) -> list[tuple[FloatArray, FloatArray]]:
         """For each noise, K A and the diagonal of [U y]' P P [U y] over its rows."""
-        found = []
+        products = []
         for A in self.model.grams[: self.model.noises]:
             AE = A @ self._left
-            found.append((self.K @ A[:-1, :-1], np.sum(self._left * AE, axis=0)))
-        return found
+            products.append((self.K @ A[:-1, :-1], np.sum(self._left * AE, axis=0)))
+        return products
 
     @cached_property
     def gradient(self) -> FloatArray:
@@ -204,38 +205,41 @@ class MixedState:
     def information(self) -> FloatArray:
         """Expected information on the variances."""
         model, w, P = self.model, self.weights, self.model.parameters
-        G, found = model.noises, np.zeros((model.count, model.count))
-        found[G:, G:] = self._sums(self._sums(self._Q[P:-1, P:-1] ** 2).T)
+        G = model.noises
+        sums = np.zeros((model.count, model.count))
+        sums[G:, G:] = self._sums(self._sums(self._Q[P:-1, P:-1] ** 2).T)
         for g, (KA, square) in enumerate(self._by_noise):
-            found[g, G:] = found[G:, g] = w[g] ** 2 * self._sums(square[P:-1])
-            for h, (other, _) in enumerate(self._by_noise):
-                found[g, h] = (w[g] * w[h]) ** 2 * float(np.sum(KA * other.T))
-            found[g, g] += w[g] ** 2 * model.counts[g] - 2.0 * w[g] ** 3 * float(np.trace(KA))
-        return 0.5 * found
+            sums[g, G:] = sums[G:, g] = w[g] ** 2 * self._sums(square[P:-1])
+            for h, (KA_h, _) in enumerate(self._by_noise):
+                sums[g, h] = (w[g] * w[h]) ** 2 * float(np.sum(KA * KA_h.T))
+            sums[g, g] += w[g] ** 2 * model.counts[g] - 2.0 * w[g] ** 3 * float(np.trace(KA))
+        return 0.5 * sums
 
     def chance_of(self, k: int, *, known: bool) -> float:
         """Return how often noise alone makes a source as likely as it is here, where it has none.
 
         By the ratio of restricted likelihoods, which has no distribution of a simple form for few
         rows: it is drawn. Rows of a known variance, such as priors, do not show an unknown scale:
-        what the parameters leave of them is no degree of freedom. Source: Crainiceanu and Ruppert,
-        J. Royal Statistical Society B 66 (2004) 165.
+        what the parameters leave of them does not count as degrees of freedom. Source: Crainiceanu
+        and Ruppert, J. Royal Statistical Society B 66 (2004) 165.
         """
-        own, model = self.model.columns(k), self.model
+        columns = self.model.columns(k)
+        model = self.model
         sure = np.flatnonzero(model.group >= model.noises)
         left_of_sure = float(
             np.sum(np.diagonal(self.block(sure)) / self.weights[model.group[sure]])
         )
         rank = len(model.y) - model.parameters - (0.0 if known else left_of_sure)
-        values, vectors = np.linalg.eigh(self._Q[own, own])
+        values, vectors = np.linalg.eigh(self._Q[columns, columns])
         kept = np.flatnonzero(values > _ALIKE * values[-1])[-max(int(rank), 1) :]
         values = values[kept]
-        seen = (vectors[:, kept].T @ self._Q[-1, own]) ** 2 / values
-        rest = max(float(self._Q[-1, -1] - seen.sum()), 0.0)
+        seen = (vectors[:, kept].T @ self._Q[-1, columns]) ** 2 / values
+        unexplained = max(float(self._Q[-1, -1] - seen.sum()), 0.0)
         rng = np.random.default_rng(0)
         drawn = rng.chisquare(1.0, (_DRAWS, len(kept)))
         others = rng.chisquare(max(rank - len(kept), TINY), _DRAWS)
-        squares, left = np.vstack([seen, drawn]), np.append(rest, others)
+        squares = np.vstack([seen, drawn])
+        left = np.append(unexplained, others)
         best = np.zeros(1 + _DRAWS)
         for ratio in np.geomspace(*_RATIOS) / values[-1]:
             growth = 1.0 + ratio * values
@@ -291,7 +295,7 @@ class MixedState:
         6.4.10). For a source of one column it is at most sqrt(2) times as large (chi-square with
         one degree of freedom). It is also at most half the bound of the variance (Popoviciu).
         """
-        found = np.zeros_like(self.information)
+        covariance = np.zeros_like(self.information)
         every = np.sqrt(np.maximum(np.diagonal(self.information), 0.0))
         kept = np.flatnonzero((self.variances > 0.0) & (every > _UNSEEN))
         part, size = np.ix_(kept, kept), every[kept]
@@ -299,11 +303,11 @@ class MixedState:
         inverse = np.linalg.pinv(self.information[part] / units, hermitian=True) / units
         std = np.sqrt(np.maximum(np.diagonal(inverse), TINY))
         most, G = 0.5 * self.model.most, self.model.noises
-        own = self.variances[G:] * np.sqrt(2.0 / np.minimum(self.degrees, 2.0))
-        most[G:] = np.minimum(most[G:], own)
+        std_alone = self.variances[G:] * np.sqrt(2.0 / np.minimum(self.degrees, 2.0))
+        most[G:] = np.minimum(most[G:], std_alone)
         least = np.minimum(1.0, most[kept] / std)
-        found[part] = inverse * np.outer(least, least)
-        return found
+        covariance[part] = inverse * np.outer(least, least)
+        return covariance
 
     @cached_property
     def predicted(self) -> FloatArray:
@@ -353,7 +357,7 @@ class MixedState:
 
 
 def shares(state: MixedState, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return what each variance adds to the covariance of lever . y at 1, and known noise as it is.
+    """Return the covariance of lever . y from each source at unit variance, and from known noise.
 
     For a lever (P, m): (count, P, P), and (groups, P, P).
     """

@@ -165,8 +165,8 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
         if value < 0.0 and np.isfinite(value):
             unit = shown_unit(parameter.unit, problem.motion)
             within = " (zero is within two standard errors)" if -value < 2.0 * error else ""
-            given = parameter.name not in optimum.names
-            size = f"as given: {value:g} {unit}" if given else with_unit(value, error or None, unit)
+            known = parameter.name not in optimum.names
+            size = f"as given: {value:g} {unit}" if known else with_unit(value, error or None, unit)
             yield f"{parameter.name} is negative, {size}{within}"
 
 
@@ -183,8 +183,8 @@ def beyond_friction_limit(
     bound, u = 0.0, 0.0
     for element in problem.model.elements:
         if not element.is_linear:
-            own = [np.asarray(values[p.name]) for p in element.parameters]
-            bound += float(element.force_bounds(own)[1])
+            law_values = [np.asarray(values[p.name]) for p in element.parameters]
+            bound += float(element.force_bounds(law_values)[1])
             forces = (p for p in element.parameters if p.dimension == (1, 0, 0))
             u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
     if not 0.0 < bound < np.inf:
@@ -192,7 +192,8 @@ def beyond_friction_limit(
     limit = 0.25 * np.pi * bound
     unit, view = shown_unit("N", problem.data.motion), problem.stiffness_data
     names = partial(row_names, problem.data)
-    friction, size = friction_stiffness(optimum), view.amplitude
+    friction = friction_stiffness(optimum)
+    size = view.amplitude
     seen = view.weights > 0.0
     force = np.where((view.harmonic == 1) & seen, np.abs(friction) * size, np.nan)
     noise = np.sqrt(2.0) * optimum.scale / np.where(seen, view.weights, np.nan) * size
@@ -265,7 +266,8 @@ def _estimated_singles(fit: Assessment) -> Iterator[tuple[Element, Parameter, di
     for element in fit.problem.model.elements:
         if is_single(element) and element.parameters[0].free:
             (parameter,) = element.parameters
-            name, unit = parameter.name, shown_unit(parameter.unit, fit.problem.motion)
+            name = parameter.name
+            unit = shown_unit(parameter.unit, fit.problem.motion)
             estimate = {"value": values[name], "stderr": stderr[name], "unit": unit}
             yield element, parameter, {"name": name, **estimate}
 
@@ -299,13 +301,13 @@ def _sizes(optimum: Optimum) -> Iterator[str]:
     for element in optimum.problem.model.elements:
         if not element.has_memory:
             continue
-        own = [float(values[p.name]) for p in element.parameters]
+        law_values = [float(values[p.name]) for p in element.parameters]
         sizes = [
             (p.name, p.unit, _DIMENSIONS[p.dimension], value)
-            for p, value in zip(element.parameters, own, strict=True)
+            for p, value in zip(element.parameters, law_values, strict=True)
             if p.free and p.dimension in _DIMENSIONS
         ]
-        low, high = element.knee([np.asarray(v) for v in own])
+        low, high = element.knee([np.asarray(v) for v in law_values])
         if sizes and low == high:
             sizes.append(("x_c", "m", "x_c", float(low)))
         for name, unit, kind, value in sizes:

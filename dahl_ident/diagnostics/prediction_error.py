@@ -3,13 +3,13 @@ r"""Error of a prediction of a measurement: parameters, model error, scatter, no
 At an operating point where the model's relative slopes with respect to the parameters are j, ln
 gain and phase of the device are -j delta + sum_k C_k u_k in addition to the model's, delta and u_k
 those of :mod:`dahl_ident.diagnostics.mixed_model` and C_k what a source does at that point. Their
-best linear prediction is how far the device is expected to depart from the model there, and with
-x = [-j, C_1, ...] its error has the covariance x K x'. Another test has a scatter and a noise of
-its own. Source: universal kriging, see Rasmussen and Williams, *Gaussian Processes*, 2006, section
-2.7.
+best linear prediction is how far the device is expected to depart from the model there, and with x
+= [-j, C_1, ...] its error has the covariance x K x'. Another test adds its scatter and its noise.
+Source: universal kriging, see Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
 
-The model error also follows earlier data into later ones: C u, independent u of unit variance, are
-further parameters of measurements to come, and K^-1 is what earlier data say of all of them.
+Earlier data also determine the model error of later ones: for measurements to come, the u of C u,
+independent and of unit variance, are further parameters, and K^-1 is the information of the earlier
+data on all of them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from dahl_ident.diagnostics.error_sources import (
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.problem import TableProblem
 
-_LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are beyond all use
+_LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are too large to be of use
 _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
 
 
@@ -57,19 +57,20 @@ def prediction_error(
     """Return the error of a predicted fundamental."""
     state, names = errors.state, errors.names
     model, basis = state.model, errors.estimate.basis
-    where, own = places(amplitude, omega), parts(slopes)
+    where = places(amplitude, omega)
+    by_theta = parts(slopes)
     X = np.zeros((len(slopes), 2, model.U.shape[1]))
-    X[..., : model.parameters] = -own if basis is None else -own @ basis.matrix
+    X[..., : model.parameters] = -by_theta if basis is None else -by_theta @ basis.matrix
     for k, source in enumerate(errors.sources):
         made = source.changes(names, slopes, where, stiffness)
         if made is not None:
             X[..., model.columns(k)] = made
     covariance, by_variance = state.prediction_variance(X)
     if TESTS in errors.contributions:
-        covariance = covariance + own @ errors.contributions[TESTS] @ own.swapaxes(1, 2)
+        covariance = covariance + by_theta @ errors.contributions[TESTS] @ by_theta.swapaxes(1, 2)
     if of_a_test:
         for k, source in enumerate(errors.sources):
-            if source.own:
+            if source.per_test:
                 drawn = np.broadcast_to(source.drawn(names, slopes), covariance.shape)
                 covariance = covariance + errors.variances[k] * drawn
                 by_variance[model.noises + k] += _diagonal(drawn)
@@ -89,11 +90,11 @@ def prediction_error(
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
     if errors.by_runs is not None:  # a new run scatters about the mean of the others
-        mean = _diagonal(own @ errors.by_runs.covariance @ own.swapaxes(1, 2))
+        mean = _diagonal(by_theta @ errors.by_runs.covariance @ by_theta.swapaxes(1, 2))
         runs = errors.by_runs.runs
         dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
     if basis is not None:
-        covariance[~basis.holds(own).all(axis=1)] = np.inf
+        covariance[~basis.holds(by_theta).all(axis=1)] = np.inf
     return PredictionError(X @ state.predicted, covariance, np.maximum(dof, _LEAST_DOF))
 
 
@@ -129,7 +130,7 @@ def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) ->
 
 
 class Departures(NamedTuple):
-    """Model error at places to come, and what earlier data say of it."""
+    """Model error at future operating points, and the information of earlier data on it."""
 
     columns: FloatArray  # (K, 2, W): changes of ln gain and phase at each place, at unit variance
     # (Q + W, Q + W): Of theta and of the departures: earlier data, their priors, and the unit

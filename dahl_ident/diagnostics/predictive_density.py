@@ -2,10 +2,9 @@ r"""How well a model predicts tests that it was not fitted to: the log density o
 
 Deviations count relative to the fundamental of the same test. Their errors are the stated
 covariance and beyond it a variance each for fundamentals and for harmonics, estimated from what
-this model leaves; so harmonics whose covariance is tiny cannot rule, and a model that misses pays
-for its misses. Each run has an unknown gain and phase, with variances estimated
-as well. To first order in the parameters, with X their columns and those of the runs, and D the
-errors' covariance,
+this model leaves; so harmonics with a tiny covariance cannot dominate, and a larger misfit lowers
+the density. Each run has an unknown gain and phase, with variances estimated as well. To first
+order in the parameters, with X their columns and those of the runs, and D the errors' covariance,
 
     P = D^-1 - D^-1 X (X' D^-1 X + S^-1)^-1 X' D^-1,
 
@@ -30,7 +29,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.problem import RecordProblem
 
 _EXACT = 1e-5  # relative errors that count as none
-_ROUNDING = 1e-12  # variance of residuals that are none, in units of what is stated or left
+_ROUNDING = 1e-12  # variance of residuals that are rounding errors, over that stated or left
 _RANK = 1e-7  # singular value of the derivatives, over the largest, that counts as none
 _LEAST_LEFT = 1e-9  # of a row's weight, that the others do not determine
 _LEAST_SHARED = 1e-6  # of a direction of the parameters outside a block, the same
@@ -58,7 +57,7 @@ class PredictiveDensity:
     def gain_over(self, other: PredictiveDensity) -> tuple[float, float]:
         """Return how much higher the density is than another's, and its standard error.
 
-        The larger of what tests and what runs scatter.
+        The error is the larger of those from the scatter of tests and of runs.
         """
         each = self.tests - other.tests
         sums = np.bincount(self.run, each)
@@ -96,16 +95,17 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     )
     scatter: list[FloatArray] = []
     if run.max() > 0:
-        relative, own = predicted / size, run == np.arange(run.max() + 1)[:, None]
+        relative = predicted / size
+        members = run == np.arange(run.max() + 1)[:, None]
         turns = (relative, 1j * data.harmonic * relative)
-        scatter = [np.array([_parts(turn) for turn in own * one]).T for one in turns]
+        scatter = [np.array([_parts(turn) for turn in members * one]).T for one in turns]
     stated, group = _stated(optimum, size), np.repeat(~fundamental, 2).astype(np.intp)
     real = np.repeat(data.harmonic == 0, 2) & (np.arange(y.size) % 2 == 1)
     keep = np.flatnonzero(~real)
     _, group = np.unique(group[keep], return_inverse=True)
     groups, y, stated = int(group.max()) + 1, y[keep], stated[keep]
-    own = [group == g for g in range(groups)]
-    beyond = np.array([max(float(np.mean(y[g] ** 2 - stated[g])), 0.0) for g in own])
+    of_group = [group == g for g in range(groups)]
+    beyond = np.array([max(float(np.mean(y[g] ** 2 - stated[g])), 0.0) for g in of_group])
     unit = np.sqrt(stated + beyond[group] + _EXACT**2)
     Z = [one[keep] / unit[:, None] for one in scatter]
     model = MixedModel(
@@ -115,7 +115,8 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     state = model.reml(np.ones(len(Z)))
     tests = _densities(state, np.repeat(test, 2)[keep], unit, robust=optimum.loss != "linear")
     first = np.unique(test, return_index=True)[1]
-    square, count = np.abs(missed) ** 2, int(fundamental.sum())
+    square = np.abs(missed) ** 2
+    count = int(fundamental.sum())
     misfit = of_harmonics = np.nan
     if count:
         misfit = float(np.sqrt(square[fundamental].mean()))
@@ -142,10 +143,10 @@ def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:
     first = np.cumsum([0, *(len(e) for e in left)])
     tests = np.empty(len(blocks))
     for number, (record, rows) in enumerate(blocks):
-        own, e = Q[first[record] + rows], y[first[record] + rows]
-        values, vectors = np.linalg.eigh(np.eye(Q.shape[1]) - own.T @ own)
+        Q_block, e = Q[first[record] + rows], y[first[record] + rows]
+        values, vectors = np.linalg.eigh(np.eye(Q.shape[1]) - Q_block.T @ Q_block)
         shared = values > _LEAST_SHARED
-        part = vectors.T[shared] @ (own.T @ e)
+        part = vectors.T[shared] @ (Q_block.T @ e)
         squares = float(e @ e + np.sum(part**2 / values[shared])) / variance
         n = e.size - np.count_nonzero(~shared)
         volume = np.log(values[shared]).sum() - n * np.log(2.0 * np.pi * variance)
@@ -180,14 +181,14 @@ def _stated(optimum: Optimum, size: FloatArray) -> FloatArray:
 def _densities(
     state: MixedState, test: NDArray[np.intp], unit: FloatArray, *, robust: bool
 ) -> FloatArray:
-    """Return the log density of each test by what all others say."""
-    found = np.empty(int(test.max()) + 1)
-    for number in range(len(found)):
+    """Return the log density of each test, given all others."""
+    densities = np.empty(int(test.max()) + 1)
+    for number in range(len(densities)):
         rows = np.flatnonzero(test == number)
         values, vectors = np.linalg.eigh(state.block(rows))
         values = np.maximum(values, _LEAST_LEFT * state.weights[state.model.group[rows]].max())
         squares = float(np.sum((vectors.T @ state.weighted[rows]) ** 2 / values))
         volume = float(np.log(values).sum() - len(rows) * np.log(2.0 * np.pi))
         density = _log_density(squares, volume, len(rows), robust=robust)
-        found[number] = density - float(np.log(unit[rows]).sum())
-    return found
+        densities[number] = density - float(np.log(unit[rows]).sum())
+    return densities

@@ -112,7 +112,7 @@ class Bracket:
         return self.end
 
     def _move(self, newton: FloatArray, below: BoolArray) -> None:
-        """Choose the next positions: Newton's, kept between what is known and what is bearable."""
+        """Choose the next positions: Newton's, kept within the bracket and the longest step."""
         a = self.active
         position, inner, outer = self.position[a], self._inner[a], self._outer[a]
         bracketed = np.isfinite(outer)
@@ -248,7 +248,7 @@ class Profiler:
         return [] if self._problem.response is None else microslip_charts(self._problem)
 
     def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
-        """Return the change of theta along its tangent, in logarithms of bearable length."""
+        """Return the change of theta along its tangent, limited in its logarithms."""
         change = moved[:, None] * tangent
         short = np.clip(change, -_LONGEST, _LONGEST)
         return np.where(self._logarithmic & (change != moved[:, None]), short, change)
@@ -375,7 +375,7 @@ class Profiler:
         return np.array([below | flat, (values == np.inf) | flat])
 
     def _jump(self, index: IntArray, sign: FloatArray) -> FloatArray:
-        """Return the first distance where a spring lies at minus infinity: to where it is seen."""
+        """Return the distance to where a spring at minus infinity begins to have an effect."""
         jump, theta = np.full(len(index), np.nan), self._optimum.theta
         for chart in self._microslip_charts:
             assert chart.tied is not None
@@ -431,7 +431,7 @@ class Profiler:
 
 
 class _Distances(NamedTuple):
-    """Range of ln x_c and ln sigma outside of which friction is its own limit.
+    """Range of ln x_c and ln sigma outside of which friction is at a limit.
 
     Stiffer than `stiffest` with an x_c beyond the `smallest` amplitude, it is all but cancelled
     by a spring.
@@ -446,7 +446,7 @@ class _Distances(NamedTuple):
 
 @dataclass(frozen=True)
 class _ConstrainedOptima:
-    """Constrained optima: where, deviance, half its slope by the held coordinate, tangent."""
+    """Constrained optima: theta, deviance, half its slope along the held coordinate, tangent."""
 
     theta: FloatArray
     deviance: FloatArray

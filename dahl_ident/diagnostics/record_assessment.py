@@ -86,11 +86,13 @@ class RecordAssessment(Assessment):
     @property
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
         """Estimates and combined standard uncertainties by name."""
-        names, u = self.optimum.names, np.sqrt(np.diagonal(self.covar)).tolist()
+        names = self.optimum.names
+        u = np.sqrt(np.diagonal(self.covar)).tolist()
         values = dict(zip(names, self.optimum.values.tolist(), strict=True))
         stderr = dict(zip(names, u, strict=True))
         for one in self.errors.assumed:
-            values[one.name], stderr[one.name] = one.value, one.value * one.std
+            values[one.name] = one.value
+            stderr[one.name] = one.value * one.std
         return values, stderr
 
     @property
@@ -168,7 +170,9 @@ class RecordAssessment(Assessment):
 
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
-        array, values, assumed = checked_levels(levels), self.optimum.values, self.errors.assumed
+        array = checked_levels(levels)
+        values = self.optimum.values
+        assumed = self.errors.assumed
         dof = [self.errors.dof_for(place) for place in range(values.size)]
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
@@ -299,7 +303,7 @@ class RecordAssessment(Assessment):
     def started(
         self, record: Record, values: FloatArray, initial: str
     ) -> tuple[RecordProblem, FloatArray]:
-        """Return the problem of another record, and all its values; the model's are given."""
+        """Return the problem of another record, with the model's `values` completed."""
         problem = self.problem.of([record])
         if initial == "fitted":
             return problem, hold_model(problem, values)
@@ -325,7 +329,8 @@ class RecordAssessment(Assessment):
 
     def hold_out(self, parts: int | None) -> HoldOut:
         """Return how well parts of the records are predicted by fits to the others."""
-        problem, several = self.problem, len(self.problem.records) > 1
+        problem = self.problem
+        several = len(self.problem.records) > 1
         if parts is None:
             parts = 1 if several else 4
         if whole_number(parts, "parts", 1) == 1 and not several:
@@ -338,7 +343,7 @@ class RecordAssessment(Assessment):
         start = dict(zip(problem.names[: problem.n_reported], self.optimum.values, strict=False))
         left_out = []
         for k, (number, piece) in enumerate(pieces):
-            others = problem.like(records=[other for i, (_, other) in enumerate(pieces) if i != k])
+            others = problem.like(records=[each for i, (_, each) in enumerate(pieces) if i != k])
             optimum = solve(others, loss=self.optimum.loss, start=start)
             fit = RecordAssessment(optimum)
             band = fit.predict_record(piece, "fitted")

@@ -1,7 +1,7 @@
 """The checks of a fit to records: each yields findings, of which the worst is the status.
 
-As for tables: which parameters are determined, whether the model describes the records, and what
-the result rests on that the records cannot test.
+As for tables: which parameters are determined, whether the model describes the records, and which
+assumptions the records cannot test.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
 _WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
 _FAIRLY = 0.04  # share of variance left: a fifth of the output, beyond which intervals fail
 _STRUCTURED = 0.5  # correlation of neighbouring residuals
-_FEW = 10.0  # degrees of freedom that know an uncertainty to a fifth
+_FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
 _BECAUSE = {  # by the source of most of the uncertainty
     EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
     RUNS: "the records ask for different values: fit each alone, and look at what differs",
@@ -180,7 +180,7 @@ def undetermined(fit: RecordAssessment) -> Iterator[Finding]:
 def _motion_that_lacks(
     element: Element, paths: Sequence[Stretches], motion: Motion, *, known: bool
 ) -> str:
-    """Return what the displacement lacks to determine a law; nothing where it lacks nothing.
+    """Return what the displacement lacks to determine a law; "" where it suffices.
 
     An estimate that is not `known` to its own size says nothing of where slip begins.
     """

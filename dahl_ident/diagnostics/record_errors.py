@@ -1,4 +1,4 @@
-"""What a fit to records is uncertain of: noise, model error, drive, calibration; its budget."""
+"""Errors of a fit to records: noise, model error, drive, calibration; and their budget."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that noise in the displacement may shift without being counted
 _DRIVE_DRAWS = 4, 16  # of the drive's noise, least and most: the latter know it to a third
 _DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
-_BENT = 6.0  # times the displacement's noise: what a second difference has by chance once in 100
+_BENT = 6.0  # times the displacement's noise: exceeded by a second difference by chance once in 100
 _OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
 _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _NOT_FOUND = ", though it was not given: with another no motion was found"
 RELATIVE_STEP = 1e-5
-"""Of parameters, for slopes of what follows from them."""
+"""Relative step of parameters for the slopes of quantities that follow from them."""
 NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
 MODEL, DISPLACEMENT = "model error", "noise in the displacement"
 PATH = "model error after each reversal"
@@ -173,9 +173,9 @@ def record_errors(
     if problem.output == "force":
         plain, change_of = problem.outputs(values), _change_of(problem, jacobians)
 
-        def count_change(source: str, other: RecordProblem) -> None:
+        def count_change(source: str, alternative: RecordProblem) -> None:
             """Count how far the estimate moves if another problem is the right one."""
-            output = other.outputs(values)
+            output = alternative.outputs(values)
             change = change_of([b - a for a, b in zip(plain, output, strict=True)])
             count(source, np.outer(change, change))
 
@@ -187,10 +187,10 @@ def record_errors(
             more = noise_at_turns(problem, values, white, left, noise)
             count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
             count_change(SAMPLING, problem.altered("latest", motions=_beyond_samples(problem)))
-    other = {
+    of_motion = {
         name: C for name, C in sources.items() if name in (DISPLACEMENT, TURNS, SAMPLING, DELAY)
     }
-    alike = after_reversals(problem, values, white, left, other.values())
+    alike = after_reversals(problem, values, white, left, of_motion.values())
     if alike is not None:
         sources[PATH] = alike[0]
     scale = np.zeros(values.size)
@@ -337,7 +337,7 @@ def _by_displacement(
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
 ) -> FloatArray:
-    """Return the mean square change of the estimate with the displacement's noise.
+    """Return the mean square change of the estimate by the displacement's noise.
 
     As large as that of as much noise again, in addition to the `plain` prediction; or, with a dead
     band, from where in it the true displacement may be.
@@ -448,7 +448,7 @@ def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:
-    """Return what the estimate rests on and the records cannot test."""
+    """Return the assumptions of the estimate that the records cannot test."""
     parts = [str(one) for one in errors.assumed]
     known = {one.name for one in errors.assumed}
     parts += [

@@ -1,8 +1,8 @@
 """Sources of error of a fit to records other than noise: model, scatter between runs, exponents.
 
 What a model misses differs from place to place, and what a device does from run to run. Blocks of
-the records, or whole records, then ask for other parameters; what their scatter exceeds that of
-noise by counts as an error of its own.
+the records, or whole records, then ask for other parameters; the scatter beyond that of noise
+counts as a separate error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dahl_ident.fitting.record_search import STEPS, RecordSearch
 from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
-"""Of all records together, from which the model error is estimated."""
+"""Number of blocks of all records together, from which the model error is estimated."""
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
 _ROUNDING = 1e-9  # of a logarithm
@@ -139,7 +139,7 @@ def held_exponents(
 def _exponent_slopes(
     problem: RecordProblem, exponents: Sequence[Parameter], values: FloatArray
 ) -> list[list[FloatArray]]:
-    """Return the filtered derivatives of each output by the logarithm of each exponent."""
+    """Return the filtered derivatives of each output with respect to ln of each exponent."""
     if not exponents:
         return []
     free = problem.freed([p.name for p in exponents])
@@ -295,7 +295,7 @@ def between_records(
         return None
     whole: list[tuple[FloatArray, FloatArray]] = []
     for run in sorted(set(runs)):
-        members = [i for i, other in enumerate(runs) if other == run]
+        members = [i for i, run_of_record in enumerate(runs) if run_of_record == run]
         J, e = ([parts[i] for i in members] for parts in (jacobians, residuals))
         whole.append((J[0], e[0]) if len(members) == 1 else (np.concatenate(J), np.concatenate(e)))
     return _beyond(whole, known, count, _RUNS_LEVEL)
@@ -392,7 +392,8 @@ def after_reversals(
         larger = (U / np.sqrt(np.maximum(1.0 - b, _ALONE))) @ U.T
         steps.append(root @ (larger @ (root @ (J[rows].T @ e[rows]))))
         shares.append((root @ share @ root).diagonal())
-    between, weights = np.array(steps).T @ np.array(steps), np.array(shares)
+    between = np.array(steps).T @ np.array(steps)
+    weights = np.array(shares)
     by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size)
     dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
     ratio = between.diagonal() / by_chance.diagonal()

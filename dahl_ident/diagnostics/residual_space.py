@@ -59,10 +59,10 @@ class Linearization:
 
     def change(self, changes: ComplexArray) -> FloatArray:
         """Return what changes (k, n) of the measured responses add to residuals, shape (k, m)."""
-        found = np.zeros((len(changes), 2 * changes.shape[1]))
+        added = np.zeros((len(changes), 2 * changes.shape[1]))
         for problem, rows, theta in self.parts:
-            found[:, np.repeat(rows, 2)] = -problem.residual_change(theta, changes[:, rows])
-        return found
+            added[:, np.repeat(rows, 2)] = -problem.residual_change(theta, changes[:, rows])
+        return added
 
 
 def linearization(problem: TableProblem, theta: FloatArray, runs: RunDeviations) -> Linearization:
@@ -189,8 +189,8 @@ class RelativeSpace(_Complement):
         self.residuals = r - self.basis @ (self.basis.T @ r)
 
     def _raw(self, changes: ComplexArray) -> FloatArray:
-        own = changes[:, self._rows]
-        return np.concatenate([own.real, own.imag], axis=-1)
+        of_rows = changes[:, self._rows]
+        return np.concatenate([of_rows.real, of_rows.imag], axis=-1)
 
     @property
     def scale(self) -> float:
@@ -224,15 +224,17 @@ class ResidualSpace(_Complement):
         scale = optimum.scale
         self._scale = scale if np.isfinite(scale) and scale > 0.0 else 1.0
         y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
-        own = np.zeros((m, 0))
+        of_runs = np.zeros((m, 0))
         if runs is not None:
             near = linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
-            own = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
-            self.dof -= orthonormal(np.hstack([J[:m], own])).shape[1]
+            of_runs = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
+            self.dof -= orthonormal(np.hstack([J[:m], of_runs])).shape[1]
             self.dof += orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
-        every = np.vstack([np.hstack([J[:m], own]), np.pad(J[m:], ((0, 0), (0, own.shape[1])))])
+        every = np.vstack(
+            [np.hstack([J[:m], of_runs]), np.pad(J[m:], ((0, 0), (0, of_runs.shape[1])))]
+        )
         every[:m] *= self._column_weight[:, None]
         self.basis = orthonormal(every)[:m]
         r = residual_weight * y[:m] * (not optimum.is_exact)

@@ -18,7 +18,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     if not errors.sources and (as_stated or not problem.scale_known):
         return None
     counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
-    # residuals in units of the noise that each row has of its own, or of an unknown scale
+    # residuals in units of the noise of each single row, or of an unknown scale
     known = problem.scale_known
     unit, size = (1.0, 1.0) if known else (errors.noises[0], estimate.scale)
     root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
@@ -43,7 +43,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     turn = np.linalg.solve(L, np.eye(r)).T @ vectors
     turn = turn.T if inside is None else turn.T @ inside.T
     volume = -float(np.log(np.diagonal(L)).sum())
-    differing = {s.own for s in errors.sources if s.name == RUNS}
+    differing = {s.per_test for s in errors.sources if s.name == RUNS}
     scatters = np.array([name in differing for name in errors.names])
     factors = size * root.reshape(-1, 2, 1) * estimate.factors(problem)
     volume += float(np.log(np.abs(np.linalg.det(factors))).sum())

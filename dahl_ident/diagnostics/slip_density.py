@@ -94,7 +94,7 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
     Notes
     -----
     The bound is exact for sums of Jenkins elements (Masing, Iwan and Maxwell-slip laws) up to a
-    grid of 48 slip displacements a decade. The Dahl and Bouc-Wen laws are no such sums: their
+    grid of 48 slip displacements a decade. The Dahl and Bouc-Wen laws are not such sums: their
     loops soften less than Masing's for the same loss, and exact tables of them leave 5 to 15 %.
 
     Examples
@@ -112,15 +112,17 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
     system = _system(data, linear)
     n = system.slip.size
     _, least = _solved(system, 0.0)
-    found, misfit = next(
+    coefficients, misfit = next(
         (pair for s in _SMOOTHING if (pair := _solved(system, s))[1]
          <= max(_ALLOWED * least, _EXACT)),
         _solved(system, 0.0),
     )  # fmt: skip
     parallel_values = dict.fromkeys(system.names, 0.0)
-    for name, sign, value in zip(system.names, system.signs, found[n + 1 :], strict=True):
+    for name, sign, value in zip(system.names, system.signs, coefficients[n + 1 :], strict=True):
         parallel_values[name] += sign * float(value)
-    return SlipDensity(system.slip, found[:n], float(found[n]), parallel_values, least, misfit)
+    return SlipDensity(
+        system.slip, coefficients[:n], float(coefficients[n]), parallel_values, least, misfit
+    )
 
 
 def least_misfit(data: FrequencyResponse, model: Element) -> float:
@@ -184,6 +186,8 @@ def _solved(system: _SlipSystem, smoothing: float) -> tuple[FloatArray, float]:
     rough[:, :n] = smoothing * np.sqrt(len(right) / n) * bend
     from scipy.optimize import nnls
 
-    found, _ = nnls(np.concatenate([both, rough]), np.append(want, np.zeros(n - 2)), maxiter=10000)
-    misfit = float(np.sqrt(np.mean(np.abs(scaled @ found - right) ** 2)))
-    return found / size, misfit
+    coefficients, _ = nnls(
+        np.concatenate([both, rough]), np.append(want, np.zeros(n - 2)), maxiter=10000
+    )
+    misfit = float(np.sqrt(np.mean(np.abs(scaled @ coefficients - right) ** 2)))
+    return coefficients / size, misfit

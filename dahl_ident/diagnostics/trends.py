@@ -38,7 +38,7 @@ _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
 _FEWEST_ROWS = 3  # in a band
 LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
-_FEWEST_IN_A_GROUP = 3  # rows on average: fewer groups than that are not levels of their own
+_FEWEST_IN_A_GROUP = 3  # rows on average: smaller groups are not separate levels
 _SAME = 0.01  # of the covariate's logarithm: values closer than this are one
 LEAST_RANGE = np.log(1.05)  # of a covariate that varies
 _LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests find little
@@ -76,11 +76,13 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     if not rows.size:
         return None
     kept, band = _bands(np.log(view.amplitude[rows]))
-    rows, count = rows[kept], int(band.max(initial=-1)) + 1
-    own = (band[:, None] == np.arange(count)).astype(np.float64)
-    x, weights = np.log(view.amplitude[rows]), view.weights[rows]
-    centre = x @ own / own.sum(axis=0)
-    design = np.column_stack([own, own * (x[:, None] - centre)])
+    rows = rows[kept]
+    count = int(band.max(initial=-1)) + 1
+    in_band = (band[:, None] == np.arange(count)).astype(np.float64)
+    x = np.log(view.amplitude[rows])
+    weights = view.weights[rows]
+    centre = x @ in_band / in_band.sum(axis=0)
+    design = np.column_stack([in_band, in_band * (x[:, None] - centre)])
     linear = (e.parameter(n) for e in elements if e.is_linear for n in e.linear_parameters)
     if any(p.free and p.is_mass for p in linear):
         square = view.omega[rows] ** 2
@@ -94,7 +96,8 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     left = weights * (stiffness - design @ values)
     covariance = inverse @ inverse.T * float(left @ left / dof)  # as they scatter
     i, j = np.triu_indices(count, 1)
-    rise, variance = values[j] - values[i], np.diagonal(covariance)
+    rise = values[j] - values[i]
+    variance = np.diagonal(covariance)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(variance[i] + variance[j] - 2.0 * covariance[i, j])
         t = np.nan_to_num(rise / error)
@@ -102,7 +105,8 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     low, high = i[best], j[best]
     if t[best] <= 0.0 or values[low] <= 0.0:
         return None
-    ends, unit = np.exp(centre), shown_unit("m", optimum.problem.data.motion)
+    ends = np.exp(centre)
+    unit = shown_unit("m", optimum.problem.data.motion)
     p = min(1.0, len(t) * float(special.stdtr(dof, -t[best])))
     size, spread = rise[best] / values[low], error[best] / values[low]
     return Stiffening(float(ends[low]), float(ends[high]), unit, float(size), float(spread), p)
@@ -203,7 +207,8 @@ def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
 
     Those in which the amplitude varies: else they are levels, over which there is a trend.
     """
-    data, found = optimum.problem.data, []
+    data = optimum.problem.data
+    differences = []
     amplitude = np.log(optimum.problem.stiffness_data.amplitude)
     columns = {} if "verdict" in data.quality else dict(data.quality)  # the extraction's are not
     if data.level is not None:
@@ -212,24 +217,24 @@ def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
         names, which = np.unique(labels, return_inverse=True)
         if not 1 < len(names) <= data.n // _FEWEST_IN_A_GROUP:
             continue
-        own = which == np.arange(len(names))[:, None]
-        if min(float(np.ptp(amplitude[rows])) for rows in own) < LEAST_RANGE:
+        members = which == np.arange(len(names))[:, None]
+        if min(float(np.ptp(amplitude[rows])) for rows in members) < LEAST_RANGE:
             continue
-        changes = own.astype(np.complex128)
+        changes = members.astype(np.complex128)
         p = space.p_value(changes)
         if not np.isnan(p):
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = np.log(np.abs(data.response / optimum.problem.predict(optimum.theta)))
             ratio[(data.harmonic != 1) | ~np.isfinite(ratio)] = np.nan
-            gain = [float(np.exp(np.nanmedian(ratio[rows]))) for rows in own]
+            gain = [float(np.exp(np.nanmedian(ratio[rows]))) for rows in members]
             low, high = ((str(names[i]), gain[i]) for i in (np.argmin(gain), np.argmax(gain)))
-            found.append(GroupsDiffer(name, low, high, p))
-    return found
+            differences.append(GroupsDiffer(name, low, high, p))
+    return differences
 
 
 def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
     """Return the departures over each covariate that varies enough."""
-    found = []
+    departures = []
     friction, relative = _friction_parts(optimum), RelativeSpace(optimum)
     for name, values, unit in covariates(optimum):
         x = np.log(values)
@@ -248,13 +253,13 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
             sizes = np.abs(np.expm1(relative.fitted(changes)))
         largest = float(np.where(np.isnan(sizes), np.inf, sizes).max())
         ends = float(values.min()), float(values.max())
-        found.append(Trend(name, *ends, unit, stiffness, loss, largest, p))
-    return found
+        departures.append(Trend(name, *ends, unit, stiffness, loss, largest, p))
+    return departures
 
 
 def runs(optimum: Optimum, space: ResidualSpace) -> list[Runs]:
     """Return the number of runs of the residuals' signs over each covariate."""
-    found = []
+    counts = []
     for name, values, _ in covariates(optimum):
         order = np.argsort(values, kind="stable")
         count, mean, variance, signs = 0, 0.0, 0.0, 0
@@ -268,8 +273,8 @@ def runs(optimum: Optimum, space: ResidualSpace) -> list[Runs]:
             signs += n
         if signs >= 2 * _FEWEST_SIGNS and variance > 0.0:
             z = (count - mean + 0.5) / np.sqrt(variance)
-            found.append(Runs(name, count, mean, float(special.ndtr(z))))
-    return found
+            counts.append(Runs(name, count, mean, float(special.ndtr(z))))
+    return counts
 
 
 def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
@@ -298,8 +303,8 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
     view = problem.stiffness_data
     total, stiffness, loss = np.zeros((3, len(view.amplitude)), dtype=np.complex128)
     for element in problem.model.elements:
-        own = [np.asarray(values[p.name]) for p in element.parameters]
-        part = view.of(element, own)
+        law_values = [np.asarray(values[p.name]) for p in element.parameters]
+        part = view.of(element, law_values)
         total += part
         if not element.is_linear or (optimum.status.at_infinity and is_spring(element)):
             stiffness += part.real

@@ -89,8 +89,8 @@ def _patterns(
             path[chosen] += sign * step
             motions = list(problem.motions)
             motions[number] = path, v, a
-            other = problem.altered("latest", motions=tuple(motions))
-            ends.append(other.predict(values, number, derivatives=False).output[chosen[0] :])
+            turned = problem.altered("latest", motions=tuple(motions))
+            ends.append(turned.predict(values, number, derivatives=False).output[chosen[0] :])
         pattern = (ends[0] - ends[1]) / (2.0 * step)
         size = np.abs(pattern)
         last = np.abs(pattern[np.append(chosen[1:] - chosen[0], pattern.size) - 1])
@@ -114,14 +114,15 @@ def _between(pattern: FloatArray, first: IntArray, covariance: FloatArray) -> Fl
     waves = np.array([fft.rfft(w, m) for w in windows])
     lags = np.arange(m)
     lags[lags > m // 2] -= m
-    found = np.zeros((first.size, first.size))
+    covariances = np.zeros((first.size, first.size))
     for apart in range(first.size):
-        one, other = np.arange(first.size - apart), np.arange(apart, first.size)
-        distance = np.abs((first[other] - first[one])[:, None] + lags)
+        earlier = np.arange(first.size - apart)
+        later = np.arange(apart, first.size)
+        distance = np.abs((first[later] - first[earlier])[:, None] + lags)
         near = distance < covariance.size
         if not near.any():
             break
-        crossed = fft.irfft(waves[one].conj() * waves[other], m)
+        crossed = fft.irfft(waves[earlier].conj() * waves[later], m)
         weights = np.where(near, covariance[np.minimum(distance, covariance.size - 1)], 0.0)
-        found[one, other] = found[other, one] = (crossed * weights).sum(axis=1)
-    return found
+        covariances[earlier, later] = covariances[later, earlier] = (crossed * weights).sum(axis=1)
+    return covariances

@@ -228,7 +228,8 @@ def judged(
         name: _verdict(std, intervals[name][-1])
         for name, std in zip(problem.names, spread, strict=True)
     }
-    beyond, blind = dict[str, str](), _unseen(optimum)
+    beyond = dict[str, str]()
+    blind = _unseen(optimum)
     if errors is not None:
         beyond = _lost_beyond_noise(errors, verdicts, natural)
         for name, size in zip(problem.names, natural.tolist(), strict=True):
@@ -277,7 +278,7 @@ def _lost_beyond_noise(
     errors: ErrorModel, verdicts: Mapping[str, Verdict], natural: FloatArray
 ) -> dict[str, str]:
     """Return why parameters that noise alone leaves determined are not, by name."""
-    found = {}
+    reasons = {}
     for name, size in zip(verdicts, natural.tolist(), strict=True):
         i = errors.names.index(name)
         parts = {n: float(C[i, i]) for n, C in errors.contributions.items()}
@@ -286,8 +287,8 @@ def _lost_beyond_noise(
         most = _MOST_BY.get(source, NOT_IDENTIFIED_ABOVE)
         most = most if parts[source] > 0.5 * (u * size) ** 2 else NOT_IDENTIFIED_ABOVE
         if verdicts[name] is not Verdict.NOT_IDENTIFIED and u > most:
-            found[name] = f"because of {source}: {_REMEDY.get(source, _MEASURE)}"
-    return found
+            reasons[name] = f"because of {source}: {_REMEDY.get(source, _MEASURE)}"
+    return reasons
 
 
 def _unseen(optimum: Optimum) -> dict[str, str]:
@@ -297,14 +298,16 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
     with parameters that pulling and pushing exchange. A move that should have cost something, by
     the derivatives, costs nothing.
     """
-    problem, scale, found = optimum.problem, optimum.scale or 1.0, dict[str, str]()
+    problem = optimum.problem
+    scale = optimum.scale or 1.0
+    reasons = dict[str, str]()
     driven = problem.data.controlled == "force"
     if not (problem.data.harmonic[driven] != 1).any():  # harmonics of motions need the motion
         problem = problem.with_steady("describing function")
     theta, error = optimum.theta, np.sqrt(np.diagonal(optimum.covariance))
 
-    def alike(other: FloatArray) -> bool:
-        y, moved = problem.residuals(np.array([theta, other]), scale)
+    def alike(changed: FloatArray) -> bool:
+        y, moved = problem.residuals(np.array([theta, changed]), scale)
         return abs(float(moved @ moved - y @ y)) < _NO_DIFFERENCE
 
     def shown(i: int, value: float) -> str:
@@ -315,7 +318,7 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
         turned = theta.copy()
         turned[i] = -turned[i]
         if not problem.parameters[i].positive and abs(theta[i]) > error[i] and alike(turned):
-            found[problem.names[i]] = (
+            reasons[problem.names[i]] = (
                 f"its size is {shown(i, abs(float(optimum.values[i])))}, its sign is not "
                 "determined: the fundamental is the same for either; measure the mean force or "
                 "even harmonics too"
@@ -328,13 +331,13 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
         for i in np.flatnonzero(np.abs(move) > error).tolist():
             j = int(order[i])
             values = [shown(k, float(optimum.values[k])) for k in (i, j)]
-            found[problem.names[i]] = (
+            reasons[problem.names[i]] = (
                 f"either {' or '.join(values)}, as {problem.names[i]} and {problem.names[j]} are "
                 "exchangeable: these data are the same for either order; measure the mean force "
                 "or even harmonics too"
             )
         break
-    return found
+    return reasons
 
 
 def _exchanges(optimum: Optimum) -> Iterator[NDArray[np.intp]]:
@@ -403,8 +406,8 @@ def _determined(
 
     Noise says which; a combination that other sources of error leave vague is not determined.
 
-    Of `loose` parameters, short of identified, a product needs two: with known ones it says no
-    more than its one unknown member, which has a verdict of its own.
+    A product needs two `loose` parameters, which are not identified: with one, and known ones, it
+    says no more than the verdict on that one.
     """
 
     def stated(c: Candidate) -> Iterator[StatedCombination]:
@@ -419,7 +422,7 @@ def _determined(
     every = candidates(optimum)
     units = {p.name: p.unit for p in optimum.problem.parameters}
     units |= {c.expression: c.unit for c in every}
-    found = [
+    determined = [
         StatedCombination(
             c.expression,
             units.get(c.expression, units.get(c.expression.partition("/")[0], "")),  # f_max/alpha
@@ -442,9 +445,9 @@ def _determined(
             parts = np.diag(candidate.direction)[np.flatnonzero(candidate.direction)]
             if information.std(candidate.direction) > information.std(parts).min():
                 continue  # one of its parts alone is known better
-        found += stated(candidate)
-    seen = None if found else stiffness_seen(optimum)
-    return tuple(found if seen is None or not seen.members <= loose else stated(seen))
+        determined += stated(candidate)
+    seen = None if determined else stiffness_seen(optimum)
+    return tuple(determined if seen is None or not seen.members <= loose else stated(seen))
 
 
 def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> bool:
