@@ -1,4 +1,4 @@
-"""What every search, sampler and judge sees of a problem, of tables and of records alike."""
+"""What every search, sampler and test uses of a problem, for tables and for records."""
 
 from __future__ import annotations
 
@@ -38,30 +38,30 @@ class Problem(ABC):
     """Residuals as functions of search coordinates, and what is known of their noise."""
 
     arguments: ClassVar[tuple[str, ...]]
-    """Names of those of the class, each an attribute as well."""
+    """Names of the class's arguments; each is also an attribute."""
     kind: ClassVar[str]
     """What was measured: "table" or "records"; `called` is the same in a sentence."""
     called: ClassVar[str]
     refused: ClassVar[Mapping[str, str]]
     """Options of estimates that such data do not take, and why."""
     around_optimum: ClassVar[bool] = False
-    """Whether a posterior is that around the least-squares optimum, which has to exist."""
+    """Whether a posterior is centred on the least-squares optimum, which then has to exist."""
     scaled_priors: ClassVar[bool] = False
     """Whether priors are in units of the residuals, and scaled with them."""
     model: Model
     space: Space
     motion: Motion
     n_residuals: int
-    """Of the data; those of priors come on top."""
+    """Number of residuals of the data; those of priors are added."""
     n_numbers: int
-    """Residuals that can differ from zero."""
+    """Number of residuals that can differ from zero."""
     runs: tuple[Any, ...]
-    """The runs, of which one may be named several times."""
+    """The run of each row or record."""
     sensors: Sensors = EXACT
     parts: int = 2
     """Residuals of each row, which count in a robust loss as one."""
     priors: Mapping[str, Prior] = {}
-    """Of sensor parameters that are free."""
+    """Priors of free sensor parameters."""
     ranges: Mapping[str, tuple[float, float]] = {}
     """Mean and standard deviation of the logarithms of assumed parameters."""
     scale_known: bool = False
@@ -92,7 +92,7 @@ class Problem(ABC):
     @property
     @abstractmethod
     def extent(self) -> str:
-        """How much was measured, in words."""
+        """The amount of data, in words."""
 
     @property
     def n_reported(self) -> int:
@@ -184,7 +184,7 @@ class Problem(ABC):
         return self.space.is_bounded
 
     def near(self, theta: FloatArray) -> Problem:
-        """Return a problem that predicts as this one does near theta, where one is faster."""
+        """Return a faster problem that predicts as this one does near theta, if there is one."""
         return self
 
     def in_order(self, theta: ArrayLike) -> FloatArray:
@@ -192,16 +192,16 @@ class Problem(ABC):
         return self.space.checked(theta)
 
     def like(self, **changes: Any) -> Self:
-        """Return this problem with some arguments of its class in place of its own."""
+        """Return this problem with some of its arguments changed."""
         return type(self)(**{name: getattr(self, name) for name in self.arguments} | changes)
 
     def altered(self, *stale: str, **changes: Any) -> Self:
         """Return this problem with other attributes, without the `stale` ones that it computed."""
-        other = copy(self)
+        changed = copy(self)
         for name in stale:
-            other.__dict__.pop(name, None)
-        other.__dict__.update(changes)
-        return other
+            changed.__dict__.pop(name, None)
+        changed.__dict__.update(changes)
+        return changed
 
     @abstractmethod
     def fitted(self, theta: FloatArray) -> Any:
@@ -256,7 +256,7 @@ class Problem(ABC):
         derivatives: bool = True,
         tails: bool = True,
     ) -> FloatArray:
-        """Return the same over the noise's scale, () or (S,), then what priors add."""
+        """Return the same over the noise's scale, () or (S,), followed by the rows of priors."""
         rows = self.data_rows(theta, derivatives=derivatives, tails=tails)
         size = np.asarray(scale)[..., None, None]
         if self.scaled_priors:
@@ -281,7 +281,8 @@ class Problem(ABC):
         rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
         rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
         """
-        rho, m = rho or self.tail, self.n_residuals
+        rho = rho or self.tail
+        m = self.n_residuals
         rows = self.rows(theta, scale, tails=False)
         if chart is not None:
             r, J = rows[..., :1, :], rows[..., 1:, :]

@@ -130,12 +130,13 @@ class ProblemBatch(TableProblem):
         return [checked_table(table) for table in data]
 
     def _rows_of(self, tables: list[FrequencyResponse]) -> Rows:
-        self.tables, self._orbits = tuple(tables), {}
+        self.tables = tuple(tables)
+        self._orbits = {}
         return Rows.stack(tables)
 
     @classmethod
     def replicates(cls, problem: TableProblem, responses: ComplexArray) -> ProblemBatch:
-        """Return `problem` with each of S sets of responses, shape (S, n), in place of its own.
+        """Return `problem` with each of S sets of responses, shape (S, n), as the data.
 
         Everything else, covariance included, stays as it is.
         """

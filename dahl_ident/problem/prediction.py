@@ -13,7 +13,7 @@ derivatives come from the implicit function theorem,
 
 The measured amplitude of such a row serves only to choose among several solutions.
 
-That balance takes the displacement for a sine. Where the model has an equation of motion, and
+That balance assumes a sinusoidal displacement. Where the model has an equation of motion, and
 unless the describing function was asked for, rows whose force was controlled are predicted by the
 exact steady motion instead (:mod:`dahl_ident.problem.steady_rows`).
 """
@@ -45,7 +45,7 @@ _NONE: ComplexArray = np.zeros((), dtype=np.complex128)
 
 
 class Prediction(NamedTuple):
-    """The response R with its derivatives by search coordinate and by ln A (explicit rows)."""
+    """The response R, its derivatives with respect to theta, and to ln A (explicit rows)."""
 
     value: ComplexArray
     changes: list[ComplexArray]
@@ -56,9 +56,9 @@ class Nearby:
     """The prediction near a point: that of the describing function, corrected to the exact one.
 
     The logarithm of the ratio of both is taken as linear in the search coordinates and in the
-    logarithm of the drive. The error is of second order in the distance, and small, because
-    only the correction is linearized. It costs as much as the describing function. Harmonics of
-    the displacement, which that has not, are linear themselves.
+    logarithm of the drive. The error is of second order in the distance, and small, because only
+    the correction is linearized. It costs as much as the describing function. Harmonics of the
+    displacement, which the describing function does not have, are taken as linear.
     """
 
     def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:
@@ -120,7 +120,7 @@ class _Group:
     amplitude: FloatArray
     drive: FloatArray | None
     steady: SteadyRows | None
-    """Of rows that are predicted by the exact steady motion."""
+    """Steady motions of rows that are predicted by these."""
 
     @cached_property
     def orders(self) -> int | NDArray[np.int64]:
@@ -133,7 +133,7 @@ class Predictor:
     """Prediction of a model with its sensors for the operating points of `rows`.
 
     `shooting` solves for the exact steady motion of rows whose force was controlled; without it
-    the describing function does. `orbits` are those where it starts, kept up to date.
+    the describing function does. It starts from `orbits`, which are kept up to date.
     """
 
     def __init__(
@@ -276,12 +276,12 @@ class Predictor:
         derivatives: int,
         amplitude_error: FloatArray | None,
     ) -> Prediction:
-        own, sensed = values[:-3], values[-3:]
+        of_model, sensed = values[:-3], values[-3:]
         if group.steady is not None:
-            linear = group.steady.is_linear(own)
+            linear = group.steady.is_linear(of_model)
             if not linear.all():
                 moving = [
-                    np.where(linear[..., None], np.nan, v) if linear.any() else v for v in own
+                    np.where(linear[..., None], np.nan, v) if linear.any() else v for v in of_model
                 ]
                 exact = self._predict_steady(
                     group, group.steady, [*moving, *sensed], derivatives, amplitude_error
@@ -303,25 +303,25 @@ class Predictor:
         amplitude_error: FloatArray | None,
     ) -> Prediction:
         """Return the response by the describing function; it has no harmonics of the motion."""
-        own, sensed = values[:-3], values[-3:]
-        amplitude, found = self._amplitude(group, own, sensed, amplitude_error)
+        of_model, sensed = values[:-3], values[-3:]
+        amplitude, exists = self._amplitude(group, of_model, sensed, amplitude_error)
         harmonic = 1 if group.forced else group.orders
         factor = group.operator * (group.harmonic == harmonic)
         if not self._neutral:
             sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         if not derivatives:
-            Z = self._model.stiffness(own, amplitude, group.omega, harmonic)
-            return Prediction(factor * _where(found, Z) ** self._exponent, [], _NONE)
+            Z = self._model.stiffness(of_model, amplitude, group.omega, harmonic)
+            return Prediction(factor * _where(exists, Z) ** self._exponent, [], _NONE)
         sine = Sine(amplitude, group.omega, harmonic)
-        Z, by_amplitude, by_parameter = self._model.settled(own, sine, derivatives)
-        Z = _where(found, Z)
+        Z, by_amplitude, by_parameter = self._model.settled(of_model, sine, derivatives)
+        Z = _where(exists, Z)
         by_ln_amplitude = amplitude * by_amplitude
         response = factor * Z if self._exponent == 1 else factor / Z
         slope = factor if self._exponent == 1 else -response / Z
         stretch = 1.0 / (1.0 + (by_ln_amplitude / Z).real) if group.forced else None
         changes = []
-        for (index, _), value, d in zip(self._slots, own, by_parameter, strict=False):
+        for (index, _), value, d in zip(self._slots, of_model, by_parameter, strict=False):
             if index is None or derivatives < 2:
                 continue
             change = d * value if self._space.positive[index] else d
@@ -342,13 +342,13 @@ class Predictor:
         error: FloatArray | None,
     ) -> Prediction:
         """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X_k)^q."""
-        own, sensed = values[:-3], values[-3:]
+        of_model, sensed = values[:-3], values[-3:]
         factor, drive = group.operator, self._true_drive(group, sensed, error)
         if not self._neutral:
             sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         free = [i for i, (index, _) in enumerate(self._slots[:-3]) if index is not None]
-        motion = rows.at(own, drive, free if derivatives > 1 else [])
+        motion = rows.at(of_model, drive, free if derivatives > 1 else [])
         response = factor * (motion.displacement / drive) ** -self._exponent
         if not derivatives:
             return Prediction(response, [], _NONE)
@@ -357,7 +357,7 @@ class Predictor:
         for place, i in enumerate(free if derivatives > 1 else []):
             positive = self._space.positive[self._slots[i][0]]
             change = motion.by_parameter[..., place]
-            changes.append(slope * (change * own[i] if positive else change))
+            changes.append(slope * (change * of_model[i] if positive else change))
         by_level = slope * drive * motion.by_drive + self._exponent * response
         if not self._neutral and derivatives > 1:
             changes += self._sensor_changes(group, response, by_level)
@@ -374,12 +374,12 @@ class Predictor:
     def _sensor_changes(
         self, group: _Group, response: ComplexArray, direct: ComplexArray
     ) -> list[ComplexArray]:
-        """Return dR by the free sensor parameters; `direct` is dR/dln A or dR/dln u_0."""
-        own = self._exponent * response
+        """Return dR/d(free sensor parameters); `direct` is dR/dln A or dR/dln u_0."""
+        by_gain = self._exponent * response
         by_sensor = (
-            own - direct if group.forced else own,
-            -own if group.forced else -own - direct,
-            1j * group.harmonic * group.omega * own,
+            by_gain - direct if group.forced else by_gain,
+            -by_gain if group.forced else -by_gain - direct,
+            1j * group.harmonic * group.omega * by_gain,
         )
         slots = self._slots[-3:]
         return [d for d, (index, _) in zip(by_sensor, slots, strict=True) if index is not None]
@@ -387,22 +387,22 @@ class Predictor:
     def _amplitude(
         self,
         group: _Group,
-        own: Sequence[FloatArray],
+        of_model: Sequence[FloatArray],
         sensed: Sequence[FloatArray],
         error: FloatArray | None,
     ) -> tuple[FloatArray, NDArray[np.bool_] | None]:
-        """Return the true amplitude of each row, and where there is one unless everywhere."""
+        """Return the true amplitude of each row, and where it exists; None if everywhere."""
         amplitude = group.amplitude if self._neutral else group.amplitude / sensed[1]
         if not group.forced:
             return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
         drive = self._true_drive(group, sensed, error)
-        amplitude = steady_state.solve(self._model, own, group.omega, drive, amplitude)
-        found = np.isfinite(amplitude)
-        return (amplitude, None) if found.all() else (np.where(found, amplitude, 1.0), found)
+        amplitude = steady_state.solve(self._model, of_model, group.omega, drive, amplitude)
+        exists = np.isfinite(amplitude)
+        return (amplitude, None) if exists.all() else (np.where(exists, amplitude, 1.0), exists)
 
 
-def _where(found: NDArray[np.bool_] | None, Z: ComplexArray) -> ComplexArray:
-    return Z if found is None else np.where(found, Z, np.nan)
+def _where(exists: NDArray[np.bool_] | None, Z: ComplexArray) -> ComplexArray:
+    return Z if exists is None else np.where(exists, Z, np.nan)
 
 
 def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, FloatArray]:
@@ -413,7 +413,7 @@ def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, Flo
 
 
 def _check(rows: Rows, model: Model) -> None:
-    """Check that every row can be predicted, and that some say something about the model."""
+    """Check that every row can be predicted, and that some depend on the model."""
     if rows.amplitude is None:
         _require(~rows.forced, "displacement", "amplitude")
     if rows.drive is None:
@@ -442,7 +442,7 @@ def _check(rows: Rows, model: Model) -> None:
 
 
 def _fundamental(rows: Rows, response: ComplexArray) -> ComplexArray:
-    """Return the responses, with those of the fundamental in rows of the displacement's others."""
+    """Return the responses; rows of other harmonics of the displacement have the fundamental's."""
     if not rows.of_displacement.any():
         return response
     return np.where(rows.of_displacement, rows.of_fundamental(response), response)
@@ -457,10 +457,11 @@ def _parts(rows: Rows) -> Iterator[tuple[slice | NDArray[np.intp], bool]]:
 
 def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:
     if rows.any():
-        other = {"displacement": "force", "force": "displacement"}[controlled]
+        uncontrolled = {"displacement": "force", "force": "displacement"}[controlled]
         raise DataError(
             f"row {int(np.argmax(rows))} is {controlled}-controlled, but the data have no {name}; "
-            f"give it, or say {argument('controlled', other)} if the laboratory held the {other}"
+            f"give it, or say {argument('controlled', uncontrolled)} if the laboratory held the "
+            f"{uncontrolled}"
         )
 
 

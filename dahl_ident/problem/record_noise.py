@@ -115,11 +115,11 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     n = len(record)
     drive = record.force_samples
     line = np.linspace(y[0], y[-1], n)
-    rest = y - line
-    spectrum = np.fft.rfft(np.concatenate([rest, -rest[-2:0:-1]]))
+    detrended = y - line
+    spectrum = np.fft.rfft(np.concatenate([detrended, -detrended[-2:0:-1]]))
     m = 2 * n - 2
     s = 2j * np.pi * np.fft.rfftfreq(m, 1.0 / record.sample_rate)
-    power = _power(drive if _power(drive).any() else y)  # in a free decay what moves is the band
+    power = _power(drive if _power(drive).any() else y)  # in a free decay the motion gives the band
     bins = np.flatnonzero(power >= _BAND * power.max())
     highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
     lowest = 0.5 * bins[0] / power.size
@@ -152,12 +152,12 @@ def _power(wave: FloatArray) -> FloatArray:
 
 
 _ORDER = 4  # of the differences, which leave little of any motion
-_BLOCKS = 50  # some of which see little of the motion
+_BLOCKS = 50  # in some of them there is little motion
 _QUIET = 0.25  # quantile of the blocks
 _MEDIAN = 0.6745  # of a normal variable's absolute value, in standard deviations
 _HALF_BAND = 4.0  # standard deviations to either side
 LEADS = (1.0, 2.0, 3.0)
-"""Least, middle and largest place of the true displacement ahead of the band's middle."""
+"""Least, middle and largest lead of the true displacement over the band's middle."""
 
 
 def noise_of(displacement: FloatArray) -> float:

@@ -99,7 +99,7 @@ def motion_of(
     return Predicted(motion.output + of_record[starts], by, motion.by_delay)
 
 
-_SMALL = 0.1  # of the motion's inverse size: rates below are searched as numbers
+_SMALL = 0.1  # of the inverse size of the motion: smaller rates are searched as numbers
 
 
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:
@@ -129,15 +129,15 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
             unknowns.append(Parameter(f"drift{tail}", "N/s", "slope of the measured force"))
         else:
             unknowns.append(Parameter(f"offset{tail}", unit, "constant in the measured motion"))
-    own = Counter(p.name for p in unknowns)
-    name, count = own.most_common(1)[0]
+    occurrences = Counter(p.name for p in unknowns)
+    name, count = occurrences.most_common(1)[0]
     if count > 1:
         raise ModelError(
             f"a fit of records calls an unknown of several elements {name}; give each a name, "
             "such as Dahl(name='pivot')"
         )
     for p in model.parameters:
-        if p.name in own:
+        if p.name in occurrences:
             raise ModelError(
                 f"{model!r} has a parameter called {p.name}, as a fit of records calls one of its "
                 "own; expected another name: change it in the law's declaration"
@@ -146,7 +146,7 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
 
 
 def bends(free: Sequence[Parameter], count: int, records: Sequence[Record]) -> FloatArray:
-    """Return below which size a parameter is searched as a number, and not as a logarithm.
+    """Return the size below which a parameter is searched as a number, above as a logarithm.
 
     Rates such as those of Bouc-Wen may have either sign, but beyond a tenth of the motion's
     inverse size they go with a stiffness in proportion. 0 for those that are searched in one

@@ -1,9 +1,9 @@
 """Records of any motion: residuals sample by sample, with exact derivatives.
 
 Two kinds. Where the force is the output, the measured displacement goes into the elements, and
-their forces are added. Where the motion is the output, the measured force or base motion drives
-the plant's equation of motion. Every record adds unknowns of its own: the state at its first
-sample, an offset and, for forces, a drift.
+their forces are added. Where the motion is the output, the measured force or base motion drives the
+plant's equation of motion. Every record adds unknowns: the state at its first sample, an offset
+and, for forces, a drift.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ _SHORTEST = 16  # samples from which noise can be estimated
 _PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
 _DELAY_STEP = 0.02  # of a sample, for derivatives with respect to the delay
 _LEAST = 1e-300  # of a positive value that has vanished
-_VANISHED = 1e4  # times below what would change the residuals: held, or all steps shrink with it
+_VANISHED = 1e4  # times below a size that matters: held, else it shortens all steps
 
 
 class RecordProblem(Problem):
     """Records of one device and a model: residuals, Jacobian and cost.
 
     Residuals are measured minus predicted samples over the standard deviation of the output, so
-    that their scale is unknown. Each record is a run, or each a level of one run. Where anything is
-    integrated, is differentiated or remembers, a record is cut at its gaps into parts with a first
+    that their scale is unknown. Each record is a run, or each a level of one run. Where the model
+    integrates, differentiates or has memory, a record is cut at its gaps into parts with a first
     state each; where anything is integrated or differentiated, unevenly sampled parts are
     resampled. Both with a warning. The `output` that is predicted is by default "motion" where the
     model has inertia, else "force". For the output "motion" the records' force channel is, by
@@ -174,7 +174,7 @@ class RecordProblem(Problem):
 
     @property
     def noise(self) -> str:
-        """What the residuals are taken for: "white", or filtered by their "spectrum"."""
+        """The model of the residuals: "white", or filtered by their "spectrum"."""
         return "spectrum" if self.whitening.size > 1 else "white"
 
     def at(self, table: FrequencyResponse) -> TableProblem:
@@ -184,8 +184,8 @@ class RecordProblem(Problem):
     def shortened(self, samples: int) -> RecordProblem:
         """Return the problem with about `samples` samples in all.
 
-        Of measured displacements so many samples are left out as slow cycles do without; what is
-        still too long is cut to the liveliest part of each record.
+        Measured displacements are thinned as far as slow cycles allow; records still too long are
+        cut to their liveliest part.
         """
         parts = []
         spare = self.n_residuals / samples
@@ -226,8 +226,8 @@ class RecordProblem(Problem):
 
     def delayed(self, delay: float) -> RecordProblem:
         """Return the same problem, the motion taken to lag the force by so many seconds."""
-        other = self.altered("motions", "drives", "latest", delay=delay)
-        return other.without_noise(self.displacement_noise)
+        delayed = self.altered("motions", "drives", "latest", delay=delay)
+        return delayed.without_noise(self.displacement_noise)
 
     def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
         """Return the derivatives of each record's output with respect to the delay, per s."""
@@ -300,7 +300,7 @@ class RecordProblem(Problem):
 
     @property
     def n_reported(self) -> int:
-        """How many parameters are the model's; states, offsets and drifts follow."""
+        """The number of the model's parameters; states, offsets and drifts follow."""
         return len(self.free)
 
     @property
@@ -329,13 +329,13 @@ class RecordProblem(Problem):
 
     @property
     def extent(self) -> str:
-        """How much was measured, in words."""
+        """The amount of data, in words."""
         n = len(self.records)
         return f"{n} record{'s' if n > 1 else ''}, {self.n_samples} samples"
 
     @property
     def output_in_words(self) -> str:
-        """What a misfit is a share of: of its variation."""
+        """The output of which a misfit is a share."""
         return f"the {self.output}"
 
     @property
@@ -357,7 +357,7 @@ class RecordProblem(Problem):
 
     @property
     def n_residuals(self) -> int:  # type: ignore[override]
-        """Residuals: all samples, but those that the filter takes to begin."""
+        """Number of residuals: all samples except those with which the filter begins."""
         return self.n_samples - len(self.records) * (self.whitening.size - 1)
 
     n_numbers = n_residuals
@@ -454,7 +454,7 @@ class RecordProblem(Problem):
         return self.space.to_search(np.where(self.space.positive & (array == 0.0), _LEAST, array))
 
     def step_bounds(self, values: FloatArray, *, of_starts: bool) -> tuple[FloatArray, FloatArray]:
-        """Return between which search coordinates steps may lead.
+        """Return the limits of the search coordinates.
 
         Exponents with a prior stay within their ranges, loads of several springs at the first
         sample below slip, and on request other friction there below full slip at the values.
@@ -501,7 +501,7 @@ class RecordProblem(Problem):
 
     @cached_property
     def latest(self) -> dict[int, tuple[bytes, tuple[str, ...], Predicted]]:
-        """The last prediction of each record: its values, and the names of what it is derived by.
+        """The last prediction of each record: values, and names of the differentiated parameters.
 
         It is asked for more than once, also by problems in which other parameters are free.
         """
@@ -509,12 +509,12 @@ class RecordProblem(Problem):
 
     @cached_property
     def coefficients(self) -> Coefficients:
-        """How the equations' numbers follow from the parameters."""
+        """The map from the parameters to the equations' numbers."""
         return Coefficients(self.model)
 
     @cached_property
     def first(self) -> FirstState:
-        """How first states follow from what a record adds."""
+        """The map from a record's unknowns to the first states."""
         return FirstState(self.coefficients.model)
 
     def outputs(self, values: FloatArray) -> list[FloatArray]:
@@ -559,7 +559,8 @@ class RecordProblem(Problem):
         """Return the filtered residuals of all samples and their derivatives, see ``Problem``."""
         if theta.ndim == 2:
             return np.stack([self.data_rows(row, derivatives=derivatives) for row in theta])
-        values, waves = self.space.to_values(theta), []
+        values = self.space.to_values(theta)
+        waves = []
         lost = np.full((1 + derivatives * theta.size, self.n_residuals), np.nan)
         if not np.isfinite(values).all():
             return lost

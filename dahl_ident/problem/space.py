@@ -14,7 +14,7 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 
-_INSIDE = 1.0 - 1e-9  # of the way to a bound: on it, a search would see no slope and stay
+_INSIDE = 1.0 - 1e-9  # of the way to a bound: on it the slope is zero, and a search would stay
 
 
 class Space:
@@ -123,7 +123,7 @@ class Space:
 
 
 class Interchangeable:
-    """Like elements of a model, and like parts of one, whose labels could switch.
+    """Interchangeable elements of a model, and interchangeable parts of one element.
 
     Elements are ordered by their knees, parts by the first parameter of each.
     """
@@ -157,8 +157,8 @@ class Interchangeable:
         for elements, columns in zip(self._sets, self._columns, strict=True):
             values = space.to_values(array)
             knees = []
-            for element, own in zip(elements, columns, strict=True):
-                free = iter(values[..., column] for column in own)
+            for element, of_element in zip(elements, columns, strict=True):
+                free = iter(values[..., column] for column in of_element)
                 at = [next(free) if p.free else np.asarray(p.value) for p in element.parameters]
                 knees.append(np.broadcast_to(element.knee(at)[0], theta.shape[:-1]))
             _exchange(array, columns, np.stack(knees, axis=-1))
@@ -175,7 +175,7 @@ def _exchange(array: FloatArray, columns: NDArray[np.intp], key: FloatArray) -> 
 def with_changes(
     model: Model, sensors: Sensors, free: Iterable[str], fixed: Mapping[str, float]
 ) -> tuple[Model, Sensors]:
-    """Free and fix parameters by name, wherever they live."""
+    """Free and fix parameters by name, in the model and the sensors."""
     if not isinstance(sensors, Sensors):
         raise ValidationError(f"sensors is {sensors!r}; expected Sensors(...)")
     if isinstance(free, str):

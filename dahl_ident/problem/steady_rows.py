@@ -1,12 +1,12 @@
 """Rows whose force was controlled, predicted by the exact steady motion of the plant.
 
-Shooting starts from the orbit that the row had at the parameters before, of which the result
-depends by far less than any noise: where no friction law and no damper feeds energy in, the motion
-is unique. Elsewhere there may be several, and the rows are followed as a sweep is measured: in
-the order of the rows, at one level each from the orbit of the row before. An orbit that is no
-longer stable is left for a stable one, which is the jump of the response. Where there is no stable
-one, as at a row that should not be in the table, the other stands for it, so that a search can go
-on; a verdict names such rows.
+Shooting starts from the row's orbit at the previous parameters, on which the result depends far
+less than on any noise: where no friction law and no damper feeds energy in, the motion is unique.
+Elsewhere there may be several, and the rows are followed as a sweep is measured: in the order of
+the rows, at one level each from the orbit of the row before. Where an orbit is no longer stable, a
+stable one is taken: the jump of the response. Where no stable one exists, as for a row that should
+not be in the table, the unstable one is used, so that a search can go on; a verdict names such
+rows.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class _SteadyMotions(NamedTuple):
 class SteadyRows:
     """Steady motions of some rows at any parameters, with the orbits where they were last found.
 
-    `drive` and `omega`, (n,) or (S, n), are as measured; levels are told apart by the drive. The
+    `drive` and `omega`, (n,) or (S, n), are as measured; levels are distinguished by the drive. The
     `measured` fundamental of the displacement chooses among several motions. `harmonic` is the k of
     each row, `fundamental` the row, of these, that holds its fundamental. `orbits` are those last
     found, (n, order), by their order; kept up to date.
@@ -102,16 +102,16 @@ class SteadyRows:
             order = self._shooting.system.order
             last = self._orbits.get(order)
             starts = None if last is None else last[points][alone % m]
-            found = self._solve(p[alone], w[alone], u[alone], chosen, starts, stable=False)
-            X[alone] = found.X
+            motions = self._solve(p[alone], w[alone], u[alone], chosen, starts, stable=False)
+            X[alone] = motions.X
             if last is None:
                 last = self._orbits[order] = np.full((shape[-1], order), np.nan)
-            orbits = found.orbits[:m][point]
+            orbits = motions.orbits[:m][point]
             last[:] = np.where(np.isfinite(orbits), orbits, last)
         for table in np.flatnonzero(several):
-            own = slice(table * m, (table + 1) * m)
-            X[own], stable[own] = self._followed(
-                points, p[own], w[own], u[own], measured[own], chosen
+            rows = slice(table * m, (table + 1) * m)
+            X[rows], stable[rows] = self._followed(
+                points, p[rows], w[rows], u[rows], measured[rows], chosen
             )
         X = X.reshape(*shape[:-1], m, *X.shape[1:])[..., point, self._place, :]
         stable = stable.reshape(*shape[:-1], m)[..., point]
@@ -124,26 +124,26 @@ class SteadyRows:
         rounding relative to the spring.
         """
         low = np.full((), np.inf)
-        for element, own in self._model.of(values):
+        for element, law_values in self._model.of(values):
             if not element.is_linear:
                 with np.errstate(all="ignore"):
-                    low = np.minimum(low, element.knee(own)[0])
+                    low = np.minimum(low, element.knee(law_values)[0])
         with np.errstate(invalid="ignore"):
             far = low > _MICROSLIP * np.nanmax(np.abs(self._measured), axis=-1, keepdims=True)
         return np.asarray(far.all(axis=-1))
 
     def _within_reach(self, values: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return values with the stiffness of friction that slips at once brought within reach."""
+        """Return values with a lower stiffness where friction slips at far smaller amplitudes."""
         smallest = np.nanmin(np.abs(self._measured), axis=-1, keepdims=True)
         reachable = []
-        for element, own in self._model.of(values):
-            kept = list(own)
+        for element, law_values in self._model.of(values):
+            kept = list(law_values)
             if not element.is_linear:
                 with np.errstate(all="ignore"):
-                    share = element.knee(own)[1] / (_SLIP * smallest)
+                    share = element.knee(law_values)[1] / (_SLIP * smallest)
                 for i, parameter in enumerate(element.parameters):
                     if parameter.dimension == _STIFFNESS and (share < 1.0).any():
-                        kept[i] = own[i] * np.where(share < 1.0, share, 1.0)
+                        kept[i] = law_values[i] * np.where(share < 1.0, share, 1.0)
             reachable += kept
         return reachable
 
@@ -152,9 +152,9 @@ class SteadyRows:
         if not self._unique_laws:
             return np.zeros(shape, dtype=np.bool_)
         loss = np.zeros(())
-        for element, own in self._model.of(values):
+        for element, law_values in self._model.of(values):
             if element.is_linear:
-                loss = loss + element.stiffness(own, np.zeros(()), self._omega).imag
+                loss = loss + element.stiffness(law_values, np.zeros(()), self._omega).imag
         return np.broadcast_to(loss >= 0.0, shape)
 
     def _solve(
@@ -169,13 +169,13 @@ class SteadyRows:
         stable: bool = True,
     ) -> _SteadyMotions:
         """Return the motions of some points of one or more tables."""
-        found = self._shooting(
+        motions = self._shooting(
             values, omega, drive, chosen=chosen, harmonics=self._harmonics, starts=starts,
             again=again, stable=stable,
         )  # fmt: skip
-        X = [found.harmonics[..., None], found.by_drive[..., None], found.by_parameter]
+        X = [motions.harmonics[..., None], motions.by_drive[..., None], motions.by_parameter]
         return _SteadyMotions(
-            np.concatenate(X, axis=-1), found.starts, found.harmonics[:, 0], found.multiplier
+            np.concatenate(X, axis=-1), motions.starts, motions.harmonics[:, 0], motions.multiplier
         )
 
     def _followed(
@@ -197,7 +197,7 @@ class SteadyRows:
         sweep = place_of[self._sweep]
         sweep = sweep[sweep >= 0]
         order_of_levels = [
-            sweep[own] for own in levels(np.atleast_2d(self._drive)[0][points[sweep]])
+            sweep[rows] for rows in levels(np.atleast_2d(self._drive)[0][points[sweep]])
         ]
         shape = (drive.size, len(self._harmonics), 2 + len(chosen))
         stable = np.ones(drive.size, dtype=np.bool_)
@@ -205,9 +205,9 @@ class SteadyRows:
         order = self._shooting.system.order
         orbits = np.full((len(order_of_levels), order), np.nan)
         for place in range(max(map(len, order_of_levels))):
-            sweeps = [i for i, own in enumerate(order_of_levels) if place < len(own)]
+            sweeps = [i for i, level in enumerate(order_of_levels) if place < len(level)]
             rows = np.array([order_of_levels[i][place] for i in sweeps])
-            X, own, first, _ = self._solve(
+            X, reached, first, _ = self._solve(
                 values[rows], omega[rows], drive[rows], chosen, orbits[sweeps]
             )
             apart = np.abs(first - measured[rows])
@@ -217,15 +217,16 @@ class SteadyRows:
                 at = measured[rows[far]]
                 begin[:, 0], begin[:, 1] = at.real, -omega[rows[far]] * at.imag
                 there = rows[far]
-                other, orbit, first, _ = self._solve(
+                X_there, orbits_there, first, _ = self._solve(
                     values[there], omega[there], drive[there], chosen, begin, again=False
                 )
                 nearer = ~(apart[far] <= np.abs(first - at)) & np.isfinite(first)
-                X[far[nearer]], own[far[nearer]] = other[nearer], orbit[nearer]
+                X[far[nearer]] = X_there[nearer]
+                reached[far[nearer]] = orbits_there[nearer]
             lost = np.flatnonzero(np.isnan(X[:, 0, 0]))
             if lost.size:
                 there = rows[lost]
-                X[lost], own[lost], _, multiplier = self._solve(
+                X[lost], reached[lost], _, multiplier = self._solve(
                     values[there], omega[there], drive[there], chosen, orbits[sweeps][lost],
                     stable=False,
                 )  # fmt: skip
@@ -233,7 +234,7 @@ class SteadyRows:
             result[rows] = X
             if chosen and np.isnan(X).any():
                 break  # of no use to a search
-            orbits[sweeps] = own
+            orbits[sweeps] = reached
         return result, stable
 
 

@@ -40,7 +40,7 @@ from dahl_ident.steady_state import ACCURACY, STEADY, Shooting, Steady, obstacle
 from dahl_ident.units import shown_unit
 
 _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()
-"""Where shooting last ended, by table and number of states: one fit makes many problems of one."""
+"""The last orbits of shooting, by table and number of states, shared by the problems of one fit."""
 
 _Kind = TypeVar("_Kind", bound="TableProblem")
 
@@ -97,7 +97,9 @@ class TableProblem(Problem):
         self.steady = steady
         tables = self._checked(data)
         model, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
-        self.model, self.sensors, self.motion = model, sensors, tables[0].motion
+        self.model = model
+        self.sensors = sensors
+        self.motion = tables[0].motion
         parameters = [p for p in (*model.parameters, *sensors.parameters) if p.free]
         if self.motion == "rotation":
             parameters = [replace(p, unit=shown_unit(p.unit, self.motion)) for p in parameters]
@@ -119,7 +121,7 @@ class TableProblem(Problem):
             )
 
     def _checked(self, data: Any) -> list[FrequencyResponse]:
-        """Return the tables that `data` are: one."""
+        """Return `data` as a tuple of one table, checked."""
         return [checked_table(data)]
 
     def _rows_of(self, tables: list[FrequencyResponse]) -> Rows:
@@ -156,24 +158,24 @@ class TableProblem(Problem):
 
         Rows are Gaussian then; see ``Measured.widened`` in noise.py.
         """
-        other = self.altered("stiffness_data", _misfit=misfit)
-        other._set_noise(noise_for(self._rows, self.noise))
-        return other
+        widened = self.altered("stiffness_data", _misfit=misfit)
+        widened._set_noise(noise_for(self._rows, self.noise))
+        return widened
 
     def part(self, rows: NDArray[np.bool_], response: ComplexArray) -> TableProblem:
         """Return the problem of some rows, with other responses in place of the data's."""
         data = replace(self.data.select(rows=rows), response=response)
-        other = self.like(data=data)
-        return other if self._misfit is None else other.widened(self._misfit[rows])
+        part = self.like(data=data)
+        return part if self._misfit is None else part.widened(self._misfit[rows])
 
     def _with_rows(self, kind: type[_Kind], rows: Rows) -> _Kind:
         """Return this problem, or batch, with other rows."""
-        other = object.__new__(kind)
-        other.__dict__.update(self.__dict__)
+        problem = object.__new__(kind)
+        problem.__dict__.update(self.__dict__)
         for stale in ("stiffness_data", "data", "tables"):
-            other.__dict__.pop(stale, None)
-        other._set_rows(rows, self.noise)
-        return other
+            problem.__dict__.pop(stale, None)
+        problem._set_rows(rows, self.noise)
+        return problem
 
     def __repr__(self) -> str:
         return (
@@ -233,7 +235,7 @@ class TableProblem(Problem):
         )
 
     def unstable_rows(self, theta: ArrayLike) -> list[int]:
-        """Return the rows whose predicted steady motion is not stable, for want of one that is."""
+        """Return the rows whose predicted steady motion is not stable, as no stable one exists."""
         if not isinstance(self._predictor, Predictor):
             return []
         with np.errstate(all="ignore"):
@@ -241,9 +243,9 @@ class TableProblem(Problem):
 
     def with_steady(self, steady: Steady) -> Self:
         """Return the same problem, or batch, with another way to predict driven rows."""
-        other = self.altered("stiffness_data", steady=steady)
-        other._set_rows(self._rows, self.noise)
-        return other
+        problem = self.altered("stiffness_data", steady=steady)
+        problem._set_rows(self._rows, self.noise)
+        return problem
 
     def coarser(self) -> Self:
         """Return a problem that costs less and has nearly the same optimum; else itself.
@@ -253,10 +255,10 @@ class TableProblem(Problem):
         model = self.model.coarser() if self.is_exact else self.model
         if model is self.model and self._noise.amplitude is None:
             return self
-        other = self.altered("stiffness_data", "obstacle_to_exact", "_shooting", model=model)
-        other._coarse = True
-        other._set_rows(self._rows, self.noise)
-        return other
+        coarse = self.altered("stiffness_data", "obstacle_to_exact", "_shooting", model=model)
+        coarse._coarse = True
+        coarse._set_rows(self._rows, self.noise)
+        return coarse
 
     def takes_energy(self, theta: FloatArray) -> bool:
         """Return whether every motion takes energy from the drive, by the describing function.
@@ -276,12 +278,12 @@ class TableProblem(Problem):
         """
         if not self.is_exact or isinstance(self._predictor, Nearby):
             return self
-        other = self.with_steady(self.steady)
+        nearby = self.with_steady(self.steady)
         with np.errstate(all="ignore"):
-            other._predictor = Nearby(
+            nearby._predictor = Nearby(
                 self._predicting(exact=True), self._predicting(exact=False), theta
             )
-        return other
+        return nearby
 
     def _predicting(self, *, exact: bool) -> Predictor:
         shooting = self._shooting if exact else None
@@ -289,10 +291,10 @@ class TableProblem(Problem):
 
     def assuming(self, spread: Mapping[str, float]) -> TableProblem:
         """Return the problem with parameters free, with priors of such a `spread` of ln."""
-        other = self.like(free=spread)
-        values = {p.name: p.value or 1.0 for p in other.parameters}
-        other.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
-        return other
+        freed = self.like(free=spread)
+        values = {p.name: p.value or 1.0 for p in freed.parameters}
+        freed.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
+        return freed
 
     # Coordinates
 
@@ -368,7 +370,7 @@ class TableProblem(Problem):
     def rounding(self) -> FloatArray:
         """Size of residuals that may be rounding errors alone; no estimated scale is smaller.
 
-        Nor is it so small that rounding of the information loses what calibrations say of gains.
+        It is also large enough that rounding keeps the calibrations' information on gains.
         """
         widths = [float(p.std()) for name, p in self.priors.items() if name.endswith("_gain")]
         known = _LOST * max(widths, default=0.0) * self.n_residuals**0.5 / ROUNDING
@@ -403,11 +405,13 @@ class TableProblem(Problem):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
             if noise.amplitude is None:
                 predicted, by, _ = self._prediction(theta, 2 * derivatives)
-                y, changes = noise.residual(predicted), [noise.change(predicted, d) for d in by]
+                y = noise.residual(predicted)
+                changes = [noise.change(predicted, d) for d in by]
             elif self._coarse:
                 predicted, by, slope = self._prediction(theta, 1 + derivatives)
                 whiten = noise.amplitude.whitening(noise.covariance, slope)
-                y, changes = whiten(noise.response - predicted), [-whiten(d) for d in by]
+                y = whiten(noise.response - predicted)
+                changes = [-whiten(d) for d in by]
             else:
                 y, whiten, error = correct_amplitude(noise, value_and_slope)
                 by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
@@ -457,11 +461,12 @@ class TableProblem(Problem):
     def information(
         self, theta: ArrayLike, scale: ArrayLike = 1.0, chart: FloatArray | None = None
     ) -> FloatArray:
-        """Return the Fisher information; an estimated covariance counts as noise.py says."""
+        """Return the Fisher information; for an estimated covariance see noise.py."""
         theta = self.space.checked(theta)
         if self.tail is None:
             return super().information(theta, scale, chart)
-        rows, m = self.rows(theta, scale, tails=False), self.n_residuals
+        rows = self.rows(theta, scale, tails=False)
+        m = self.n_residuals
         counted = weighted(rows, m, *self.tail.information(squares_of(rows[..., 0, :m])))
         J, counted = rows[..., 1:, :], counted[..., 1:, :]
         if chart is not None:
