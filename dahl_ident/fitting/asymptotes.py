@@ -17,8 +17,8 @@ and any law may vanish. Of a law that declares none, every direction with a unit
 (:mod:`dahl_ident.fitting.directions`) is tried far out on either side of the data.
 
 Each lies at the boundary of the model, so the best fit may lie there, and a search would then
-return the arbitrary large number at which it stopped. A limit is searched as a problem of its own,
-in a **chart**: coordinates phi that stay finite, mapped to a theta so far out that the model is its
+return the arbitrary large number at which it stopped. A limit is searched as a separate problem, in
+a **chart**: coordinates phi that stay finite, mapped to a theta so far out that the model is its
 limit, to five digits or more (three for no full slip). If the sum of squares there is no higher
 than at any finite optimum, the limit is the optimum, and phi gives what is determined, with its
 covariance.
@@ -64,7 +64,7 @@ class Chart:
     offset: FloatArray
     """(P,), or (S, P) for the tables of a batch."""
     back: FloatArray
-    """Gives a phi near a theta: of theta - offset, after theta[spring] += exp(theta[sigma])."""
+    """phi near theta is back (theta - offset), after theta[spring] += exp(theta[sigma])."""
     tied: tuple[int, int] | None = None
     """Indices of the spring and of sigma, where phi holds their sum in the spring's place."""
 
@@ -111,7 +111,7 @@ class Limit:
     """The names of theta's coordinates."""
     status: Status
     meaning: str
-    """What the element is in this limit, where the status does not say it."""
+    """What the element becomes in this limit, where the status does not say it."""
     chart: Chart
     extremes: dict[str, float]
     """Values of the parameters that run away."""
@@ -168,7 +168,7 @@ def _spread(by_phi: FloatArray, covariance: FloatArray) -> float:
 
 
 class Reach:
-    """Where friction is neither at a limit nor negligible: what a search may pass through."""
+    """The region where friction is neither at a limit nor negligible; searches stay in it."""
 
     def __init__(self, problem: TableProblem) -> None:
         view = problem.stiffness_data
@@ -179,9 +179,9 @@ class Reach:
         for element in problem.model.elements:
             if element.is_linear:
                 continue
-            own = directions(element)
-            for direction in own.nonlinear:
-                row, rest = direction.row(problem)
+            axes = directions(element)
+            for direction in axes.nonlinear:
+                row, offset = direction.row(problem)
                 if not direction.parameter.positive:
                     if direction.dimension == (0, -1, 0):
                         fastest = np.exp(direction.sizes(view).max(axis=-1)) * _FASTEST
@@ -192,7 +192,7 @@ class Reach:
                     scan = direction.parameter.scan or (0.25, 4.0)
                     low, high = np.log(min(scan) * _NUMBERS[0]), np.log(max(scan) * _NUMBERS[1])
                 else:
-                    tied = springs and own.is_free and _tying(element) is not None
+                    tied = springs and axes.is_free and _tying(element) is not None
                     size = direction.sizes(view)
                     edges = _EDGES[0], _TIED_EDGE if tied else _EDGES[1]
                     if direction.dimension[1] < 0:
@@ -200,12 +200,13 @@ class Reach:
                     low = size.min(axis=-1) + np.log(edges[0])
                     high = size.max(axis=-1) + np.log(edges[1])
                 rows += [row, -row]
-                least += [np.asarray(low - rest), np.asarray(rest - high)]
-            if own.is_free and own.reference is not None and own.reference.positive:
-                scale = Direction(own.reference, None, own.reference.dimension)
-                (row, rest), softest = scale.row(problem), scale.sizes(view)
+                least += [np.asarray(low - offset), np.asarray(offset - high)]
+            if axes.is_free and axes.reference is not None and axes.reference.positive:
+                scale = Direction(axes.reference, None, axes.reference.dimension)
+                (row, offset) = scale.row(problem)
+                softest = scale.sizes(view)
                 rows.append(row)
-                least.append(softest.min(axis=-1) + _LEAST_FRICTION - rest)
+                least.append(softest.min(axis=-1) + _LEAST_FRICTION - offset)
         self._rows = np.array(rows).reshape(-1, P).T
         self._least = np.stack(np.broadcast_arrays(*least), axis=-1) if least else np.empty(0)
 
@@ -268,7 +269,8 @@ def _straight_charts(problem: TableProblem) -> Iterator[tuple[Chart, bool]]:
             continue
         tied = element.parameter(asymptote.adds_to_spring)
         both = [element.parameter(label) for label in asymptote.follows[:2]]
-        matrix, whole = np.eye(len(problem.parameters)), all(p.free for p in both)
+        matrix = np.eye(len(problem.parameters))
+        whole = all(p.free for p in both)
         if not tied.free or (whole and len(asymptote.kept) != 1):
             continue
         if whole:
@@ -317,15 +319,15 @@ def _plain(
         return []
     follow = None
     if asymptote.follows is not None:
-        label, other, factor = asymptote.follows
-        names = [element.parameter(x).name for x in (label, other)]
-        if other in free:
+        label, followed, factor = asymptote.follows
+        names = [element.parameter(x).name for x in (label, followed)]
+        if followed in free:
             tying = _tying(element)
-            if spring and tying is not None and {other} == {tying.adds_to_spring}:
+            if spring and tying is not None and {followed} == {tying.adds_to_spring}:
                 return []  # in parallel with a spring the law has no effect
             follow = names[0], names[1], np.log(np.asarray(factor))
         else:
-            pins[names[0]] = np.log(np.asarray(factor)) + _ln(element.parameter(other))
+            pins[names[0]] = np.log(np.asarray(factor)) + _ln(element.parameter(followed))
     chart = _chart(problem, pins, follow, _kept(problem, element, asymptote))
     return [_limit(problem, element, asymptote, chart)]
 
@@ -337,8 +339,8 @@ def _microslip(
     pins = _pins(element, asymptote)
     if pins is None or asymptote.follows is None or asymptote.adds_to_spring is None:
         return []
-    label, other, factor = asymptote.follows
-    both = [element.parameter(x) for x in (label, other)]
+    label, followed, factor = asymptote.follows
+    both = [element.parameter(x) for x in (label, followed)]
     if not all(p.free for p in both):
         return []
     sigma = problem.names.index(element.parameter(asymptote.adds_to_spring).name)

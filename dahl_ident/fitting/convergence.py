@@ -29,7 +29,7 @@ class Ends:
     minima : Minima
         By theta, shape (S, P). At a limit, theta so far out that the model is its limit.
     limits : dict of int to (Limit, ndarray, ndarray)
-        Tables at a limit, with phi and the Hessian by phi.
+        Tables at a limit, with phi and the Hessian with respect to phi.
     """
 
     def __init__(self, minima: Minima) -> None:
@@ -67,7 +67,7 @@ class Ends:
                 self.limits[old] = other.limits[new]
 
     def at_limit(self, table: int, limit: Limit, there: Minima) -> None:
-        """Let one table end at a limit, whose searches of all tables are given."""
+        """Let one table end at a limit, with the ends of all tables' searches there."""
         which = np.array([table])
         limit = limit.of(which)
         phi, hessian = there.theta[table], there.hessian[table]
@@ -111,7 +111,8 @@ def optima(
         one = problem.table(0)
         inner, lost = inverse(information_of(one, theta[0], scale, loss, int(dof[0]))[None])
     values = problem.to_values(theta)
-    with np.errstate(invalid="ignore"):  # infinite variances of what no residual holds
+    # infinite variances of parameters that no residual determines
+    with np.errstate(invalid="ignore"):
         covariance = inner * (final / scale)[:, None, None] ** 2
     status: list[Status] = []
     combinations: dict[int, tuple[DeterminedCombination, ...]] = {}

@@ -2,8 +2,8 @@
 
 The force of most laws is proportional to some parameters. The others are **directions**, in which
 it is nonlinear: ratios of parameters that scale the force together, such as x_c = f_max/sigma,
-lengths, speeds and pure numbers. The dimension of a direction says what it is measured by: a length
-by the amplitudes of the data, a speed by amplitude times angular frequency.
+lengths, speeds and pure numbers. The dimension of a direction gives its scale: the amplitudes of
+the data for a length, amplitude times angular frequency for a speed.
 """
 
 from __future__ import annotations
@@ -37,19 +37,20 @@ class Direction:
         return not any(self.dimension)
 
     def row(self, problem: TableProblem) -> tuple[FloatArray, float]:
-        """Return its logarithm as row times theta plus number."""
-        row, rest = np.zeros(len(problem.parameters)), 0.0
+        """Return row and offset of its logarithm, row @ theta + offset."""
+        row = np.zeros(len(problem.parameters))
+        offset = 0.0
         for parameter, sign in ((self.parameter, 1.0), (self.over, -1.0)):
             if parameter is None:
                 continue
             if parameter.free:
                 row[problem.names.index(parameter.name)] = sign
             elif parameter.value is not None:
-                rest += sign * float(np.log(parameter.value))
-        return row, rest
+                offset += sign * float(np.log(parameter.value))
+        return row, offset
 
     def sizes(self, view: StiffnessData) -> FloatArray:
-        """Return the logarithm of what each row of data measures it by, (n,) or (S, n)."""
+        """Return the logarithm of its scale at each row of the data, (n,) or (S, n)."""
         force, displacement, time = self.dimension
         ln_size = displacement * np.log(view.amplitude)
         if time:
@@ -66,11 +67,11 @@ class Directions:
 
     element: Element
     linear: tuple[Parameter, ...]
-    """Free ones in which the force is linear."""
+    """Free parameters in which the force is linear."""
     scale: tuple[Parameter, ...]
-    """Those that scale the rest of the force together."""
+    """Parameters that scale the remaining force together."""
     reference: Parameter | None
-    """The one of `scale` that the others are divided by."""
+    """The parameter of `scale` by which the others are divided."""
     nonlinear: tuple[Direction, ...]
 
     @property
@@ -111,11 +112,15 @@ def directions(element: Element) -> Directions:
     for parameter in element.parameters:
         if not parameter.free or parameter in linear or parameter is reference:
             continue
-        if element.is_linear:  # how its force depends on it is for nobody but the user to know
+        if element.is_linear:  # only the user knows how the force depends on it
             continue
         over = reference if parameter in scale else None
-        own, other = parameter.dimension, (0, 0, 0) if over is None else over.dimension
-        dimension = own[0] - other[0], own[1] - other[1], own[2] - other[2]
+        force, displacement, time = parameter.dimension
+        if over is not None:
+            force -= over.dimension[0]
+            displacement -= over.dimension[1]
+            time -= over.dimension[2]
+        dimension = force, displacement, time
         searched.append(Direction(parameter, over, dimension))
     return Directions(
         element, tuple(p for p in linear if p.free), scale, reference, tuple(searched)
@@ -128,7 +133,7 @@ def is_positive(parameter: Parameter) -> bool:
 
 
 def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:
-    """Return what the other scale parameters are divided by: a known one, or a stiffness."""
+    """Return the divisor of the other scale parameters: a known one, or a stiffness."""
     known = [p for p in scale if not p.free]
     stiff = [p for p in scale if p.dimension == _STIFFNESS]
     return next(iter((*known, *stiff, *scale)), None)

@@ -7,13 +7,13 @@ given,
     N = sigma h_alpha(A / x_c),
 
 and springs, dampers and masses are linear anyway. Least squares in dynamic stiffness, with
-amplitudes as measured and weights that the noise model has at the data, is therefore a search
-over the directions that are left (:mod:`dahl_ident.fitting.directions`): at each node of a grid of
-those, the linear parameters are solved exactly. The lowest local minima are the starts.
+amplitudes as measured and weights that the noise model has at the data, is therefore a search over
+the remaining directions (:mod:`dahl_ident.fitting.directions`): at each node of a grid of those,
+the linear parameters are solved exactly. The lowest local minima are the starts.
 
-A length has four nodes a decade from a hundredth of the smallest amplitude to a hundred times
-the largest, and one a decade beyond, down to 1e-8 and up to 1e6 times. Farther out the curve is
-its own limit to well below any noise; whether the optimum lies out there, at infinity, is for
+A length has four nodes a decade from a hundredth of the smallest amplitude to a hundred times the
+largest, and one a decade beyond, down to 1e-8 and up to 1e6 times. Farther out the curve agrees
+with its limit to well below any noise; whether the optimum lies out there, at infinity, is for
 :mod:`dahl_ident.fitting.asymptotes` to decide. A pure number takes the values that its law
 declares. All nodes are combined while they are few; else points of a quasi-random sequence are.
 
@@ -66,7 +66,7 @@ _ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be
 
 
 class Starts(NamedTuple):
-    """Starts of all tables: whose each is, (M,), and its search coordinates, (M, P)."""
+    """Starts of all tables: the table of each, (M,), and its search coordinates, (M, P)."""
 
     table: IntArray
     theta: FloatArray
@@ -84,10 +84,10 @@ class Starts(NamedTuple):
 def own_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
     """Return the best starts of every table of a problem, best first.
 
-    Values that the user gave to free parameters make one more start, the last.
-    `resistant` ones have an outlier rule some of them, but not all: by other weights as well. A
-    response far too large has no say where errors count relative to it, one far too small has
-    none where all count alike.
+    Values that the user gave to free parameters make one more start, the last. `resistant` starts
+    are made with two kinds of weights, so that an outlier dominates only some of them. A response
+    far too large has little weight where errors count relative to it, one far too small where all
+    count alike.
     """
     view = problem.stiffness_data
     begin = _starts(problem, view)
@@ -165,15 +165,15 @@ class _LinearPart:
 
 @dataclass(frozen=True)
 class _Curves:
-    """One element at the K nodes of its own grid."""
+    """One element at the K nodes of its grid."""
 
     values: dict[str, FloatArray]
     """Nonlinear parameters, and those that a column multiplies at 1: (K,) or (S, K)."""
     columns: list[_LinearPart]
     known: ComplexArray | None
-    """What does not depend on any coefficient, (..., K, n)."""
+    """The part that does not depend on any coefficient, (..., K, n)."""
     edges: list[NDArray[np.bool_]]
-    """For either end of each direction: which nodes lie there, (K,)."""
+    """The nodes at either end of each direction, (K,)."""
 
 
 @dataclass(frozen=True)
@@ -276,20 +276,20 @@ def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
     curves = [_curves(d, view, each) for d in searched]
     counts = [_size(c) for c in curves]
     nodes = np.indices(counts).reshape(len(counts), math.prod(counts)).T
-    rest = np.zeros(view.stiffness.shape, dtype=np.complex128)
+    fixed = np.zeros(view.stiffness.shape, dtype=np.complex128)
     common: list[_LinearPart] = []
     for d in every:
         if d.nonlinear:
             continue
         known, columns = _columns(d, {}, view)
-        rest = rest + (0.0 if known is None else known)
+        fixed = fixed + (0.0 if known is None else known)
         common += columns
     return _Grid(
         problem,
         curves,
         nodes,
         tuple(counts),
-        (view.stiffness - rest) * view.weights,
+        (view.stiffness - fixed) * view.weights,
         view.weights,
         common,
         any(len(d.nonlinear) > 1 for d in searched),
@@ -358,7 +358,7 @@ def _columns(
 
 
 def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
-    """Return an element at its own grid, of at most about `most` nodes."""
+    """Return an element at the nodes of its grid, about `most` at most."""
     if d.lengths:
         return _tabulated_curves(d, view, most)
     most = min(most, _MOST_OF_ONE)
@@ -397,7 +397,7 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
 def _possible(
     d: Directions, ordered: list[Direction], axes: list[FloatArray], index: IntArray
 ) -> NDArray[np.bool_]:
-    """Return at which nodes nothing speaks against an element physically, or every node."""
+    """Return the nodes where an element is physically possible, or every node."""
     names = [x.parameter.name for x in ordered]
     possible = []
     for node in index.T:
@@ -603,11 +603,11 @@ def _solve_linear(
     because those in `separate`, (..., C, 2 n), can be hard to tell from them.
     """
     Q, R = _factors(common, target)
-    rest = _projected(target, Q)
+    residual = _projected(target, Q)
     columns = (
         np.stack(np.broadcast_arrays(*separate), axis=-2)
         if separate
-        else rest[..., None, :][..., :0, :]
+        else residual[..., None, :][..., :0, :]
     )
     # a hardening law overflows at some nodes: no starts
     usable = np.asarray((np.abs(columns) < _LARGEST).all(axis=(-2, -1)))
@@ -620,10 +620,10 @@ def _solve_linear(
         norm[norm < _DEPENDENT * whole] = 0.0
     left = left / np.where(norm > 0.0, norm, np.inf)[..., None]
     gram = left @ left.swapaxes(-1, -2) + 1e-13 * np.eye(left.shape[-2])
-    scaled = np.linalg.solve(gram, left @ rest[..., None])
-    rest = rest - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
+    scaled = np.linalg.solve(gram, left @ residual[..., None])
+    residual = residual - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
     coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
-    cost = np.where(usable, np.einsum("...i,...i->...", rest, rest), np.inf)
+    cost = np.where(usable, np.einsum("...i,...i->...", residual, residual), np.inf)
     if not common:
         return cost, coefficients
     explained = target - (coefficients[..., None, :] @ columns)[..., 0, :]

@@ -13,10 +13,10 @@ casadi symbol, in SI units, and returns comparisons::
         p["pivot_sigma"] == p["seal_sigma"],
     ]
 
-Fixed parameters stand there as well, as the numbers they are held at. ``<`` means ``<=``. casadi
-differentiates them twice. An equality takes one parameter's worth of freedom
-away: the covariance is that of the estimate on the constraint. An inequality that holds with
-equality acts as a bound does; the covariance is that without it.
+Fixed parameters are there as well, as the numbers at which they are held. ``<`` means ``<=``.
+casadi differentiates them twice. An equality takes away one degree of freedom: the
+covariance is that of the estimate on the constraint. An inequality that holds with equality acts as
+a bound does; the covariance is that without it.
 
 **Coordinates.** Search coordinates relative to the start, each in the unit that changes the
 residuals by their own size, so that nothing depends on physical units.
@@ -72,7 +72,7 @@ _WORDS = {
 
 
 Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
-"""What a user gives; see the head of this module."""
+"""The user's function of constraints; see the head of this module."""
 
 
 _EXAMPLE = "lambda p: [p['f_max'] <= 1e-3 * p['sigma']]"
@@ -218,7 +218,7 @@ def solve_ipopt(
     begin = solve(problem if relations.texts else plain, loss=loss, start=start, tell=tell)
     if begin.status.at_infinity and not relations.texts and problem is plain:
         return replace(begin, method="ipopt")
-    # as the search left it: by a sine where there is no steady motion, freed of a record's delay
+    # as the search ended: by a sine where no steady motion exists, freed of a record's delay
     problem = begin.problem if problem is plain else problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     target = Target(problem, begin.scale if adapts else 1.0, loss)
@@ -238,7 +238,7 @@ def solve_ipopt(
 
 @dataclass(frozen=True)
 class Target:
-    """What is minimised: a problem, the scale of its residuals, and how they count."""
+    """The cost to minimise: a problem, the scale of its residuals, and their loss."""
 
     problem: Problem
     scale: float = 1.0
@@ -258,7 +258,7 @@ class _Found:
     return_status: str
     evaluations: int
     slopes: FloatArray
-    """Of the relations' differences by theta, (C, P)."""
+    """Derivatives of the relations' differences with respect to theta, (C, P)."""
     active: tuple[bool, ...]
 
     @property
@@ -312,12 +312,12 @@ def _descend(
     def hessian(xi: FloatArray) -> list[FloatArray]:
         at = target.at(start + unit * (xi + np.vstack([np.zeros(xi.size), np.diag(step)])))
         exact = (at.gradient[1:] - at.gradient[0]) / step[:, None] * unit
-        found = (
+        curvature = (
             exact + exact.T
             if np.isfinite(exact).all()
             else 2.0 * at.hessian[0] * np.outer(unit, unit)
         )
-        return [weight * found]
+        return [weight * curvature]
 
     xi = ca.SX.sym("xi", start.size)
     differences = relations.at(problem, ca.DM(start) + ca.DM(unit) * xi)
@@ -378,7 +378,7 @@ def _descend(
 
 
 def _units(target: Target, start: FloatArray) -> tuple[FloatArray, float, float, FloatArray]:
-    """Return what IPOPT's coordinates xi and function f are measured in.
+    """Return the units of IPOPT's coordinates xi and function f.
 
     The unit of each coordinate, the factor from the sum of losses to f, the tolerance of the
     gradient, and steps of xi for differences of the gradient.

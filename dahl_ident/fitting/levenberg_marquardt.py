@@ -5,10 +5,10 @@ Hessian and D = diag H, so it does not depend on the parameters' units. lambda s
 nothing, a Gauss-Newton step; it falls where a step does what H predicted, and rises where the cost
 does not fall. All problems take their steps together; those that have ended drop out.
 
-A problem has converged where the step after the next, as the steps shrink, would move the
-residuals by less than 1e-8 of their standard deviation, or by no more than what rounding, or the
-accuracy of predictions, leaves of the data; it ends with the next step, which needs no evaluation
-of its own. `scipy.optimize.least_squares` is the other method, on the same residuals and Jacobian.
+A problem has converged where the step after the next, as the steps shrink, would move the residuals
+by less than 1e-8 of their standard deviation, or by no more than what rounding, or the accuracy of
+predictions, leaves of the data; it ends with the next step, which needs no further evaluation.
+`scipy.optimize.least_squares` is the other method, on the same residuals and Jacobian.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
 """(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
 Bounds = tuple[FloatArray, FloatArray]
-"""Between which coordinates, (P,) each, steps may lead."""
+"""Least and largest coordinates, (P,) each, of steps."""
 Fall = Callable[[FloatArray], FloatArray | float]
 """Costs (S,) -> their falls that are not worth a step."""
 
@@ -78,7 +78,7 @@ class _Searches:
 
 @dataclass(frozen=True)
 class Minima(_Searches):
-    """Where S searches ended."""
+    """The ends of S searches."""
 
     theta: FloatArray
     cost: FloatArray
@@ -87,7 +87,7 @@ class Minima(_Searches):
     evaluations: IntArray
 
     def put(self, which: IntArray, other: Minima) -> None:
-        """Let some of the searches end where those of `other`, which went on from there, did."""
+        """Replace the ends of some searches by those of `other`, which continued them."""
         before = self.evaluations[which]
         self.assign(which, other)
         self.evaluations[which] += before
@@ -181,7 +181,8 @@ def minimise(
     active = np.arange(S)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last = np.full(S, 1e-300)
-    first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)  # converged one of an owner
+    # steps of each owner's converged search
+    first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
     for count in range(steps if P else 0):
         step, moves, predicted, longest = _step(at, damping, logarithmic, bounds)
         shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
@@ -220,7 +221,8 @@ def minimise(
         tiny = predicted <= unseen_change * at.cost
         better = (new.cost < at.cost) | (tiny & (new.cost <= (1.0 + unseen_change) * at.cost))
         gain = np.where(tiny, 1.0, at.cost - new.cost) / np.where(tiny, 1.0, predicted)
-        least = np.where(growth > 2.0, 1.0 / 3.0, 0.05)  # what was needed a step ago still is
+        # the damping of the last step is still needed
+        least = np.where(growth > 2.0, 1.0 / 3.0, 0.05)
         calmer = np.maximum(damping * np.maximum(least, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
@@ -270,10 +272,10 @@ def _step(
             at_bounds = np.where(cut, delta, 0.0)
             g_there = np.where(cut, 0.0, g + (damped @ at_bounds[:, :, None])[:, :, 0])
             free = np.where(cut[:, :, None] | cut[:, None, :], np.eye(P), damped)
-            rest = -np.linalg.solve(free + _ROUNDING * np.eye(P), g_there[:, :, None])[:, :, 0]
-            furthest = np.abs(rest / size * logarithmic).max(axis=1)
-            rest *= np.minimum(1.0, _LONGEST_STEP / np.maximum(furthest, 1e-300))[:, None]
-            delta = (np.clip(at.theta + (at_bounds + rest) / size, low, high) - at.theta) * size
+            inner = -np.linalg.solve(free + _ROUNDING * np.eye(P), g_there[:, :, None])[:, :, 0]
+            furthest = np.abs(inner / size * logarithmic).max(axis=1)
+            inner *= np.minimum(1.0, _LONGEST_STEP / np.maximum(furthest, 1e-300))[:, None]
+            delta = (np.clip(at.theta + (at_bounds + inner) / size, low, high) - at.theta) * size
             longest = np.maximum(longest, furthest)
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     predicted = -(delta * g).sum(axis=1) - 0.5 * moves
@@ -312,7 +314,8 @@ def minimise_by_scipy(
         return last[key]
 
     def evaluated(phi: FloatArray) -> FloatArray:
-        theta, m = phi if chart is None else chart.theta(phi), problem.n_residuals
+        theta = phi if chart is None else chart.theta(phi)
+        m = problem.n_residuals
         values = problem.to_values(theta)
         if not np.isfinite(values).all() or (values[problem.space.positive] == 0.0).any():
             return np.full((1 + phi.size, m + problem.n_priors), np.nan)
@@ -339,7 +342,9 @@ def minimise_by_scipy(
                 residuals, start, jacobian, bounds=bounds,
                 x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
-        phi, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
+        phi = np.asarray(end.x)
+        converged = end.status > 0
+        nfev = int(end.nfev)
     theta = phi if chart is None else chart.theta(phi)
     slopes = None if chart is None else chart.derivative(theta)
     there = problem.quadratic(theta, scale, loss, slopes)

@@ -6,7 +6,7 @@ outlier as a whole, whichever way the coordinates are turned. A sample of a reco
 model rho(z) = z.
 
 - ``huber``: z up to 1.345^2, then growing with |y|;
-- ``soft_l1``: 2 (sqrt(1 + z) - 1), a smooth relative of it;
+- ``soft_l1``: 2 (sqrt(1 + z) - 1), similar and smooth;
 - ``student_t``: (4 + p) ln(1 + z/4), for p residuals a row: the likelihood of Student's t with 4
   degrees of freedom; distant points lose their influence altogether.
 
@@ -48,7 +48,7 @@ class Loss:
     slope: Callable[[FloatArray], FloatArray]
     curvature: Callable[[FloatArray], FloatArray]
     power: int
-    """Of rho' in chi."""
+    """Power of rho' in chi."""
     parts: int = 2
     """Residuals of a row."""
 
@@ -57,7 +57,7 @@ class Loss:
         return self.rho(z), self.slope(z), self.curvature(z)
 
     def chi(self, z: FloatArray) -> FloatArray:
-        """Return what the scale is measured by; it rises with z."""
+        """Return chi, whose mean determines the scale; it rises with z."""
         return self.slope(z) ** self.power * z
 
     @cached_property
@@ -67,7 +67,7 @@ class Loss:
         return float(weights @ self.chi(2.0 * nodes) / weights.sum())
 
     def scores(self, y: FloatArray) -> FloatArray:
-        """Return residuals (m,) of which least squares makes the estimate of the loss.
+        """Return residuals (m,) with which least squares gives the estimate of the loss.
 
         They are psi(y)/mean(psi'), y in units of the noise: their scatter gives its covariance,
         and what moves y moves them as much on average. Source: Huber, section 7.10.
@@ -76,7 +76,7 @@ class Loss:
         return y * np.repeat(self.slope(z) / self.mean_slope(z), self.parts)
 
     def counts(self, z: FloatArray, dof: float) -> FloatArray:
-        """Return by how much each square `z` counts in the scale: noise alone gives sum z = dof."""
+        """Return the part of each square `z` in the scale; for noise alone their sum is dof."""
         weight = self.slope(z * (self.parts * z.size / dof)) ** self.power
         return weight * (self.parts / self.gaussian_chi)
 

@@ -19,7 +19,7 @@ from dahl_ident.problem import Problem
 
 _RESCALINGS = 100  # of the noise's scale; a handful is the rule
 _SAME_SCALE = 1e-9  # change of ln scale that ends them
-_LONGEST_SECANT = 20.0  # plain steps in one: where they shrink slowly, not where noise is all
+_LONGEST_SECANT = 20.0  # plain steps in one: for steps that shrink slowly
 _AT_BOUND = 1e-8  # relative distance from a bound that is none
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
 _NOTHING = 1e-100  # information on a parameter, as its root, that is none
@@ -192,7 +192,7 @@ class Optimum:
 
     @property
     def jacobian(self) -> FloatArray:
-        """The derivatives of `residuals` by theta, shape (m, P)."""
+        """The derivatives of `residuals` with respect to theta, shape (m, P)."""
         return self._rows[1]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Least squares for records of any motion, and what an estimate takes out: a delay and noise."""
+"""Least squares for records of any motion, with the delay and the noise that are removed."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _COMPARED = 8  # steps after which starts of a driven motion are compared
 _GOOD = 0.01  # share of variance left at which no further start is tried, if it may be noise
 _BETTER = 0.1  # relative fall of the cost, after which first states are begun once more
 _SAME = 1e-3  # relative difference of the costs of one minimum
-_PRIORS = 4  # descents until the noise is known of which a prior is one more sample
+_PRIORS = 4  # descents until the noise is known, of which a prior is one more sample
 _SAME_NOISE = 1.3  # factor within which it is
 _SETTLING = 2000  # samples after which simulated noise has forgotten its start
 _MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
 _DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not the drive noisy
 _REPEATS = 12  # a limit for weights that do not settle
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
-_ALIGNED = 0.02  # of the sum of squares that a delay has to explain to be taken out
+_ALIGNED = 0.02  # of the sum of squares that a delay has to explain to be removed
 _LONGEST_DELAY = 2.0  # samples: twice the standard deviation that nobody stated
 _ALIGNMENTS = 4  # steps of the delay: each leaves a hundredth of the one before
 SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
 EXACT = 1e-12  # share of variance left that is rounding
 LOOSE = 1e4  # of the step at which a search of a long record has converged
-ROUGH = 15  # steps after which the noise is known well enough to say what a step is worth
+ROUGH = 15  # steps after which the noise is known well enough to judge a step by it
 _STAGNANT = 0.01  # relative fall of the cost in as many steps, below which more lead nowhere
 WORTHLESS = 1e-5  # fall of the cost, over the residuals' variance
 SETTLED = 0.03  # step in standard errors that no longer matters
@@ -106,9 +106,9 @@ def solve_repetitions(
 
 
 class RecordSearch:
-    """One search, from starts to the estimate with what is taken out of the records.
+    """One search, from starts to the estimate, with delay and noise removed from the records.
 
-    It holds what is minimised, how far it has come, and its lowest point.
+    It holds the cost, the number of evaluations, and the lowest point.
     """
 
     def __init__(self, method: str, loss: str, tell: Tell | None = None) -> None:
@@ -153,7 +153,8 @@ class RecordSearch:
             if not np.isfinite(at.cost):
                 return end
             size = np.sqrt(at.hessian.diagonal())
-            size[size == 0.0] = 1.0  # what vanishes, such as a damper that these data do not need
+            # parameters that vanish, such as a damper that these data do not need
+            size[size == 0.0] = 1.0
             out = ((end.theta[0] <= low) & (at.gradient > 0.0)) | (
                 (end.theta[0] >= high) & (at.gradient < 0.0)
             )
@@ -450,7 +451,7 @@ def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> flo
 
 
 def noise_power(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
-    """Return the variance of residuals as slow as those given, times what slowness makes of it."""
+    """Return the variance of residuals, times the factor that their correlation adds."""
     slow = correlation(residuals)
     return 2.0 * cost / samples * (1.0 + slow) / (1.0 - slow)
 
@@ -495,7 +496,7 @@ def _first_states_again(problem: RecordProblem, theta: FloatArray) -> FloatArray
 
 
 def _structured(problem: RecordProblem, end: Minima) -> bool:
-    """Return whether a search has left residuals that follow each other as noise seldom does."""
+    """Return whether a search has left residuals more correlated than noise is likely to be."""
     if 2.0 * end.cost[0] < EXACT * problem.n_residuals:
         return False
     return correlation(problem.split_residuals(problem.to_values(end.theta[0]))) > SLOW

@@ -117,15 +117,15 @@ class _Scan:
         chosen = [kept[place] for place in sorted(kept)][:count]
         return np.array([started_at(self.problem, values) for values in chosen])
 
-    def _apart(self, one: list[float], other: list[float]) -> bool:
-        a, b = np.array(one), np.array(other)
+    def _apart(self, first: list[float], second: list[float]) -> bool:
+        a, b = np.array(first), np.array(second)
         return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
 
     def _choices(self, element: Element) -> Iterator[tuple[float, ...]]:
         """Yield values for an element's parameters at which its force is to be computed.
 
-        The first parameter that scales the force is 1. With it those that follow are lengths and
-        times in disguise: with 1 N/m a force is the length at which a spring exerts it.
+        The first parameter that scales the force is 1. In units of it, the following parameters are
+        lengths and times: with 1 N/m, a force is the length at which a spring exerts it.
         """
         grids: list[list[float]] = []
         one: tuple[int, int, int] | None = None  # dimension of the parameter that is 1
@@ -152,7 +152,8 @@ class _Scan:
                 if force:
                     size = self._force_size() ** force
                     if one is not None and one[0]:
-                        share = force / one[0]  # the power of what is 1 that has this force
+                        # the power of the unit parameter that has the dimension of a force
+                        share = force / one[0]
                         length, time = length - share * one[1], time - share * one[2]
                         size = self.time**time
                     lengths = [size * (self.length * s) ** length for s in _LENGTHS]
@@ -184,8 +185,8 @@ class _Scan:
         normal: FloatArray | None = None
         for i, (_, _, _, force) in enumerate(self.histories):
             rows = [self._weighed(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
-            rest = force - sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
-            rows.append(self._weighed(i, rest))
+            remaining = force - sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
+            rows.append(self._weighed(i, remaining))
             block = np.array(rows)
             product_ = np.real(block.conj() @ block.T)
             normal = product_ if normal is None else normal + product_
@@ -282,7 +283,7 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
 
 
 def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None:
-    """Load the springs of a law that has several as the record's first samples want it."""
+    """Load the springs of a law that has several, to match the record's first samples."""
     of_record, place = problem.own(full, number), 2 if problem.output == "motion" else 0
 
     def misfit() -> float:

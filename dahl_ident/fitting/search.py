@@ -49,7 +49,7 @@ from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
 
 DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
-_STEPS = 80  # of a search; ten are the rule
+_STEPS = 80  # steps of a search; usually ten
 _BRIEF = 30  # steps where no limit counts
 _SLIGHT = 1e-5  # fall of the cost, over that of one residual, that is not worth a step there
 _FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
@@ -119,9 +119,9 @@ def _solve_table(
     optimum = search.run(begin)[0]
     if limits and problem.is_exact and not problem.takes_energy(optimum.theta):
         sine = problem.with_steady("describing function")
-        other = _solve_table(sine, method, loss, start, limits=True)
-        if not problem.takes_energy(other.theta):
-            return other  # no steady motion is to be found there
+        by_sine = _solve_table(sine, method, loss, start, limits=True)
+        if not problem.takes_energy(by_sine.theta):
+            return by_sine  # no steady motion is to be found there
     return optimum
 
 
@@ -164,7 +164,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     rows = batch.n_residuals // 2
     at_once = min(_ROWS_AT_ONCE, _CURVES_AT_ONCE // grid_size(batch.take(slice(0, 1)))) // rows
     if batch.priors and not batch.scale_known:
-        at_once = 1  # each has a scale of its own to agree with
+        at_once = 1  # the scale of each is estimated separately
     at_once = max(1, at_once)
     parts = []
     for first in range(0, S, at_once):
@@ -174,7 +174,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
             parts.append(search.run(own_starts(part)))
         else:
             some = begin[first : first + at_once]
-            parts.append(search.run(Starts(np.arange(len(some)), some), given=True))
+            parts.append(search.run(Starts(np.arange(len(some)), some), starts_given=True))
     return OptimumBatch.joined(batch, parts)
 
 
@@ -232,7 +232,7 @@ class TableSearch:
         self.low, self.high = problem.bounds()
         self.bounded = problem.is_bounded
         self.rescales = not problem.scale_known and bool(loss is not None or problem.priors)
-        self.given = False
+        self.starts_given = False
         self._strayed = np.zeros(problem.n_tables, dtype=np.bool_)  # where searches left the bounds
 
     @cached_property
@@ -240,9 +240,9 @@ class TableSearch:
         """Where a search is still at a finite optimum."""
         return Reach(self.problem)
 
-    def run(self, begin: Starts, *, given: bool = False) -> OptimumBatch:
+    def run(self, begin: Starts, *, starts_given: bool = False) -> OptimumBatch:
         """Search, with the noise's scale adapted where the optimum depends on it."""
-        self.given, scale = given, 1.0
+        self.starts_given, scale = starts_given, 1.0
         if self.bounded:
             begin = Starts(begin.table, np.clip(begin.theta, self.low, self.high))
         if self.rescales:
@@ -303,7 +303,7 @@ class TableSearch:
         if len(tables) == self.problem.n_tables:
             return self
         part = TableSearch(self.problem.take(tables), self.loss, self.method, self.tolerance)
-        part.given = self.given
+        part.starts_given = self.starts_given
         return part
 
     def _descend(
@@ -315,7 +315,7 @@ class TableSearch:
         limit: bool = False,
         steps: int | None = None,
     ) -> Minima:
-        """Return the best end of each table's searches, by phi in a chart where one is given."""
+        """Return the best end of each table's searches; with a chart, they are in its phi."""
         problem, loss, S = self.problem, self.loss, self.problem.n_tables
         each = len(begin.table) == S and bool((begin.table == np.arange(S)).all())
 
@@ -401,25 +401,25 @@ class TableSearch:
         sine = TableSearch(
             self.problem.with_steady("describing function"), self.loss, self.method, self.tolerance
         )
-        other = sine._search(begin, scale)
+        by_sine = sine._search(begin, scale)
         lost = doubtful[~ends.minima.converged[doubtful]]
         if lost.size:
-            again = Starts(np.arange(lost.size), other.minima.theta[lost])
+            again = Starts(np.arange(lost.size), by_sine.minima.theta[lost])
             further = self._of(lost)._descend(again, scale)
             better = np.flatnonzero(further.converged | (further.cost < ends.minima.cost[lost]))
             ends.put(lost[better], Ends(further.take(better)))
         infinite = ~np.isfinite(self._friction_error(ends, scale))
         for table in doubtful.tolist():
-            if table in other.limits and (infinite[table] or not ends.minima.converged[table]):
+            if table in by_sine.limits and (infinite[table] or not ends.minima.converged[table]):
                 one = np.array([table])
-                ends.put(one, other.take(one))
+                ends.put(one, by_sine.take(one))
 
     def _look_wider(self, ends: Ends, begin: Starts, scale: float) -> Ends:
         """Return the best of `ends`, of searches in microslip's charts, and of the limits."""
         problem, S = self.problem, self.problem.n_tables
         end = ends.minima
         every = np.arange(S)
-        if self.given:
+        if self.starts_given:
             begin = begin.joined(own_starts(problem))
             end = end.better(self._descend(begin, scale))
         begin = Starts(every, end.theta).joined(begin)
