@@ -297,8 +297,11 @@ def weighted_estimate(
         for end in (centre - 3.0**0.5 * std, centre + 3.0**0.5 * std):
             change = along / variance * (end - best.theta[problem.names.index(name)])
             begin = np.clip(best.theta + change, *problem.bounds())
-            with suppress(np.linalg.LinAlgError):
-                minima.append(_descended(optimum, problem, begin, determined=True))
+            with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # far off
+                there = _descended(optimum, problem, begin, determined=True)
+                minima += [there] if np.isfinite(there.deviance) else []
+    if len(minima) == 1:
+        return best
     best = min(minima, key=lambda minimum: minimum.deviance)
     apart = [m for m in minima if np.linalg.norm(best.columns @ (m.theta - best.theta)) > _APART]
     if not apart:
