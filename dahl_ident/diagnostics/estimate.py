@@ -328,10 +328,10 @@ def _descended(
         y = scores_of(r, m, loss)
         basis = None if basis is None else basis.at(theta)
         columns = J if basis is None else J @ basis.matrix
+        if not (np.isfinite(y).all() and np.isfinite(columns).all()):
+            raise np.linalg.LinAlgError("no finite step from the estimate")
         step = np.linalg.lstsq(columns, -y, rcond=1e-13)[0]
         size = np.linalg.norm(columns @ step)
-        if not np.isfinite(size):
-            raise np.linalg.LinAlgError("no finite step from the estimate")
         if size < _SETTLED:
             break
         moved = columns @ step
