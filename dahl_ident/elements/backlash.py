@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
 _CLOSED = 1e-9  # gap over the smallest amplitude that counts as none
-_NARROWEST = 1e-9  # of the path: crossings of a narrower gap cannot be told apart in time
+_NARROWEST = 1e-9  # of the path: crossings of a narrower gap cannot be distinguished in time
 
 
 class Backlash(Friction):
@@ -57,7 +57,7 @@ class Backlash(Friction):
 
     Notes
     -----
-    At amplitudes up to gap/2 there is no force at all. A history starts in the middle of the gap,
+    At amplitudes up to gap/2 the force is zero. A history starts in the middle of the gap,
     or in contact where it starts with a force.
 
     Examples
@@ -150,10 +150,10 @@ class Backlash(Friction):
         if float(values[-1]) >= _NARROWEST * float(np.abs(np.diff(path.displacement)).sum()):
             return super().history(values, path, state, slopes=slopes)
         stiffness = self._stiffness(values)
-        found = self.element.history(values[:-1], path, stiffness * state, slopes=slopes)
+        behind = self.element.history(values[:-1], path, stiffness * state, slopes=slopes)
         zero = np.zeros(path.displacement.shape)
-        by_parameter = (*found.by_parameter, zero)
-        return found._replace(by_state=stiffness * found.by_state, by_parameter=by_parameter)
+        by_parameter = (*behind.by_parameter, zero)
+        return behind._replace(by_state=stiffness * behind.by_state, by_parameter=by_parameter)
 
     def rest_stiffness(self, values: Values) -> FloatArray:
         """Return 0: small motions do not cross the gap."""

@@ -1,4 +1,4 @@
-"""What every element answers: stiffness, derivatives, force and facts, in plain numbers.
+"""The mathematics of every element: stiffness, derivatives, force and facts, in plain numbers.
 
 Nothing is checked here; :class:`dahl_ident.Element` adds names, files, sums and checked calls.
 """
@@ -251,7 +251,7 @@ class Behaviour(ABC):
     ) -> tuple[str, float] | None:
         """Return a simpler law and how far its best N is from this one's at some levels, rms.
 
-        None from a law that has no such relative.
+        None for a law without a simpler one.
         """
         return None
 

@@ -117,7 +117,7 @@ class BoucWen(Friction):
         sigma, q, p, *exponent = values
         ahead = direction * force
         if not exponent:
-            size = np.fabs(ahead)  # each side's sum or difference is exact: q is not lost beside p
+            size = np.fabs(ahead)  # each side's sum or difference is exact: p does not hide q
             return sigma - 0.5 * (q * (ahead + size) + p * (ahead - size))
         (n,) = exponent
         softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))

@@ -40,12 +40,12 @@ class Coefficients:
     def __call__(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the coefficients, (rows, Q), and their derivatives, (rows, Q, P)."""
         numbers, blocks, first = [], [], 0
-        for element, other in self._pairs:
+        for element, counterpart in self._pairs:
             last = first + len(element.parameters)
             part = values[:, first:last]
-            block = np.zeros((len(values), len(other.parameters), values.shape[1]))
-            if isinstance(other, _LinearEquation):
-                part, block[:, :, first:last] = other.coefficients(part)
+            block = np.zeros((len(values), len(counterpart.parameters), values.shape[1]))
+            if isinstance(counterpart, _LinearEquation):
+                part, block[:, :, first:last] = counterpart.coefficients(part)
             else:
                 place = np.arange(len(element.parameters))
                 block[:, place, first + place] = 1.0

@@ -48,7 +48,7 @@ from dahl_ident.errors import ValidationError
 
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
-_JENKINS = 3  # elements of Maxwell slip compared with Dahl: six numbers, more than most tables tell
+_JENKINS = 3  # elements of Maxwell slip compared with Dahl: six numbers, more than most tables determine
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
 _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
@@ -145,8 +145,8 @@ class Dahl(Friction):
         asymmetry: float | None = 0.0,
         name: str | None = None,
     ) -> None:
-        given = {"f_max": f_max, "sigma": sigma, "alpha": alpha, "asymmetry": asymmetry}
-        self._bind(given, name)
+        numbers = {"f_max": f_max, "sigma": sigma, "alpha": alpha, "asymmetry": asymmetry}
+        self._bind(numbers, name)
         if alpha is not None:
             array_between(alpha, self.parameters[2].name, *_EXPONENTS)
         if self.has_optional:
@@ -355,36 +355,36 @@ class Dahl(Friction):
         f_max, sigma = values[:2]
         alpha, name = self.parameter("alpha"), self.name
         exponent = "exponent 1" if alpha.free else "exponent free"
-        other = alpha.fixed(1.0) if alpha.free else alpha.freed()
-        changed = self.with_bound(tuple(other if p is alpha else p for p in self.parameters))
+        other_alpha = alpha.fixed(1.0) if alpha.free else alpha.freed()
+        changed = self.with_bound(tuple(other_alpha if p is alpha else p for p in self.parameters))
         two = [
             Dahl(name=which).started((force * f_max, stiffness * sigma, 1.0))
             for which, force, stiffness in (("early", 0.3, 0.6), ("late", 0.7, 0.4))
         ]
-        found = {
+        alternatives = {
             exponent: Alternative((changed.started((f_max, sigma, 1.0, *values[3:])),)),
             "two Dahl elements": Alternative(tuple(two)),
         }
         if not alpha.assumed and (alpha.free or alpha.value != 1.0):
-            return found
+            return alternatives
         limits = Dahl(asymmetry=None, name=name).started((f_max, sigma, 1.0, 0.01))
         if not self.has_optional:
-            found["two limits"] = Alternative((limits,), "asymmetry")
+            alternatives["two limits"] = Alternative((limits,), "asymmetry")
         gap = min(0.3 * f_max / sigma, smallest)
         behind = self.started(values)
-        found["gap"] = Alternative((Backlash(behind).started((*values, gap)),))
+        alternatives["gap"] = Alternative((Backlash(behind).started((*values, gap)),))
         rates = sigma, sigma / f_max, sigma / f_max
-        found["Bouc-Wen"] = Alternative((BoucWen(name=name).started(rates),))
-        found["Bouc-Wen, exponent free"] = Alternative(
+        alternatives["Bouc-Wen"] = Alternative((BoucWen(name=name).started(rates),))
+        alternatives["Bouc-Wen, exponent free"] = Alternative(
             (BoucWen(exponent=None, name=name).started((*rates, 1.0)),)
         )
-        found["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
-        found["LuGre"] = Alternative((LuGre(name=name),), "speed")
-        found["Maxwell slip"] = Alternative((MaxwellSlip(_JENKINS, name=name),), "masing")
+        alternatives["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
+        alternatives["LuGre"] = Alternative((LuGre(name=name),), "speed")
+        alternatives["Maxwell slip"] = Alternative((MaxwellSlip(_JENKINS, name=name),), "masing")
         if not self.has_optional:
             both = Backlash(limits).started((f_max, sigma, 1.0, 0.01, gap))
-            found["two limits and gap"] = Alternative((both,), "asymmetry")
-        return found
+            alternatives["two limits and gap"] = Alternative((both,), "asymmetry")
+        return alternatives
 
     def universal_curve(self) -> UniversalCurve | None:
         """Return h(beta) = N/sigma of the linear Dahl model; None for another exponent."""
@@ -425,7 +425,7 @@ def _per(c: ComplexArray, beta: FloatArray) -> ComplexArray:
 def _by_amplitude(
     values: Values, beta: FloatArray, harmonic: Orders, by_ln_f_max: ComplexArray
 ) -> ComplexArray:
-    """Return dN/dA = -(sigma/A) times the derivative of h by ln f_max, also at rest."""
+    """Return dN/dA = -(sigma/A) dh/d(ln f_max), also at rest."""
     f_max, sigma, _ = values
     slope = np.asarray(by_ln_f_max * (-sigma / f_max * sigma / np.maximum(beta, _AT_REST)))
     rests = beta < _AT_REST

@@ -334,7 +334,9 @@ class Model(Element):
 
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return the sum of the elements' F_k/X_1 with its derivatives, unchecked."""
-        parts = [element.settled(own, sine, derivatives) for element, own in self.of(values)]
+        parts = [
+            element.settled(numbers, sine, derivatives) for element, numbers in self.of(values)
+        ]
         value, by_amplitude, _ = parts[0]
         for part in parts[1:]:
             value, by_amplitude = value + part.value, by_amplitude + part.by_amplitude
@@ -347,8 +349,8 @@ class Model(Element):
     ) -> HistoryGradient:
         """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
         parts = [
-            element.history(own, path, state if element.has_memory else 0.0, slopes=slopes)
-            for element, own in self.of(values)
+            element.history(numbers, path, state if element.has_memory else 0.0, slopes=slopes)
+            for element, numbers in self.of(values)
         ]
         value = np.asarray(sum(part.value for part in parts))
         by_state = np.asarray(sum(part.by_state for part in parts))
@@ -356,7 +358,7 @@ class Model(Element):
 
     def start_with(self, values: Sequence[Any], force: float) -> float:
         """Return the unknown of the friction, of which there is one if there is a force."""
-        return sum(e.start_with(own, force) for e, own in self.of(values) if e.has_memory)
+        return sum(e.start_with(numbers, force) for e, numbers in self.of(values) if e.has_memory)
 
     @property
     def has_inertia(self) -> bool:
@@ -364,7 +366,7 @@ class Model(Element):
         return any(element.has_inertia for element in self._elements)
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
-        remember = [(e, own) for e, own in self.of(values) if e.has_memory]
+        remember = [(e, numbers) for e, numbers in self.of(values) if e.has_memory]
         if not remember:
             super()._check_start(values, initial_force)
         if initial_force and len(remember) > 1:
@@ -372,20 +374,20 @@ class Model(Element):
                 f"initial_force is {initial_force!r} for {len(remember)} elements with memory; "
                 "evaluate them one by one, or leave it out"
             )
-        for element, own in remember:
-            element._check_start(own, initial_force)
+        for element, numbers in remember:
+            element._check_start(numbers, initial_force)
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the sums of the elements' bounds of abs(N) and A abs(N)."""
-        bounds = [element.force_bounds(own) for element, own in self.of(values)]
+        bounds = [element.force_bounds(numbers) for element, numbers in self.of(values)]
         steepest, largest = (np.asarray(sum(b[i] for b in bounds)) for i in (0, 1))
         return steepest, largest
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the lowest and highest knee of the elements; NaN where all are linear."""
         low, high = np.full((), np.nan), np.full((), np.nan)
-        for element, own in self.of(values):
-            first, last = element.knee(own)
+        for element, numbers in self.of(values):
+            first, last = element.knee(numbers)
             low, high = np.fmin(low, first), np.fmax(high, last)
         return low, high
 
@@ -394,17 +396,21 @@ class Model(Element):
     ) -> FloatArray:
         """Return the decay of the element that forgets most slowly."""
         slowest = super().transient_decay(values, amplitude, omega)
-        for element, own in self.of(values):
-            slowest = np.maximum(slowest, element.transient_decay(own, amplitude, omega))
+        for element, numbers in self.of(values):
+            slowest = np.maximum(slowest, element.transient_decay(numbers, amplitude, omega))
         return slowest
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
         """Return the values of all elements, those that no longer matter held where they do."""
-        return [v for element, own in self.of(values) for v in element.resolved(own, amplitude)]
+        return [
+            v for element, numbers in self.of(values) for v in element.resolved(numbers, amplitude)
+        ]
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of all elements to their values."""
-        return tuple(text for element, own in self.of(values) for text in element.physics(own))
+        return tuple(
+            text for element, numbers in self.of(values) for text in element.physics(numbers)
+        )
 
     def coarser(self) -> Model:
         """Return the model of elements whose motion under a force costs less, or itself."""
@@ -439,7 +445,7 @@ class Model(Element):
         return self.with_parameters({n: replace(known[n], value=v) for n, v in values.items()})
 
     def _known(self, names: Iterable[str]) -> dict[str, Parameter]:
-        """Return the parameters by name; refuse names that are none."""
+        """Return the parameters by name; refuse unknown names."""
         known = {p.name: p for p in self.parameters}
         unknown = [name for name in names if name not in known]
         if unknown:

@@ -74,10 +74,10 @@ def plant_equations(
     states: list[ca.SX] = []
     rates: list[ca.SX] = []
     with numpy_names():
-        for element, own in model.of(values):
+        for element, numbers in model.of(values):
             mine = [ca.SX.sym(f"y{len(states) + i}") for i in range(element.n_states)]
             states += mine
-            part = traced(element, own, x, v, s, mine)
+            part = traced(element, numbers, x, v, s, mine)
             if excitation == "base" and element.is_linear and element.n_states:
                 raise ModelError(
                     f"{element!r} has inertia inside, and how the base moves it is not known; "
@@ -122,10 +122,10 @@ class FirstState:
         unknown = [ca.SX.sym("x"), ca.SX.sym("v")]
         states = list(unknown)
         with numpy_names():
-            for element, own in model.of(values):
+            for element, numbers in model.of(values):
                 count = len(element.starts) if element.has_memory else element.n_states
                 mine = [ca.SX.sym(f"start{len(unknown) + i}") for i in range(count)]
-                states += element.initial_states(own, mine)
+                states += element.initial_states(numbers, mine)
                 unknown += mine
         first, starts, parameters = (ca.vertcat(*group) for group in (states, unknown, values))
         slopes = [ca.densify(ca.jacobian(first, group)) for group in (starts, parameters)]

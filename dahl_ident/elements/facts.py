@@ -1,4 +1,4 @@
-"""What elements answer with: a stiffness or force with derivatives, limits, products of powers."""
+"""Results of elements: a stiffness or force with derivatives, limits, products of powers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dahl_ident.elements.element import Element
 
 Values = Sequence[FloatArray]
-"""Of an element's parameters, in their order."""
+"""Values of an element's parameters, in their order."""
 
 Orders = int | NDArray[np.int64]
 """One harmonic, or that of each row along the last axis."""
@@ -120,8 +120,10 @@ def each_harmonic(settled: Settled) -> Settled:
         whole = [np.empty(shape, dtype=np.complex128) for _ in range(count)]
         for k in np.unique(orders).tolist():
             rows = np.flatnonzero(orders == k)
-            own = [v[..., rows] if v.shape[-1:] == orders.shape else v for v in arguments]
-            part = settled(law, own[:-2], Sine(own[-2], own[-1], k), derivatives)
+            row_arguments = [v[..., rows] if v.shape[-1:] == orders.shape else v for v in arguments]
+            part = settled(
+                law, row_arguments[:-2], Sine(row_arguments[-2], row_arguments[-1], k), derivatives
+            )
             pieces = (part.value, part.by_amplitude, *part.by_parameter)
             for target, piece in zip(whole, pieces, strict=False):
                 target[..., rows] = piece

@@ -92,14 +92,14 @@ class Friction(Element):
     ) -> None:
         check_declarations(type(self))
         labels = [p.name for p in type(self).parameters]
-        given = dict(zip(labels, values, strict=False))
-        wrong = [label for label in named if label not in labels or label in given]
+        by_position = dict(zip(labels, values, strict=False))
+        wrong = [label for label in named if label not in labels or label in by_position]
         if wrong or len(values) > len(labels):
             raise ModelError(
                 f"{type(self).__name__} got {len(values)} values and the names {list(named)}; "
                 f"expected each at most once of {', '.join(labels)}"
             )
-        self._bind(given | named, name)
+        self._bind(by_position | named, name)
         check_slope(self)
         if not self.scale_parameters:
             self.scale_parameters = scaling_the_force(self)
@@ -163,8 +163,8 @@ class Friction(Element):
     def start_bounds(self, values: Values) -> tuple[float, float]:
         """Return between which numbers the unknowns at the first sample are: forces of full slip.
 
-        Beyond them friction falls back within a small part of x_c, so that hardly anything tells
-        how far beyond it began.
+        Beyond them friction falls back within a small part of x_c, so that the data hardly show how
+        far beyond them it began.
         """
         up, down = (float(force) for force in self.force_limits(values))
         return self.start_with(values, -down), self.start_with(values, up)
@@ -183,8 +183,8 @@ class Friction(Element):
         value = loops.coefficients / A
         rests = A[:, 0] <= _SMALLEST
         if self.rate_independent and rests.any():
-            own = [np.asarray(v) for v in at[rests, 2:].T]
-            value[rests] = self.rest_stiffness(own)[:, None] * (orders == 1)
+            law_values = [np.asarray(v) for v in at[rests, 2:].T]
+            value[rests] = self.rest_stiffness(law_values)[:, None] * (orders == 1)
         by = np.zeros((len(values) if derivatives > 1 else 0, *value.shape), dtype=np.complex128)
         by[chosen] = np.moveaxis(loops.by_parameter, 2, 0) / A
         by_amplitude = (loops.by_amplitude - value) / A

@@ -57,7 +57,7 @@ _LEAST_BETA = 1e-200
 """Smaller loops are computed as one of this size, whose curvature underflows to zero."""
 
 _DEEPEST = 44.0
-"""Integrals over l end here: exp(-44) is nothing, even over a root where slip sets in."""
+"""Integrals over l end here: exp(-44) is negligible, even over a root where slip sets in."""
 
 COUNTS = 1, 2, 4
 """How many arrays are returned with 0, 1 and 2 derivatives."""
@@ -180,13 +180,13 @@ def _stiffness(
     rule = quadrature_rule(int(k.max(initial=1)))
     reach = np.minimum(length, _DEEPEST)
     depth = reach * rule.rise  # l
-    rest = (length - reach) + reach * rule.fall
+    remaining = (length - reach) + reach * rule.fall
     scaled = p * path  # p E(L)
     sin2 = -np.expm1(-p * depth) / scaled  # of theta/2, as cos2
     slipped = 1.0 - 1.0 / np.maximum(scaled, 1.0)
-    cos2 = np.exp(-p * depth) * -np.expm1(-p * rest) / scaled + slipped
+    cos2 = np.exp(-p * depth) * -np.expm1(-p * remaining) / scaled + slipped
     z = np.exp(log_z0 - depth)
-    curved = z * -np.expm1(-alpha * rest)
+    curved = z * -np.expm1(-alpha * remaining)
     sin = 2.0 * np.sqrt(sin2 * cos2)
     sin_k, cos_k = sin, 1.0 - 2.0 * sin2
     if (k > 1).any():

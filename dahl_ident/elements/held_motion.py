@@ -25,7 +25,7 @@ _SYSTEMS: dict[Hashable, System] = {}
 """Compiled equations by law; not kept on the laws, which are sent to other processes."""
 _BOTH_WAYS: dict[Hashable, bool] = {}
 _FIRST: dict[Hashable, FirstState] = {}
-"""How first states follow from what is unknown there, by law."""
+"""The maps from the unknowns at the first sample to the states, by law."""
 
 _EVEN = 0.1  # of a step: what even sampling may leave unexplained
 _FINER = 10.0  # than a driven motion, where a step is not that across a narrow gap

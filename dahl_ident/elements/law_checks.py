@@ -157,13 +157,13 @@ def _agrees_with_units(law: Friction) -> bool:
     try:
         with np.errstate(all="ignore"):
             slope = np.asarray(law.slope(force, direction, speed, values))
-            other = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
+            rescaled = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
     except Exception as exc:  # what one set of values does not show, such as an if on a value
         raise ModelError(
             f"{type(law).__name__}.slope failed for arrays of {_TRIALS} forces and of {_TRIALS} "
             f"of each value: {_in_words(exc)}"
         ) from exc
-    return bool(np.allclose(other, _FORCE_UNIT * slope, rtol=1e-12, atol=0.0, equal_nan=True))
+    return bool(np.allclose(rescaled, _FORCE_UNIT * slope, rtol=1e-12, atol=0.0, equal_nan=True))
 
 
 class _Trial:
@@ -176,15 +176,15 @@ class _Trial:
         self._count = 1 if known else _TRIALS
         self._values = [_tried(p, rng, self._count)[:, None] for p in law.parameters]
         self._size = np.concatenate([-_MAGNITUDES[::-1], [0.0], _MAGNITUDES])
-        rest = len(_MAGNITUDES)
+        zero = len(_MAGNITUDES)
         force = np.broadcast_to(self._size, (self._count, self._size.size))
         self._wide = [self._slope(s * force, s) for s in (1.0, -1.0)]
-        self._rest = self._wide[0][:, rest]
+        self._at_rest = self._wide[0][:, zero]
         limits = [self._limit(s, wide) for s, wide in zip((1.0, -1.0), self._wide, strict=True)]
         self._limits = np.stack(limits)
         with np.errstate(all="ignore"):
-            changed = np.abs(self._wide[0][:, rest:] / self._rest[:, None] - 1.0) > _CHANGED
-        first = np.where(changed.any(axis=1), self._size[rest + changed.argmax(axis=1)], np.inf)
+            changed = np.abs(self._wide[0][:, zero:] / self._at_rest[:, None] - 1.0) > _CHANGED
+        first = np.where(changed.any(axis=1), self._size[zero + changed.argmax(axis=1)], np.inf)
         scale = np.fmin(first, self._limits.min(axis=0))
         self._scale = np.where(np.isfinite(scale), scale, 1.0)
 
@@ -204,7 +204,7 @@ class _Trial:
         arguments = f"an array of {force.shape} forces, and {len(self._values)} values"
         rated = not law.rate_independent
         try:
-            found = self._called(force, heading, 0.0 if rated else None)
+            returned = self._called(force, heading, 0.0 if rated else None)
         except Exception as exc:  # whatever a user's code raises
             if not rated and self._works_with_velocity(force, heading):
                 raise ModelError(
@@ -212,13 +212,13 @@ class _Trial:
                     "declare rate_independent = False"
                 ) from exc
             raise ModelError(f"{name} failed for {arguments}: {_in_words(exc)}") from exc
-        if found is None:
+        if returned is None:
             raise ModelError(f"{name} returned None; expected dF/dx, N/m: end it with return")
-        array: NDArray[Any] = np.asarray(found)
+        array: NDArray[Any] = np.asarray(returned)
         if array.dtype.kind not in "fiub":
             raise ModelError(
-                f"{name} returned {_shown(found)}, numbers of type {array.dtype}; expected dF/dx, "
-                "N/m, as real numbers"
+                f"{name} returned {_shown(returned)}, numbers of type {array.dtype}; expected "
+                "dF/dx, N/m, as real numbers"
             )
         try:
             fits = np.broadcast_shapes(array.shape, force.shape) == force.shape
@@ -244,14 +244,15 @@ class _Trial:
 
     def _limit(self, direction: float, wide: FloatArray) -> FloatArray:
         """Return the size of the force at which the slope ceases to be positive; inf if never."""
-        size, rest = self._size, len(_MAGNITUDES)
+        size = self._size
+        zero = len(_MAGNITUDES)
         low, high = np.zeros(self._count), np.full(self._count, np.inf)
         for row in range(self._count):
             with np.errstate(invalid="ignore"):
-                stops = np.flatnonzero(~((wide[row, rest:] > 0.0) & (wide[row, rest:] < np.inf)))
-                far = wide[row, rest : rest + stops[0]] if stops.size else wide[row, rest:]
+                stops = np.flatnonzero(~((wide[row, zero:] > 0.0) & (wide[row, zero:] < np.inf)))
+                far = wide[row, zero : zero + stops[0]] if stops.size else wide[row, zero:]
             if stops.size and not (far.size and far[-1] > _OVERFLOW * far[0]):
-                low[row], high[row] = size[max(rest, rest + stops[0] - 1)], size[rest + stops[0]]
+                low[row], high[row] = size[max(zero, zero + stops[0] - 1)], size[zero + stops[0]]
         open_ended = np.isinf(high)
         for _ in range(4):
             line = (
@@ -278,32 +279,33 @@ class _Trial:
 
     def _within(self, reached: FloatArray) -> list[str]:
         """Return what is wrong with the slope at sizes of forces to either side, from 0 on."""
-        found = [""] * self._count
+        objections = [""] * self._count
         for i, direction in enumerate((1.0, -1.0)):
-            own, other = reached[i], reached[1 - i]  # after a reversal, the other side's forces
-            size = np.c_[-other[:, :0:-1], own, _BEYOND * own[:, -1]]
+            ahead, behind = reached[i], reached[1 - i]  # after a reversal, the other side's forces
+            size = np.c_[-behind[:, :0:-1], ahead, _BEYOND * ahead[:, -1]]
             slopes = self._slope(direction * size, direction)
             place, peak = self._peak(size, slopes, direction)
             size, slopes = np.c_[place, size], np.c_[peak, slopes]
             for row in range(self._count):
-                found[row] = found[row] or (
+                objections[row] = objections[row] or (
                     self._not_finite(row, size[row], slopes[row], direction)
                     or self._positive_again(row, i, direction)
                     or self._not_positive(row, size[row, :-1], slopes[row, :-1], direction)
                 )
-        return found
+        return objections
 
     def _reached(self, side: int) -> FloatArray:
         """Return sizes of the forces that motions reach on one side, from 0 on.
 
         Up to full slip; without it, ever farther apart, until one direction's slope overflows.
         """
-        share, rest = np.linspace(0.0, 1.0, _LINE), len(_MAGNITUDES)
-        before, after = self._wide[side][:, rest + 1 :], self._wide[1 - side][:, rest - 1 :: -1]
+        share = np.linspace(0.0, 1.0, _LINE)
+        zero = len(_MAGNITUDES)
+        before, after = self._wide[side][:, zero + 1 :], self._wide[1 - side][:, zero - 1 :: -1]
         limit, scale = self._limits[side], self._scale
         with np.errstate(invalid="ignore"):
             steepest = np.maximum(np.abs(before), np.abs(after))
-            wild = ~(steepest < _OVERFLOW * self._rest[:, None])
+            wild = ~(steepest < _OVERFLOW * self._at_rest[:, None])
         wild &= scale[:, None] < _MAGNITUDES
         farthest = np.where(wild, _MAGNITUDES, _FAR * scale[:, None]).min(axis=1)
         sizes: FloatArray = scale[:, None] * np.expm1(share * np.log1p(farthest / scale)[:, None])
@@ -348,11 +350,11 @@ class _Trial:
     ) -> str:
         largest = np.max(np.abs(slopes))
         negative = np.flatnonzero(slopes < -_ROUNDING * largest)
-        if not self._rest[row] > 0.0:
+        if not self._at_rest[row] > 0.0:
             where = self._at(row, 0.0, direction)
             return (
-                f"is {self._rest[row]:.4g} N/m {where}; expected a positive slope at rest and up "
-                "to full slip"
+                f"is {self._at_rest[row]:.4g} N/m {where}; expected a positive slope at rest and "
+                "up to full slip"
             )
         inner = negative[size[negative] < size[-1] * (1.0 - 1e-3)]
         if not inner.size:
@@ -369,7 +371,7 @@ class _Trial:
         limit, slopes, size = self._limits[side, row], self._wide[side][row], self._size
         near = (size > limit) & (size < 1e3 * limit)
         with np.errstate(invalid="ignore"):
-            smallest = _ROUNDING * self._rest[row]
+            smallest = _ROUNDING * self._at_rest[row]
             negative = np.flatnonzero(near & (slopes < -smallest))
             later = np.flatnonzero(near & (slopes > smallest))
         if not (negative.size and later.size and later[-1] > negative[0]):
@@ -383,19 +385,19 @@ class _Trial:
 
     def constant(self) -> list[str]:
         """Return that the slope is the same for all forces and directions, if it is."""
-        found = []
+        objections = []
         for row in range(self._count):
             slopes = np.concatenate([wide[row] for wide in self._wide])
             slopes = slopes[np.isfinite(slopes)]  # forces far beyond full slip may overflow
             same = bool(slopes.size) and np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
-            found.append(
+            objections.append(
                 f"is {slopes[0]:.4g} N/m for every force and direction: a constant number, which "
                 "is a spring without friction; expected a slope that depends on force and "
                 "direction, or use di.Spring"
                 if same
                 else ""
             )
-        return found if self._law.rate_independent else [""]
+        return objections if self._law.rate_independent else [""]
 
     def loops(self) -> list[str]:
         """Return by how much energy grows over a closed loop, for each set of values.
@@ -405,7 +407,7 @@ class _Trial:
         share = np.linspace(0.0, _TO_SLIP, _LINE)
         reach = np.where(np.isfinite(self._limits), self._limits, _SOFT * self._scale)
         upper, lower = share * reach[0][:, None], -share * reach[1][:, None]
-        found = []
+        objections = []
         with np.errstate(all="ignore"):
             high, low = self._between(upper), self._between(lower)
         for row in range(self._count):
@@ -420,7 +422,7 @@ class _Trial:
                 created = np.where(after.any(axis=1), -lost / all_of_it, -np.inf)
             worst = int(np.nanargmax(np.where(np.arange(_LINE) > 0, created, -np.inf)))
             numbers = self._at(row, 0.0, 1.0).partition("direction = +1")[2].lstrip(", ")
-            found.append(
+            objections.append(
                 f"creates energy: {-lost[worst]:.3g} J in each cycle between "
                 f"{lower[row, place[worst]]:.3g} and {upper[row, worst]:.3g} N, at {numbers}; "
                 "expected a loop that loses energy: the slope after a reversal must not be below "
@@ -428,7 +430,7 @@ class _Trial:
                 if created[worst] > _CREATED
                 else ""
             )
-        return found
+        return objections
 
     def _between(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return three integrals from rest to each force, which the forces of a loop share.
@@ -484,8 +486,8 @@ def _in_words(exc: Exception) -> str:
     )
 
 
-def _shown(found: Any) -> str:
-    text = " ".join(repr(found).split())
+def _shown(value: Any) -> str:
+    text = " ".join(repr(value).split())
     return text if len(text) <= 40 else f"{text[:40]}..."
 
 
@@ -509,7 +511,7 @@ def traced(
 
 
 def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
-    """Refuse a slope that is another one in symbols than in numbers."""
+    """Refuse a slope that differs between symbols and numbers."""
     import casadi as ca
 
     rng = np.random.default_rng(1)
@@ -522,8 +524,8 @@ def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> Non
     with np.errstate(all="ignore"):
         expected = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
         rows = zip(forces, direction, speed, *(n for _, n in free), strict=True)
-        found = np.array([float(function(*row)) for row in rows])
-    if not np.allclose(found, expected, rtol=_AGREE, atol=0.0, equal_nan=True):
+        computed = np.array([float(function(*row)) for row in rows])
+    if not np.allclose(computed, expected, rtol=_AGREE, atol=0.0, equal_nan=True):
         raise ModelError(
             f"{type(law).__name__}.slope cannot be compiled: with symbols in place of numbers it "
             "gives another result; expected plain arithmetic, comparisons and numpy's functions, "

@@ -181,10 +181,10 @@ def restored(file: LawFile, name: str) -> Any:
     """Return an element without its content, of a class that a file defines."""
     if file.module not in _FILES:
         run(file)
-    found: Any = sys.modules[file.module]
+    cls: Any = sys.modules[file.module]
     for part in name.split("."):
-        found = getattr(found, part)
-    return object.__new__(found)
+        cls = getattr(cls, part)
+    return object.__new__(cls)
 
 
 def own_laws(elements: Iterable[Element]) -> list[type[Element]]:
@@ -195,13 +195,13 @@ def own_laws(elements: Iterable[Element]) -> list[type[Element]]:
 
 def describe_laws(elements: Iterable[Element]) -> list[dict[str, Any]]:
     """Return what to import for the laws of a model that are not this package's, as plain data."""
-    found = []
+    descriptions = []
     for law in own_laws(elements):
         path, file = source_path(law), file_of(law)
         module = Path(file.path).stem if file else law.__module__
         about = {"kind": law.kind, "class": law.__qualname__, "module": module, "file": path}
-        found.append(about)
-    return found
+        descriptions.append(about)
+    return descriptions
 
 
 def require_laws(laws: Sequence[Mapping[str, Any]], holder: str) -> None:

@@ -105,7 +105,7 @@ def describing_function(beta: FloatArray) -> ComplexArray:
 def describing_function_gradient(
     beta: FloatArray,
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return h, -beta h' and h + beta h': N/sigma and its derivatives by ln f_max and ln sigma.
+    """Return h, -beta h' and h + beta h': N/sigma, its derivatives wrt ln f_max and ln sigma.
 
     Each part is computed without cancellation, so it is accurate by itself except near a change of
     its sign.

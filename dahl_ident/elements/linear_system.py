@@ -105,18 +105,18 @@ class LinearSystem(Element):
         name: str | None = None,
     ) -> None:
         one_of(quantity, "quantity", QUANTITIES)
-        given = dict(parameters or {})
+        arguments = dict(parameters or {})
         is_function = callable(system) and not _is_system(system)
-        if is_function != bool(given):
+        if is_function != bool(arguments):
             raise ValidationError(
-                f"system is a {type(system).__name__} with the parameters {list(given)}; expected "
-                "a python-control system without parameters, or a function of all of them"
+                f"system is a {type(system).__name__} with the parameters {list(arguments)}; "
+                "expected a python-control system without parameters, or a function of all of them"
             )
         self._name = name
         self._system = system
         self._quantity = quantity
-        self._labels = tuple(given)
-        self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in given.items())
+        self._labels = tuple(arguments)
+        self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in arguments.items())
         self._last: tuple[FloatArray, ComplexArray] | None = None
         self._known: tuple[tuple[float, ...], Equation] | None = None
         if not is_function:
@@ -239,7 +239,8 @@ class LinearSystem(Element):
                     f"under a prescribed displacement the force of {self!r} grows beyond all "
                     "bounds; give records in which a force drives a mass"
                 )
-            rest, h = np.zeros((equation.order, 1)), self._step(path.time)
+            rest = np.zeros((equation.order, 1))
+            h = self._step(path.time)
             paths = Path(x, v, a).polynomials(np.full(x.size - 1, h)).T
             states = self._histories(equation, h, paths, rest)
             force = np.asarray(force + states[:, 0] @ equation.output)
@@ -389,9 +390,9 @@ class LinearSystem(Element):
 
     def __repr__(self) -> str:
         what = getattr(self._system, "__name__", type(self._system).__name__)
-        _, _, rest = super().__repr__().partition("(")
-        separator = "" if rest == ")" else ", "
-        return f"LinearSystem({self._quantity} of {what}{separator}{rest}"
+        _, _, arguments = super().__repr__().partition("(")
+        separator = "" if arguments == ")" else ", "
+        return f"LinearSystem({self._quantity} of {what}{separator}{arguments}"
 
 
 class Equation(NamedTuple):
@@ -439,12 +440,12 @@ class Equation(NamedTuple):
 def coefficients_of(Z: Rational, rate: float) -> FloatArray:
     """Return the coefficients of :class:`Equation` of a function that grows no faster than s^2."""
     n = Z.degrees[1]
-    polynomial, rest = Z.split()
+    polynomial, proper = Z.split()
     k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
     powers = rate ** np.arange(1, n + 1)
     a, b = (
         f[f.size - n :] / Z.denominator[0] / powers
-        for f in (Z.denominator, np.append(np.zeros(n), rest.numerator))
+        for f in (Z.denominator, np.append(np.zeros(n), proper.numerator))
     )
     return np.concatenate([[k, c, m], a, b])
 
@@ -537,10 +538,10 @@ def _is_system(system: Any) -> bool:
     return isinstance(system, (control.TransferFunction, control.StateSpace, control.FRD))
 
 
-def _parameter(name: str, given: float | Parameter | None) -> Parameter:
-    if isinstance(given, Parameter):
-        return replace(given, name=name)
-    return Parameter(name, "", "argument of a linear system", given)
+def _parameter(name: str, value: float | Parameter | None) -> Parameter:
+    if isinstance(value, Parameter):
+        return replace(value, name=name)
+    return Parameter(name, "", "argument of a linear system", value)
 
 
 def differences(

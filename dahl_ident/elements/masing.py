@@ -215,10 +215,10 @@ class _Paths:
             if not self._open:
                 break
             # a path ends where the one before it began; the first one mirrors its own origin
-            own = self._open[-1]
-            limit = self._origin[self._open[-2]] if len(self._open) > 1 else -self._origin[own]
+            path = self._open[-1]
+            limit = self._origin[self._open[-2]] if len(self._open) > 1 else -self._origin[path]
             inside = int(np.searchsorted(heading * places, heading * limit, side="right"))
-            path_of[begin:inside] = own
+            path_of[begin:inside] = path
             begin = max(begin, inside)
             if begin < places.size:
                 del self._open[-2:]

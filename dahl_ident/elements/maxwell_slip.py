@@ -72,13 +72,13 @@ class MaxwellSlip(Masing):
         *,
         name: str | None = None,
     ) -> None:
-        given: FloatArray | None = None
+        displacements: FloatArray | None = None
         if isinstance(slips, int):
             n = whole_number(slips, "slips", 1)
         else:
-            given = np.atleast_1d(positive_array(slips, "slips"))
-            n = given.size
-            if given.ndim != 1 or np.any(np.diff(given) <= 0.0):
+            displacements = np.atleast_1d(positive_array(slips, "slips"))
+            n = displacements.size
+            if displacements.ndim != 1 or np.any(np.diff(displacements) <= 0.0):
                 raise ValidationError(f"slips are {list(slips)}; expected rising displacements")
         stiff = None if stiffnesses is None else positive_array(stiffnesses, "stiffnesses")
         if stiff is not None and stiff.shape != (n,):
@@ -93,7 +93,7 @@ class MaxwellSlip(Masing):
             )
             for label, unit, meaning, values in (
                 ("stiffness", "N/m", "stiffness of Jenkins element", stiff),
-                ("slip", "m", "slip displacement of Jenkins element", given),
+                ("slip", "m", "slip displacement of Jenkins element", displacements),
             )
             for i in range(n)
         )  # fmt: skip
@@ -170,8 +170,8 @@ class MaxwellSlip(Masing):
         return force_along(self, values, path, state, free if slopes else None)
 
     def __repr__(self) -> str:
-        own = {
+        arguments = {
             self.label(p): "free" if p.value is None else f"{p.value:g}" for p in self.parameters
         }
         name = f", name={self.name!r}" if self.name else ""
-        return f"MaxwellSlip({', '.join(f'{k}={v}' for k, v in own.items())}{name})"
+        return f"MaxwellSlip({', '.join(f'{k}={v}' for k, v in arguments.items())}{name})"

@@ -124,13 +124,13 @@ class Parameter:
         >>> Parameter("damping", "N s/m", "viscous damping").dimension
         (1, -1, 1)
         """
-        found = _dimension(self.unit)
-        if found is None:
+        powers = _dimension(self.unit)
+        if powers is None:
             raise ValidationError(
                 f"{self.name} has the unit {self.unit!r}; expected a product of powers of "
                 f"{', '.join(UNITS)}, such as 'N s/m'"
             )
-        return found
+        return powers
 
     @property
     def is_mass(self) -> bool:
@@ -191,9 +191,9 @@ def _dimension(unit: str) -> tuple[int, int, int] | None:
     total = [0, 0, 0]
     for place, part in enumerate(unit.split("/")):
         for factor in part.split():
-            found = re.fullmatch(r"\(?([A-Za-z]+|1)(?:\^(-?\d+))?\)?", factor)
-            if found is None or found[1] not in UNITS:
+            match = re.fullmatch(r"\(?([A-Za-z]+|1)(?:\^(-?\d+))?\)?", factor)
+            if match is None or match[1] not in UNITS:
                 return None
-            power = (-1 if place else 1) * int(found[2] or 1)
-            total = [t + power * u for t, u in zip(total, UNITS[found[1]], strict=True)]
+            power = (-1 if place else 1) * int(match[2] or 1)
+            total = [t + power * u for t, u in zip(total, UNITS[match[1]], strict=True)]
     return total[0], total[1], total[2]

@@ -95,8 +95,8 @@ class PowerDamper(Element):
         reference_speed: float = 1.0,
         name: str | None = None,
     ) -> None:
-        given = {"coefficient": coefficient, "exponent": exponent}
-        self._bind({**given, "reference_speed": reference_speed}, name)
+        numbers = {"coefficient": coefficient, "exponent": exponent}
+        self._bind({**numbers, "reference_speed": reference_speed}, name)
 
     @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:

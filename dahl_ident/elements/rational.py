@@ -34,8 +34,8 @@ class Rational:
 
     def split(self) -> tuple[FloatArray, Rational]:
         """Return the polynomial part and the strictly proper rest."""
-        quotient, rest = np.polydiv(self.numerator, self.denominator)
-        return np.atleast_1d(quotient), Rational(np.atleast_1d(rest), self.denominator)
+        quotient, remainder = np.polydiv(self.numerator, self.denominator)
+        return np.atleast_1d(quotient), Rational(np.atleast_1d(remainder), self.denominator)
 
     def without_common_zeros_at_0(self) -> Rational:
         """Return the same function with powers of s that cancel left out."""

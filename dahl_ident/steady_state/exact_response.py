@@ -142,7 +142,7 @@ def _followed(motions: list[list[_Orbit]], begins: BoolArray) -> IntArray:
         stable = [place for place, motion in enumerate(every) if motion.stable]
         last = None if first else last
         if stable:
-            own = [every[place].fundamental for place in stable]
-            nearest = 0 if last is None else int(np.argmin(np.abs(np.array(own) - last)))
-            result[point], last = stable[nearest], own[nearest]
+            fundamentals = [every[place].fundamental for place in stable]
+            nearest = 0 if last is None else int(np.argmin(np.abs(np.array(fundamentals) - last)))
+            result[point], last = stable[nearest], fundamentals[nearest]
     return result

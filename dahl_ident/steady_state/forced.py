@@ -206,10 +206,10 @@ def response(
         _check_reach(roots)
         amplitude = roots * points.unit[:, None]
         _check_reach(amplitude)
-    found = np.isfinite(roots)
-    force = points.at(np.nonzero(found)[0]).force(roots[found])
+    exists = np.isfinite(roots)
+    force = points.at(np.nonzero(exists)[0]).force(roots[exists])
     X: ComplexArray = np.full(roots.shape, np.nan, dtype=np.complex128)
-    X[found] = amplitude[found] * (force.conj() / np.abs(force))
+    X[exists] = amplitude[exists] * (force.conj() / np.abs(force))
     harmonics = np.where(np.array(HARMONICS) == 1, X[..., None], 0.0)
     multiplier = np.full(X.shape, np.nan)
     chosen = np.zeros(X.shape[0], dtype=np.intp)
@@ -224,11 +224,11 @@ def response(
         multiplier = np.pad(multiplier, more, constant_values=np.nan)
         harmonics = np.pad(harmonics, (*more, (0, 0)), constant_values=np.nan)
         harmonics[exact], multiplier[exact], chosen[exact] = motions
-    found = np.isfinite(harmonics[..., 1])
-    count = found.sum(axis=1).reshape(shape)
+    exists = np.isfinite(harmonics[..., 1])
+    count = exists.sum(axis=1).reshape(shape)
     active = points.linear.imag < 0.0
     message = _message(
-        count, active.reshape(shape), ((chosen < 0) & found.any(axis=1)).reshape(shape),
+        count, active.reshape(shape), ((chosen < 0) & exists.any(axis=1)).reshape(shape),
         np.broadcast_to(f, shape), np.broadcast_to(u0, shape),
     )  # fmt: skip
     if steady == "exact" and not exact.all() and why != LINEAR:
@@ -240,7 +240,7 @@ def response(
         omega, u = (np.broadcast_to(v, shape).ravel()[at] for v in (2.0 * np.pi * f, u0))
         message = "; ".join(filter(None, (message, _not_a_sine(plant, omega, u, amplitude[at, 0]))))
     if all_roots:
-        f, u0, shape = f[..., None], u0[..., None], (*shape, found.shape[1])
+        f, u0, shape = f[..., None], u0[..., None], (*shape, exists.shape[1])
     else:
         if np.any(count > 1):
             one = "the one that a sweep in their order follows" if exact.any() else "the smallest"

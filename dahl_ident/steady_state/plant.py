@@ -44,7 +44,7 @@ class Nonlinear:
     @property
     def shared(self) -> bool:
         """Whether all points have one vector of parameters."""
-        return self.omega.ndim == 0 and all(v.ndim == 0 for own in self.values for v in own)
+        return self.omega.ndim == 0 and all(v.ndim == 0 for numbers in self.values for v in numbers)
 
     def force(self, amplitude: FloatArray, vector: IntArray) -> ComplexArray:
         """Return A N, the force's fundamental; `vector` is the parameter vector of each row."""
@@ -163,11 +163,11 @@ class Plant:
         self, amplitude: FloatArray, force: ComplexArray, slope: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return ln(A |Z| / u_0) and its derivative with respect to ln A."""
-        rest = amplitude * self.linear
-        total = rest + force
+        linear = amplitude * self.linear
+        total = linear + force
         size = np.abs(total)
         with np.errstate(divide="ignore", invalid="ignore"):  # Z = 0 at a limit cycle
-            return np.log(size / self.drive), ((rest + slope) / total).real
+            return np.log(size / self.drive), ((linear + slope) / total).real
 
     def conditioning(self, amplitude: FloatArray, force: ComplexArray) -> FloatArray:
         """Return (|L| + |N|) A/u_0, the amplification of rounding near a sharp resonance."""
@@ -182,13 +182,13 @@ def flatten(
     linear, size = np.zeros((), dtype=np.complex128), np.zeros(())
     elements: list[Element] = []
     friction: _Values = []
-    for element, own in as_model(model).of(values):
+    for element, numbers in as_model(model).of(values):
         if element.is_linear:
-            part = element.stiffness(own, _AT_REST, omega)
+            part = element.stiffness(numbers, _AT_REST, omega)
             linear, size = linear + part, size + np.abs(part)
         else:
             elements.append(element)
-            friction.append(own)
+            friction.append(numbers)
     rates = [] if all(e.rate_independent for e in elements) else [np.asarray(omega)]
     which: IntArray | None = None
     if rates and rates[0].ndim == 1 and all(np.shape(v)[-1:] in ((), (1,)) for v in values):
@@ -196,7 +196,7 @@ def flatten(
         rates = [one]
     linear, friction = _without_overflow(linear, friction)
     force, stiffness, friction = _units(elements, friction)
-    batch = np.broadcast_shapes(*(np.shape(v) for own in (*friction, rates) for v in own))
+    batch = np.broadcast_shapes(*(np.shape(v) for numbers in (*friction, rates) for v in numbers))
     vectors = np.arange(np.prod(batch, dtype=np.intp)).reshape(batch)
     if which is not None:
         vectors = vectors[..., which]
@@ -207,7 +207,7 @@ def flatten(
         _flat(vectors, shape),
         Nonlinear(
             tuple(elements),
-            tuple(tuple(_flat_values(v, batch) for v in own) for own in friction),
+            tuple(tuple(_flat_values(v, batch) for v in numbers) for numbers in friction),
             _flat_values(rates[0], batch) if rates else np.zeros(()),
             all(element.unique_response for element in elements),
         ),
@@ -218,12 +218,12 @@ def flatten(
 
 def _without_overflow(linear: ComplexArray, friction: _Values) -> tuple[ComplexArray, _Values]:
     """Mask values at which a search overflowed: no L, and no amplitude, there."""
-    finite = [np.isfinite(v) for own in friction for v in own]
+    finite = [np.isfinite(v) for numbers in friction for v in numbers]
     if all(np.all(f) for f in finite):
         return linear, friction
     sound = np.all(np.broadcast_arrays(*finite), axis=0)
     return np.where(sound, linear, np.nan), [
-        [np.where(sound, v, 1.0) for v in own] for own in friction
+        [np.where(sound, v, 1.0) for v in numbers] for numbers in friction
     ]
 
 

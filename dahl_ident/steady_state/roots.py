@@ -74,11 +74,11 @@ def find_roots(plant: Plant, per_decade: int = _SCAN_PER_DECADE) -> FloatArray:
     active = np.flatnonzero(known & ~passive)
     if not active.size:
         return amplitude[:, None]
-    point, found = _scan(plant, active, per_decade)
+    point, crossing = _scan(plant, active, per_decade)
     column = _places(point)
     roots = np.full((amplitude.size, 1 + int(column.max(initial=0))), np.nan)
     roots[:, 0] = amplitude
-    roots[point, column] = found
+    roots[point, column] = crossing
     return roots
 
 
@@ -224,11 +224,11 @@ def _compared(
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return whether A |Z| exceeds u_0, whether it falls, and whether a change of A may reach u_0.
 
-    `force` and `slope` are A N and its derivative by ln A. A changes by at most `ratio`; A |Z|
-    then changes by no more than twice its steepest slope at A.
+    `force` and `slope` are A N and its derivative with respect to ln A. A changes by at most
+    `ratio`; A |Z| then changes by no more than twice its steepest slope at A.
     """
-    rest = plant.linear * amplitude
-    total, slope = rest + force, rest + slope
+    linear = plant.linear * amplitude
+    total, slope = linear + force, linear + slope
     size = np.sqrt(total.real**2 + total.imag**2)
     steepest = np.sqrt(slope.real**2 + slope.imag**2)
     falling = total.real * slope.real + total.imag * slope.imag < 0.0
@@ -241,9 +241,9 @@ def _separated(plant: Plant, cells: _Cells) -> tuple[_Cells, FloatArray]:
 
     By bisection towards the turning point, until it is beyond u_0 or too far to reach it.
     """
-    found, between = np.zeros(cells.point.shape, dtype=np.bool_), np.empty(cells.point.shape)
+    crossed, between = np.zeros(cells.point.shape, dtype=np.bool_), np.empty(cells.point.shape)
     low, high = cells.low.copy(), cells.high.copy()
-    active = np.arange(found.size)
+    active = np.arange(crossed.size)
     while active.size:
         middle = np.sqrt(low[active]) * np.sqrt(high[active])
         part = plant.at(cells.point[active])
@@ -251,11 +251,11 @@ def _separated(plant: Plant, cells: _Cells) -> tuple[_Cells, FloatArray]:
         above, falling, near = _compared(part, middle, force, slope, high[active] / low[active])
         across = above != cells.above[active]
         going = near & ~across & (middle > low[active]) & (middle < high[active])
-        found[active[across]], between[active[across]] = True, middle[across]
+        crossed[active[across]], between[active[across]] = True, middle[across]
         before = falling == cells.falling[active]
         low[active[before]], high[active[~before]] = middle[before], middle[~before]
         active = active[going]
-    return cells.take(found), between[found]
+    return cells.take(crossed), between[crossed]
 
 
 def _places(point: IntArray) -> IntArray:

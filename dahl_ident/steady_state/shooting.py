@@ -192,7 +192,8 @@ class Shooting:
         self._solve(result, possible & ~result.found & unstable, ask, cycles=_LONG)
         if stable and self.system.odd:
             unstable = np.isfinite(result.multiplier)
-            which, runs = possible & ~result.found & unstable, _PATIENT if one_sided else 0
+            which = possible & ~result.found & unstable
+            runs = _PATIENT if one_sided else 0
             self._solve(result, which, ask._replace(one_sided=True), cycles=_LONG, runs=runs)
         if slopes is not None:
             result = result._replace(by_parameter=result.by_parameter @ slopes[:, chosen])
@@ -218,23 +219,23 @@ class Shooting:
         begin = None if starts is None else starts[rows]
         for count in (*[_ALONE] * runs, cycles):
             with np.errstate(all="ignore"):
-                found = settled(
+                motions = settled(
                     system, ask.drive[rows], ask.omega[rows], ask.values[rows], chosen=ask.chosen,
                     harmonics=ask.harmonics, starts=begin, cycles=count, finer=finer,
                 )  # fmt: skip
-            begin = found.starts
+            begin = motions.starts
         multiplier = np.full(rows.size, np.nan)
-        ok = found.found & np.isfinite(found.maps).all(axis=(1, 2))
-        sizes = np.abs(np.linalg.eigvals(found.maps[ok])).max(axis=1, initial=0.0)
+        ok = motions.found & np.isfinite(motions.maps).all(axis=(1, 2))
+        sizes = np.abs(np.linalg.eigvals(motions.maps[ok])).max(axis=1, initial=0.0)
         multiplier[ok] = sizes**2 if system.odd else sizes  # the map of half a cycle
         with np.errstate(invalid="ignore"):
             good = ok & (multiplier <= 1.0 + NEUTRAL) if ask.stable else ok
         put, at = np.flatnonzero(good), rows[good]
         result.found[at] = True
-        result.harmonics[at] = found.coefficients[put]
-        result.by_drive[at] = found.by_amplitude[put]
-        result.by_parameter[at] = found.by_parameter[put]
-        result.starts[at] = found.starts[put]
+        result.harmonics[at] = motions.coefficients[put]
+        result.by_drive[at] = motions.by_amplitude[put]
+        result.by_parameter[at] = motions.by_parameter[put]
+        result.starts[at] = motions.starts[put]
         result.multiplier[rows] = multiplier
 
 
