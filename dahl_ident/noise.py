@@ -260,29 +260,29 @@ def correct_amplitude(
 ) -> tuple[ComplexArray, Whitening, FloatArray]:
     """Return residuals with every true amplitude at its best value, their whitening, and ln errors.
 
-    `predict` takes the error e of ln A, and returns the response and its derivative by ln A at
-    the amplitude measured over exp(e). Each row is a fixed-point iteration of one variable, which
-    secants of its last two steps shorten unless it hardly contracts.
+    `predict` takes the error e of ln A, and returns the response and its derivative with respect to
+    ln A at the amplitude measured over exp(e). Each row is a fixed-point iteration of one variable,
+    which secants of its last two steps shorten unless it hardly contracts.
     """
     error = noise.amplitude
     assert error is not None
     spread = np.sqrt(error.variance)
-    found = last = step = np.zeros(noise.response.shape)
+    ln_error = last = step = np.zeros(noise.response.shape)
     size, longest = np.where(spread > 0.0, spread, np.inf), np.inf
     for _ in range(_AMPLITUDE_STEPS):
-        predicted, slope = predict(found)
-        r = noise.response - predicted - slope * found
+        predicted, slope = predict(ln_error)
+        r = noise.response - predicted - slope * ln_error
         whitening = error.whitening(noise.covariance, slope)
         lever = whitening.solve(r)
         shift = error.cross - error.variance * slope
-        new = shift.real * lever.real + shift.imag * lever.imag - found
+        new = shift.real * lever.real + shift.imag * lever.imag - ln_error
         before, longest = longest, float(np.max(np.abs(new) / size, initial=0.0))
         if not longest > _AMPLITUDE_TOLERANCE or _ROUNDED > longest >= before:
             break
-        secant = (new - step) / (found - last)  # -1 where one plain step is enough
+        secant = (new - step) / (ln_error - last)  # -1 where one plain step is enough
         stretch = np.where((-np.inf < secant) & (secant < -0.1), -1.0 / secant, 1.0)
-        found, last, step = found + stretch * new, found, new
-    return whitening(r), whitening, found
+        ln_error, last, step = ln_error + stretch * new, ln_error, new
+    return whitening(r), whitening, ln_error
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,8 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
         if empty.any():
             table = f" of table {int(np.argmax(empty))}" if empty.ndim else ""
             raise DataError(f"every response{table} is 0; there is nothing to estimate from")
-        one, none = np.ones(rows.response.shape), np.zeros(rows.response.shape)
+        one = np.ones(rows.response.shape)
+        none = np.zeros(rows.response.shape)
         return Measured(
             rows.response,
             Covariance(one, none, one),
@@ -397,13 +398,13 @@ def _measured(rows: Rows) -> Measured:
 def _amplitude_error(rows: Rows) -> AmplitudeError | None:
     """Return the error of the level that the model uses: ln A, or ln of the drive; None if none."""
     variance, cross = np.zeros(rows.n), np.zeros(rows.n, dtype=np.complex128)
-    for level, std, covariance, own in (
+    for level, std, covariance, held in (
         (rows.amplitude, rows.amplitude_std, rows.amplitude_covariance, ~rows.forced),
         (rows.drive, rows.drive_std, rows.drive_covariance, rows.forced),
     ):
         if std is None or level is None:
             continue
-        relative = np.where(own, 1.0 / level, 0.0)
+        relative = np.where(held, 1.0 / level, 0.0)
         variance = variance + (std * relative) ** 2
         if covariance is not None:
             cross = cross + covariance @ np.array([1.0, 1.0j]) * relative

@@ -348,11 +348,11 @@ def _without_angle(dimension: Dimension) -> Dimension:
     return tuple(part for part in dimension if part[0] != "radian")
 
 
-def _same(one: Dimension, other: Dimension, kind: str) -> bool:
+def _same(first: Dimension, second: Dimension, kind: str) -> bool:
     if kind in MECHANICAL_KINDS and kind not in MOTION_KINDS:
         # N m and N m/rad are both written for a rotary stiffness
-        return _without_angle(one) == _without_angle(other)
-    return one == other
+        return _without_angle(first) == _without_angle(second)
+    return first == second
 
 
 class QuantityForm(NamedTuple):

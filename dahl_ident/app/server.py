@@ -80,7 +80,9 @@ class Guard:
     """
 
     def __init__(self, app: ASGIApp, token: str, port: int, limit: int) -> None:
-        self._app, self._token, self._limit = app, token.encode(), limit
+        self._app = app
+        self._token = token.encode()
+        self._limit = limit
         self._hosts = {f"127.0.0.1:{port}", f"localhost:{port}"}
         self._cookie = f"dahl_ident_{port}"
 
@@ -104,7 +106,8 @@ class Guard:
         """Return the answer to a request that is not passed on."""
         if request.headers.get("host") not in self._hosts:
             return PlainTextResponse("This server answers to 127.0.0.1 alone.", 421)
-        origin, reads = request.headers.get("origin"), request.method in ("GET", "HEAD")
+        origin = request.headers.get("origin")
+        reads = request.method in ("GET", "HEAD")
         if (origin or not reads) and origin not in {f"http://{host}" for host in self._hosts}:
             return PlainTextResponse("The request comes from another page.", 403)
         if self._is_token(request.query_params.get("token", "")):

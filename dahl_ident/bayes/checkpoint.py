@@ -122,7 +122,8 @@ def _write(path: Path, chain: Chain, identity: Identity) -> None:
     h5py = library("h5py")
     _, key, *position = chain.random_state
     values = (chain.points, chain.log_density, chain.start, key, np.array(position, dtype=float))
-    text, seed = json.dumps(dict(identity), sort_keys=True), str(chain.seed)
+    text = json.dumps(dict(identity), sort_keys=True)
+    seed = str(chain.seed)
 
     def write(place: Path) -> None:
         with h5py.File(place, "w") as file:

@@ -301,7 +301,8 @@ class Density(LogDensity):
         y = y[..., :m] + errors.moved(at)
         by = np.where(np.isnan(errors.centre), by[..., :m, :], errors.slopes)
         with np.errstate(invalid="ignore", over="ignore"):
-            y, by = errors.independent(y), errors.independent(by.swapaxes(-1, -2))[0]
+            y = errors.independent(y)
+            by = errors.independent(by.swapaxes(-1, -2))[0]
             return float(0.5 * np.sum(y**2)), by @ by.T
 
     def _exponents(self, squares: FloatArray) -> FloatArray:
@@ -384,8 +385,9 @@ class RecordDensity(LogDensity):
 
     @cached_property
     def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Orthonormal derivatives by states and offsets, and those by theta, of each record."""
-        count, per_record = len(self.names), self.problem.per_record
+        """Orthonormal d/d(states and offsets), and d/d(theta), of each record."""
+        count = len(self.names)
+        per_record = self.problem.per_record
         parts = []
         for number in range(len(self.problem.records)):
             by = self.problem.filtered(self.problem.predict(self.values, number).by)
@@ -403,8 +405,8 @@ class RecordDensity(LogDensity):
         """C, symmetric in coordinates in which the covariance is the unit matrix."""
         hessian = np.zeros((len(self.names),) * 2)
         for basis, by in self._nuisance:
-            rest = by - basis @ (basis.T @ by)
-            hessian += rest.T @ rest
+            unexplained = by - basis @ (basis.T @ by)
+            hessian += unexplained.T @ unexplained
         noise = self._least / self.problem.n_residuals
         values, vectors = np.linalg.eigh(self.root.T @ hessian @ self.root / noise)
         shrunk = vectors @ np.diag(1.0 / np.sqrt(values)) @ vectors.T

@@ -73,7 +73,9 @@ class Decorrelation:
     def _moved(self, x: FloatArray, sign: float) -> FloatArray:
         if self.problem is None:
             return x
-        names, view, moved = self.problem.names, self.problem.stiffness_data, x.copy()
+        names = self.problem.names
+        view = self.problem.stiffness_data
+        moved = x.copy()
         by_name = dict(zip(names, self.problem.to_values(x[:, : len(names)]).T, strict=True))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
             N = sum(

@@ -221,7 +221,10 @@ def sample_points(
             tell(evaluations)
         return result
 
-    near, log_density, sums, error = None, partial(counted, density.marginal), density.sums, 0.0
+    near = None
+    log_density = partial(counted, density.marginal)
+    sums = density.sums
+    error = 0.0
     if density.likelihood == "gaussian":
         residuals_of = partial(counted, density.residuals)
         near = interpolated(density, residuals_of, centre, covariance, 0.5 * tolerance)

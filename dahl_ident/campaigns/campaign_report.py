@@ -35,7 +35,8 @@ def campaign_document(
     statuses = table["status"].value_counts()
     counted = ", ".join(f"{count} {status}" for status, count in statuses.items())
     verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
-    sections, status = [], "not determined"
+    sections = []
+    status = "not determined"
     if evaluated is not None:
         status = "trusted" if (table["status"] == "trusted").all() else "approximate"
         for p in evaluated.parameters.values():

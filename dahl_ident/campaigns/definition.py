@@ -221,11 +221,11 @@ def _check_names(tasks: Sequence[Task], parameters: Collection[str]) -> None:
                 f"a covariate is called {column!r}, as a column of the results; give it "
                 "another name"
             )
-    for one, other in pairwise(sorted(tasks, key=lambda task: task.name)):
-        if one.name == other.name:
+    for first, second in pairwise(sorted(tasks, key=lambda task: task.name)):
+        if first.name == second.name:
             raise ValidationError(
-                f"device {one.device!r}, run {one.run!r} and device {other.device!r}, run "
-                f"{other.run!r} are both called {one.name}; rename the files of one"
+                f"device {first.device!r}, run {first.run!r} and device {second.device!r}, run "
+                f"{second.run!r} are both called {first.name}; rename the files of one"
             )
 
 

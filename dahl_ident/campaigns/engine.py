@@ -151,13 +151,13 @@ class Scheduler(Place):
             return f"dahl_ident {version}"
 
         here = f"dahl_ident {__version__}"
-        other = {w: v for w, v in self._client.run(installed).items() if v != here}
-        if other:
-            where, version = next(iter(other.items()))
+        differing = {w: v for w, v in self._client.run(installed).items() if v != here}
+        if differing:
+            where, version = next(iter(differing.items()))
             self._client.close()
             raise ValidationError(
-                f"scheduler {self._address}: {len(other)} workers differ from this process, which "
-                f"has {here}: {where} has {version}; install the same version everywhere"
+                f"scheduler {self._address}: {len(differing)} workers differ from this process, "
+                f"which has {here}: {where} has {version}; install the same version everywhere"
             )
 
     def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:

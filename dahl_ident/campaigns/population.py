@@ -377,12 +377,14 @@ def _one(
     X[:, 1:] -= X[inside, 1:].mean(axis=0)
     posterior = _Averages.of(whole.only(inside))
     tau, omega = posterior.scatters
-    own = whole.sums(y / u**2) / whole.sums(u**-2)
+    separate = whole.sums(y / u**2) / whole.sums(u**-2)
     w = 1.0 / (omega[0] ** 2 + u**2)
     alone = whole.sums(w)
     shrunken, variance = whole.sums(w * y) / alone, 1.0 / alone
     shrunken[~outlying], variance[~outlying] = posterior.devices, posterior.variance
-    devices = pd.DataFrame({"own": own, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels)
+    devices = pd.DataFrame(
+        {"own": separate, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels
+    )
     devices["p"], devices["outlying"] = p, outlying
     if logarithmic:
         devices["u"] *= np.exp(devices["shrunken"])

@@ -35,7 +35,8 @@ WRONG_USE = 2  # as click has it for unknown options
 NOT_TRUSTED = 3  # the first that is free
 _NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
 _STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
-_STYLES, _RED = {"Trusted": "1;32", "Approximate": "1;33"}, "1;31"
+_STYLES = {"Trusted": "1;32", "Approximate": "1;33"}
+_RED = "1;31"
 INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
 
 

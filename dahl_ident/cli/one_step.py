@@ -252,7 +252,8 @@ class Reporting:
         from dahl_ident.campaigns.campaign_report import FORMATS
         from dahl_ident.data.storage import place_of
 
-        columns, place = self.covariate or [], self.report
+        columns = self.covariate or []
+        place = self.report
         if place is None:
             if columns or self.order:
                 raise ValidationError(

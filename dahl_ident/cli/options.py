@@ -133,7 +133,8 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
         if name not in groups:
             parameters.append(parameter.replace(annotation=hints[name]))
             continue
-        group, types = groups[name], get_type_hints(groups[name])
+        group = groups[name]
+        types = get_type_hints(groups[name])
         for one in fields(group):
             declared = one.metadata["option"]
             panel = {"panel": group.panel} | declared.keywords

@@ -223,7 +223,8 @@ class Binding:
 
     def _called(self, role: str) -> RawChannel | None:
         """Return the one column that is called what the role is."""
-        matches, names = self.called(role), self.columns[role].names
+        matches = self.called(role)
+        names = self.columns[role].names
         if role not in self.map.roles:  # a column that the map gives another role has no second one
             named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
             taken = [self.source.find(column).content for column in named]

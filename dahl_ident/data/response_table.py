@@ -92,7 +92,8 @@ def response_from(
     for label, one in by_level(source, columns).items():
         named, of = source, ""
         if label is not None:
-            options, of = replace(options, level=label), f"level {label}: "
+            options = replace(options, level=label)
+            of = f"level {label}: "
             named = replace(source, name=f"{source.name}, level {label}")
         table = _TableBinding(named, one, options)
         try:
@@ -271,7 +272,8 @@ class _TableBinding(Binding):
 
     def _refuse_waveforms(self) -> None:
         """Say so where samples in time were given for responses."""
-        channels, roles = self.source.channels, ("time", *MOTION_KINDS, "force")
+        channels = self.source.channels
+        roles = ("time", *MOTION_KINDS, "force")
         called = [r for r in roles if any(c.is_called(RECORD_COLUMNS[r]) for c in channels)]
         if called[:1] == ["time"] and len(called) > 1:
             raise WaveformsError(
@@ -300,7 +302,8 @@ class _TableBinding(Binding):
         channel = self.channel(role)
         if channel is None:
             return None, ""
-        values, unit = self.si(role), self.unit(role, channel)
+        values = self.si(role)
+        unit = self.unit(role, channel)
         if unit.marker is None and not self.source.metadata:
             self.notes.append(f"{role} [{unit.text}] taken as zero to peak: the table does not say")
         return values, self.kind(role, unit)[0]
@@ -332,10 +335,10 @@ class _TableBinding(Binding):
                 return quantity, factor * self.source.complex_numbers(channel)
             case ("real", "imag"):
                 quantity, real = self._part("real")
-                other, imag = self._part("imag")
-                if other != quantity:
+                imag_is, imag = self._part("imag")
+                if imag_is != quantity:
                     raise UnitError(
-                        f"{self.source.name}: units disagree: real is {quantity}, imag {other}"
+                        f"{self.source.name}: units disagree: real is {quantity}, imag {imag_is}"
                     )
                 return quantity, real + 1j * imag
             case (role, "phase"):

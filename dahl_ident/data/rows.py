@@ -82,9 +82,9 @@ class Rows:
         held = np.where(self.forced, drive, amplitude)
         keys = [np.broadcast_to(k, shape).ravel() for k in (held, self.forced, self.omega, table)]
         order = np.lexsort(keys)
-        other = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+        changes = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
         point = np.empty(self.response.size, dtype=np.intp)
-        point[order] = np.concatenate([[0], np.cumsum(other)])
+        point[order] = np.concatenate([[0], np.cumsum(changes)])
         fundamentals = np.flatnonzero(np.broadcast_to(self.harmonic == 1, shape))[::-1]
         first = np.full(point.size, -1)
         first[point[fundamentals]] = fundamentals

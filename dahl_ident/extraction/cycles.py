@@ -111,7 +111,8 @@ class Cycles:
     @property
     def ramping(self) -> bool:
         """Whether the amplitude goes one way, faster than friction follows."""
-        a, n = self.log_amplitude, len(self)
+        a = self.log_amplitude
+        n = len(self)
         line = np.polyfit(np.arange(n), a, 1)
         scatter = float(np.std(a - np.polyval(line, np.arange(n)), ddof=min(2, n - 1)))
         return self.trending and abs(_change(a)) > max(_SLOW * n, _SCATTERED * scatter)
@@ -160,9 +161,9 @@ def _joined(runs: list[FloatArray]) -> list[FloatArray]:
     for edges in runs:
         if joined:
             last = joined[-1]
-            period, other = last[-1] - last[-2], edges[1] - edges[0]
+            period, next_period = last[-1] - last[-2], edges[1] - edges[0]
             apart = (edges[0] - last[-1]) / period
-            alike = abs(other / period - 1.0) < _ALIKE
+            alike = abs(next_period / period - 1.0) < _ALIKE
             if alike and apart < _MOST_BRIDGED and abs(apart - round(apart)) < _ALIKE:
                 bridge = np.linspace(last[-1], edges[0], round(apart) + 1)[1:-1]
                 joined[-1] = np.concatenate([last, bridge, edges[0 if round(apart) else 1 :]])

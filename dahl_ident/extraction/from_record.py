@@ -189,7 +189,8 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
     forgotten = (excess <= 1.0) | (not transient.significant)
     missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / transient.rate))
     if phasors.mean_moves:
-        forgotten, missing = np.zeros_like(forgotten), np.maximum(missing, cycles)
+        forgotten = np.zeros_like(forgotten)
+        missing = np.maximum(missing, cycles)
     settled = forgotten & (np.abs(lag) <= _TOLERATED * error)
     quality = {
         "settled": settled,

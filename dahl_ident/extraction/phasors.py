@@ -188,7 +188,8 @@ class Phasors:
             sine = fit.coefficients.T @ columns(shown.theta, tau, fit.orders, fit.trending)
             left = without(self.transient, shown, self.settings).channels - sine
             residual = np.sqrt(np.mean(left**2, axis=1))
-        amplitudes, samples = np.abs(fit.phasors(1)), self.samples.time.size
+        amplitudes = np.abs(fit.phasors(1))
+        samples = self.samples.time.size
         return quantisation_errors(amplitudes, self.steps, residual, samples / self.cycles)
 
     @cached_property

@@ -57,7 +57,7 @@ _OF_THOSE = 5  # ... and a fifth of all at most
 _SOLVABLE = 1e8  # condition of normal equations
 _STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
 _MOST_CYCLES_MORE = 2  # on either side
-_MOST_CYCLES_LESS = 3  # on either side; where more stray, the motion is no ramp but changes slowly
+_MOST_CYCLES_LESS = 3  # on either side; where more stray, the motion changes slowly, not as a ramp
 
 
 def record_spans(

@@ -290,7 +290,8 @@ def estimate_frequency(segment: Segment) -> Segment:
 
     Gauss-Newton from within half a cycle; the channels are weighted by their residuals.
     """
-    few, moved = segment.thinned(), 0.0
+    few = segment.thinned()
+    moved = 0.0
     for _ in range(_MAX_STEPS):
         step = _frequency_step(few)
         moved += step
@@ -451,7 +452,8 @@ def line_noise(
         if harmonic:
             weights, sides = frequency, 1
         else:
-            weights, sides = (np.abs(lines) <= _MEAN_LINES).astype(np.float64), 2
+            weights = (np.abs(lines) <= _MEAN_LINES).astype(np.float64)
+            sides = 2
         weights = weights / (weights @ free)
         # a straight line, which the fit removes, holds 6/(pi p)^2 of the sine with p periods in the
         # record and nothing of the cosine; its part in the harmonics, about 1/P^2, is theirs

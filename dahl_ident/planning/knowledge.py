@@ -201,7 +201,8 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
             "values with 95 % probability"
         )
     model, assumed = _with_assumed(model)
-    parameters, names = tuple(p for p in model.parameters if p.free), [p.name for p in free]
+    parameters = tuple(p for p in model.parameters if p.free)
+    names = [p.name for p in free]
     theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
     return Knowledge(
         model, parameters, _among(parameters, names, theta),

@@ -264,7 +264,8 @@ class Plan:
         levels with equal cycles; NaN where the time is too short. At the plan's own time, its
         uncertainties are those of the plan.
         """
-        times, search = self.seconds * np.array(_CURVE), self.search
+        times = self.seconds * np.array(_CURVE)
+        search = self.search
         both: tuple[list[Mapping[str, Expected]], ...] = (
             [self.expected if t == self.seconds else search.expected_after(t) for t in times],
             [search.expected_after(t, grid=True) for t in times],

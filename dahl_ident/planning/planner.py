@@ -227,11 +227,11 @@ def _of_motions(question: PlanRequest) -> Plan:
     holds few repeats, whose first is spent on the record's own unknowns, is not preferred.
     """
     first = Search(question, options_of(question, question.limits))
-    one = first.best()
-    second = Search(question, options_of(question, question.limits, lasting=one.seconds))
-    other = second.best()
-    better = second.score(other) > first.score(one)
-    return _plan(second, other) if better else _plan(first, one)
+    first_best = first.best()
+    second = Search(question, options_of(question, question.limits, lasting=first_best.seconds))
+    second_best = second.best()
+    better = second.score(second_best) > first.score(first_best)
+    return _plan(second, second_best) if better else _plan(first, first_best)
 
 
 def _plan(search: Search, design: Design) -> Plan:

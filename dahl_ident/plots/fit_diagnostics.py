@@ -361,7 +361,8 @@ def plot_control_charts(
         charts.append((f"{label}, EWMA", "ewma", "ewma_limit"))
     size = (6.4, 4.4 if "ewma" in fits else 2.6)
     axes = style.axes_column(ax, len(charts), size=size)
-    n, centre = np.arange(1, len(fits) + 1), fits["centre"]
+    n = np.arange(1, len(fits) + 1)
+    centre = fits["centre"]
     for axis, (name, column, limit) in zip(axes, charts, strict=True):
         line, width = fits[column], fits[limit]
         axis.axhline(centre.iloc[0], color=style.GREY, lw=1.0)
@@ -440,7 +441,8 @@ def plot_corner(
             axis.axvline(truth[names[j]], color=style.VERMILION, lw=1)
         if truth and i != j and names[i] in truth:
             axis.axhline(truth[names[i]], color=style.VERMILION, lw=1)
-        bottom, left = i == p - 1, j == 0 and i > 0  # only outer panels have numbers and names
+        bottom = i == p - 1
+        left = j == 0 and i > 0  # only outer panels have numbers and names
         axis.grid(visible=False)
         axis.tick_params(labelbottom=bottom, labelleft=left, which="both")
         axis.tick_params(axis="x", labelrotation=30, which="both")

@@ -66,7 +66,7 @@ def comparison_of(fits: Sequence[FitResult]) -> Compared:
         return _of_both(fits)
     firsts = [fit.data[0] for fit in of_records]
     channels = ("time", "displacement", "velocity", "acceleration", "force", "drive")
-    for a, b in pairwise(firsts):  # models of the same records are no changes
+    for a, b in pairwise(firsts):  # models of the same records are not changes
         if all(np.array_equal(getattr(a, name), getattr(b, name)) for name in channels):
             return Compared()
     named = [Path(str((r.provenance or {}).get("file", "measurement"))).stem for r in firsts]

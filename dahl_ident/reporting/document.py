@@ -157,7 +157,8 @@ class Document:
         """
         counts = {Picture: 0, TextTable: 0}
         names: dict[str, int] = {}
-        total, drawn = len(self.pictures), set[str]()
+        total = len(self.pictures)
+        drawn = set[str]()
 
         def finished(block: Block) -> Block:
             if not isinstance(block, TextTable | Picture):

@@ -244,7 +244,8 @@ def markdown(document: Document, folder: str) -> bytes:
 
 def _with_signature(document: Document) -> Iterator[Section]:
     """Yield the sections, and before the details a field for the signature."""
-    sections, name = document.sections, ", ".join(document.signatory) or BLANK
+    sections = document.sections
+    name = ", ".join(document.signatory) or BLANK
     signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {name} Signature {BLANK}"),))
     for before, section in zip((None, *sections), sections, strict=False):
         if section.details and not (before and before.details):

@@ -78,7 +78,8 @@ def document(
         repeated = command or provenance.equivalent_command(results)
         origin = tuple(_origin(tables_first, repeated, typed=command is not None))
         sections = (*content.sections, Section("Origin", origin, details=True))
-        content, command = replace(content, sections=sections), repeated
+        content = replace(content, sections=sections)
+        command = repeated
     files = _files(tables_first)
     of_first = (s for s in provenance.sources(tables_first[0].provenances) if s.read and s.sha256)
     identity = [f"Report {known.number}"] if known.number else []
@@ -107,7 +108,8 @@ def _of_one_table(results: Sequence[Result], known: Metadata, record: Record | N
     around = [one.fit for one in drawn if one.fit is not None and one.problem.around_optimum]
     fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
     compared = comparison_of(fits)
-    front, details = list(compared.sections), list[Section]()
+    front = list(compared.sections)
+    details = list[Section]()
     for fit in fits:
         of = _of(fit, fits)
         determined = tuple(f"Determined: {c}" for c in fit.identifiability.combinations)

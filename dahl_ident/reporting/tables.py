@@ -44,7 +44,8 @@ def answer(fit: FitResult) -> TextTable:
             lost, reason = False, _ASSUMED
         elif name in of_device:
             verdict, reason = fit.verdict_on(name)
-            lost, limit = not verdict.known, limits[name]
+            lost = not verdict.known
+            limit = limits[name]
             closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())  # a bound holds
             text = interval(limit.lower, limit.upper, "")
             within = Cell(text, struck=not described or closed)

@@ -106,20 +106,24 @@ def is_usable(fit: FitResult, name: str) -> bool:
 
 
 def _change(name: str, a: str, fit: FitResult, b: str, later: FitResult) -> Change:
-    one, other = fit.params[name], later.params[name]
-    if one.unit != other.unit:
-        raise ValidationError(f"{name} is in {one.unit} of {a} and in {other.unit} of {b}")
+    earlier_value, later_value = fit.params[name], later.params[name]
+    if earlier_value.unit != later_value.unit:
+        raise ValidationError(
+            f"{name} is in {earlier_value.unit} of {a} and in {later_value.unit} of {b}"
+        )
     known = [_scatter(each, name) for each in (fit, later)]
     stated = max((share for share in known if share is not None), default=0.0)
     missing = [
-        stated * abs(p.value) for p, share in zip((one, other), known, strict=True) if share is None
+        stated * abs(p.value)
+        for p, share in zip((earlier_value, later_value), known, strict=True)
+        if share is None
     ]
-    u = math.hypot(one.stderr or 0.0, other.stderr or 0.0, *missing)
+    u = math.hypot(earlier_value.stderr or 0.0, later_value.stderr or 0.0, *missing)
     usable = is_usable(fit, name) and is_usable(later, name) and 0.0 < u < math.inf
-    change = other.value - one.value
-    relative = change / one.value if one.value else math.nan
+    change = later_value.value - earlier_value.value
+    relative = change / earlier_value.value if earlier_value.value else math.nan
     p = float(2.0 * special.ndtr(-abs(change) / u)) if usable else math.nan
-    return Change(name, one.unit, a, b, change, relative, u, len(missing) < len(known), p)
+    return Change(name, earlier_value.unit, a, b, change, relative, u, len(missing) < len(known), p)
 
 
 def _scatter(fit: FitResult, name: str) -> float | None:

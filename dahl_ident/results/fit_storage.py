@@ -164,7 +164,8 @@ _BUILT: Mapping[str, Callable[[Mapping[str, Any]], Problem]] = {
 
 def _describe_optimum(optimum: Optimum) -> dict[str, Any]:
     """Return an optimum as data, its problem left out."""
-    cost, combinations = optimum.constraint_cost, [asdict(c) for c in optimum.combinations]
+    cost = optimum.constraint_cost
+    combinations = [asdict(c) for c in optimum.combinations]
     stored = {one.name: getattr(optimum, one.name) for one in fields(optimum)}
     stored |= {"status": optimum.status.name, "combinations": combinations}
     stored["constraint_cost"] = None if cost is None else asdict(cost)

@@ -90,10 +90,8 @@ def predictive_checks(
     for name, statistic in _STATISTICS.items():
         if name != "size" or not density.has_scale:
             observed, replicated = statistic(y[:, order]), statistic(noise[:, order])
-            means, share = (
-                (float(observed.mean()), float(replicated.mean())),
-                replicated >= observed,
-            )
+            means = (float(observed.mean()), float(replicated.mean()))
+            share = replicated >= observed
             checks.append(PredictiveCheck(name, *means, float(np.mean(share))))
     return tuple(checks)
 
@@ -125,8 +123,8 @@ def pointwise_log_likelihood(density: Density, points: FloatArray) -> FloatArray
         rows = -(0.5 * TAIL_DOF + 1.0) * np.log1p(z / TAIL_DOF)
     else:
         rows = -0.5 * z
-    rest = density.log_likelihood(theta, scale) - rows.sum(axis=1)
-    return np.asarray(rows + rest[:, None] / z.shape[1])
+    constant = density.log_likelihood(theta, scale) - rows.sum(axis=1)
+    return np.asarray(rows + constant[:, None] / z.shape[1])
 
 
 def _neighbours(data: FrequencyResponse) -> NDArray[np.intp]:
@@ -279,7 +277,8 @@ def to_arviz(density: Density, sample: ChainSample, seed: int) -> Any:
         "prior": _by_name(density, density.problem.to_values(prior)[None]),  # not of the scale
     }
     if density.likelihood != "none":
-        flat, shape = kept.reshape(-1, D), (*kept.shape[:2], -1)
+        flat = kept.reshape(-1, D)
+        shape = (*kept.shape[:2], -1)
         theta, scale = density.split(flat)
         observed, at_point = (_whitened(density, x) for x in (theta.mean(axis=0)[None], theta))
         noise = scale[:, None] * replicated_noise(density, at_point.shape, random)

@@ -124,11 +124,11 @@ def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equa
     tangent = ca.SX(stiffness)
     with numpy_names():
         for law in laws:
-            own = [ca.SX.sym(f"y{len(states) + i}") for i in range(law.n_states)]
-            part = traced(law, _values(law), x, s, s, own)
+            law_states = [ca.SX.sym(f"y{len(states) + i}") for i in range(law.n_states)]
+            part = traced(law, _values(law), x, s, s, law_states)
             rates = ca.vertcat(*part.rates) * s  # over the displacement
-            tangent += ca.mtimes(ca.jacobian(part.force, ca.vertcat(*own)), rates)
-            states, slopes = [*states, *own], [*slopes, rates]
+            tangent += ca.mtimes(ca.jacobian(part.force, ca.vertcat(*law_states)), rates)
+            states, slopes = [*states, *law_states], [*slopes, rates]
     if damping:
         rates = ca.vertcat(v, (u - tangent * v) / damping, *(slope * v for slope in slopes))
         return Equations([x, v, *states], u, s, [], rates, x, held=False)

@@ -350,8 +350,12 @@ def _parsed(file: File, sheet: str | None) -> RawFile:
 
 def _given(**options: Any) -> dict[str, Any]:
     """Return the options that were given, as JSON data."""
-    given = {name: plain_data(value) for name, value in options.items() if value is not None}
-    return {name: value for name, value in given.items() if (name, value) != ("passive", True)}
+    options_given = {
+        name: plain_data(value) for name, value in options.items() if value is not None
+    }
+    return {
+        name: value for name, value in options_given.items() if (name, value) != ("passive", True)
+    }
 
 
 def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:

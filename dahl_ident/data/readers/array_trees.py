@@ -83,7 +83,8 @@ def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool, rows: sli
     if not isinstance(array, Stored):
         matrix = array.reshape(shape)
     elif rows != slice(None) and upright and array.shape == shape:
-        matrix, rows = array[rows], slice(None)
+        matrix = array[rows]
+        rows = slice(None)
     else:
         matrix = array.array.reshape(shape)
     if len(shape) < 2:

@@ -118,7 +118,8 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
     for channel in group.channels():
         properties = channel.properties
         unit = properties.get("unit_string") or properties.get("NI_UnitDescription")
-        count, what = len(channel), f"{file.name}: {channel.path}"
+        count = len(channel)
+        what = f"{file.name}: {channel.path}"
         file.refuse_above_limit(8 * count, channel.path)
         read = functools.partial(_tdms_values, content, channel)
         values: Any = Stored((count,), np.dtype(channel.dtype), read, what)

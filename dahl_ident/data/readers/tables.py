@@ -427,7 +427,9 @@ def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
             width = 0
             continue
         if not width:
-            start, width, score = i, len(row), 0
+            start = i
+            width = len(row)
+            score = 0
         if len(row) == width > 1:
             filled = len(row) if numbers == len(row) else len([c for c in row if c.strip()])
             score += 3 * numbers - filled
@@ -479,7 +481,9 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
         split.append(
             [(name, _bare(cell)) for (name, _), cell in zip(stated, lines[k], strict=True)]
         )
-        named = [(n, own or u) for (n, own), (_, u) in zip(stated, split[-1], strict=True)]
+        named = [
+            (n, unit or below) for (n, unit), (_, below) in zip(stated, split[-1], strict=True)
+        ]
     names, units = zip(*named, strict=True)
     contradicted = any(contradict(named, other) for other in split)
     if k is not None and k + 1 < len(lines):  # real and imaginary part, say, of one name

@@ -46,7 +46,8 @@ class Device:
 
 def device(result: Any, form: str, carried: Mapping[str, str]) -> Device:
     """Return the device of a fit."""
-    laws, lumped = [], dict.fromkeys(LUMPED.values(), 0.0)
+    laws = []
+    lumped = dict.fromkeys(LUMPED.values(), 0.0)
     notes = [f"made by dahl_ident {__version__}, SI units; the fit is {result.status.value}"]
     lost = [name for name, p in result.params.items() if not math.isfinite(p.value)]
     if lost:
@@ -141,11 +142,11 @@ def frictionloss(result: Any) -> str:
 def _mjcf(
     parts: Device, notes: Sequence[str], damping: float, limit: float, actuators: Sequence[str]
 ) -> str:
-    given = {
+    attributes = {
         "armature": parts.mass, "damping": damping, "stiffness": parts.stiffness,
         "frictionloss": limit,
     }  # fmt: skip
-    fields = "".join(f' {name}="{value!r}"' for name, value in given.items() if value)
+    fields = "".join(f' {name}="{value!r}"' for name, value in attributes.items() if value)
     kind = "hinge" if parts.rotation else "slide"
     body = "1e-9" if parts.mass else "1"
     remark = "the fit has no mass; the body's is 1, to be replaced"
@@ -318,7 +319,8 @@ def c_header(result: Any) -> str:
     """Return the header; the mass is a macro, its force is not in the function."""
     parts = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
     body = ["double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
-    states, kinds = 0, set()
+    states = 0
+    kinds = set()
     for law in parts.laws:
         body += _LINES[law.kind](law, f"s->f[{states}]")
         states += {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
