@@ -226,8 +226,8 @@ class MultipleSolutionsWarning(UserWarning):
 
     >>> import dahl_ident as di
     >>> plant = di.Dahl(0.1, 30.0) + di.Mass(0.3) + di.Damper(-0.05) + di.Spring(0.3)
-    >>> found = di.response(plant, 0.16, 0.02, all_roots=True)
-    >>> int((found.amplitude > 0.0).sum())
+    >>> response = di.response(plant, 0.16, 0.02, all_roots=True)
+    >>> int((response.amplitude > 0.0).sum())
     3
     """
 
@@ -244,8 +244,8 @@ class NoSteadyMotionWarning(UserWarning):
     >>> plant = di.Dahl(1.0, 1.0) + di.Mass(1.0) + di.Spring(1.0)
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", di.errors.NoSteadyMotionWarning)
-    ...     found = di.response(plant, 0.5 / 3.141592653589793, 2.0).found
-    >>> bool(found)
+    ...     exists = di.response(plant, 0.5 / 3.141592653589793, 2.0).found
+    >>> bool(exists)
     False
     """
 

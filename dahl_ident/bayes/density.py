@@ -75,11 +75,11 @@ class LogDensity(ABC):
 
     @abstractmethod
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Return the residuals of which the squares are added, (S, P) -> (S, K)."""
+        """Return the residuals whose squares are added, (S, P) -> (S, K)."""
 
     @property
     def weights(self) -> FloatArray:
-        """What their squares count, (K, M) or (1, 1), for each of M sizes of shared errors."""
+        """Weights of their squares, (K, M) or (1, 1), for each of M sizes of shared errors."""
         return np.ones((1, 1))
 
     def sums(self, theta: FloatArray) -> FloatArray:
@@ -272,7 +272,7 @@ class Density(LogDensity):
         return np.where(np.isnan(result), -np.inf, result)
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Return the residuals of which the squares are added, (S, P) -> (S, K)."""
+        """Return the residuals whose squares are added, (S, P) -> (S, K)."""
         if self.errors is None:
             return self.quick.whitened(theta)
         y = self.quick.whitened(self.errors.held(theta), tails=False)
@@ -282,7 +282,7 @@ class Density(LogDensity):
 
     @property
     def weights(self) -> FloatArray:
-        """What their squares count, (K, M) or (1, 1), for each of M sizes of shared errors."""
+        """Weights of their squares, (K, M) or (1, 1), for each of M sizes of shared errors."""
         return np.ones((1, 1)) if self.errors is None else self.errors.weights
 
     def probabilities(self, sums: FloatArray) -> FloatArray:

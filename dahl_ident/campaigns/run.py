@@ -226,7 +226,7 @@ def campaign(
 
     Notes
     -----
-    Fits run in processes of their own. Laws that a script defines are known there because its file
+    Each fit runs in a separate process. Laws that a script defines are known there because its file
     is run once more, so such a script must call this under ``if __name__ == "__main__":``.
 
     Examples

@@ -1,6 +1,6 @@
-"""One fit of a campaign in a process of its own: from files to a row, with limits.
+"""One fit of a campaign in a separate process: from files to a row, with limits.
 
-Fits run in a process of their own wherever they run: on this machine, in a thread of an executor,
+Each fit runs in a separate process, wherever it runs: on this machine, in a thread of an executor,
 on a worker of a cluster. So a fit that hangs, needs too much memory or kills its process ends as a
 row, and nothing else is lost. Jobs go through standard input and rows come back through standard
 output, as pickles; nothing of the calling script is imported but the files of its laws. Numerical
@@ -264,7 +264,7 @@ _busy: set[_Process] = set()
 
 
 def do_within(job: Job, seconds: float, memory: float | None) -> Row:
-    """Return the row of a job that may take some seconds and GB, done in a process of its own."""
+    """Return the row of a job that may take some seconds and GB, done in a separate process."""
     if job.version != __version__:
         return failed(
             f"ValidationError: this worker has dahl_ident {__version__}, and the campaign was "

@@ -1,4 +1,4 @@
-"""Curves of a frequency response: over which axis, and which rows make one curve.
+"""Curves of a frequency response: the choice of axis, and of the rows of each curve.
 
 The plot functions, of a higher layer, are imported when a plot is requested.
 """

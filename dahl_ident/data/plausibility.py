@@ -19,7 +19,7 @@ from dahl_ident.errors import DataError
 from dahl_ident.units import percent
 
 Doubt = Callable[[NDArray[np.bool_], str], None]
-"""What warns of the rows that are marked, with a message, if there are any."""
+"""A function that warns of the marked rows, if any, with a message."""
 _SIGNIFICANT = 0.00135  # one-sided; three standard deviations of a normal distribution
 _ASSUMED_ERROR = 0.1  # of the gain, where no covariance is known
 _MISMATCH = 0.1  # of a logarithm: rms for zero to peak is 0.35; also a fall of the gain

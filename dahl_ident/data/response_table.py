@@ -58,7 +58,7 @@ class WaveformsError(DataError):
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """What a user says about a whole table; see :func:`read_frequency_response`."""
+    """What the user states for a whole table; see :func:`read_frequency_response`."""
 
     frequency: float | None = None
     amplitude: str | None = None

@@ -200,8 +200,7 @@ def _name(data: FrequencyResponse, row: int) -> str:
 def labelled(parts: Sequence[FrequencyResponse], names: Sequence[str]) -> list[FrequencyResponse]:
     """Return the tables of several files with their names as levels, or else as runs.
 
-    A level measured in a file of its own is not a run: how such files differ is what levels are
-    for.
+    A level measured in a separate file is not a run: such files differ by their levels.
     """
     named = [(part, np.full(part.n, name)) for part, name in zip(parts, names, strict=True)]
     if any(part.run is not None for part in parts) or not _one_level_each(parts):

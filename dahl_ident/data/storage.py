@@ -1,4 +1,4 @@
-"""Tables to files with nothing lost: CSV, TSV, Parquet and HDF5; no half files are left."""
+"""Tables to files without loss: CSV, TSV, Parquet and HDF5; incomplete files are never left."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def make_folder(folder: Path, *, parents: bool = True) -> None:
 
 
 def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
-    """Write a file so that it is there whole or not at all."""
+    """Write a file completely, or not at all."""
     if not overwrite:
         refuse_existing(path)
     try:

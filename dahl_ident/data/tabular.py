@@ -1,4 +1,4 @@
-"""What a frequency response and a record have in common: both are tables that print and save."""
+"""The common base of frequency responses and records: tables that print and save."""
 
 from __future__ import annotations
 

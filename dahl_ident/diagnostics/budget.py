@@ -91,10 +91,10 @@ class Budget(Mapping[str, ParameterBudget]):
     Examples
     --------
     >>> import dahl_ident as di
-    >>> found = budget(di.fit(di.load_dataset("noisy"), di.Dahl()).optimum)
-    >>> [row.source for row in found["f_max"].rows][:2]
+    >>> of_fit = budget(di.fit(di.load_dataset("noisy"), di.Dahl()).optimum)
+    >>> [row.source for row in of_fit["f_max"].rows][:2]
     ['jackknife over tests', 'noise']
-    >>> round(sum(row.share for row in found["f_max"].rows), 9)
+    >>> round(sum(row.share for row in of_fit["f_max"].rows), 9)
     1.0
     """
 

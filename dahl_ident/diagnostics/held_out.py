@@ -188,8 +188,8 @@ def cross_validation(left_out: HeldOut | None) -> CrossValidation | None:
     Examples
     --------
     >>> import dahl_ident as di
-    >>> found = di.fit(di.load_dataset("noisy"), di.Dahl()).cross_validation
-    >>> found.gains > 0.8 * found.rows, found.phases > 0.8 * found.rows
+    >>> check = di.fit(di.load_dataset("noisy"), di.Dahl()).cross_validation
+    >>> check.gains > 0.8 * check.rows, check.phases > 0.8 * check.rows
     (True, True)
     """
     if left_out is None:

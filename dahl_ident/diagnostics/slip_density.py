@@ -101,8 +101,8 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
     --------
     >>> law = MaxwellSlip([1e-4, 1e-3], [3e4, 1e4])
     >>> A = np.geomspace(3e-5, 3e-3, 20)
-    >>> found = slip_density(FrequencyResponse(np.ones(20), law.describing_function(A), A))
-    >>> print(f"{found.least_misfit:.3f}, {found.stiffness.sum() + found.spring:.0f} N/m")
+    >>> density = slip_density(FrequencyResponse(np.ones(20), law.describing_function(A), A))
+    >>> print(f"{density.least_misfit:.3f}, {density.stiffness.sum() + density.spring:.0f} N/m")
     0.001, 39999 N/m
     """
     linear = [] if parallel is None else list(as_model(parallel).elements)

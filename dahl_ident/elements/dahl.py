@@ -48,7 +48,7 @@ from dahl_ident.errors import ValidationError
 
 _EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
-_JENKINS = 3  # elements of Maxwell slip compared with Dahl: six numbers, more than most tables determine
+_JENKINS = 3  # elements of Maxwell slip compared with Dahl: six numbers, more than most tables give
 _AT_REST = 1e-30
 """Smaller beta are rest, to more digits than a number has."""
 _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16

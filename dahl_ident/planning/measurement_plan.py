@@ -329,7 +329,7 @@ class Plan:
         )
 
     def _spare(self) -> list[str]:
-        """Return what the time that is left would buy, and what to use it for."""
+        """Return what the remaining time would gain, and what to use it for."""
         time = self.search.question.limits.time
         if not (self.reached and self.seconds < 0.5 * time < np.inf):
             return []

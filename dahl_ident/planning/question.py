@@ -1,4 +1,4 @@
-"""What a plan is asked: the limits of the bench, the noise, and the quantities to determine."""
+"""The question of a plan: the limits of the bench, the noise, and the quantities to determine."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class Search:
         return design if q.recorded is None else self._exactly(design)
 
     def score(self, design: Design) -> tuple[bool, float]:
-        """Return what is larger for the better of two designs of the same question."""
+        """Return the score of a design, larger for the better of two for the same question."""
         if self.question.has_numbers:
             reached = self.reached(design)
             return reached, -design.seconds if reached else -design.ratio

@@ -79,8 +79,8 @@ class FitBatch(Sequence[FitResult]):
     def estimates(self) -> FloatArray:
         """Estimates that take every source of error into account, shape (S, P).
 
-        Those of ``batch[i].params``. Each table has an error model of its own, which takes
-        some 10 ms, here and in `stderr`; it is computed once.
+        Those of ``batch[i].params``. Each table has its error model, which takes some 10 ms, here
+        and in `stderr`; it is computed once.
         """
         return np.asarray(self._combined[..., 0])
 

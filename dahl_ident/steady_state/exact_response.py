@@ -17,7 +17,7 @@ from dahl_ident.steady_state.plant import BoolArray, IntArray
 from dahl_ident.steady_state.shooting import NEUTRAL, Shooting, SteadyMotion
 
 HARMONICS = tuple(range(10))
-"""Of a motion, that are returned."""
+"""The harmonics of a motion that are returned."""
 _SAME = 1e-6  # relative difference of two motions that are one
 _CYCLES = 3  # that an estimate goes through, so that memory of its own start fades
 _STEP = 0.005  # of ln of drive and frequency together, in which motions are followed

@@ -29,10 +29,10 @@ STEADY: tuple[Steady, ...] = ("exact", "describing function")
 """How the response to a force that is held is predicted."""
 
 ACCURACY = 1e-9
-"""Relative difference of two solutions of one motion from different starts, with room."""
+"""Largest relative difference of two solutions of one motion from different starts."""
 
 LINEAR = "the model is linear"
-"""And its response a sine."""
+"""Why there is no exact motion to compute: the response is a sine."""
 
 NEUTRAL = 1e-6  # beyond 1: the multiplier of a motion that may lie anywhere is 1, to rounding
 _FINER = 10.0  # times: a motion that hardly turns is lost where steps pass over its two turns

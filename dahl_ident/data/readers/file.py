@@ -1,8 +1,8 @@
 """A file with its hash, its format found from the content, and limits of size and time.
 
 A damaged file of some kilobytes may declare exabytes, so sizes are limited before memory is taken.
-Compiled libraries trust what a file says of itself; they work in a process of its own (where there
-is ``fork``), so that a crash is an error like others.
+Compiled libraries trust what a file says of itself; they work in a separate process (where there is
+``fork``), so that a crash is an error like others.
 """
 
 from __future__ import annotations
@@ -294,14 +294,14 @@ def utf8(data: bytes) -> bytes:
 
 
 class Answer(NamedTuple):
-    """What the work gave, or why it gave nothing."""
+    """The result of the work, or the reason why there is none."""
 
     value: Any = None
     error: str = ""
 
 
 def apart(work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = None) -> Answer:
-    """Return what a function gives within some time, and memory in addition to what is used."""
+    """Return a function's result, within limits of time and of memory beyond that in use."""
     if not hasattr(os, "fork"):
         return Answer(work())
     reading, writing = os.pipe()

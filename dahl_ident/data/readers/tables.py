@@ -84,7 +84,7 @@ def read_workbook(file: File, sheet: str | None = None) -> RawFile:
 
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:
-    """Return the cells of every sheet, read in a process of its own."""
+    """Return the cells of every sheet, read in a separate process."""
     broken = None
     with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
         broken = archive.testzip()
