@@ -413,7 +413,9 @@ def polar_std(response: ComplexArray, covariance: FloatArray) -> tuple[FloatArra
     """Return the standard deviations of gain and of phase (rad), to first order."""
     along = np.stack([response.real, response.imag], -1) / np.abs(response)[:, None]
     across = np.stack([-along[:, 1], along[:, 0]], -1)
-    gain, arc = (
-        np.sqrt(np.einsum("ni,nij,nj->n", v, covariance, v).clip(0.0)) for v in (along, across)
-    )
-    return gain, arc / np.abs(response)
+
+    def std(direction: FloatArray) -> FloatArray:
+        variance = np.einsum("ni,nij,nj->n", direction, covariance, direction)
+        return np.asarray(np.sqrt(variance.clip(0.0)))
+
+    return std(along), std(across) / np.abs(response)

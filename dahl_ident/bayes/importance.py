@@ -209,7 +209,8 @@ def _fitted(target: _Integrand, centre: FloatArray, covariance: FloatArray) -> _
     root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
     step = 1e-3 * root.T  # small, so that a straight line in theta is one in phi
     decorrelated = target.decorrelation.decorrelated
-    ahead, behind = (decorrelated(centre + s) for s in (step, -step))
+    ahead = decorrelated(centre + step)
+    behind = decorrelated(centre - step)
     phi = decorrelated(centre[None])
     mixtures = [_Mixture(phi, (ahead - behind).T[None] / 2e-3)]
     seen: _Batch | None = None
@@ -356,7 +357,8 @@ def interpolated(
         far = centre + stdtrit(_TAILS[1], for_checks.random(count)) @ root.T
         if wide:
             far = np.concatenate([far, density.prior.quantiles(of_prior.random(count))])
-        near, far = (x[density.log_prior(x) > -np.inf] for x in (near, far))
+        near = near[density.log_prior(near) > -np.inf]
+        far = far[density.log_prior(far) > -np.inf]
         if not (len(near) and len(far)):
             return None
         exact = in_blocks(lambda x: density.added(residuals_of(x)), far)

@@ -147,10 +147,13 @@ class LoopMargins:
 
         if self.gain_margin.ndim == 1:
             return plot_margins(self.amplitude, self.gain_margin, self.phase_margin_deg, ax=ax)
-        names = "gain_margin", "phase_margin_deg"
-        gain, phase = (self.band(name) for name in names)
-        medians = (self.band(name, 0.0)[0] for name in names)
-        return plot_margins(self.amplitude, *medians, gain_band=gain, phase_band=phase, ax=ax)
+        gain, _ = self.band("gain_margin", 0.0)
+        phase, _ = self.band("phase_margin_deg", 0.0)
+        gain_band = self.band("gain_margin")
+        phase_band = self.band("phase_margin_deg")
+        return plot_margins(
+            self.amplitude, gain, phase, gain_band=gain_band, phase_band=phase_band, ax=ax
+        )
 
 
 def loop_margins(

@@ -268,16 +268,15 @@ def robust_values(
         weight[2 * rows :] = variance
         root = np.sqrt(weight)
         last = move
-        solution = np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)
-        move = np.asarray(solution[0])
+        move = np.asarray(np.linalg.lstsq(root[:, None] * J, -root * y, rcond=1e-10)[0])
         if np.linalg.norm(J @ (move - last)) < _SETTLED * np.sqrt(variance):
             break
     theta, std = errors.theta.copy(), np.zeros(len(errors.theta))
     theta[free] += move
     std[free] = np.sqrt(np.diagonal(known))
     std *= np.abs(problem.value_slopes(errors.theta))
-    both = (problem.to_values(theta), std)
-    robust, by_noise = (dict(zip(problem.names, one.tolist(), strict=True)) for one in both)
+    robust = dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
+    by_noise = dict(zip(problem.names, std.tolist(), strict=True))
     return robust, by_noise
 
 

@@ -203,9 +203,8 @@ class ErrorModel:
         slopes = every
         if sources is not None:
             counted = np.array([name in sources for name in names], dtype=bool)
-            slopes = without_exponents * counted + (every - without_exponents) * (
-                EXPONENT in sources
-            )
+            of_exponents = every - without_exponents
+            slopes = without_exponents * counted + of_exponents * (EXPONENT in sources)
         spread = float(slopes @ self.state.variances_covariance @ slopes)
         total = 0.0
         for name in self.contributions if sources is None else sources:
@@ -399,11 +398,9 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     ranged = any(one.source == EXPONENT for one in assumed.values())
     if estimate.basis is None and ranged:
-        whole, others = (np.asarray(sum(parts.values())) for parts in (every, without_exponents))
-        every = {
-            **without_exponents,
-            EXPONENT: without_exponents.get(EXPONENT, 0.0) + _positive(whole - others),
-        }
+        total = np.asarray(sum(every.values()))
+        added = _positive(total - np.asarray(sum(without_exponents.values())))
+        every = {**without_exponents, EXPONENT: without_exponents.get(EXPONENT, 0.0) + added}
     if estimate.second is not None:
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:

@@ -208,13 +208,12 @@ class WeightedEstimate:
     def factors(self, problem: TableProblem) -> FloatArray:
         """Return the matrices from each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
         sides = np.array([1.0, 1.0j])[:, None] * np.ones(self.problem.data.n, dtype=np.complex128)
-        change_here, change = (
-            p.residual_change(self.theta, sides) for p in (self.problem, problem)
-        )
-        pairs = (
-            each.reshape(2, -1, 2).transpose(1, 2, 0) for each in (change_here / self.scale, change)
-        )
-        ours, theirs = pairs
+
+        def by_row(changes: FloatArray) -> FloatArray:
+            return changes.reshape(2, -1, 2).transpose(1, 2, 0)
+
+        ours = by_row(self.problem.residual_change(self.theta, sides) / self.scale)
+        theirs = by_row(problem.residual_change(self.theta, sides))
         return np.asarray(ours @ np.linalg.pinv(theirs))
 
     @cached_property
@@ -430,12 +429,16 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
     Both are estimates of the parameters, and the factor is that of Paule and Mandel: the square of
     their distance, over its variance, is the number of directions that harmonics determine.
     """
-    harmonic_rows = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
-    (A, b), (A_h, b_h) = (
-        (J[rows].T @ J[rows], J[rows].T @ y[rows]) for rows in (~harmonic_rows, harmonic_rows)
-    )
+    of_harmonics = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
+
+    def normal_equations(rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        return J[rows].T @ J[rows], J[rows].T @ y[rows]
+
+    A, b = normal_equations(~of_harmonics)
+    A_h, b_h = normal_equations(of_harmonics)
     size = np.sqrt(np.maximum(np.diagonal(A + A_h), TINY))
-    A, A_h, b, b_h = A / np.outer(size, size), A_h / np.outer(size, size), b / size, b_h / size
+    A, b = A / np.outer(size, size), b / size
+    A_h, b_h = A_h / np.outer(size, size), b_h / size
     directions = int(np.linalg.matrix_rank(A_h, tol=_NOTICED, hermitian=True))
 
     def explained(M: FloatArray, v: FloatArray) -> float:

@@ -310,15 +310,18 @@ def compare(
         if not np.array_equal(earlier.levels, last.levels):
             raise ValidationError(f"{earlier.method} and {last.method} intervals differ in level")
         for side in ("lower", "upper"):
-            a, b = (getattr(one, side)[:, :count] for one in (last, earlier))
-            ours, theirs = (search_coordinates(optimum, one) for one in (a, b))
+            trusted = getattr(last, side)[:, :count]
+            compared = getattr(earlier, side)[:, :count]
+            trusted_theta = search_coordinates(optimum, trusted)
+            compared_theta = search_coordinates(optimum, compared)
             with np.errstate(invalid="ignore"):
-                apart = np.abs(ours - theirs) > _DISAGREES * np.abs(ours - theta)
-            apart |= np.isinf(ours) != np.isinf(theirs)
-            apart &= ~np.isclose(a, b, rtol=_ROUNDING, atol=0)
+                half_width = np.abs(trusted_theta - theta)
+                apart = np.abs(trusted_theta - compared_theta) > _DISAGREES * half_width
+            apart |= np.isinf(trusted_theta) != np.isinf(compared_theta)
+            apart &= ~np.isclose(trusted, compared, rtol=_ROUNDING, atol=0)
             for row, i in np.argwhere(apart).tolist():
                 level = float(last.levels[row])
-                limits = (b[row, i], a[row, i])
+                limits = (compared[row, i], trusted[row, i])
                 methods = (earlier.method, last.method)
                 disagreements.append(Disagreement(last.names[i], level, side, methods, limits))
     return IntervalComparison(tuple(intervals), tuple(disagreements), stated)

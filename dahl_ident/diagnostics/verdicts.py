@@ -380,9 +380,8 @@ def _profile_std(
 ) -> FloatArray:
     """Return half the width of the 95.45 % interval over its threshold, in natural sizes."""
     (q,) = thresholds(optimum, np.array([LEVELS[1]]))
-    lower, upper = (
-        search_coordinates(optimum, end[1]) for end in (intervals.lower, intervals.upper)
-    )
+    lower = search_coordinates(optimum, intervals.lower[1])
+    upper = search_coordinates(optimum, intervals.upper[1])
     with np.errstate(divide="ignore", invalid="ignore"):
         std = (upper - lower) / (2.0 * q * natural)
     return np.where(np.isnan(std), np.inf, std)

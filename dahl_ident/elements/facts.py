@@ -75,8 +75,11 @@ class Path(NamedTuple):
         if a is None:
             place, speed = np.diff(x) - start, end - start
             return np.stack([x[:-1], start, 3.0 * place - speed, speed - 2.0 * place])
-        two, last = (0.5 * intervals**2 * one for one in (a[:-1], a[1:]))
-        place, speed, bend = np.diff(x) - start - two, end - start - 2.0 * two, last - two
+        two = 0.5 * intervals**2 * a[:-1]
+        last = 0.5 * intervals**2 * a[1:]
+        place = np.diff(x) - start - two
+        speed = end - start - 2.0 * two
+        bend = last - two
         return np.stack(
             [
                 x[:-1], start, two,

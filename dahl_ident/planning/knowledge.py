@@ -176,7 +176,8 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
         drawn = _drawn(rng, at, covariance, draws, problem.parameters)
     model, assumed = _with_assumed(problem.model)
     wider = problem.like(model=model) if assumed else problem
-    theta, at = (_among(wider.parameters, problem.names, one) for one in (drawn, at))
+    theta = _among(wider.parameters, problem.names, drawn)
+    at = _among(wider.parameters, problem.names, at)
     noise, cycles = _row_noise(wider, float(np.median(scale)))
     return Knowledge(
         model, wider.parameters, theta, _stated(source, wider.parameters),

@@ -266,16 +266,16 @@ class Plan:
         """
         times = self.seconds * np.array(_CURVE)
         search = self.search
-        both: tuple[list[Mapping[str, Expected]], ...] = (
-            [self.expected if t == self.seconds else search.expected_after(t) for t in times],
-            [search.expected_after(t, grid=True) for t in times],
-        )
+        planned = [self.expected if t == self.seconds else search.expected_after(t) for t in times]
+        even = [search.expected_after(t, grid=True) for t in times]
 
-        def after(name: str) -> tuple[FloatArray, FloatArray]:
-            planned, even = ([e[name].after if e else np.nan for e in each] for each in both)
-            return np.array(planned), np.array(even)
+        def after(name: str, plans: Sequence[Mapping[str, Expected]]) -> FloatArray:
+            return np.array([e[name].after if e else np.nan for e in plans])
 
-        return {name: (times, *after(name)) for name in self.target or self.expected}
+        return {
+            name: (times, after(name, planned), after(name, even))
+            for name in self.target or self.expected
+        }
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the predicted uncertainty against bench time, next to that of a logarithmic grid.

@@ -113,11 +113,11 @@ def _of_both(fits: Sequence[FitResult]) -> Compared:
         if c.p * comparable < SIGNIFICANT:
             says = "disagree"
             disagree.append(c.parameter)
-            one, two = (with_unit(e.value, e.stderr or 0.0, c.unit) for e in both)
+            of_table, of_waveforms = (with_unit(e.value, e.stderr or 0.0, c.unit) for e in both)
             verdict.append(
-                f"Table and waveforms disagree: {c.parameter} is {one} from the table and {two} "
-                f"from the waveforms ({c.p_text}). At least one has an error that its uncertainty "
-                "does not hold."
+                f"Table and waveforms disagree: {c.parameter} is {of_table} from the table and "
+                f"{of_waveforms} from the waveforms ({c.p_text}). At least one has an error "
+                "that its uncertainty does not hold."
             )
         texts = (" \u00b1 ".join(rounded(e.value, e.stderr or 0.0)) for e in both)
         cells = [Cell(text, e.value) for text, e in zip(texts, both, strict=True)]

@@ -496,7 +496,8 @@ def contradict(
     one: Sequence[tuple[str, str | None]], other: Sequence[tuple[str, str | None]]
 ) -> bool:
     """Return whether two lines of names and units name the same columns, but not alike."""
-    names, others = ([plain(name) for name, _ in line] for line in (one, other))
+    names = [plain(name) for name, _ in one]
+    others = [plain(name) for name, _ in other]
     if sorted(filter(None, names)) != sorted(filter(None, others)) or len(set(names)) < 2:
         return False
     units = [(a, b) for (_, a), (_, b) in zip(one, other, strict=True) if a and b and a != b]

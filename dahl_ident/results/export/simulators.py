@@ -305,7 +305,9 @@ def _slips(law: Law, state: str) -> list[str]:
 
 
 def _power(law: Law, _: str) -> list[str]:
-    c, p, speed = (law[name] for name in ("coefficient", "exponent", "reference_speed"))
+    c = law["coefficient"]
+    p = law["exponent"]
+    speed = law["reference_speed"]
     return [f"force += v == 0.0 ? 0.0 : copysign({c!r} * pow(fabs(v) / {speed!r}, {p!r}), v);"]
 
 
