@@ -338,6 +338,6 @@ def _distinct(cycles: Iterable[LimitCycle]) -> tuple[LimitCycle, ...]:
     for one in sorted(cycles, key=lambda c: (c.amplitude, c.frequency_hz)):
         place = one.amplitude, one.frequency_hz
         others = ((c.amplitude, c.frequency_hz) for c in distinct)
-        if not any(np.allclose(place, other, rtol=1e-6, atol=0.0) for other in others):
+        if not any(np.allclose(place, known, rtol=1e-6, atol=0.0) for known in others):
             distinct.append(one)
     return tuple(distinct)

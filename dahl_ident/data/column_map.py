@@ -228,7 +228,7 @@ class Binding:
         if role not in self.map.roles:  # a column that the map gives another role has no second one
             named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
             taken = [self.source.find(column).content for column in named]
-            matches = [c for c in matches if not any(c.content is other for other in taken)]
+            matches = [c for c in matches if not any(c.content is channel for channel in taken)]
         elif not matches:
             raise DataError(
                 f"{self.source.name}: no column is called {' or '.join(names)}; name "
@@ -293,8 +293,8 @@ class Binding:
         text = self.mapped(role).unit or channel.unit
         if text is None and channel.is_called(declared):
             text = channel.unit_in_name
-        if not text and (other := next(filter(self.has, declared.like), None)) is not None:
-            inherited = self.unit(other, self.required(other))
+        if not text and (alike := next(filter(self.has, declared.like), None)) is not None:
+            inherited = self.unit(alike, self.required(alike))
             text = None if inherited.decibel else inherited.text
         elif not text and declared.unit == "1":
             text = "1"

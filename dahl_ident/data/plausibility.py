@@ -146,9 +146,9 @@ def record_doubts(
     for values in (motion, force) if starts.size else ():
         torn |= _edges(values, starts, stops) > least * _usual(np.abs(np.diff(values)))
     yield starts[torn], "motion and force are 0 for a while, from {}: are samples missing?"
-    for name, values, other in (("motion", motion, force), ("force", force, motion)):
+    for name, values, partner in (("motion", motion, force), ("force", force, motion)):
         yield (
-            _few(np.union1d(_unit_changes(values, other), _scaled_values(values))),
+            _few(np.union1d(_unit_changes(values, partner), _scaled_values(values))),
             f"the {name} is 1000 times larger or smaller from {{}}: another unit?",
         )
     ratio = np.log10(np.diff(time)[2:] / np.diff(time)[:-2])
@@ -156,13 +156,13 @@ def record_doubts(
     yield places, "steps of time are 1000 times larger or smaller from {}: another unit?"
 
 
-def _stuck(held: FloatArray, other: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
+def _stuck(held: FloatArray, partner: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
     """Return where one signal stays at one value while the other continues."""
     steps = np.abs(np.diff(held))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
     starts = starts - 1  # the value was there before it was repeated
-    travel = np.abs(other[[(starts + stops) // 2, stops]] - other[starts]).max(axis=0)
-    moved = travel > _STUCK_TRAVEL * np.ptp(other)
+    travel = np.abs(partner[[(starts + stops) // 2, stops]] - partner[starts]).max(axis=0)
+    moved = travel > _STUCK_TRAVEL * np.ptp(partner)
     starts, stops = starts[moved], stops[moved]
     if not starts.size or not steps.any():  # a force of 0 throughout is a free decay
         return np.asarray(starts[:1] if smooth else starts[:0])
@@ -203,12 +203,12 @@ def _bend(values: FloatArray) -> float:
     return 5.0 * float(np.quantile(np.abs(np.diff(values, 2)), 0.98))
 
 
-def _unit_changes(values: FloatArray, other: FloatArray) -> NDArray[np.intp]:
+def _unit_changes(values: FloatArray, partner: FloatArray) -> NDArray[np.intp]:
     """Return where values are 1000 times, or a thousandth of, what they were just before."""
     if values.size > 2 * _PART:
         parts = [slice(i, i + _PART + 2 * _SWITCH) for i in range(0, values.size, _PART)]
         return np.unique(
-            np.concatenate([p.start + _unit_changes(values[p], other[p]) for p in parts])
+            np.concatenate([p.start + _unit_changes(values[p], partner[p]) for p in parts])
         )
     at = np.arange(4, values.size - 3)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -216,7 +216,7 @@ def _unit_changes(values: FloatArray, other: FloatArray) -> NDArray[np.intp]:
         change = np.log10(after / before)
         bend = np.log10(np.divide(*_sizes(values, at, 2)))
         later = np.minimum(at + _SWITCH, values.size - 4)
-        still = [np.log10(np.divide(*_sizes(other, place, 1))) for place in (at, later)]
+        still = [np.log10(np.divide(*_sizes(partner, place, 1))) for place in (at, later)]
         going_on = np.abs(values[at] * 10.0 ** (-3.0 * np.sign(change)) - values[at - 1])
     marked = (going_on < _FURTHER * before) & ~(np.abs(still) > 1.5 * _DECADES).any(axis=0)
     for ratio in (change, bend):

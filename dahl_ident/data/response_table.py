@@ -477,8 +477,8 @@ class _TableBinding(Binding):
             name: _typed(self.source.find(name).values, kind) for name, kind in kinds.items()
         }
         for channel in self.source.channels:
-            other = channel.name in self.used or channel.short is not None  # of another level
-            if other or channel.name in covariates or channel.content.shape != (n,):
+            has_role = channel.name in self.used or channel.short is not None  # of another level
+            if has_role or channel.name in covariates or channel.content.shape != (n,):
                 continue
             numeric = channel.kind in "biuf" and np.isfinite(channel.values).all()
             if numeric and not any(map(channel.is_called, RESPONSE_COLUMNS.values())):

@@ -47,8 +47,8 @@ def _describe(element: Element) -> dict[str, Any]:
 
 
 def _build(entry: Mapping[str, Any]) -> Element:
-    rest = dict(entry)
-    kind = rest.pop("kind", None)
+    content = dict(entry)
+    kind = content.pop("kind", None)
     cls = class_named(str(kind))
     if cls is None:
         raise ModelError(
@@ -56,5 +56,5 @@ def _build(entry: Mapping[str, Any]) -> Element:
             "whose file was imported or given as laws (on the command line --laws), or one of "
             f"{choices(KINDS, str(kind))}"
         )
-    name = rest.pop("name", None)
-    return cls.from_description(rest, name)
+    name = content.pop("name", None)
+    return cls.from_description(content, name)

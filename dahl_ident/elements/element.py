@@ -87,14 +87,14 @@ class Element(Behaviour):
             return super().__reduce_ex__(protocol)
         return restored, (file, type(self).__qualname__), self.__dict__
 
-    def _bind(self, given: Mapping[str, float | None], name: str | None) -> None:
+    def _bind(self, arguments: Mapping[str, float | None], name: str | None) -> None:
         """Give the declared parameters their full names and values."""
         self._name = name
         declared = type(self).parameters
-        if self.optional and given[self.optional[0].name] != self.optional[1]:
+        if self.optional and arguments[self.optional[0].name] != self.optional[1]:
             declared = (*declared, self.optional[0])
         self.parameters = tuple(
-            p.bound(prefixed(name, p.name), given.get(p.name, p.value)) for p in declared
+            p.bound(prefixed(name, p.name), arguments.get(p.name, p.value)) for p in declared
         )
 
     @property
@@ -132,10 +132,10 @@ class Element(Behaviour):
             options[cls.optional[0].name] = None
         return cls(**options)._described(rest)
 
-    def _described(self, rest: Mapping[str, Any]) -> Self:
+    def _described(self, description: Mapping[str, Any]) -> Self:
         """Return this element with the parameters that plain data describe, by label."""
         known = self.labels
-        unknown = [label for label in rest if label not in known]
+        unknown = [label for label in description if label not in known]
         if unknown:
             raise ModelError(
                 f"the {self.kind} element has the keys {', '.join(unknown)}; expected "
@@ -143,7 +143,7 @@ class Element(Behaviour):
             )
         return self.with_bound(
             tuple(
-                p.described(rest[label]) if label in rest else p
+                p.described(description[label]) if label in description else p
                 for label, p in zip(known, self.parameters, strict=True)
             )
         )
@@ -240,8 +240,8 @@ class Element(Behaviour):
         start = finite_number(initial_force, "initial_force")
         self._check_start(values, start)
         v, a = (
-            None if given is None else np.atleast_1d(motion(given, name, x, self))
-            for given, name in ((velocity, "velocity"), (acceleration, "acceleration"))
+            None if channel is None else np.atleast_1d(motion(channel, name, x, self))
+            for channel, name in ((velocity, "velocity"), (acceleration, "acceleration"))
         )
         t = None
         if time is not None and x.size > 1:

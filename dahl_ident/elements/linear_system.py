@@ -212,8 +212,8 @@ class LinearSystem(Element):
     def free_responses(self, time: FloatArray) -> FloatArray:
         """Return the force from each state at the first sample, (n, states)."""
         equation = self._equation
-        rest = np.zeros((time.size - 1, 6))
-        states = self._histories(equation, self._step(time), rest, np.eye(equation.order))
+        undriven = np.zeros((time.size - 1, 6))
+        states = self._histories(equation, self._step(time), undriven, np.eye(equation.order))
         return np.asarray(states @ equation.output)
 
     def history(
@@ -239,10 +239,10 @@ class LinearSystem(Element):
                     f"under a prescribed displacement the force of {self!r} grows beyond all "
                     "bounds; give records in which a force drives a mass"
                 )
-            rest = np.zeros((equation.order, 1))
+            at_rest = np.zeros((equation.order, 1))
             h = self._step(path.time)
             paths = Path(x, v, a).polynomials(np.full(x.size - 1, h)).T
-            states = self._histories(equation, h, paths, rest)
+            states = self._histories(equation, h, paths, at_rest)
             force = np.asarray(force + states[:, 0] @ equation.output)
         zero = np.zeros(force.shape)
         return HistoryGradient(force, zero, (zero,) * len(self.parameters))

@@ -137,12 +137,12 @@ class Parameter:
         """Whether the unit is that of a mass."""
         return _dimension(self.unit) == (1, -1, 2)
 
-    def bound(self, name: str, given: float | None) -> Parameter:
+    def bound(self, name: str, value: float | None) -> Parameter:
         """Return this declaration as a parameter called `name`: fixed at a number, or free."""
-        if given is None and self.value is None and self.free and name == self.name:
+        if value is None and self.value is None and self.free and name == self.name:
             return self
-        assumed = isinstance(given, Assumed)
-        return replace(self, name=name, value=given, free=None, assumed=assumed)
+        assumed = isinstance(value, Assumed)
+        return replace(self, name=name, value=value, free=None, assumed=assumed)
 
     def describe(self) -> Any:
         """Return a fixed value as a number, "free", or a mapping with the details."""
@@ -155,21 +155,21 @@ class Parameter:
         start = {} if self.value is None else {"start": self.value}
         return {"free": True, **start, **bounds}
 
-    def described(self, given: Any) -> Parameter:
+    def described(self, description: Any) -> Parameter:
         """Return this parameter as :meth:`describe` wrote it."""
-        if given == "free":
+        if description == "free":
             return replace(self, value=None, free=True, assumed=False)
-        if not isinstance(given, Mapping):
-            return self.fixed(given)
-        if "assumed" in given:
-            return replace(self, value=given["assumed"], free=False, assumed=True)
+        if not isinstance(description, Mapping):
+            return self.fixed(description)
+        if "assumed" in description:
+            return replace(self, value=description["assumed"], free=False, assumed=True)
         return replace(
             self,
-            value=given.get("start"),
+            value=description.get("start"),
             free=True,
             assumed=False,
-            lower=given.get("lower", self.lower),
-            upper=given.get("upper", self.upper),
+            lower=description.get("lower", self.lower),
+            upper=description.get("upper", self.upper),
         )
 
     def freed(self) -> Parameter:

@@ -81,8 +81,8 @@ class Nonlinear:
         """Upper bounds of |N| and A |N| for each vector; infinite where unknown."""
         steepest, largest = np.zeros(()), np.zeros(())
         for element, values in zip(self.elements, self.values, strict=True):
-            own = element.force_bounds(values)
-            steepest, largest = steepest + own[0], largest + own[1]
+            of_element = element.force_bounds(values)
+            steepest, largest = steepest + of_element[0], largest + of_element[1]
         return steepest, largest
 
     def knees(self) -> tuple[FloatArray, FloatArray]:

@@ -149,9 +149,9 @@ class Shooting:
         rows = np.flatnonzero(beyond.any(axis=1))
         if rows.size:
             near = result.starts[rows]
-            other = self._motions(resolved[rows], omega[rows], drive[rows], starts=near, **how)
-            other.by_parameter.swapaxes(1, 2)[beyond[rows][:, list(chosen)]] = 0.0
-            for part, new in zip(result, other, strict=True):
+            repeated = self._motions(resolved[rows], omega[rows], drive[rows], starts=near, **how)
+            repeated.by_parameter.swapaxes(1, 2)[beyond[rows][:, list(chosen)]] = 0.0
+            for part, new in zip(result, repeated, strict=True):
                 part[rows] = new
         return result
 

@@ -504,9 +504,9 @@ def contradict(
     return names != others or any(_differ(*pair) for pair in units)
 
 
-def _differ(unit: str, other: str) -> bool:
+def _differ(first: str, second: str) -> bool:
     try:
-        return replace(parse_unit(unit), text="") != replace(parse_unit(other), text="")
+        return replace(parse_unit(first), text="") != replace(parse_unit(second), text="")
     except UnitError:
         return False
 
