@@ -298,7 +298,7 @@ def spelled(python: str, options: str) -> str:
 
 
 class Placeholder(str):
-    """What stands in a message for a value that the user knows."""
+    """The text of a message in place of a value that the user knows."""
 
     __slots__ = ()
 

@@ -123,7 +123,7 @@ class LogDensity(ABC):
     @property
     @abstractmethod
     def facts(self) -> dict[str, str | Sequence[object]]:
-        """What the density depends on in addition to model and priors: texts, or arrays."""
+        """Inputs of the density in addition to model and priors: texts, or arrays."""
 
     def in_order(self, points: FloatArray) -> FloatArray:
         """Return points with interchangeable elements in order."""
@@ -286,7 +286,7 @@ class Density(LogDensity):
         return np.ones((1, 1)) if self.errors is None else self.errors.weights
 
     def probabilities(self, sums: FloatArray) -> FloatArray:
-        """Return how probable each size of shared errors is, (S, M), given sums of squares."""
+        """Return the probability of each size of shared errors, (S, M), given sums of squares."""
         if self.errors is None:
             return np.ones(sums.shape)
         each = self._exponents(sums) + self.errors.log_weights

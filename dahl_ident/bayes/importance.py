@@ -93,7 +93,7 @@ class WeightedDraws:
 
     @cached_property
     def _distribution(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Of every axis: theta in order, and the probability below; as NumPy has it where alike."""
+        """For every axis: sorted theta, and the probability below; with equal weights as NumPy."""
         if np.ptp(self.weights) == 0.0:
             below = np.linspace(0.0, 1.0, len(self.theta))
             return [(x, below) for x in np.sort(self.theta, axis=0).T]

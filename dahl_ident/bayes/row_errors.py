@@ -60,7 +60,7 @@ class RowErrors:
 
     @cached_property
     def _variances(self) -> FloatArray:
-        """Of each coordinate, shape (k, M)."""
+        """Weights of each coordinate, shape (k, M)."""
         return 1.0 + self.shared[:, None] * self.sizes
 
     @cached_property
@@ -103,7 +103,7 @@ class RowErrors:
 
     @cached_property
     def weights(self) -> FloatArray:
-        """What the squares of uncorrelated residuals count, for each lambda, (K, M)."""
+        """Weights of the squares of uncorrelated residuals, for each lambda, (K, M)."""
         alone = 0 if self.inside is None else len(self.inside)
         return np.concatenate([1.0 / self._variances, np.ones((alone, len(self.sizes)))])
 

@@ -400,11 +400,11 @@ _RECORD = tuple(
     )
 )
 COLUMNS = {str(column.source): column for column in _RESPONSE if column.check}
-"""Of a frequency response in memory."""
+"""Columns of a frequency response in memory."""
 RESPONSE_COLUMNS = {column.names[0]: column for column in _RESPONSE if column.names}
-"""Of files of responses, in the order in which they are saved."""
+"""Columns of files of responses, in the order in which they are saved."""
 RECORD_COLUMNS = {column.names[0]: column for column in _RECORD}
-"""Of a record, in memory and in files."""
+"""Columns of a record, in memory and in files."""
 FILE_COLUMNS = RECORD_COLUMNS | RESPONSE_COLUMNS
 
 

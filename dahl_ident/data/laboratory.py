@@ -15,7 +15,7 @@ from dahl_ident.errors import DahlIdentError, ValidationError, choices
 from dahl_ident.units import parse_quantity
 
 CHANNELS = {"force": "force_gain", "displacement": "displacement_gain", "delay": "delay"}
-"""What an instrument's uncertainty belongs to, and the parameter of the sensors for it."""
+"""The quantities of instruments' uncertainties, and the sensors' parameters for them."""
 
 _FIELDS = {
     "laboratory": "Laboratory",

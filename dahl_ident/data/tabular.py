@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Lines = Sequence[tuple[str, str]]
 ASSUMED = "assumed"
-"""What the provenance says of a frequency that the table does not have."""
+"""The note in the provenance where a table has no frequency."""
 _SHOWN = 8  # items that fit into a line of a message
 
 

@@ -1,4 +1,4 @@
-"""What a fit states of its data: errors, values, intervals, bands, judgement."""
+"""The assessment of a fit: errors, values, intervals, bands, judgement."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _OF_ONE_KIND = {
     "record_at_draws": "prediction of a record",
     "residuals": "residuals sample by sample",
 }
-"""What one kind of data alone has, in words."""
+"""Texts that depend on the kind of data."""
 _NOISE = {
     "measured": "measured: the data's covariance, scale known",
     "relative": "relative: constant variance of (ln gain, phase)",
@@ -75,7 +75,7 @@ class Assessment(ABC):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is stated for machines, apart from parameters, verdict and budget."""
+        """Statements for machines, apart from parameters, verdict and budget."""
         optimum = self.optimum
         return {
             "search": optimum.status.name.lower().replace("_", " "),
@@ -100,7 +100,7 @@ class Assessment(ABC):
 
     @property
     def constraint_cost(self) -> ConstraintCost | None:
-        """What constraints cost."""
+        """The cost of constraints."""
         return self.optimum.constraint_cost
 
     @property
@@ -338,7 +338,7 @@ class TableAssessment(Assessment):
         return judgement(self)
 
     def assumptions(self, *, counted: bool = True) -> Iterator[Finding]:
-        """Return what the result depends on."""
+        """Return the assumptions of the result."""
         return assumptions(self.optimum, self.errors if counted else None)
 
     @cached_property
@@ -362,7 +362,7 @@ class TableAssessment(Assessment):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is stated for machines, see ``Assessment``."""
+        """Statements for machines, see ``Assessment``."""
         suspicious = [str(point) for point in self.goodness.suspicious]
         return super().facts | {
             "noise": self.problem.noise, "suspicious": suspicious, "redchi": self.redchi

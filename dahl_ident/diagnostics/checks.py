@@ -159,7 +159,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 
 
 def _reservations(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield what keeps a fit from being trusted although its residuals may look like noise."""
+    """Yield reasons not to trust a fit although its residuals may look like noise."""
     yield from _beyond_limit(fit)
     yield from below_zero(fit)
     yield from _contradicted_priors(fit)

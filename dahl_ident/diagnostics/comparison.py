@@ -1,4 +1,4 @@
-"""Which model describes the data, and what friction is whatever the model.
+"""Which model describes the data, and the quantities of friction that do not depend on the model.
 
 Candidates come from what the fit leaves: a mean force asks for two limits, a response that changes
 with frequency for a damper, a force that falls with it for LuGre's law, any other misfit for
@@ -8,8 +8,8 @@ error of the highest, the simplest is the best. The model fitted stays the best 
 density exceeds its by more than chance explains among many candidates. AIC and BIC do not count:
 over harmonics whose covariance is tiny they prefer a model that spoils the fundamental. If no model
 describes the data, the best of them does not either; a model with negative damping does not
-describe a mechanism. Each model is fitted as :func:`dahl_ident.fit` fits it, an exponent that
-nobody gave with its range included.
+describe a mechanism. Each model is fitted as :func:`dahl_ident.fit` fits it, with the range of an
+exponent that the user did not give.
 """
 
 from __future__ import annotations
@@ -317,7 +317,7 @@ class ModelComparison:
         return "\n".join(lines)
 
     columns = ("model", "reason", "misfit", "harmonics", "dof", "f_max", "sigma", "density")
-    """Of :attr:`rows`."""
+    """Columns of :attr:`rows`."""
 
     @property
     def rows(self) -> list[list[str]]:
@@ -372,7 +372,7 @@ def _levels(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
-    """Return what all laws have in common at the values of the parameters, see `ComparedModel`."""
+    """Return the quantities common to all laws at the parameters' values, see `ComparedModel`."""
     A, rates = _levels(problem)
     sizes = np.geomspace(A.min(), A.max(), _LEVELS if A.max() > A.min() else 1)
     omega = np.asarray(np.exp(np.mean(np.log(rates))))
@@ -631,7 +631,7 @@ def _falling_force(optimum: Optimum) -> str:
 
 
 def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
-    """Return what parallel Jenkins elements would leave where that is far less, else ""."""
+    """Return the misfit of parallel Jenkins elements where it is far smaller, else ""."""
     if optimum.problem.is_exact:
         return ""  # the bound is that of displacements that are sines
     try:

@@ -128,7 +128,7 @@ class ErrorModel:
 
     @property
     def distinguishes_noise(self) -> bool:
-        """Whether there are enough residuals to tell a model error from noise."""
+        """Whether there are enough residuals to distinguish a model error from noise."""
         return _distinguishes_noise(self.problem, self.assumed)
 
     @cached_property

@@ -295,12 +295,12 @@ class Goodness:
 
     @cached_property
     def objections(self) -> tuple[str, ...]:
-        """What speaks against the model, in words with numbers; empty where nothing does."""
+        """Objections to the model, in words with numbers."""
         return tuple(self._departures(self.level))
 
     @cached_property
     def hints(self) -> tuple[str, ...]:
-        """The same at a level that noise alone reaches in one data set of twenty."""
+        """Objections at a level that noise alone reaches in one data set of twenty."""
         return tuple(self._departures(_HINT / _FALSE_ALARM * self.level))
 
     def _departures(self, level: float) -> Iterator[str]:
@@ -387,7 +387,7 @@ class Goodness:
 
     @property
     def cause(self) -> str:
-        """What explains why the data are not described, in words; empty where nothing does."""
+        """The reason why the data are not described, in words; empty where none is known."""
         causes = (f for f in self.findings() if f.code in ("sign", "rows_apart"))
         return next(map(str, causes), "")
 

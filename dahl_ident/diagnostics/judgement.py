@@ -34,7 +34,7 @@ class VerdictStatus(StrEnum):
 
 
 class Question(StrEnum):
-    """What a finding answers."""
+    """The question that a finding answers."""
 
     DETERMINED = "determined"
     """Which parameters or combinations do the data determine?"""
@@ -78,7 +78,7 @@ _MOST_TOLD = 5  # findings of a verdict; more are not read
 
 
 class Judgement:
-    """What was found about a result, the most serious first.
+    """The findings about a result, the most serious first.
 
     The worst severity is its `status`. At most five findings are `told`: of an unusable result
     without what only a usable one needs, which is what is identified or assumed; of a usable one

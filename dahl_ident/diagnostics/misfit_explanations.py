@@ -89,7 +89,7 @@ def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, f
 
 
 def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
-    """Return the same for a robust fit, which no outlier has bent: whatever noise cannot reach."""
+    """Return the same for a robust fit, which outliers do not bend: all points beyond the noise."""
     m, dof = optimum.problem.n_residuals, max(optimum.dof, 1)
     y, _ = optimum.problem.residuals_and_jacobian(optimum.theta, optimum.scale, tails=False)
     squares = y[:m:2] ** 2 + y[1:m:2] ** 2

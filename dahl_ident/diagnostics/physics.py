@@ -70,7 +70,7 @@ def _steady_difference(optimum: Optimum) -> tuple[int, float]:
 
 
 def steady_findings(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield how driven rows were predicted, what the other way would have been, and jumps."""
+    """Yield how driven rows were predicted, the difference from the other method, and jumps."""
     optimum, problem = fit.optimum, fit.problem
     if not (problem.data.controlled == "force").any():
         return

@@ -38,7 +38,7 @@ _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
 
 
 class PredictionError(NamedTuple):
-    """Of ln gain and phase at n points: departure, (n, 2), covariance, (n, 2, 2), dof, (n, 2)."""
+    """Error of ln gain and phase at n points: departure, (n, 2), covariance, dof, (n, 2)."""
 
     departure: FloatArray
     covariance: FloatArray
@@ -136,7 +136,7 @@ class Departures(NamedTuple):
     # (Q + W, Q + W): Of theta and of the departures: earlier data, their priors, and the unit
     # variances
     information: FloatArray
-    # whether its variance is assumed, because residuals are too few to tell it from noise
+    # whether its variance is assumed, as residuals are too few to distinguish it from noise
     assumed: bool
 
 
@@ -149,7 +149,7 @@ def departures(
 ) -> Departures | None:
     """Return the model error of a fit at other places; None where it has none.
 
-    Where residuals are too few to tell it from noise, it is taken to be as large as the noise.
+    Where residuals are too few to distinguish it from noise, it is assumed as large as the noise.
     """
     sized = {
         _kind(source): variance

@@ -1,4 +1,4 @@
-"""What a fit of records of any motion states, and how it predicts others."""
+"""The assessment of a fit of records of any motion, and its predictions of other records."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class RecordBand:
 
     @property
     def rms_share(self) -> float:
-        """The same over the measured samples' standard deviation."""
+        """RMS of measured minus predicted, over the measured samples' standard deviation."""
         return self.rms_error / float(np.std(self.measured))
 
 
@@ -202,7 +202,7 @@ class RecordAssessment(Assessment):
 
     @property
     def constraint_cost(self) -> ConstraintCost | None:
-        """What constraints cost; correlated samples count as few."""
+        """The cost of constraints; correlated samples count as fewer."""
         cost = self.optimum.constraint_cost
         share = self.errors.effective / self.problem.n_samples
         return cost and replace(cost, rise=cost.rise * share, dof=cost.dof * share)
@@ -218,12 +218,12 @@ class RecordAssessment(Assessment):
         return Judgement(finding for check in CHECKS for finding in check(self))
 
     def assumptions(self, *, counted: bool = True) -> tuple[Finding, ...]:
-        """Return what the result depends on."""
+        """Return the assumptions of the result."""
         return (record_assumptions(self.problem, self.errors),)
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is stated for machines, see ``Assessment``."""
+        """Statements for machines, see ``Assessment``."""
         return super().facts | {
             "records": len(self.problem.records),
             "samples": self.problem.n_samples,

@@ -240,7 +240,7 @@ def _misfit(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 def _physics(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield what speaks against a law's estimates physically, or against an exponent."""
+    """Yield physical objections to a law's estimates, and objections to an exponent."""
     for element in fit.model.elements:
         if not is_single(element):
             for text in element.physics([p.value or 0.0 for p in element.parameters]):
@@ -256,7 +256,7 @@ def _physics(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 def _slight(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield what carries less force than the misfit, and may stand for a part of it."""
+    """Yield elements that carry less force than the misfit, and may describe a part of it."""
     problem = fit.problem
     if problem.output == "motion" or not misses(fit):
         return

@@ -81,7 +81,7 @@ class RecordErrors:
 
     @property
     def assumed(self) -> list[HeldValue]:
-        """The exponents that nobody stated."""
+        """The exponents that the user did not state."""
         return [one for one in self.exponents if one.assumed]
 
     @property
@@ -248,7 +248,7 @@ def errors_on_constraints(
 def _by_calibration(
     problem: RecordProblem, values: FloatArray, jacobians: Sequence[FloatArray]
 ) -> dict[str, FloatArray]:
-    """Return what stated calibrations do to the estimate, by source.
+    """Return the covariance of the estimate by stated calibrations, by source.
 
     A gain changes the units of force or of displacement, and every parameter with them, if all were
     estimated; known ones stay, which changes the others as if they had been given wrongly. A delay
@@ -294,7 +294,7 @@ def _by_drive(
     known: FloatArray,
     stds: Sequence[float],
 ) -> FloatArray:
-    """Return what white noise in the drive does to the estimate beyond what residuals show.
+    """Return the effect of white noise in the drive on the estimate, beyond that in the residuals.
 
     It moves the plant most where it resonates or where friction slips, and parameters are
     determined at these places. The `known` covariance takes the residuals as equally large

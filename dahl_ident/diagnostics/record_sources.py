@@ -54,7 +54,7 @@ class HeldValue:
         Covariance of the estimate through it: as if it were estimated too, and at least as much
         as the value estimated from the records moves it.
     assumed : bool
-        Whether nobody stated it.
+        Whether the user did not state it.
     """
 
     name: str
@@ -181,7 +181,7 @@ def by_delay(
     residuals: Sequence[FloatArray],
     noise: Sequence[FloatArray],
 ) -> FloatArray:
-    """Return the covariance of the estimate through the delay, which nobody stated.
+    """Return the covariance of the estimate through the delay, which the user did not state.
 
     A normal distribution of one sample counts, and for less where the records say more; the
     estimated delay is taken out already.

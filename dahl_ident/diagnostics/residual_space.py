@@ -58,7 +58,7 @@ class Linearization:
     parts: Sequence[tuple[TableProblem, NDArray[np.bool_], FloatArray]]
 
     def change(self, changes: ComplexArray) -> FloatArray:
-        """Return what changes (k, n) of the measured responses add to residuals, shape (k, m)."""
+        """Return the changes of residuals, (k, m), by changes (k, n) of the measured responses."""
         added = np.zeros((len(changes), 2 * changes.shape[1]))
         for problem, rows, theta in self.parts:
             added[:, np.repeat(rows, 2)] = -problem.residual_change(theta, changes[:, rows])
@@ -263,7 +263,7 @@ class ResidualSpace(_Complement):
         return np.asarray(columns * self._column_weight)
 
     def p_value(self, changes: ComplexArray) -> float:
-        """Return how likely noise alone gives as much departure along `changes`, (k, n)."""
+        """Return the probability of such a departure along `changes`, (k, n), by noise alone."""
         basis = orthonormal(self.columns(changes).T)
         explained = float(np.sum((basis.T @ self.residuals) ** 2))
         return self.tail(explained, basis.shape[1])

@@ -1,4 +1,4 @@
-"""What rows share of their errors, from the error model of a fit, for a posterior's likelihood."""
+"""Errors that rows share, from the error model of a fit, for a posterior's likelihood."""
 
 from __future__ import annotations
 

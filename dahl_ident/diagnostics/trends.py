@@ -278,7 +278,7 @@ def runs(optimum: Optimum, space: ResidualSpace) -> list[Runs]:
 
 
 def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
-    """Yield name, values and unit of whatever varies over the rows."""
+    """Yield name, values and unit of the quantities that vary over the rows."""
     problem = optimum.problem
     data, motion = problem.data, problem.data.motion
     driven = data.drive if (data.controlled == "force").all() else None

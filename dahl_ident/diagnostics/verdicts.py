@@ -292,7 +292,7 @@ def _lost_beyond_noise(
 
 
 def _unseen(optimum: Optimum) -> dict[str, str]:
-    """Return what is said of friction parameters whose sign or order the data do not show.
+    """Return the texts on friction parameters whose sign or order the data do not determine.
 
     Where a mirrored law is the same to a sine, it is to the exact motion's fundamental; so it is
     with parameters that pulling and pushing exchange. A move that should have cost something, by

@@ -214,7 +214,7 @@ class Behaviour(ABC):
         return np.zeros((time.size, 0))
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return what abs(N) and A abs(N) never exceed, over all amplitudes; inf where nothing."""
+        """Return upper bounds of abs(N) and A abs(N) over all amplitudes; inf if unbounded."""
         return np.full((), np.inf), np.full((), np.inf)
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
@@ -260,7 +260,7 @@ class Behaviour(ABC):
         return values
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
-        """Return what speaks against the values physically, in words; empty where nothing."""
+        """Return the physical objections to the values, in words."""
         return ()
 
     def rational_stiffness(self) -> tuple[FloatArray, FloatArray] | None:

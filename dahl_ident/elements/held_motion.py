@@ -65,7 +65,7 @@ def _first_of(law: Element) -> FirstState:
 
 
 def form_of(law: Element) -> Hashable:
-    """Return what the equations of a law depend on: its class, constants and other attributes."""
+    """Return the key of a law's equations: its class, constants and other attributes."""
     constants = tuple(None if p.free else p.value for p in law.parameters)
     others = tuple(
         (name, form_of(value) if isinstance(value, Element) else repr(value))

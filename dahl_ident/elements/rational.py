@@ -24,7 +24,7 @@ class Rational:
 
     @property
     def degrees(self) -> tuple[int, int]:
-        """Of numerator and denominator."""
+        """Degrees of numerator and denominator."""
         return self.numerator.size - 1, self.denominator.size - 1
 
     def trimmed(self) -> Rational:

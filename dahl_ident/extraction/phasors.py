@@ -259,7 +259,7 @@ class Phasors:
 
     @property
     def bias(self) -> ComplexArray:
-        """What the transient adds to the response of each harmonic."""
+        """The transient's contribution to the response of each harmonic."""
         one = np.eye(2)[self.settings.transient_channel]  # to whose mean it adds nothing
         added = {k: self.transient_phasors[k] * one * (k > 0) for k in (1, *self.harmonics)}
         return self.changed(added)
@@ -373,7 +373,7 @@ class Phasors:
         }
 
     def objections(self, settled: bool, quality: dict[str, Any]) -> list[str]:
-        """Return what speaks against all rows."""
+        """Return the objections to all rows."""
         objections = []
         N, covariance, _, dof = self.fundamental
         std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))

@@ -38,7 +38,7 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError, argument
 
 FEWEST_CYCLES = 2  # that a fit with offset and drift needs
-HARMONICS = 9  # fitted at least, where the sampling can tell them apart
+HARMONICS = 9  # fitted at least, where the sampling can separate them
 _MOST_HARMONICS = 40  # fitted so that they do not leak where cycles are not whole samples
 _AFFORDABLE = 4e5  # samples times harmonics; leakage falls with the number of samples
 _NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate

@@ -198,7 +198,7 @@ class _Grid:
         return np.where(allowed, cost, np.inf), coefficients
 
     def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
-        """Return what is to be fitted, (..., C, 2 n), columns of every node, and of each."""
+        """Return the target, (..., C, 2 n), columns common to all nodes, and those of each."""
         target = self.target[..., None, :]
         columns = []
         for index, curves in enumerate(self.curves):
@@ -309,7 +309,7 @@ def _size(curves: _Curves) -> int:
 def _columns(
     d: Directions, values: dict[str, FloatArray], view: StiffnessData
 ) -> tuple[ComplexArray | None, list[_LinearPart]]:
-    """Return what is known of an element's stiffness, and a column for each coefficient.
+    """Return the known part of an element's stiffness, and a column for each coefficient.
 
     `values` are those of the directions, each (..., K).
     """

@@ -535,7 +535,7 @@ def _constrained(
 def _constraint_cost(
     target: Target, end: _Found, relations: Relations, begin: Optimum
 ) -> ConstraintCost | None:
-    """Return what the constraints cost against the least squares without them, `begin`."""
+    """Return the rise of the cost by the constraints over `begin`, least squares without them."""
     of_one_scale = target.problem.scale_known or not target.problem.priors
     if target.loss != "linear" or not of_one_scale or begin.is_exact or begin.dof <= 0:
         return None

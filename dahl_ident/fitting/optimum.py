@@ -143,7 +143,7 @@ class Optimum:
     values: FloatArray
     """Parameter values, (P,); infinite or zero where the optimum has them so."""
     covariance: FloatArray
-    """Of theta: scale^2 times the inverse Fisher information; infinite where undetermined."""
+    """Covariance of theta: scale^2 over the Fisher information; infinite where undetermined."""
     scale: float
     """Standard deviation of the residuals: 1 where the noise model knows it, else estimated as
     (sum of squares / dof)^(1/2), but no less than rounding makes it."""
@@ -161,7 +161,7 @@ class Optimum:
     method: str
     loss: str = "linear"
     combinations: tuple[DeterminedCombination, ...] = field(default=())
-    """What is determined where the optimum lies at infinity."""
+    """The determined combinations where the optimum lies at infinity."""
     constraint_cost: ConstraintCost | None = None
     """None where there are no constraints, or the loss is robust."""
 
@@ -267,9 +267,9 @@ class OptimumBatch(Sequence[Optimum]):
     method: str
     loss: str
     combinations: Mapping[int, tuple[DeterminedCombination, ...]]
-    """Of the tables at a limit."""
+    """Determined combinations of the tables at a limit."""
     meanings: Mapping[int, str]
-    """Of their limits, where the status does not say it."""
+    """Meanings of their limits, where the status does not state them."""
 
     def __len__(self) -> int:
         return len(self.theta)

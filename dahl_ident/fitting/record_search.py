@@ -31,7 +31,7 @@ _DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not 
 _REPEATS = 12  # a limit for weights that do not settle
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
 _ALIGNED = 0.02  # of the sum of squares that a delay has to explain to be removed
-_LONGEST_DELAY = 2.0  # samples: twice the standard deviation that nobody stated
+_LONGEST_DELAY = 2.0  # samples: twice the assumed standard deviation
 _ALIGNMENTS = 4  # steps of the delay: each leaves a hundredth of the one before
 SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
 EXACT = 1e-12  # share of variance left that is rounding
@@ -335,7 +335,7 @@ class RecordSearch:
         return self.optimum(problem, end)
 
     def optimum(self, problem: RecordProblem, end: Minima) -> Optimum:
-        """Return the optimum where a search has ended, exponents that nobody stated held there."""
+        """Return the optimum where a search has ended, with assumed exponents held there."""
         if problem.ranges:
             values = dict(zip(problem.names, problem.to_values(end.theta[0]), strict=True))
             theta = end.theta[:, [name not in problem.ranges for name in problem.names]]
@@ -347,7 +347,7 @@ class RecordSearch:
         return optima(problem, Ends(end), self.scale, rho, self.method, end.evaluations)[0]
 
     def freed(self, problem: RecordProblem, held: Minima) -> tuple[RecordProblem, Minima]:
-        """Return the estimate with exponents that nobody stated free, their ranges as priors.
+        """Return the estimate with assumed exponents free, their ranges as priors.
 
         A prior counts as one more sample of the residuals' noise, of which neighbours are alike.
         The estimate stays as it was where no motion is next to it.

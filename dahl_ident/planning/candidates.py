@@ -270,7 +270,7 @@ class BenchTime:
 
     @property
     def alone(self) -> FloatArray:
-        """The same of each candidate alone, (K,)."""
+        """Seconds before anything is measured at each candidate alone, (K,)."""
         return self.fixed(np.arange(len(self.frequency_hz))[:, None])
 
     def seconds(self, levels: Sequence[int] | NDArray[np.intp], cycles: FloatArray) -> float:

@@ -219,7 +219,7 @@ class Design:
 
 
 class Coverage(NamedTuple):
-    """What levels need so that their data can be judged."""
+    """Requirements on levels so that their data can be judged."""
 
     fewest: int  # number of levels, at least
     span: float  # ln of the largest displacement amplitude over the smallest, at least

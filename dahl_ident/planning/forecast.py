@@ -1,4 +1,4 @@
-"""What measurements at candidates would determine, in addition to what earlier data did.
+"""Uncertainties after measurements at candidates, in addition to earlier data.
 
 The model error of an earlier fit (:mod:`dahl_ident.diagnostics.prediction_error`) enters as W more
 parameters, shared by earlier and later levels: a level close to a measured one then teaches

@@ -108,7 +108,7 @@ class Search:
 
     @cached_property
     def _coverage(self) -> Coverage:
-        """What levels need for a fit to them alone that can tell a wrong model from noise."""
+        """Requirements on levels so that a fit to them alone can reveal a wrong model."""
         known, candidates = self.question.knowledge, self.forecast.candidates
         amplitude = np.log(np.median(candidates.amplitude, axis=0))
         if known.problem is not None or known.sample_noise is not None or candidates.motions:
@@ -119,7 +119,7 @@ class Search:
         return Coverage(fewest, span, amplitude)
 
     def can_be_judged(self, design: Design) -> bool:
-        """Return whether the data of a design alone can tell a wrong model from noise."""
+        """Return whether the data of a design alone can distinguish a wrong model from noise."""
         enough = design.runs * len(design.levels) >= self._coverage.fewest
         return enough and bool(self._coverage.wide(design.levels))
 

@@ -55,7 +55,7 @@ class Trapezoid:
 
     @property
     def parameters(self) -> Mapping[str, float]:
-        """What describes it, SI."""
+        """The parameters of the motion, SI."""
         return dict(vars(self))
 
     @property

@@ -40,7 +40,7 @@ class Problem(ABC):
     arguments: ClassVar[tuple[str, ...]]
     """Names of the class's arguments; each is also an attribute."""
     kind: ClassVar[str]
-    """What was measured: "table" or "records"; `called` is the same in a sentence."""
+    """The kind of data: "table" or "records"; `called` names it in a sentence."""
     called: ClassVar[str]
     refused: ClassVar[Mapping[str, str]]
     """Options of estimates that such data do not take, and why."""
@@ -127,7 +127,7 @@ class Problem(ABC):
     @property
     @abstractmethod
     def output_in_words(self) -> str:
-        """What a misfit is a share of."""
+        """The quantity of which a misfit is a share, in words."""
 
     # Tables
 

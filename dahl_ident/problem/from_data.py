@@ -1,4 +1,4 @@
-"""The problem of whatever was measured: of a table, of records, of many tables of one shape."""
+"""Problems for all kinds of data: a table, records, many tables of one shape."""
 
 from __future__ import annotations
 

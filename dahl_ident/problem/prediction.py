@@ -81,7 +81,7 @@ class Nearby:
         derivatives: int = 2,
         amplitude_error: FloatArray | None = None,
     ) -> Prediction:
-        """Return what a predictor returns."""
+        """Return the prediction, as a predictor does."""
         near = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
         alone, change = self._alone, self._correction
         for place, slope in enumerate(self._slopes):

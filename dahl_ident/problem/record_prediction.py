@@ -1,4 +1,4 @@
-"""What the samples of a record should be, and the unknowns that records add to those of a model."""
+"""The predicted samples of a record, and the unknowns that records add to those of a model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What a record's samples should be."""
+    """The predicted samples of a record, with derivatives."""
 
     output: FloatArray
     by: FloatArray

@@ -486,7 +486,7 @@ class RecordProblem(Problem):
         return values[start : start + self.per_record]
 
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
-        """Return what the samples of record `number` should be."""
+        """Return the predicted samples of record `number`."""
         predicted = force_of if self.output == "force" else motion_of
         names = self.names if derivatives else ()
         key = np.append(self.full_values(values), self.own(values, number)).tobytes()

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from dahl_ident.elements import Element, Parameter
 
 Provenances = Iterable[Mapping[str, Any] | None]
-"""Of a table, or of each record."""
+"""Provenance of a table, or of each record."""
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
 _LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes", "warnings"}
 _USUAL = {
     "f_max": None, "sigma": None, "alpha": 1.0,
     "force_gain": 1.0, "displacement_gain": 1.0, "delay": 0.0,
 }  # fmt: skip
-"""What options stand for that are left out; None where the parameter is estimated then."""
+"""Values of options that are left out; None where the parameter is then estimated."""
 _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 """Parameters with an option of their own; other elements are written with --element."""
 

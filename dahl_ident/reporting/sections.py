@@ -185,7 +185,7 @@ def _of_several_tables(results: Sequence[Result], known: Metadata) -> Document:
 
 
 def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
-    """Return what distinguishes a fit from the others of a report, for headings."""
+    """Return the text that distinguishes a fit from the others of a report, for headings."""
     alike = of_kind(fit.problem.kind, fits)
     parts = [repr(fit.problem.model)] if len(alike) > 1 else []
     if len(alike) < len(fits):
@@ -281,7 +281,7 @@ def _assumed(fit: FitResult) -> Iterator[str]:
 
 
 def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Section]:
-    """Yield what follows the signature."""
+    """Yield the sections after the signature."""
 
     def section(title: str, *blocks: Block) -> Section:
         return Section(f"{title}{of}", blocks, details=True)

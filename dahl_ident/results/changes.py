@@ -1,4 +1,4 @@
-"""What changed from one fit to the next: differences of parameters with the whole uncertainty."""
+"""Changes from one fit to the next: differences of parameters with their combined uncertainty."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit states, as text and for machines: the verdict, then every number with its source."""
+"""Reports of a fit, as text and for machines: the verdict, then every number with its source."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BRIEF = 15  # lines that a reader takes in at a glance
 
 
 def facts(fit: FitResult) -> dict[str, Any]:
-    """Return what a fit states for machines, apart from its parameters."""
+    """Return a fit's statements for machines, apart from its parameters."""
     budget = fit.stated_budget
     return {
         "status": str(fit.status),

@@ -84,7 +84,7 @@ class FitResult(Result):
 
     @cached_property
     def assessment(self) -> TableAssessment | RecordAssessment:
-        """What the data tell of the estimate."""
+        """The assessment of the estimate by the data."""
         kind = _ASSESSMENTS[self.problem.kind]
         return kind(self.optimum, first_order=self.first_order)
 

@@ -122,7 +122,7 @@ class Result(ABC):
     _called: ClassVar[str] = "a result"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs, without what follows from it."""
+        """Return the state for a copy, without values computed from it."""
         kind = type(self)
         return {
             name: value
@@ -147,7 +147,7 @@ class Result(ABC):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What was found about data, model and assumptions, the most serious first."""
+        """The findings about data, model and assumptions, the most serious first."""
         return self.judgement.findings
 
     @property

@@ -240,7 +240,7 @@ class Shooting:
 
 
 class _Ask(NamedTuple):
-    """What is wanted of every row."""
+    """The request for every row: values, drive, and harmonics."""
 
     values: FloatArray
     omega: FloatArray

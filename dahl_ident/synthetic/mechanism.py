@@ -139,7 +139,7 @@ def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equa
 
 
 class EngineMotion:
-    """What equations give along a waveform, from rest, at any times within it."""
+    """The solution of equations along a waveform, from rest, at any times within it."""
 
     def __init__(
         self,
