@@ -201,8 +201,8 @@ class App:
     async def data(self, request: Request) -> Response:
         """Show what the files hold, and the form that says what it means."""
         work = self._work(request)
-        found = await run_in_threadpool(self._preview, work)
-        return self._page("data", work=work, state=work.state, found=found, roles=commands.ROLES)
+        preview = await run_in_threadpool(self._preview, work)
+        return self._page("data", work=work, state=work.state, found=preview, roles=commands.ROLES)
 
     def _preview(self, work: Work) -> dict[str, Any]:
         child = subprocess.run(
@@ -233,8 +233,8 @@ class App:
     async def model(self, request: Request) -> Response:
         """Show the form of model and knowledge."""
         work = self._work(request)
-        found = await run_in_threadpool(laws, self.laws)
-        return self._page("model", work=work, state=work.state, laws=found)
+        known_laws = await run_in_threadpool(laws, self.laws)
+        return self._page("model", work=work, state=work.state, laws=known_laws)
 
     async def save_model(self, request: Request) -> Response:
         """Store model and knowledge, and start a run."""

@@ -177,7 +177,7 @@ def combined_intervals(
     if doubtful.any():
         shape = profile()
         values = np.where(held, values, shape.estimate)
-        # with no limit on one side, u is no measure of the other: that is the profile's limit,
+        # with no limit on one side, u is not a measure of the other: use the profile's limit,
         # moved away from the estimate by the sources that the profile does not count
         unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))
         by_profile = doubtful & (~held | unlimited.any(axis=0))
