@@ -314,6 +314,17 @@ def test_what_another_law_does_after_every_reversal_is_a_model_error(law, motion
         assert fit.status.value == "not described"
 
 
+def test_much_white_noise_does_not_speak_against_a_law():
+    t = np.arange(2000) / 200.0
+    x = 0.01 * np.sin(2.0 * np.pi * t) * np.linspace(0.1, 1.0, 2000)
+    for seed in range(5):
+        force = di.Dahl(0.1, 30.0).force(x)
+        force += 0.02 * np.random.default_rng(seed).standard_normal(2000)
+        fit = di.fit(di.Record(t, displacement=x, force=force), di.Dahl(alpha=1.0))
+        assert fit.goodness.rms_misfit > 0.2
+        assert fit.status.usable
+
+
 @pytest.mark.parametrize("alpha", [0.8, 1.3])
 def test_an_exponent_stated_wrongly_is_not_described(alpha):
     fit = di.fit(held(di.Dahl(0.1, 30.0, alpha=alpha), 1), di.Dahl(alpha=1.0))

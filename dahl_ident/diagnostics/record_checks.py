@@ -33,7 +33,8 @@ _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not det
 _LONG_ENOUGH = 0.02  # share of samples near a reversal
 _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
 _WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
-_FAIRLY = 0.04  # share of variance left: a fifth of the output, beyond which intervals fail
+_FAIRLY = 0.04  # share of variance that a model misses: beyond it, intervals do not hold
+_TOO_LARGE = 0.25  # share of variance left, of noise too: half of the output is not the model's
 _STRUCTURED = 0.5  # correlation of neighbouring residuals
 _FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
 _BECAUSE = {  # by the source of most of the uncertainty
@@ -223,7 +224,8 @@ def _reason(fit: RecordAssessment, place: int) -> str:
 
 def _misfit(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield whether the model describes the records."""
-    far, converged = fit.goodness.share_in_band > _FAIRLY, fit.optimum.converged
+    converged = fit.optimum.converged
+    far = fit.goodness.share_in_band > (_FAIRLY if misses(fit) else _TOO_LARGE)
     if far:
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "records_not_described")
     if not converged:
