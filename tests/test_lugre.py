@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dahl_ident import Dahl, Damper, Friction, LuGre, Record, fit
+from dahl_ident import (
+    Dahl,
+    Damper,
+    Friction,
+    LuGre,
+    Mass,
+    Parameter,
+    Record,
+    Spring,
+    fit,
+    response,
+)
 from dahl_ident.errors import ModelError, ValidationError
 
 LAW = LuGre(1.0, 300.0, 1.6, 0.02, 0.4, 0.3)
@@ -103,3 +114,43 @@ def test_a_record_of_it_is_fitted():
     found = fit(Record(t, displacement=x, force=force), LuGre())
     for name, truth in (("f_max", 1.0), ("sigma", 300.0), ("static_ratio", 1.6)):
         assert found.params[name].value == pytest.approx(truth, rel=0.02)
+
+
+def test_a_motion_that_turns_just_before_a_sample_ends_there():
+    x, v, a = [0.01094447, 0.0110331], [3.56285877e-02, -5.26156355e-07], [-7.13556111, -7.06570654]
+    force = LuGre(1.0, 3000.0, 1.5, 0.016).force(x, velocity=v, acceleration=a, time=[0.285, 0.29])
+    assert force[1] == pytest.approx(0.2374, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("divided", "whole"),
+    [
+        (lambda v, v_0: (np.abs(v) / v_0) ** 1.5, lambda v, v_0: np.abs(v / v_0) ** 1.5),
+        (lambda v, v_0: np.sqrt(np.abs(v) / v_0), lambda v, v_0: np.sqrt(np.abs(v / v_0))),
+    ],
+)
+def test_a_root_of_a_speed_may_be_divided_within_it(divided, whole):
+    """At a turning point, rounding must not make the root's argument negative."""
+
+    def law(power):
+        class Falling(Friction):
+            kind = "falling"
+            rate_independent = False
+            parameters = (
+                Parameter("f_max", "N", "limit", lower=0.0, transform="log"),
+                Parameter("sigma", "N/m", "stiffness", lower=0.0, transform="log"),
+            )
+
+            def slope(self, force, direction, velocity, values):
+                f_max, sigma = values
+                limit = f_max * (1.0 + 0.6 * np.exp(-power(velocity, 0.02)))
+                return sigma * (1.0 - direction * force / limit)
+
+        return Falling(1.0, 300.0)
+
+    found = [
+        response(law(power) + Mass(1.0) + Damper(0.5) + Spring(10.0), 1.0, 2.0).amplitude
+        for power in (divided, whole)
+    ]
+    assert float(found[0]) == pytest.approx(float(found[1]), rel=1e-9)
+    assert float(found[1]) == pytest.approx(0.0584, abs=1e-4)

@@ -115,7 +115,7 @@ def as_json(result: FitResult) -> dict[str, Any]:
         "message": result.message,
         "assumed": {p.name: {"value": p.value, "stderr": p.stderr} for p in assumed},
         "params": {
-            name: {**vars(estimate), "interval": limits[name][1:] if estimate.vary else None}
+            name: {**vars(estimate), "interval": limits[name][1:] if name in limits else None}
             for name, estimate in result.params.items()
         },
     }

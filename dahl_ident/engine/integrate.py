@@ -255,7 +255,8 @@ def advance(
                 step, last = h * max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
                 continue
             nearest = _NEAREST * (w[at.interval + 2] - w[at.interval + 1])
-            if which == 0 and at.rated and h > nearest:  # what happens near rest is short
+            # what happens near rest is short; a step is stretched by a tenth to end at a knot
+            if which == 0 and at.rated and h > 1.2 * nearest:
                 step, last = max(0.5 * h, nearest), 0.0
                 continue
             if not there:

@@ -30,7 +30,7 @@ def on_one_branch(
     """
     function = ca.Function("f", list(inputs), [ca.densify(outputs)])
     work: dict[int, ca.SX] = {}
-    sizes: dict[int, ca.SX] = {}  # absolute values, which powers take beyond a switch too
+    whole: dict[int, ca.SX] = {}  # with switches that are not held: roots take them beyond one too
     functions, sides = ([motion[0]], [motion[1]]) if motion else ([], [])
     held = [ca.SX(0.0)] * function.nnz_out(0)
 
@@ -55,14 +55,18 @@ def on_one_branch(
             held[target[1]] = work[source[0]]
         else:
             a = [work[i] for i in source]
-            if code in _OF_POSITIVE and source[0] in sizes:
-                a[0] = sizes[source[0]]
-            sizes.pop(target[0], None)
+            if code in _OF_POSITIVE and source[0] in whole:
+                a[0] = whole[source[0]]
+            unheld = [whole.get(i, work[i]) for i in source]
+            switched = code in (ca.OP_FABS, ca.OP_FMAX, ca.OP_FMIN) or any(
+                i in whole for i in source
+            )
+            whole.pop(target[0], None)
+            if switched and code not in _OF_POSITIVE:
+                whole[target[0]] = (ca.SX.unary if len(a) == 1 else ca.SX.binary)(code, *unheld)
             if code in _SIGNED:
                 side = side_of(a[0])
                 work[target[0]] = side * a[0] if code == ca.OP_FABS else side
-                if code == ca.OP_FABS:
-                    sizes[target[0]] = ca.fabs(a[0])
             elif code in _COMPARED:
                 side = side_of(a[0] - a[1])
                 larger, smaller = (1.0 + side) / 2.0, (1.0 - side) / 2.0

@@ -102,7 +102,8 @@ class _Scan:
                     columns[e, place] = self._columns(elements[e], choices[e][place])
             shapes = [choices[e][p] for e, p in enumerate(places)]
             sets = [columns[e, p] for e, p in enumerate(places)]
-            begin += self._solve(elements, shapes, sets)
+            if all(sets):
+                begin += self._solve(elements, shapes, sets)
         if not begin:
             values = [p.value if p.value is not None else 1.0 for p in self.problem.free]
             begin = [_Start(0.0, values, passive=True)]
@@ -169,10 +170,15 @@ class _Scan:
         return max(float(np.std(h[3])) for h in self.histories)
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
-        return [
-            element.force_history(values, x, v, 0.0, acceleration=a, time=record.time)
-            for record, (x, v, a, _) in zip(self.problem.records, self.histories, strict=True)
-        ]
+        """Return the force along each record; none where one has no motion at these values."""
+        records = zip(self.problem.records, self.histories, strict=True)
+        try:
+            return [
+                element.force_history(values, x, v, 0.0, acceleration=a, time=record.time)
+                for record, (x, v, a, _) in records
+            ]
+        except FitError:
+            return []
 
     def _solve(
         self,

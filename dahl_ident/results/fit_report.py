@@ -94,7 +94,9 @@ def _parameters(fit: FitResult, intervals: ConfidenceIntervals, names: Iterable[
         if not p.vary:
             assumed = name in fit.assumed
             shown = rounded(p.value, p.stderr) if p.stderr is not None else (f"{p.value:g}", "")
-            rows.append([name, *shown, p.unit, "", "assumed" if assumed else "fixed"])
+            stated = name in intervals
+            within = interval(*intervals[name][-1][1:], "") if stated else ""
+            rows.append([name, *shown, p.unit, within, "assumed" if assumed else "fixed"])
             continue
         value, error = rounded(p.value, p.stderr)
         if math.isfinite(p.value) and p.stderr == math.inf and fit.nfree > 0:
