@@ -539,9 +539,9 @@ def _candidates(
             "speed": _falling_force(optimum),
             "masing": _jenkins(optimum, left),
         }
-    exponents = [p.name for e in model.elements for p in e.parameters if p.assumed]
+    exponent_is_assumed = any(p.assumed for e in model.elements for p in e.parameters)
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
-        if name == "exponent free" and exponents:
+        if name == "exponent free" and exponent_is_assumed:
             continue  # the fit estimates it
         taken = [offered[name] for _, offered in offers if name in offered]
         if len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken):

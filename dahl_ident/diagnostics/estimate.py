@@ -289,12 +289,12 @@ def weighted_estimate(
     covariance = np.linalg.pinv(best.jacobian.T @ best.jacobian, hermitian=True)
     minima = [best]
     for name, (centre, std) in problem.ranges.items():
-        along = covariance[:, problem.names.index(name)]
-        variance = float(along[problem.names.index(name)])
+        place = problem.names.index(name)
+        along, variance = covariance[:, place], float(covariance[place, place])
         if name == GAIN or not variance > _LITTLE_SAID * std**2:
             continue
         for end in (centre - 3.0**0.5 * std, centre + 3.0**0.5 * std):
-            change = along / variance * (end - best.theta[problem.names.index(name)])
+            change = along / variance * (end - best.theta[place])
             begin = np.clip(best.theta + change, *problem.bounds())
             with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # far off
                 there = _descended(optimum, problem, begin, determined=True)

@@ -159,18 +159,17 @@ def combined_intervals(
     side, the profile's, widened by the sources that it does not count. What was assumed follows the
     parameters that were fitted.
     """
-    array = checked_levels(levels)
-    held = np.array([errors.holds(name) for name in optimum.names])
+    array, every = checked_levels(levels), errors.problem
+    estimates, directions = every.to_values(errors.theta), np.eye(len(errors.names))
+    u_of_all = errors.std(directions)
+    dof_of_all = np.array([errors.dof(direction) for direction in directions])
+    k_of_all = coverage_factors(dof_of_all, array[:, None])
+    low, high = around(every.space, estimates, u_of_all * every.space.slopes(estimates), k_of_all)
     place = [errors.names.index(name) for name in optimum.names]
-    u = errors.std(np.eye(len(errors.names)))[place]
-    directions = np.eye(len(errors.names))[place]
-    known = zip(directions, held, strict=True)
-    dof = np.array([errors.dof(d) if is_held else np.inf for d, is_held in known])
-    k = coverage_factors(dof, array[:, None])
+    held = np.array([errors.holds(name) for name in optimum.names])
+    values, lower, upper = estimates[place], low[:, place], high[:, place]
+    u, k, dof = u_of_all[place], k_of_all[:, place], np.where(held, dof_of_all[place], np.inf)
     positive = optimum.problem.space.positive
-    values = errors.problem.to_values(errors.theta)[place]
-    slopes = optimum.problem.space.slopes(values)
-    lower, upper = around(optimum.problem.space, values, u * slopes, k)
     noise = errors.by_noise
     by_noise = np.sqrt(np.diagonal(noise.covariance))
     doubtful = ~held | ~(by_noise <= _LARGE)
@@ -193,14 +192,8 @@ def combined_intervals(
     shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"
-    every = errors.problem
     assumed = [name for name in errors.assumed if errors.holds(name)]
     also = [errors.names.index(name) for name in assumed]
-    estimates = every.to_values(errors.theta)
-    directions = np.eye(len(errors.names))
-    u = errors.std(directions) * every.space.slopes(estimates)
-    dof = np.array([errors.dof(direction) for direction in directions])
-    low, high = around(every.space, estimates, u, coverage_factors(dof, array[:, None]))
     lower, upper = np.hstack([lower, low[:, also]]), np.hstack([upper, high[:, also]])
     units = tuple(
         p.unit for p in (*optimum.problem.parameters, *(every.parameters[i] for i in also))

@@ -25,6 +25,7 @@ from dahl_ident.diagnostics.record_sources import (
     between_blocks,
     between_records,
     by_delay,
+    exponent_slopes,
     held_exponents,
 )
 from dahl_ident.diagnostics.turning_noise import noise_at_turns
@@ -123,14 +124,14 @@ def record_errors(
 
     A model that misses more than noise does so differently from place to place: where the blocks of
     a record ask for parameters that scatter more than noise explains, the excess is the model
-    error. What the model misses everywhere alike does not show. Where several records ask for
-    parameters that scatter more than that explains, the excess is the scatter between runs. What an
-    assumed exponent changes counts with its range and with what the records say of it. Noise in a
-    measured drive makes the response look smaller than it is, by the noise's share of the drive's
-    power within its band, and makes the plant wander; a calibration error of the force scales every
-    force. Noise in a measured displacement counts as far as it shifts the estimate; where the
-    residuals show larger errors of the displacement at turning points, what these shift beyond
-    that; and so does what samples miss of the turning points that lie between them.
+    error; what it misses alike after every reversal is a source of its own. Where several records
+    ask for parameters that scatter more than that explains, the excess is the scatter between runs.
+    What an assumed exponent changes counts with its range and with what the records say of it.
+    Noise in a measured drive makes the response look smaller than it is, by the noise's share of
+    the drive's power within its band, and makes the plant wander; a calibration error of the force
+    scales every force. Noise in a measured displacement counts as far as it shifts the estimate;
+    where the residuals show larger errors of the displacement at turning points, what these shift
+    beyond that; and so does what samples miss of the turning points that lie between them.
 
     Parameters
     ----------
@@ -157,7 +158,8 @@ def record_errors(
     scatter = between_records(white, left, so_far, len(problem.free), problem.runs)
     if scatter is not None:
         sources[RUNS] = scatter
-    exponents = held_exponents(problem, values, white, left, noise)
+    slopes = exponent_slopes(problem, values)
+    exponents = held_exponents(problem, values, white, left, noise, slopes)
     if assumed := [one.contribution for one in exponents if one.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
 
@@ -190,7 +192,7 @@ def record_errors(
     of_motion = {
         name: C for name, C in sources.items() if name in (DISPLACEMENT, TURNS, SAMPLING, DELAY)
     }
-    alike = after_reversals(problem, values, white, left, of_motion.values())
+    alike = after_reversals(problem, values, white, left, slopes, of_motion.values())
     if alike is not None:
         sources[PATH] = alike[0]
     scale = np.zeros(values.size)

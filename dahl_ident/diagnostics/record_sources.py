@@ -7,7 +7,7 @@ counts as a separate error.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,6 @@ from scipy import special
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
-from dahl_ident.elements import Parameter
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.record_search import STEPS, RecordSearch
@@ -90,6 +89,7 @@ def held_exponents(
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
     noise: Sequence[FloatArray],
+    slopes: Mapping[str, Sequence[FloatArray]],
 ) -> tuple[HeldValue, ...]:
     """Return what the records say of each exponent that the fit holds, stated or not.
 
@@ -106,19 +106,18 @@ def held_exponents(
         Of each record, filtered as the estimate weighs them.
     noise : sequence of ndarray
         Autocovariances of the residuals' noise.
+    slopes : mapping of str to sequence of ndarray
+        Those of `exponent_slopes`.
 
     Returns
     -------
     tuple of HeldValue
     """
-    exponents, place = problem.exponents, len(problem.free)
-    try:
-        slopes = _exponent_slopes(problem, exponents, values)
-    except FitError:
-        return ()  # no motion next to the estimate
+    place = len(problem.free)
     held = []
-    for p, waves in zip(exponents, slopes, strict=True):
-        joint = [np.insert(J, place, w, axis=1) for J, w in zip(jacobians, waves, strict=True)]
+    for p in (p for p in problem.exponents if p.name in slopes):
+        waves = zip(jacobians, slopes[p.name], strict=True)
+        joint = [np.insert(J, place, wave, axis=1) for J, wave in waves]
         step, moved = _freed(joint, residuals, place)
         value, limits = float(p.value or 1.0), p.prior or (1.0, 1.0)
         low, high = (float(np.log(end / value)) for end in limits)
@@ -136,18 +135,26 @@ def held_exponents(
     return tuple(held)
 
 
-def _exponent_slopes(
-    problem: RecordProblem, exponents: Sequence[Parameter], values: FloatArray
-) -> list[list[FloatArray]]:
-    """Return the filtered derivatives of each output with respect to ln of each exponent."""
+def exponent_slopes(problem: RecordProblem, values: FloatArray) -> dict[str, list[FloatArray]]:
+    """Return the filtered derivatives of each output with respect to ln of each exponent.
+
+    Nothing where there is no exponent that the fit holds, or no motion next to the estimate.
+    """
+    exponents = problem.exponents
     if not exponents:
-        return []
+        return {}
     free = problem.freed([p.name for p in exponents])
     known = {p.name: p.value for p in exponents} | dict(zip(problem.names, values, strict=True))
     at = np.array([known[name] for name in free.names], dtype=np.float64)
-    by = [free.predict(at, number).by for number in range(len(problem.records))]
-    places = [free.names.index(p.name) for p in exponents]
-    return [[problem.filtered(at[i] * slopes[:, i]) for slopes in by] for i in places]
+    try:
+        by = [free.predict(at, number).by for number in range(len(problem.records))]
+    except FitError:
+        return {}
+    places = {p.name: free.names.index(p.name) for p in exponents}
+    return {
+        name: [problem.filtered(at[i] * slopes[:, i]) for slopes in by]
+        for name, i in places.items()
+    }
 
 
 def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float, float] | None:
@@ -321,15 +328,29 @@ def _beyond(
     inverse = np.linalg.inv(sum(parts))
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
-    correlation = noise / np.outer(size, size)
     weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
+    judged = np.arange(len(noise)) < count
+    return _excess(between, noise / np.outer(size, size), weights, judged, level, size)
+
+
+def _excess(
+    between: FloatArray,
+    by_chance: FloatArray,
+    weights: FloatArray,
+    judged: NDArray[np.bool_],
+    level: float,
+    size: FloatArray,
+) -> FloatArray | None:
+    """Return what scatter exceeds that by chance, both in units of `size`; None where it does not.
+
+    Of each of the parameters that are judged, `weights` (blocks, P) say how much each block says.
+    """
     dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
-    ratio = between.diagonal() / correlation.diagonal()
-    if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[:count].any():
+    ratio = between.diagonal() / by_chance.diagonal()
+    if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[judged].any():
         return None
-    values, vectors = np.linalg.eigh(between - correlation)
-    beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(beyond * np.outer(size, size))
+    variances, vectors = np.linalg.eigh(between - by_chance)
+    return np.asarray((vectors * np.maximum(variances, 0.0)) @ vectors.T * np.outer(size, size))
 
 
 def after_reversals(
@@ -337,6 +358,7 @@ def after_reversals(
     values: FloatArray,
     jacobians: Sequence[FloatArray],
     residuals: Sequence[FloatArray],
+    slopes: Mapping[str, Sequence[FloatArray]],
     of_displacement: Iterable[FloatArray],
 ) -> tuple[FloatArray, int] | None:
     """Return the covariance by what the model misses alike after every reversal.
@@ -354,6 +376,8 @@ def after_reversals(
         The estimate.
     jacobians, residuals : sequence of ndarray
         Of each record.
+    slopes : mapping of str to sequence of ndarray
+        Those of `exponent_slopes`.
     of_displacement : iterable of ndarray, shape (P, P)
         Covariances by errors of the displacement, which also show after reversals.
 
@@ -367,12 +391,8 @@ def after_reversals(
     farthest = max((float(path.max()) for path in paths), default=0.0)
     if not farthest > 0.0:
         return None
-    try:
-        exponents = [p for p in problem.exponents if p.assumed]
-        slopes = _exponent_slopes(problem, exponents, values)
-    except FitError:
-        slopes = []  # no motion next to the estimate
-    joint = [np.column_stack(parts) for parts in zip(jacobians, *slopes, strict=True)]
+    assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
+    joint = [np.column_stack(parts) for parts in zip(jacobians, *assumed, strict=True)]
     noise, count = sandwich(joint, residuals)[0], jacobians[0].shape[1]
     for covariance in of_displacement:
         noise[:count, :count] += covariance
@@ -393,15 +413,11 @@ def after_reversals(
         steps.append(root @ (larger @ (root @ (J[rows].T @ e[rows]))))
         shares.append((root @ share @ root).diagonal())
     between = np.array(steps).T @ np.array(steps)
-    weights = np.array(shares)
     by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size)
-    dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
-    ratio = between.diagonal() / by_chance.diagonal()
     judged = (seen < len(problem.free)) | (seen >= count)  # not states and offsets of records
-    if not (ratio > special.chdtri(dof, 1.0 - _LEVEL) / dof)[judged].any():
+    beyond = _excess(between, by_chance, np.array(shares), judged, _LEVEL, size)
+    if beyond is None:
         return None
-    variances, vectors = np.linalg.eigh(between - by_chance)
-    beyond = (vectors * np.maximum(variances, 0.0)) @ vectors.T * np.outer(size, size)
     return _embedded(beyond, seen, len(noise))[:count, :count], len(members)
 
 
