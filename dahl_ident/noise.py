@@ -61,9 +61,9 @@ Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
-_AMPLITUDE_STEPS = 40  # a limit for iterations that do not settle
-_AMPLITUDE_TOLERANCE = 1e-7  # of its standard deviation; residuals err by less than the square
-_ROUNDED = 0.01  # likewise: a step below this and not shorter than the last is of rounding
+_AMPLITUDE_STEPS = 40  # iterations, a limit if they do not settle
+_AMPLITUDE_TOLERANCE = 1e-7  # in standard deviations; residuals err by less than its square
+_ROUNDED = 0.01  # in the same unit: a shorter step that does not shrink is due to rounding
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ NOTHING_FOUND: Mapping[str, Any] = {
     "channels": [], "notes": [], "pictures": [],
     "error": "", "kind": "", "summary": "", "format": "", "sampling": "",
 }  # fmt: skip
-_SHOWN = 300  # points of a channel's picture
-_DRAWN = 6  # records
+_SHOWN = 300  # points in a channel's picture
+_DRAWN = 6  # records that are drawn
 
 
 def preview(state: dict[str, Any]) -> dict[str, Any]:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 LIMIT = 2_000_000_000
 """Bytes that one upload may have."""
-_READ_SECONDS = 600  # for the preview of files
+_READ_SECONDS = 600  # s for reading files for the preview
 _DOWNLOADS = {
     "report.html": "Report", "report.pdf": "Report, PDF", "fit.json": "Fit, JSON",
     "points.csv": "Points, CSV", "plan.csv": "Plan, CSV", "waveform.csv": "Waveform, CSV",

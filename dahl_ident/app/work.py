@@ -34,7 +34,7 @@ from dahl_ident.app.commands import JobStep
 from dahl_ident.data.storage import write_whole
 from dahl_ident.errors import DataError
 
-_LONGEST = 60  # characters of a stored name
+_LONGEST = 60  # letters of a stored name
 _ENDING = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,2}$")
 _IDENTITY = re.compile(r"\d{4}-\d\d-\d\d-\d+")
 _USABLE = (0, 3)  # exit status of commands whose output says whether the result may be used

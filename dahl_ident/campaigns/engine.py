@@ -31,16 +31,16 @@ from dahl_ident.errors import DataError, ValidationError
 from dahl_ident.version import __version__
 
 _Tag = TypeVar("_Tag")
-PATIENCE = 120.0  # seconds for which a place may not answer
+PATIENCE = 120.0  # s without an answer after which a worker counts as lost
 _WAITING = 2  # jobs submitted for each worker: one in progress, one waiting
-_LOOK = 1.0  # seconds between looks at a place from which no row came
-_ANSWER = 5.0  # seconds in which a scheduler answers
+_LOOK = 1.0  # s between looks at a worker that sent no row
+_ANSWER = 5.0  # s in which a scheduler answers
 _TIMES_MEDIAN, _LEAST = 10.0, 60.0
 _LEAST_MEMORY = 2.0
 """GB that a fit may always have where no limit was given; what is loaded takes some tenths."""
 _FIRST, _KNOWN = 600.0, 3
 """Limit of time, s, until this number of fits says how long a fit takes."""
-_RECENT = 1001  # fits whose median is taken
+_RECENT = 1001  # fits whose median time is taken
 
 
 class LostError(DataError):

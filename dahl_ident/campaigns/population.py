@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 USABLE = ("trusted", "approximate")
 """Statuses whose numbers and uncertainties can be used."""
-_NODES = 31  # of the grid in tau and in omega; twice as many change no interval by 1 %
+_NODES = 31  # grid points in tau and in omega; twice as many change no interval by 1 %
 _GONE = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
-_MOST = 20.0  # largest tau that REML tries, in standard deviations of the data
-_FALSE_ALARMS = 0.01  # probability that any device is called outlying although none is
+_MOST = 20.0  # largest tau that REML tries, in standard deviations of the estimates
+_FALSE_ALARMS = 0.01  # probability that any device is called outlying if none is
 # Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations
 EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
 # Mean difference of two normal numbers, in standard deviations (1.128)

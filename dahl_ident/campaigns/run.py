@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
-_TRIALS = 3  # fits that say whether the options of a new campaign can be used at all
+_TRIALS = 3  # fits that show whether the options of a new campaign can be used at all
 _ROWS_AT_ONCE = 2000
 """Rows that are in memory as dictionaries, which are ten times as large as in a table."""
 _OF_JOURNAL = ("key", "retry", "refused")

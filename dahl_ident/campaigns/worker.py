@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_DEATHS = 3  # deaths of a process after which its job is taken as the cause
+_DEATHS = 3  # of worker processes on one job, after which the job is taken as the cause
 _START = "import sys; sys.path[:] = {!r}; from dahl_ident.campaigns.worker import serve; serve()"
 
 

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
 
 STANDARD = "-"  # standard input or output, in place of a file's name
-BAD_INPUT = 1  # exit status, as are the others; the one of any uncaught error
-WRONG_USE = 2  # as click has it for unknown options
-NOT_TRUSTED = 3  # the first that is free
-_NARROWEST = 40  # columns; in narrower windows indented lines would hold a word or two
+BAD_INPUT = 1  # exit status, as of any uncaught error
+WRONG_USE = 2  # exit status, as click has it for unknown options
+NOT_TRUSTED = 3  # exit status: the first that is free
+_NARROWEST = 40  # columns; in a narrower window indented lines would hold a word or two
 _STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
 _STYLES = {"Trusted": "1;32", "Approximate": "1;33"}
 _RED = "1;31"
-INTERRUPTED = 130  # as shells have it: 128 and the number of SIGINT
+INTERRUPTED = 130  # exit status, as shells have it: 128 and the number of SIGINT
 
 
 @dataclass

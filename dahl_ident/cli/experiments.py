@@ -217,8 +217,8 @@ def _noise(text: str | None) -> Any:
 
 
 _UNITS = {"displacement": "m", "force": "N"}
-_SPAN = (0.1, 10.0)  # of the characteristic displacement, if no levels are given
-_COUNT = 30  # levels: 15 a decade, as in the shipped data sets
+_SPAN = (0.1, 10.0)  # least and largest level in characteristic displacements, if none are given
+_COUNT = 30  # levels: 15 in a decade, as in the shipped data sets
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from dahl_ident.units import engineering, polar_std, si_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-_SAME_FREQUENCY = 5e-3  # relative
+_SAME_FREQUENCY = 5e-3  # relative difference of frequencies that are one
 _NOMINAL = 1.5  # factor within which a numeric level is the amplitude that was held
 
 

@@ -20,19 +20,19 @@ from dahl_ident.units import percent
 
 Doubt = Callable[[NDArray[np.bool_], str], None]
 """A function that warns of the marked rows, if any, with a message."""
-_SIGNIFICANT = 0.00135  # one-sided; three standard deviations of a normal distribution
-_ASSUMED_ERROR = 0.1  # of the gain, where no covariance is known
-_MISMATCH = 0.1  # of a logarithm: rms for zero to peak is 0.35; also a fall of the gain
+_SIGNIFICANT = 0.00135  # one-sided probability of three standard deviations
+_ASSUMED_ERROR = 0.1  # relative error of the gain, where no covariance is known
+_MISMATCH = 0.1  # of a logarithm: rms instead of zero to peak makes 0.35; also the fall of a gain
 _FEWEST_ROWS, _FEW_ROWS = 3, 0.26  # rows to compare, and the share of them that may be wrong
 _STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value, and share of the motion's range
 _SELDOM, _MOSTLY = 0.01, 0.5  # shares of a signal that repeats no value, and of one that holds it
 _SWITCH = 8  # samples before and after a change of unit that are compared
-_DECADES = 1.0  # by which a change of unit may seem to differ from 1000
-_NEAR = 4.0  # steps within which a smooth signal goes on, and beyond which it is far from zero
-_FURTHER = 5.0  # mean steps by which a signal moves from one sample to the next at most
-_MOST_CHANGES = 2  # of the unit, there and back; a signal with more is one of many scales
-_PART = 1 << 20  # samples that are compared at once, to save memory
-_SMALL_PHASE = 0.1  # rad, for a gain that falls to nothing
+_DECADES = 1.0  # by which a change of unit may seem to differ from a factor of 1000
+_NEAR = 4.0  # steps within which a smooth signal continues, and beyond which it is far from zero
+_FURTHER = 5.0  # mean steps that a signal may move from one sample to the next
+_MOST_CHANGES = 2  # of the unit, there and back; more are a signal of many scales
+_PART = 1 << 20  # samples that are compared at once, to limit memory
+_SMALL_PHASE = 0.1  # rad, at most, of a gain that falls towards zero
 
 
 def check_phase_unit(phase: FloatArray, degrees: bool, name: str, doubt: Doubt) -> None:

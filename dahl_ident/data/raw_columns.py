@@ -36,14 +36,14 @@ _CODES = (
 """Marks of missing values in files of loggers, with either sign."""
 
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
-_CODE_RATIO = 5.0  # ratio of a missing-value mark to all measured numbers
-_FEW = 4  # of fewer values, one far from the others may be measured
-_LONGEST_WORD = 200  # letters of a cell; no label, time stamp or number has more
-_LONGEST_HEADER = 400  # from which a cell holds no name and unit
+_CODE_RATIO = 5.0  # a code for a missing value exceeds every measured number by this factor
+_FEW = 4  # with fewer values, one that lies far from the others may be measured
+_LONGEST_WORD = 200  # letters; no label, time stamp or number in a cell has more
+_LONGEST_HEADER = 400  # letters; a longer cell holds no name and unit
 _INDEX = re.compile(r"[\d:, ]+")
-_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # as ISO 80000 has it, F / N
+_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # as ISO 80000 has it: F / N
 _CURVED = re.compile(r"\s*(.*?\S)\s*\((.*)\)\s*")
-_PADDING = (1 << 26, 16)  # bytes, and bytes a letter, that a column of text may take
+_PADDING = (1 << 26, 16)  # most memory of a column of text: bytes, and bytes for each letter
 
 
 @dataclass(frozen=True)

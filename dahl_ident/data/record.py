@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DriveUnit = Literal["N", "N m", "V", "A"]
-_GAP = 1.5  # a step of more than this many median steps misses a sample
-_SMALLEST = SMALLEST**0.5  # squares of a stiffness, a force over it, remain representable
-_LONG_GAP = 5.0  # median steps, over which nothing is interpolated
-_MOST_GAPS = 0.02  # of the samples: with more, the steps themselves are uneven
+_GAP = 1.5  # median steps; a longer step misses a sample
+_SMALLEST = SMALLEST**0.5  # stiffness, or force over it, whose square is representable
+_LONG_GAP = 5.0  # median steps; over a longer gap nothing is interpolated
+_MOST_GAPS = 0.02  # share of the samples; with more gaps, the steps themselves are uneven
 _SHOWN_GAPS = 3
-_EVEN = 0.01  # of a step
+_EVEN = 0.01  # fraction of a step by which samples of an even grid may be off
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)

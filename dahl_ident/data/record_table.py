@@ -77,7 +77,7 @@ def record_from(
         raise DataError(f"{source.name}: {exc}") from exc
 
 
-_FEWEST_STAMPS = 16  # fewer, with some missing, may look like rounded ones
+_FEWEST_STAMPS = 16  # with fewer, times with some missing look like rounded ones
 _PLANNED = {"step", "measured"}  # columns of a waveform that a plan wrote
 
 

@@ -40,7 +40,7 @@ from dahl_ident.units import (
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
 _NUMBER = r"([0-9.]+(?:[eE][-+]?[0-9]+)?)"
 _SWEEP = re.compile(rf"\s*{_NUMBER}\s*:\s*{_NUMBER}\s*(Hz|kHz)[\s,]+(log|linear)\s*")
-_DEGREES = 10.0  # a phase reaches more in a sweep through a resonance, or through slip
+_DEGREES = 10.0  # a phase in degrees exceeds this in a sweep through a resonance, or through slip
 _UNKNOWN_FREQUENCY = (
     "the table says no frequency: taken as 1 Hz, and good for laws that do not depend on it"
 )

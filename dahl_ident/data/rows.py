@@ -26,9 +26,9 @@ from dahl_ident.units import (
     shown_unit,
 )
 
-_SAME = 1.1  # ratio up to which drives or amplitudes are one level
-_SAME_FREQUENCY = 1.001  # points next to each other at a sharp resonance differ by more
-_NEARLY_ALL = 0.99  # of a wave's samples: noise and spikes lie beyond
+_SAME = 1.1  # ratio of drives or amplitudes up to which they are one level
+_SAME_FREQUENCY = 1.001  # ratio; points next to each other at a sharp resonance differ by more
+_NEARLY_ALL = 0.99  # share of a wave's samples; noise and spikes lie beyond
 _NUMBER = r"(?P<value>[0-9]+(?:[.,][0-9]+)?(?:e[-+]?[0-9]+)?)"
 _UNIT = r"[^\W\d_][^;,\t\])\"']{0,20}"
 _LINE = re.compile(

@@ -24,39 +24,39 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 
-_THRESHOLD = 0.3  # of the amplitude; sine noise may be a tenth of it
-_QUANTILES = (0.995, 0.9, 0.7)  # for the amplitude; the next where a part of a lobe misleads
+_THRESHOLD = 0.3  # fraction of the amplitude that a lobe exceeds; noise may be a tenth of it
+_QUANTILES = (0.995, 0.9, 0.7)  # for the amplitude; the next where large lobes mislead the first
 _QUIET = 1.5  # half cycles: a longer time within the threshold may hold another level
-_FEWEST_SAMPLES = 16  # of a quiet part that is searched for cycles of its own
-_ALIKE = 0.1  # relative difference of periods, and cycles off a whole number, of one sine
-_MOST_BRIDGED = 10.0  # cycles
+_FEWEST_SAMPLES = 16  # a shorter quiet part is not searched for cycles of its own
+_ALIKE = 0.1  # of one sine: relative difference of periods, and part of a cycle off at most
+_MOST_BRIDGED = 10.0  # cycles; a longer pause ends a sine
 _DEEPEST = 12  # quiet parts within quiet parts: each below _THRESHOLD of the last, in all 5e-7
-_SAMPLED = 50_000  # samples that the quantiles are taken from
-_FEWEST_A_CYCLE = 3  # samples, as many as mean and phasor have numbers
-_NOISIEST_CUT = 0.05  # noise of the log amplitude that a cycle of known frequency may have
-_FEWEST_CUTS = 3  # that averaging leaves: fewer do not show whether a level is held
-_NOISIEST_CROSSING = 0.1  # noise of the log amplitude that a cycle between crossings may have
+_SAMPLED = 50_000  # samples at most from which the quantiles are computed
+_FEWEST_A_CYCLE = 3  # samples in a cycle: its mean and phasor are three numbers
+_NOISIEST_CUT = 0.05  # largest noise of the log amplitude of a cycle whose frequency is known
+_FEWEST_CUTS = 3  # averages that must be left: fewer do not show whether a level is held
+_NOISIEST_CROSSING = 0.1  # largest noise of the log amplitude of a cycle between two crossings
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)  # its multiples are spread most evenly
-_TOGETHER = 100_000  # samples: what is computed of them stays in the cache
-_HOLE = 1.0 / 3.0  # of a cycle without samples: its amplitude is not known
+_TOGETHER = 100_000  # samples computed at once, so that intermediate arrays stay in the cache
+_HOLE = 1.0 / 3.0  # fraction of a cycle without samples that makes its amplitude unknown
 Mode = Literal["auto", "steps", "sweep"]
 MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
-AMPLITUDE_TOLERANCE = 0.02  # of a logarithm, within a plateau: steps of level are larger
-FREQUENCY_TOLERANCE = 0.01  # the same
-_UNSTEADY = 5.0  # times wider tolerances, of groups of cycles that a drive varies
-_NOISE_FACTOR = 6.0  # standard deviations of a cycle: noise alone splits no plateau
-_WIDEST = 0.3  # tolerance that noise makes
-_LEAST_NOISE = 1e-12  # of a log amplitude: inverse squares, as weights, stay finite
+AMPLITUDE_TOLERANCE = 0.02  # of log amplitude within a plateau; steps of level are larger
+FREQUENCY_TOLERANCE = 0.01  # of log frequency within a plateau
+_UNSTEADY = 5.0  # factor by which tolerances widen for groups of cycles whose drive varies
+_NOISE_FACTOR = 6.0  # tolerance in standard deviations of a cycle: noise alone splits no plateau
+_WIDEST = 0.3  # largest tolerance, however large the noise
+_LEAST_NOISE = 1e-12  # least noise of a log amplitude: its inverse square, a weight, stays finite
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is not a cycle
-_EDGE_TOLERANCE = 0.005  # of the amplitude: cycles at the ends of a plateau that stray more go
-_MOSTLY_HELD = 0.5  # plateaus over cycles that change smoothly: with less it is a sweep
-_CLEARLY_MORE = 1.5  # times the cycles of plateaus that groups have to hold to replace them
-_SLOW = 0.005  # change of log amplitude in a cycle that friction follows without a lag
+_EDGE_TOLERANCE = 0.005  # relative; cycles at the ends of a plateau that differ more are left out
+_MOSTLY_HELD = 0.5  # least share of the cycles in plateaus; with less, the record is a sweep
+_CLEARLY_MORE = 1.5  # groups replace plateaus where they hold this many times as many cycles
+_SLOW = 0.005  # largest change of log amplitude in a cycle that friction follows without a lag
 _SCATTERED = 4.0  # standard deviations about a straight line within which a trend is scatter
-_SWEEP_RANGE = 0.2  # change of log amplitude or frequency that makes a sweep
-_SWEEP_STEP = 0.2  # change of log amplitude or frequency in a cycle that a sweep may make
-_SWEEP_CHANGE = 0.1  # in a window
-_SWEEP_CYCLES = (4, 20)  # in a window
+_SWEEP_RANGE = 0.2  # least change of log amplitude or frequency over a whole sweep
+_SWEEP_STEP = 0.2  # largest change of log amplitude or frequency from cycle to cycle of a sweep
+_SWEEP_CHANGE = 0.1  # largest change of log amplitude or frequency in one window of a sweep
+_SWEEP_CYCLES = (4, 20)  # least and most cycles in one window of a sweep
 
 
 @dataclass(frozen=True)

@@ -48,26 +48,26 @@ from dahl_ident.extraction.sine_fit import (
 from dahl_ident.extraction.transient import MOST_CYCLES, estimate_transient
 from dahl_ident.units import percent
 
-_NEGLIGIBLE = 0.2  # bias over standard error to which settling cycles are left out
+_NEGLIGIBLE = 0.2  # bias over standard error down to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
-_WELL_COVERED = 0.8  # of the moving time: points that cover more of it are none by chance
-_APART = 3.0  # cycles that may be missing between two parts
+_WELL_COVERED = 0.8  # share of the moving time; points that cover more are not there by chance
+_APART = 3.0  # cycles that may be missing between two parts of one level
 _MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
     "force_distortion", "asymmetry", "displacement_steps", "force_steps", "displacement_clipped",
     "force_clipped",
 )  # fmt: skip
-_PERIOD_CHANGE = 0.03  # limit from one cycle to the next (median by energy) of a sine measurement
-_AMPLITUDE_CHANGE = 0.1  # the same of the amplitude, which resonances change faster
-_SWEEP_RANGE = 0.2  # of the log period: less may be chance
-_FEWEST_OF_SWEEP = 6  # cycles: four changes of the period's change
-_FEWEST_PAIRS = 2  # of cycles, that show how alike they are
-_NOISY = 0.03  # of a cycle's log amplitude
-_SINE_IN_NOISE = 0.3  # of the power near the strongest line, where noise spoils the cycles
-_ONE_LINE = 0.8  # of the power, of one level whatever its cycles look like
-_LEAK = 2  # lines on either side that a line leaks into
-_SPECTRUM_OF = 2**20  # samples at most
+_PERIOD_CHANGE = 0.03  # largest relative change from cycle to cycle of a sine (median by energy)
+_AMPLITUDE_CHANGE = 0.1  # largest change likewise; at a resonance, amplitudes change faster
+_SWEEP_RANGE = 0.2  # least change of log period over a sweep: less may be chance
+_FEWEST_OF_SWEEP = 6  # cycles: they give four second differences of the period
+_FEWEST_PAIRS = 2  # pairs of cycles that are needed to tell how alike cycles are
+_NOISY = 0.03  # noise of the log amplitude from which cycles cannot be compared
+_SINE_IN_NOISE = 0.3  # share of power near the strongest line of a sine, if noise spoils the cycles
+_ONE_LINE = 0.8  # share of power near the strongest line of a sine, if its cycles look unlike
+_LEAK = 2  # lines on either side into which the strongest line leaks
+_SPECTRUM_OF = 2**20  # samples at most, from the middle of the record, whose spectrum is computed
 
 
 @dataclass(frozen=True)

@@ -51,13 +51,13 @@ from dahl_ident.extraction.sine_fit import (
 from dahl_ident.extraction.transient import SIGNIFICANT, Transient
 from dahl_ident.units import percent
 
-_DISTORTED = 0.02  # from which the fundamental alone misses percents of the loss
-_MOVING_MEAN = 0.02  # of the amplitude, over the segment, where the force is controlled
-_BEYOND_NOISE = 5.0  # standard errors of a drift in white noise
-_ROUNDING = 1e-9  # of the response
-_ALIASED = 0.01  # of the fundamental, above which aliases are reported
-_LOOKED_AT = 10_000  # samples from which their residual is taken
-_FEW_STEPS = 10.0  # amplitude over sensor step below which the step matters
+_DISTORTED = 0.02  # share of harmonics; above it the fundamental misses percents of the loss
+_MOVING_MEAN = 0.02  # drift of the mean over the amplitude, if the force is controlled
+_BEYOND_NOISE = 5.0  # standard errors by which a drift exceeds white noise
+_ROUNDING = 1e-9  # least relative standard deviation of a response
+_ALIASED = 0.01  # alias as a fraction of the fundamental above which it is reported
+_LOOKED_AT = 10_000  # samples at most from which the residual is computed
+_FEW_STEPS = 10.0  # amplitude in steps of the sensor below which rounding matters
 Row = tuple[complex, FloatArray, FloatArray, float]
 """A response, its covariance, that of what was held with it, and its degrees of freedom."""
 

@@ -22,25 +22,25 @@ from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.extraction.cycles import scattered
 from dahl_ident.extraction.sine_fit import HARMONICS, Segment, SineFit
 
-_UNROUNDED = 0.05  # residual, in steps, below which no rounding took place
-_DITHERED = np.sqrt(0.25 + 1.0 / 12.0)  # residual, in steps, of half a step of noise, rounded
-_LOOKED_AT = 20_000  # samples from which the sensor's step is found
-_FAR = 30.5  # steps, up to which a gap can be recognised as whole ones ...
-_ON_GRID = 0.1  # ... to within this
-_MOSTLY = 0.9  # of the gaps are not farther: else the step is too fine to matter
-_SAME = 1e-9  # of the range: values nearer than this are equal but for rounding
-_RAIL_RUN = 5  # samples in a row at an extreme value
-_CORNER = 3  # samples within which a clipped waveform is ...
-_AWAY = 1e-4  # ... this much of its span away from the rail
+_UNROUNDED = 0.05  # residual in steps of the sensor; with less, nothing was rounded
+_DITHERED = np.sqrt(0.25 + 1.0 / 12.0)  # residual, in steps, of half a step of noise
+_LOOKED_AT = 20_000  # samples at most from which the sensor's step is found
+_FAR = 30.5  # steps: a longer gap between values is not tested for whole steps
+_ON_GRID = 0.1  # largest distance of such a gap from whole steps
+_MOSTLY = 0.9  # least share of gaps that short; with less, the step is too fine to matter
+_SAME = 1e-9  # fraction of the range: values nearer than this differ by rounding alone
+_RAIL_RUN = 5  # samples in a row at an extreme value that may be clipped
+_CORNER = 3  # samples from a rail within which a clipped waveform has left it
+_AWAY = 1e-4  # fraction of the span by which it has then left the rail
 EVEN = (2, 4, 6, 8)  # the lowest harmonics, which are the largest
-BY_CHANCE = 1e-4  # of symmetric points, how many seem asymmetric at most
-_LEAST = 1e-3  # of the fundamental: smaller even harmonics do not matter
-_CLEAR = 9.0  # power over that of noise, of a harmonic that is seen
-_SEEN_FROM = 1.0 / 3.0  # of the fitted orders: the powers of low ones differ
+BY_CHANCE = 1e-4  # share of symmetric points that are called asymmetric at most
+_LEAST = 1e-3  # fraction of the fundamental; smaller even harmonics do not matter
+_CLEAR = 9.0  # power of a harmonic over the noise's from which it is seen
+_SEEN_FROM = 1.0 / 3.0  # fraction of the fitted orders; powers of lower ones differ too much
 _FLATTEST, _STEEPEST = 1.0, 3.0  # powers of the order: jumps of the force, and of its curvature
-_FIRST = 3  # harmonic of friction after the fundamental
-_STAYS = 0.01  # of an alias, that matters
-_FITTED = 5  # offset, drift, a sine and its frequency
+_FIRST = 3  # order of the first harmonic of friction after the fundamental
+_STAYS = 0.01  # least part of an alias that matters if it is left in the fundamental
+_FITTED = 5  # numbers that a fit estimates: offset, drift, a sine (two) and its frequency
 
 
 def sensor_step(samples: FloatArray) -> float:

@@ -39,25 +39,25 @@ from dahl_ident.extraction.sine_fit import (
     track_phase,
 )
 
-_PLATEAU_CYCLES = 3  # fewer only where no plateau has so many ...
-_NO_CHANCE = 0.1  # ... and they are this share of all cycles: noise has two alike at times
-_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude that no crossing suffers from
-_WELL_COVERED = 0.5  # of a record: where crossings find spans so long, they are right
-_SWEEP_DEGREE = 3  # of the phase in a window
-_DRIFTED = 0.2  # phase over a segment, rad, that costs 0.2 % of the amplitude, more of harmonics
-_EVENLY = 0.5  # of the turn's sum over both halves, by which they may differ
-_FEWEST_IN_HALF = 2  # cycles that show a slope
-_BY_CHANCE = 1e-6  # of segments without a drift, how many seem to have one
-_PADDED = 16  # lines for each cycle, so that a peak lies near one
-_FEWEST_SAMPLES = 4  # that a cycle's sine and offset leave something of
-_STRAY_BY_CHANCE = 1e-3  # of the cycles that belong, how many seem to stray
-_NEGLIGIBLE = 1e-4  # of the amplitude, that a cycle may stray in any case
-_UNJUDGED = 2  # cycles at either end that are judged, and do not judge ...
-_OF_THOSE = 5  # ... and a fifth of all at most
-_SOLVABLE = 1e8  # condition of normal equations
-_STRAYING = 0.005  # of the amplitude, that a further cycle may stray from the sine
-_MOST_CYCLES_MORE = 2  # on either side
-_MOST_CYCLES_LESS = 3  # on either side; where more stray, the motion changes slowly, not as a ramp
+_PLATEAU_CYCLES = 3  # least cycles of a plateau; if no plateau has so many, fewer are allowed ...
+_NO_CHANCE = 0.1  # ... where they are this share of all cycles: noise makes two alike at times
+_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude up to which crossings are found safely
+_WELL_COVERED = 0.5  # share of a record in plateaus from which crossings are believed
+_SWEEP_DEGREE = 3  # degree of the polynomial of the phase in a window
+_DRIFTED = 0.2  # rad over a segment: costs 0.2 % of the amplitude, and more of harmonics
+_EVENLY = 0.5  # largest difference of the turn in both halves, as a fraction of its sum
+_FEWEST_IN_HALF = 2  # cycles in each half, which show a slope
+_BY_CHANCE = 1e-6  # share of segments without a drift that are said to have one
+_PADDED = 16  # spectral lines for each cycle, so that one lies near any peak
+_FEWEST_SAMPLES = 4  # samples in a cycle, more than its sine and offset have numbers
+_STRAY_BY_CHANCE = 1e-3  # share of the cycles that belong to a segment but are called stray
+_NEGLIGIBLE = 1e-4  # fraction of the amplitude that a cycle may stray in any case
+_UNJUDGED = 2  # cycles at either end that are not part of the reference ...
+_OF_THOSE = 5  # ... but at most one in this many of all
+_SOLVABLE = 1e8  # largest condition number of normal equations
+_STRAYING = 0.005  # fraction of the amplitude that a further cycle may stray from the sine
+_MOST_CYCLES_MORE = 2  # cycles by which a segment may grow on either side
+_MOST_CYCLES_LESS = 3  # cycles by which it may shrink on either side; more means slow change
 
 
 def record_spans(

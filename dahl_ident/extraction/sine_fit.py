@@ -37,26 +37,26 @@ from numpy.polynomial import Polynomial
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError, argument
 
-FEWEST_CYCLES = 2  # that a fit with offset and drift needs
-HARMONICS = 9  # fitted at least, where the sampling can separate them
-_MOST_HARMONICS = 40  # fitted so that they do not leak where cycles are not whole samples
-_AFFORDABLE = 4e5  # samples times harmonics; leakage falls with the number of samples
-_NYQUIST_MARGIN = 0.45  # highest harmonic over the sampling rate
-_BLOCK = 16384  # samples whose columns stay in the cache
-_KEPT = 2_000_000  # entries of columns that are kept rather than computed twice
-_BLOCKS_PER_CYCLE = 64  # block means that lose 4e-4 of the fundamental
-_MEANS_PER_CYCLE = 256  # lose 3e-5 of the fundamental, 0.2 % of the ninth harmonic
-_EVEN = 0.05  # of a step, by which a sample may be off an even grid
-_FEWEST_SAMPLES = 2  # that have a phase from one to the next
-_LEAST_WEIGHT = 1e-6  # of a cycle relative to the strongest
-_MAX_STEPS = 20  # at most: without convergence by then the start was wrong
-_TRACKED = 0.1  # phase error that is left to the four-parameter fit, rad
-_STEP_TOLERANCE = 1e-4  # phase at the ends of the segment, rad; its square is the error left
+FEWEST_CYCLES = 2  # needed to fit offset and drift as well
+HARMONICS = 9  # least number of fitted harmonics, where the sampling can separate them
+_MOST_HARMONICS = 40  # fitted at most, against leakage where cycles are not whole samples
+_AFFORDABLE = 4e5  # samples times harmonics; leakage falls as samples grow, so fewer harmonics do
+_NYQUIST_MARGIN = 0.45  # frequency of the highest harmonic over the sampling rate
+_BLOCK = 16384  # samples computed at once, so that their columns stay in the cache
+_KEPT = 2_000_000  # entries of the columns up to which they are kept, not computed twice
+_BLOCKS_PER_CYCLE = 64  # averages over such blocks lose 4e-4 of the fundamental
+_MEANS_PER_CYCLE = 256  # averages lose 3e-5 of the fundamental and 0.2 % of the ninth harmonic
+_EVEN = 0.05  # fraction of a step by which samples may be off an even grid
+_FEWEST_SAMPLES = 2  # a phase difference needs two samples
+_LEAST_WEIGHT = 1e-6  # least weight of a cycle, as a fraction of the largest
+_MAX_STEPS = 20  # iterations; without convergence by then the start was wrong
+_TRACKED = 0.1  # rad of phase error, which the four-parameter fit then removes
+_STEP_TOLERANCE = 1e-4  # rad of phase at the ends of the segment; the error left is its square
 CYCLES_FOR_SCATTER = 4  # with fewer, lines next to the harmonic are few and far
-_MOST_LINES = 10  # a side: about 40 degrees of freedom, beyond which a region hardly shrinks
-_MEAN_LINES = 4  # the lowest ones, from which the noise of the mean is judged
-_INDEPENDENT = 0.05  # of the largest eigenvalue: lines that gaps make alike are left out
-_NOISE_BLOCKS_PER_CYCLE = 128  # slow noise loses 1 % on the line of the ninth harmonic
+_MOST_LINES = 10  # on either side: 40 degrees of freedom, more of which hardly narrow a region
+_MEAN_LINES = 4  # lowest spectral lines, from which the noise of the mean is estimated
+_INDEPENDENT = 0.05  # fraction of the largest eigenvalue; lines that gaps make alike lie below it
+_NOISE_BLOCKS_PER_CYCLE = 128  # averages lose 1 % of slow noise at the ninth harmonic
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,13 @@ from dahl_ident.extraction.sine_fit import (
     resolvable_orders,
 )
 
-SIGNIFICANT = 3.0  # standard deviations of D_0
-_RATES = np.geomspace(1e-3, 64.0, 29)  # 4 beta
-_REFINEMENTS = 5  # of the grid of rates, by 5 each
-_RATE_SPREAD = 1.0  # standard deviation of ln(rate) about what the phase says
-_FADED = 28.0  # decrements after which a departure of 1 is 1e-12
-_SLOW_LINES = 24  # from which the noise of D_0 is judged
-MOST_CYCLES = 256  # that D_0 and the rate are estimated from
+SIGNIFICANT = 3.0  # standard deviations at which D_0 differs from zero
+_RATES = np.geomspace(1e-3, 64.0, 29)  # tried values of the rate, 4 beta
+_REFINEMENTS = 5  # times that the grid of rates is refined, each time five times finer
+_RATE_SPREAD = 1.0  # standard deviation of ln(rate) about the value that the phase suggests
+_FADED = 28.0  # decay constants after which a departure of 1 is 1e-12
+_SLOW_LINES = 24  # spectral lines below the fundamental that give the noise of D_0
+MOST_CYCLES = 256  # cycles at most from which D_0 and the rate are estimated
 
 
 @dataclass(frozen=True)

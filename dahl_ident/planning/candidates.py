@@ -24,16 +24,16 @@ from dahl_ident.planning.question import BenchLimits, PlanRequest, limit
 from dahl_ident.planning.trajectories import PlannedMotion
 
 CONTROLLED = ("displacement", "force")
-_CERTAIN = 0.95  # fraction of the draws that stay within a limit
-_FREQUENCIES = 12  # at most: six a decade of the default range
+_CERTAIN = 0.95  # fraction of the draws that must stay within a limit
+_FREQUENCIES = 12  # at most: six in each decade of the default range
 _BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee where no limit is given
-_SOFTEST = 3e-3  # of the largest drive
-_CHECKED_DRAWS = 25  # at which the number of steady amplitudes is counted
+_SOFTEST = 3e-3  # smallest drive as a fraction of the largest
+_CHECKED_DRAWS = 25  # draws at which the number of steady amplitudes is counted
 _OF_DRAWS = ("amplitude", "force", "rows", "variance")
-LEAST_CYCLES = 2  # measured at a level: a single cycle does not show its noise
-_LEAST_SETTLING = 1  # cycle: no change of level is instant
-_SLOW = 0.9  # quantile of the draws that have settled
-_STEP = 1e-4  # relative, of the frequency: truncation 1e-8, rounding 1e-12
+LEAST_CYCLES = 2  # measured at each level: a single cycle does not show its noise
+_LEAST_SETTLING = 1  # cycles: no change of level is instant
+_SLOW = 0.9  # quantile of the draws by which the motion must have settled
+_STEP = 1e-4  # relative step of frequency in differences: truncation error 1e-8, rounding 1e-12
 
 
 @dataclass(frozen=True)

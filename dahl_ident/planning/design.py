@@ -40,11 +40,11 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime
 
-_POWER = 4.0  # q: 1 would add the targets' variances, infinity would use only the largest
-_IMPROVES = 1e-3  # least improvement of the logarithm by a change of the levels
+_POWER = 4.0  # norm over the targets: 1 adds their variances, infinity takes the largest alone
+_IMPROVES = 1e-3  # least gain of the logarithm for which a level is exchanged
 _TRIED = 3  # candidates whose times are optimised after a first look at all
-_NO_TIME = 1e-9  # s, shared where there is none, so that the sums stay defined
-_MOST_LEVELS = 24  # an optimum of six parameters takes at most 21 (Caratheodory)
+_NO_TIME = 1e-9  # s, shared by the levels that get none, so that all sums stay defined
+_MOST_LEVELS = 24  # six parameters need at most 21 levels (Caratheodory)
 
 
 def packed_information(

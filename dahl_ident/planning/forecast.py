@@ -23,12 +23,12 @@ from dahl_ident.planning.knowledge import Knowledge, spread, units_of
 from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
 from dahl_ident.units import DEFINITIONS
 
-NOTHING = 1e-8  # information added so that a parameter without any has an uncertainty
-_ROUNDING = 1e-14  # of a parameter's information: less is rounding, and could cancel to nothing
-_NONE = 1e12  # information on departures that are left out
+NOTHING = 1e-8  # information added, so that a parameter without any still has a finite uncertainty
+_ROUNDING = 1e-14  # fraction of a parameter's information; less is rounding and could cancel
+_NONE = 1e12  # information that holds departures at zero if they are left out
 SEARCHED = 24  # draws that the search for levels averages over
-_SEARCHED_WITH_DEPARTURES = 2  # the same of many parameters more, close to the fit's estimate
-_PLACES = 24  # of the candidates, over which the response is averaged
+_SEARCHED_WITH_DEPARTURES = 2  # draws likewise: more parameters, near the fit's estimate
+_PLACES = 24  # candidates over which the uncertainty of the response is averaged
 _UNKNOWN = 1e-2  # information for the search: a suspected parameter is known within a decade or so
 
 

@@ -30,8 +30,8 @@ from dahl_ident.units import Motion
 # Least relative standard deviation that the search takes from a range. The fit will not have the
 # range: levels chosen with it do not determine what the fit then has to.
 _LEANED_ON = 100.0
-_MANY = 2000  # draws of a posterior for its covariance: 3 % of each uncertainty (two sigma)
-_NORMAL_RANGE = 2.0 * 1.959964  # standard deviations in a 95 % range
+_MANY = 2000  # draws for the covariance of a posterior: 3 % error of each uncertainty (two sigma)
+_NORMAL_RANGE = 2.0 * 1.959964  # width of a 95 % range in standard deviations
 
 Ranges = Mapping[str, tuple[float, float]]
 

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
     from dahl_ident.plots import Axes
 
-_CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the plan's time, in the picture
+_CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the picture
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
-_FEW_LEVELS = 60  # candidates with which the effect of a wider limit is judged
-_NEARLY = 0.99  # of the longest plan: whole cycles leave some of the time
-_RELAXED = 10.0  # times: a limit that prevents nothing then hardly helps
+_FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
+_NEARLY = 0.99  # fraction of the longest time that counts as all: whole cycles leave some over
+_RELAXED = 10.0  # factor by which a limit is widened to see whether it prevents anything
 _MODEL_ERROR = {
     "none": "the model is right",
     "estimated": "the model errs as the earlier data show",

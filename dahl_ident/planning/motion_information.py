@@ -23,13 +23,13 @@ from dahl_ident.planning.question import BenchLimits, RecordedForce, limit
 from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid
 from dahl_ident.problem.record_problem import RecordProblem
 
-_PER_PERIOD = 400  # samples at which derivatives are computed: integrals hold to about 1e-3
-_LEAST_SAMPLES = 16  # in a period, however low the sample rate
-_SIMULATED = 4  # repeats from rest: in the last one the friction repeats itself
-_REPEATS = 8  # for which the search computes the information of a repeat
+_PER_PERIOD = 400  # samples at which derivatives are computed: integrals err by 1e-3
+_LEAST_SAMPLES = 16  # in a period, even if the sample rate is low
+_SIMULATED = 4  # repeats from rest, after which the friction force repeats as well
+_REPEATS = 8  # repeats for which the search computes the information
 _LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # of the candidates that a kind stands for
-_SLOWER = 2.0  # times, from speed to speed and from band to band
-_LINES = 10  # of a multisine, its highest frequency over its lowest
+_SLOWER = 2.0  # factor from one speed or band to the next
+_LINES = 10  # highest over lowest frequency of a multisine
 
 
 def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> list[PlannedMotion]:

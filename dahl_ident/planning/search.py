@@ -19,17 +19,17 @@ from dahl_ident.planning.motion_information import RepeatSums
 from dahl_ident.planning.question import PlanRequest, limit
 
 _POOL = 80  # candidates: the time of the search grows with their number
-_MOST_RUNS = 8  # against scatter between runs: a ninth would gain 6 %
-_WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of the suspected parameters, the least that is enough
-LONGEST = 30.0 * 86400.0  # s, of a plan for which no time is given: a month
-_TIMES = 20  # corrections of the time that reaches a target
-_HELPS = 0.1  # of what the square root of the time would do, below which more time is useless
+_MOST_RUNS = 8  # to average scatter between runs: a ninth run would gain 6 %
+_WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of suspected parameters; the least that suffices
+LONGEST = 30.0 * 86400.0  # s: a month, the longest plan if no time is given
+_TIMES = 20  # corrections at most of the time that reaches a target
+_HELPS = 0.1  # more time is useless below this fraction of the gain by the square root of time
 _CLOSE = 0.985  # fraction of the target at which the search stops
 _AIMED = 0.995  # fraction of the target that a corrected time aims at
-_NARROWS = 0.6  # of the logarithm of the interval that a correction leaves, else it is halved
-_APART = 2.0  # times the range that a fit takes as one amplitude: measured ones are not exact
-_GRID_LEVELS = 10  # of the usual plan that the best one is compared with
-_CORRECTIONS = 6  # of the repeats of motions, each by the whole information
+_NARROWS = 0.6  # a correction that leaves more than this of the log interval is replaced by halving
+_APART = 2.0  # in ranges that a fit takes as one amplitude: measured amplitudes are not exact
+_GRID_LEVELS = 10  # levels of the usual logarithmic plan with which the best one is compared
+_CORRECTIONS = 6  # of the repeats of motions, each with the whole information
 _FILLED = 0.999  # fraction of the target that corrected repeats aim at
 
 

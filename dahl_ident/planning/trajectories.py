@@ -13,12 +13,12 @@ from dahl_ident.arrays import FloatArray, non_negative_array, positive_number
 from dahl_ident.errors import ValidationError
 
 KINDS = ("trapezoid", "multisine")
-SAMPLES_PER_CYCLE = 10  # at least, of the fastest part of a waveform
+SAMPLES_PER_CYCLE = 10  # at least, in the fastest part of a waveform
 UNITS = {
     "stroke": "m", "speed": "m/s", "acceleration": "m/s^2", "dwell": "s", "lowest_hz": "Hz",
     "highest_hz": "Hz", "peak": "m", "rms": "m",
 }  # fmt: skip
-_FINE = 64  # places a line at which a multisine's peaks are looked for: within 0.1 %
+_FINE = 64  # points for each spectral line, which give a multisine's peak within 0.1 %
 
 
 @dataclass(frozen=True)

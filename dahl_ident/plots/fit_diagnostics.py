@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LARGEST_DISC = 250.0  # area, points squared
-_MOST_JOINED = 6  # curves; with more, lines between points only confuse
+_MOST_JOINED = 6  # curves; lines between the points of more only confuse
 _HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\", "----")
 
 
@@ -376,7 +376,7 @@ def plot_control_charts(
     return tuple(axes)
 
 
-_WIDE = 3.0  # half a decade; narrower, logarithmic ticks are hard to read
+_WIDE = 3.0  # ratio, half a decade; logarithmic ticks of a narrower range are hard to read
 _QUANTILES = (0.16, 0.5, 0.84)  # median, and one standard deviation to either side
 
 

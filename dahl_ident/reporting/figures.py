@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response over levels
-_APART = 1.2  # of the largest frequency over the smallest
+_APART = 1.2  # ratio of the largest frequency to the smallest above which they are drawn as several
 _PROFILE_POINTS = 41
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
-_WIDE = 20.0  # of amplitudes beyond which loops are drawn over displacement / amplitude
+_WIDE = 20.0  # ratio of amplitudes above which loops are drawn over displacement / amplitude
 _INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-_LOOP_POINTS = 73  # of a measured loop, every 5 degrees; one in six of the model's
+_LOOP_POINTS = 73  # of a measured loop, every 5 degrees; the model's are six times denser
 
 
 def pictures_of(fit: FitResult) -> Iterator[Picture]:

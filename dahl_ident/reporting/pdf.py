@@ -36,12 +36,12 @@ _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
 _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
-_LONGEST = 60  # characters of a title at the foot of a page
-_WHOLE = 20.0  # mm, of a paragraph that is not divided between pages
-_SIGNATURE = 26.0  # mm, of the fields for date and signature
-_WIDEST = 75.0  # mm, of a column of a table
+_LONGEST = 60  # letters of a title at the foot of a page
+_WHOLE = 20.0  # mm; a lower paragraph is not divided between pages
+_SIGNATURE = 26.0  # mm, height of the fields for date and signature
+_WIDEST = 75.0  # mm, width of a column of a table
 _PADDING = 3.5  # mm, on both sides of a column's text
-_NAME_WIDTH = 38.0  # mm, of the fields' names in the header
+_NAME_WIDTH = 38.0  # mm, width of the fields' names in the header
 _COLOURS = {
     "trusted": (17, 99, 41),
     "approximate": (122, 77, 0),

@@ -49,9 +49,9 @@ _OF_CHAIN = (
     "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, r_hat "
     "compares independent ensembles and is 1 if they agree."
 )
-_MOST_FILES = 4  # lines of them before the signature
+_MOST_FILES = 4  # lines for them before the signature
 _FACTS = {"table": "fits", "records": "record_fits"}  # names of fits in JSON, by kind of data
-_FRONT = ("response", "residuals", "record")  # how names of the pictures before the details begin
+_FRONT = ("response", "residuals", "record")  # first words of pictures before the details
 _RANK = list(MARKS).index
 """The place of a status in the order from good to bad."""
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult, Posterior
 
-_LARGEST = 3  # sources of uncertainty on the first page
+_LARGEST = 3  # sources of uncertainty that the first page names
 _ASSUMED = "assumed; u counts it"
 _NO_PART = 1e-6  # share of the variance that the details leave out: a thousandth of u
 _DIGITS = {"mcse": 2, "ess": 4, "r_hat": 5}

@@ -36,7 +36,7 @@ from dahl_ident.errors import ValidationError
 from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.synthetic.mechanism import Signal
 
-_FILTER_OVERSAMPLING = 16  # points a sample: the signal is taken as linear between
+_FILTER_OVERSAMPLING = 16  # points for each sample; the signal is linear between them
 _WAVEFORM_FAULTS = (
     "noise_std", "flicker_std", "hum_amplitude", "offset", "drift", "resolution", "limit",
 )  # fmt: skip

@@ -18,7 +18,7 @@ from dahl_ident.errors import FitError, ModelError
 from dahl_ident.synthetic.waveform import SineStep, Waveform
 
 _PER_PERIOD, _POINTS = 24, 8  # polynomials, and their points: they miss 1e-13 of a sine
-_FINER = 1e4  # than records are fitted: motions are right to about 1e-11
+_FINER = 1e4  # times finer than records are fitted: motions err by about 1e-11
 
 Signal = Callable[[FloatArray], FloatArray]
 """A channel's true value at any times, (n,) -> (n,)."""

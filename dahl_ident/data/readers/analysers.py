@@ -69,8 +69,8 @@ _FREQUENCY, _TIME = 0, 1  # domains
 _RESPONSE, _COHERENCE = 4, 8  # types of data
 _LOGARITHMIC, _COMMON, _OF_RESULT, _OF_VECTOR = 1, 2, 3, 4  # axes; 0 is linear
 _NUMBERS = {1: ">i2", 2: ">i4", 3: ">f4", 4: ">f8"}
-_POWER = 48  # of a channel that is in a result once
-_UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # others than their labels
+_POWER = 48  # stored exponent of a channel that occurs once in a result
+_UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # other than their labels
 
 
 def read_uff(file: File) -> RawFile:

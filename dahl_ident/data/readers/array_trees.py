@@ -25,12 +25,12 @@ from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-_WIDEST = 64  # columns; a matrix with more both ways is a map or a picture
+_WIDEST = 64  # columns and rows: a matrix with more of both is a map or a picture
 _SECONDS, _BYTES_A_SECOND = 5, 10_000_000  # in which MATLAB's files are read
 _LOOK_SECONDS = 1  # a look at a good file takes some milliseconds,
 _LOOK_BYTES_A_SECOND = 1_000_000  # and at one of many small objects 0.2 ms for each 300 bytes
 _PACKING = {"scale_factor", "add_offset", "_FillValue", "missing_value"}
-_LOOKED_AT = 1 << 24  # bytes in all
+_LOOKED_AT = 1 << 24  # bytes that are searched in all
 Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
 
 

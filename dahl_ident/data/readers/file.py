@@ -42,9 +42,9 @@ ZIP_ERRORS = (
     RuntimeError,
 )  # fmt: skip
 """What Python's reader of archives raises on damaged ones."""
-_UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; read, they take ten times as much
-_OBJECT_BYTES = 40  # at least, of each line or list of a text that is split into them
-_UNPACKED_RATIO = 8  # text and samples of a converter rarely pack better
+_UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; when read, they take ten times as much
+_OBJECT_BYTES = 40  # least memory of each line or list into which a text is split
+_UNPACKED_RATIO = 8  # text and samples of a converter rarely compress better
 
 
 class Format(NamedTuple):

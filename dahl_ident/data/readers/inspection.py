@@ -17,9 +17,9 @@ from dahl_ident.data.tabular import as_html, as_text, extent, listed
 from dahl_ident.errors import UnitError
 from dahl_ident.units import MOTION_KINDS, parse_unit
 
-_INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # s, of single numbers
-_RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # Hz
-_FEW_GAPS = 5  # that are listed; of more, number, longest and first say more
+_INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # names of an interval in s
+_RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # names of a rate in Hz
+_FEW_GAPS = 5  # gaps that are listed one by one; of more: number, longest and first
 # The columns that are proposed; the units of some say nothing: any of them has the gain's.
 _RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("voltage", "current"))}
 _RESPONSE = {

@@ -24,12 +24,12 @@ from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
 _LEAD_IN = struct.Struct("<4sIIQQ")  # of a TDMS segment: tag, contents, version, and two sizes
-_LONGEST_METADATA = 1 << 24  # bytes of a segment that are looked at
+_LONGEST_METADATA = 1 << 24  # bytes of a segment's metadata that are read
 _LONGEST_SEGMENT = 1 << 48  # bytes; more means that the segment was never closed
 _END = "***End_of_Header***"
 _SPECIAL = ("***Start_Special***", "***End_Special***")
 _SEPARATORS = {"tab": "\t", "comma": ",", "semicolon": ";"}
-_SAME_STEP = 0.01  # relative: more than what is rounded in times and in the header
+_SAME_STEP = 0.01  # relative difference of steps; rounding in times and in the header is less
 _MOST_SEGMENTS = 1000  # the time to read grows with their square
 Lines = list[tuple[int, str]]
 

@@ -42,7 +42,7 @@ from dahl_ident.units import parse_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-_HEAD_ROWS = 400  # looked at as text, which takes long, to find the table
+_HEAD_ROWS = 400  # read as text, which is slow, to find the table
 _BYTES, _SECONDS = 1 << 30, 15  # that reading may take: a small archive can unpack to anything
 _UNNAMED = "column {}"
 _UNIT_OF = re.compile(r"(.+?)[ _]units?")  # "displacement units": "mm"

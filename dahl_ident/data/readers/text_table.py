@@ -43,13 +43,13 @@ _LINE_END = re.compile(rb"\r\n|\n|\r")
 _BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
 # what stands in brackets is bounded, so that a line of brackets takes linear time
 _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
-_HEAD_BYTES = 1 << 15  # from the first numbers on: hundreds of lines show the format
-_HEAD_LINES = 4  # of numbers, however wide
+_HEAD_BYTES = 1 << 15  # read from the first numbers on: hundreds of lines show the format
+_HEAD_LINES = 4  # lines of numbers that are read at least, however wide
 _LONGEST_LINE = 1 << 18  # bytes: 10,000 columns and more; beyond, it is not a text table
-_MOST_COMMENTS = 20_000  # lines, before the first numbers or among them: a limit on time
-_MANY_LINES = 50  # from which decimals of one length are a format, not chance
-_FOOTER_LINES = 20  # that are left out at most; more text after the numbers is an error
-_ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # of a spreadsheet
+_MOST_COMMENTS = 20_000  # lines, before the first numbers or among them, to limit the time
+_MANY_LINES = 50  # with as many, decimals of one length are a format, not chance
+_FOOTER_LINES = 20  # lines that are left out at most; more text after the numbers is an error
+_ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # a spreadsheet's error
 # the number of points above pairs of numbers, as the SR785 and SR780 write a trace
 _TRACE = re.compile(
     rb"[ \t]*(\d{1,9})[ \t]*(?:\r\n|\n|\r)"
