@@ -240,6 +240,22 @@ class TestBudget:
         assert by_source["force calibration"].dof == np.inf
         assert 5.0 < by_source["noise"].dof < 22.01  # 24 numbers, 2 parameters, other sources
 
+    def test_the_factor_of_a_drive_scales_every_force(self):
+        rng, u = np.random.default_rng(4), np.tile([0.3, 1.0, 3.0], 4)
+        f = np.repeat(np.geomspace(0.2, 2.0, 4), 3)
+        model = Spring() + Damper()
+        R = (
+            1.0
+            / (40.0 + 2j * np.pi * f * 1.5)
+            * np.exp(1e-3 * rng.standard_normal((12, 2)) @ [1, 1j])
+        )
+        data = FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance",
+                                 drive_factor_uncertainty=0.02)  # fmt: skip
+        found = fit(data, model).budget()
+        for name in ("stiffness", "damping"):
+            by_source = {row.source: row.u for row in found[name].rows}
+            assert by_source["drive factor"] == pytest.approx(0.02 * found[name].value, rel=1e-2)
+
     def test_at_infinity_what_is_determined_has_a_budget(self):
         result = fit(table(beta=(1e-3, 1e-2), seed=3), Dahl() + Spring(), throw=False)
         assert not result.success

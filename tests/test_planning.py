@@ -120,7 +120,7 @@ class TestModelError:
         )
         own = np.linalg.inv(found.information)[:2, :2]
         # a plan weighs by all errors, a fit by noise and misfit
-        assert own == pytest.approx(errors.generalised, rel=0.02)
+        assert own == pytest.approx(errors.state.K[:2, :2], rel=0.02)
 
     def test_levels_are_spread_by_the_model_error(self):
         fit, limits = self._fit(), {**KNEE, "time": 60}
@@ -129,7 +129,7 @@ class TestModelError:
         assert len(plan.steps) > len(alone.steps) + 1
         assert "the model errs as the earlier data show" in str(plan)
         told = plan.expected["f_max"]
-        weighed = float(fit.errors.generalised[0, 0]) ** 0.5
+        weighed = float(fit.errors.state.K[0, 0]) ** 0.5
         # the fit cuts the shapes off by its own rows
         assert told.before == pytest.approx(weighed, rel=0.15)
         assert told.after > 2.0 * alone.expected["f_max"].after

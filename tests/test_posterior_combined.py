@@ -141,5 +141,5 @@ def test_what_rows_share_may_be_all_there_is():
     fit = di.fit(data, LINEAR)
     grid = di.posterior(fit, method="grid", tolerance=1e-2)
     assert np.isfinite(grid.std()[:2]).all()
-    weighed = float(fit.errors.generalised[1, 1]) ** 0.5
+    weighed = float(fit.errors.state.K[1, 1]) ** 0.5
     assert grid.std()[1] > 0.1 * weighed * fit.params["sigma"].value

@@ -138,9 +138,8 @@ class Assessment(ABC):
         key = (method, levels, replicates, seed)
         if key not in self._intervals:
             made = self._new_intervals(method, levels, replicates, seed)
-            problem = self.problem
-            units = {p.name: shown_unit(p.unit, problem.motion) for p in problem.every_parameter}
-            self._intervals[key] = replace(made, units=tuple(units[n] for n in made.names))
+            units = tuple(shown_unit(unit, self.problem.motion) for unit in made.units)
+            self._intervals[key] = replace(made, units=units)
         return self._intervals[key]
 
     def intervals_run(self, level: float) -> list[ConfidenceIntervals]:

@@ -136,12 +136,6 @@ class ErrorModel:
         """Combined covariance of theta, shape (Q, Q)."""
         return np.asarray(sum(self.contributions.values()))
 
-    @cached_property
-    def generalised(self) -> FloatArray:
-        """Covariance of generalised least squares, by which the device's response is predicted."""
-        r = self.state.model.parameters
-        return self._of_theta(self._of_theta(self.state.K[:r, :r]).T)
-
     def _of_theta(self, changes: FloatArray) -> FloatArray:
         basis = self.estimate.basis
         return changes if basis is None else basis.matrix @ changes
