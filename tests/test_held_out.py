@@ -6,7 +6,8 @@ from scipy import stats
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit
 from dahl_ident.diagnostics import error_model
-from dahl_ident.diagnostics.error_sources import NOISE, rows_of_tests
+from dahl_ident.diagnostics.contributions import NOISE
+from dahl_ident.diagnostics.error_sources import rows_of_tests
 from dahl_ident.diagnostics.held_out import band_factor
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 

@@ -265,7 +265,7 @@ def test_what_the_model_misses_from_place_to_place_is_in_the_budget():
     assert rows["model error"].u == pytest.approx(0.1 * 0.1 / np.sqrt(20.0), rel=0.3)
     assert rows["model error"].dof == 19.0
     assert fit.status.value == "approximate"
-    assert fit.errors.dof == 19.0  # of Student's t in the bands
+    assert fit.errors.least_dof == 19.0  # of Student's t in the bands
     steady = di.fit(recorded(DAHL, "random", samples, 1e-3), di.Dahl())
     assert "model error" not in {row.source for row in steady.budget()["f_max"].rows}
     assert steady.trusted

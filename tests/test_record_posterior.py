@@ -27,7 +27,7 @@ def test_as_wide_as_the_error_bars_of_the_fit_where_residuals_are_correlated():
     assert found.names == ("f_max", "sigma")
     for name in found.names:
         own, other = found.params[name].stderr or 0.0, fit.params[name].stderr or 0.0
-        dof = fit.errors.dof  # the variance of Student's t is beyond its scale
+        dof = fit.errors.least_dof  # the variance of Student's t is beyond its scale
         assert own == pytest.approx(other * (dof / (dof - 2.0)) ** 0.5, rel=0.08)
         assert own > 1.5 * _counted_as_independent(fit, name)
         assert abs(found.params[name].value - fit.params[name].value) < 0.3 * other
@@ -124,6 +124,6 @@ def test_importance_points_of_a_plant_take_few_motions():
     assert grid.evaluations < 1000
     for name in grid.names:
         parameter, low, high = fit.params[name], *grid.quantile(name, np.array([0.16, 0.84]))
-        half = t(fit.errors.dof).ppf(0.84) * parameter.stderr
+        half = t(fit.errors.least_dof).ppf(0.84) * parameter.stderr
         assert 0.5 * float(high - low) == pytest.approx(half, rel=0.03)
         assert 0.5 * float(high + low) == pytest.approx(parameter.value, abs=0.2 * half)

@@ -17,8 +17,8 @@ from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget, taken_as_exact
 from dahl_ident.diagnostics.checks import assumptions, judgement
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
+from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import NOISE
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation

@@ -16,9 +16,8 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data.storage import library as data_library
 from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY, coverage_factor
+from dahl_ident.diagnostics.contributions import CHANNELS, TYPE_A, Errors, variances
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import HARMONICS, LEVELS, MODEL_ERROR, NOISE, RUNS, TESTS
-from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import (
     degrees_text,
     html_table,
@@ -39,13 +38,7 @@ _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
 # Variance over the combined one below which a source contributes rounding errors alone.
 _ROUNDING = 1e-12
 _SAME = 1e-6  # relative difference of limits that counts as none
-_TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, RUNS, LEVELS, TESTS)
 _COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
-_CHANNELS = {
-    "force_gain": "force calibration",
-    "displacement_gain": "displacement calibration",
-    "delay": "delay between the channels",
-}
 
 
 @dataclass(frozen=True)
@@ -232,7 +225,7 @@ def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
             "no uncertainty budget: a parameter is undetermined, or nothing is left to estimate "
             f"the errors from ({optimum.message}); fix a parameter or measure more points"
         )
-    parameters = [_parameter(errors, *each) for each in entries]
+    parameters = [parameter_budget(errors, *each) for each in entries]
     D = np.array([direction for *_, direction in entries])
     return Budget(tuple(parameters), D @ errors.covariance @ D.T, taken_as_exact(optimum))
 
@@ -290,30 +283,29 @@ def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
     """Return the calibrations without a stated uncertainty."""
     sensors, priors = optimum.problem.sensors, optimum.problem.priors
     free = {p.name for p in sensors.parameters if p.free}
-    return tuple(
-        text for name, text in _CHANNELS.items() if name not in priors and name not in free
-    )
+    return tuple(text for name, text in CHANNELS.items() if name not in priors and name not in free)
 
 
-def _parameter(
-    errors: ErrorModel, name: str, unit: str, value: float, direction: FloatArray
+def parameter_budget(
+    errors: Errors, name: str, unit: str, value: float, direction: FloatArray
 ) -> ParameterBudget:
-    u = float(errors.std(direction))
-    total = u**2
+    """Return the budget of a value with the derivatives `direction`, source by source."""
+    u2 = float(errors.std(direction)) ** 2
     rows = []
     for source, covariance in errors.contributions.items():
-        variance = float(direction @ covariance @ direction)
-        variance = variance if variance > _ROUNDING * total else 0.0
-        kind: Literal["A", "B"] = "A" if source in _TYPE_A else "B"
-        estimated = source in {*_TYPE_A, EXPONENT}
-        dof = errors.dof(direction, [source]) if estimated and variance else np.inf
-        rows.append(
-            BudgetRow(source, kind, variance**0.5, dof, variance / total if total > 0.0 else 0.0)
-        )
+        part = float(variances(direction, covariance))
+        if np.isinf(u2):
+            share = float(np.isinf(part))
+        else:
+            part = part if part > _ROUNDING * u2 else 0.0
+            share = part / u2 if u2 > 0.0 else 0.0
+        kind: Literal["A", "B"] = "A" if source in TYPE_A else "B"
+        dof = errors.dof(direction, source) if part else np.inf
+        rows.append(BudgetRow(source, kind, part**0.5, dof, share))
     rows.sort(key=lambda row: -row.u)
     dof = errors.dof(direction)
     dof = dof if dof < MANY else np.inf
-    return ParameterBudget(name, unit, value, tuple(rows), u, dof, coverage_factor(dof))
+    return ParameterBudget(name, unit, value, tuple(rows), u2**0.5, dof, coverage_factor(dof))
 
 
 def _dof(dof: float) -> str:

@@ -34,12 +34,18 @@ from scipy import special
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
-from dahl_ident.diagnostics.error_sources import (
+from dahl_ident.diagnostics.contributions import (
+    CHANNELS,
+    EXPONENT,
     LEVELS,
     MODEL_ERROR,
     NOISE,
     RUNS,
     TESTS,
+    Errors,
+    positive_part,
+)
+from dahl_ident.diagnostics.error_sources import (
     Source,
     error_sources,
     own_errors,
@@ -48,7 +54,6 @@ from dahl_ident.diagnostics.error_sources import (
     rows_of_tests,
 )
 from dahl_ident.diagnostics.estimate import (
-    EXPONENT,
     GAIN,
     Assumption,
     WeightedEstimate,
@@ -57,7 +62,7 @@ from dahl_ident.diagnostics.estimate import (
 )
 from dahl_ident.diagnostics.held_out import HeldOut, held_out
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood, suspicious_points
-from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState, shares
+from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState, unit_covariances
 from dahl_ident.diagnostics.residual_space import (
     ResidualSpace,
     RunDeviations,
@@ -74,11 +79,6 @@ _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its 
 _UPPER = 0.5 * (1.0 + CONFIDENCE)
 _KINDS = 2  # of model error that were looked for, of which the more likely one counts
 _LEAST_DOF = 4  # residuals beyond the parameters, below which there is noise alone
-_CALIBRATIONS = {
-    "force_gain": "force calibration",
-    "displacement_gain": "displacement calibration",
-    "delay": "delay",
-}
 
 
 class RunJackknife(NamedTuple):
@@ -89,7 +89,7 @@ class RunJackknife(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ErrorModel:
+class ErrorModel(Errors):
     """The estimate, and its covariance by every source of error."""
 
     optimum: Optimum  # the least-squares fit that it started from
@@ -102,8 +102,9 @@ class ErrorModel:
     tests: int  # number of tests, of which each may have been left out
     # names of parameters that were assumed: exponents, the force gain for a drive factor
     assumed: tuple[str, ...]
-    limit: FloatArray
-    """Factor of the model error's part in each parameter's uncertainty, from tests left out."""
+    # (count, Q, Q) each: covariance of theta by each variance at unit size, with the exponents
+    # estimated, and with exact ones
+    unit_parts: tuple[FloatArray, FloatArray]
     by_runs: RunJackknife | None
 
     @property
@@ -131,11 +132,6 @@ class ErrorModel:
         """Whether there are enough residuals to distinguish a model error from noise."""
         return _distinguishes_noise(self.problem, self.assumed)
 
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """Combined covariance of theta, shape (Q, Q)."""
-        return np.asarray(sum(self.contributions.values()))
-
     def _of_theta(self, changes: FloatArray) -> FloatArray:
         basis = self.estimate.basis
         return changes if basis is None else basis.matrix @ changes
@@ -155,11 +151,6 @@ class ErrorModel:
         errors = size * np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
         return dict(zip(self.names, errors.tolist(), strict=True))
 
-    def std(self, directions: FloatArray) -> FloatArray:
-        """Return the combined standard uncertainty of directions . theta, for (..., Q)."""
-        variance = np.einsum("...i,ij,...j->...", directions, self.covariance, directions)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
     def holds(self, name: str) -> bool:
         """Return whether a parameter is determined, where the data leave some directions open."""
         basis = self.estimate.basis
@@ -169,45 +160,29 @@ class ErrorModel:
             return False  # at the limit at which the optimum lies
         return bool(basis.holds(np.eye(len(self.names))[self.names.index(name)]))
 
-    @cached_property
-    def _levers(self) -> tuple[FloatArray, FloatArray]:
-        """Covariance of theta from each source at unit variance, (count, Q, Q).
-
-        Then the same with assumed exponents taken as exact.
-        """
-        every, without_exponents = (
-            _limited_shares(self.sources, self.state, one, self.limit)[0]
-            for one in _levers(self.estimate, self.assumed)
-        )
-        return every, without_exponents
-
-    def dof(self, direction: FloatArray, sources: Sequence[str] | None = None) -> float:
+    def dof(self, direction: FloatArray, source: str | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 
         Satterthwaite's: 2 u^4 over the variance of u^2 that the variances' own errors make, no
         less than 1; fewer where the interval would be narrower than that of the runs alone.
-        `sources` leaves only these; infinite where all variances are known. What an assumed
+        `source` leaves only this one; infinite where all variances are known. What an assumed
         exponent adds depends on the variances as well.
         """
         direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
-        names = [NOISE] * self.state.model.noises + [s.name for s in self.sources]
-        every, without_exponents = (
-            np.einsum("i,kij,j->k", direction, C, direction) for C in self._levers
-        )
-        slopes = every
-        if sources is not None:
-            counted = np.array([name in sources for name in names], dtype=bool)
-            of_exponents = every - without_exponents
-            slopes = without_exponents * counted + of_exponents * (EXPONENT in sources)
+        slopes, exact = (np.einsum("i,kij,j->k", direction, C, direction) for C in self.unit_parts)
+        counted = self.contributions if source is None else (source,)
+        sizes = {name: float(direction @ self.contributions[name] @ direction) for name in counted}
+        if source == EXPONENT:
+            slopes = slopes - exact
+        elif source is not None:
+            names = [NOISE] * self.state.model.noises + [s.name for s in self.sources]
+            slopes = exact * [name == source for name in names]
         spread = float(slopes @ self.state.variances_covariance @ slopes)
-        total = 0.0
-        for name in self.contributions if sources is None else sources:
-            variance_of_source = float(direction @ self.contributions[name] @ direction)
-            total += variance_of_source
-            if name == TESTS:
-                spread += 2.0 * variance_of_source**2 / (self.tests - 1)
+        if TESTS in sizes:
+            spread += 2.0 * sizes[TESTS] ** 2 / (self.tests - 1)
+        total = sum(sizes.values())
         dof = max(1.0, 2.0 * total**2 / spread) if spread > 0.0 else np.inf
-        if self.by_runs is None or sources is not None:
+        if self.by_runs is None or source is not None:
             return dof
         of_runs = float(direction @ self.by_runs.covariance @ direction)
         return float(no_narrower(dof, total, of_runs, self.by_runs.runs))
@@ -380,11 +355,17 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     levers = _levers(estimate, assumed)
     tests = rows_of_tests(problem.data)
     by_tests = None if estimate.basis is not None else estimate.jackknife(tests)
-    limit = np.ones(len(problem.names))
+    parts = [unit_covariances(state, lever) for lever in levers]
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
-        limit = _limit_of_model_error(sources, state, levers[0], by_tests)
+        model = [k for k, s in enumerate(sources, noises) if s.name == MODEL_ERROR]
+        size = np.einsum("kii,k->i", parts[0][0][model], state.variances[model])
+        most = _SHARED_BY * np.diagonal(by_tests)
+        limit = np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most))
+        for each, _ in parts:
+            each[model] *= np.outer(limit, limit)
     every, without_exponents = (
-        _by_source(estimate, assumed, sources, state, one, limit) for one in levers
+        _by_source(problem, assumed, sources, state, lever, *part)
+        for lever, part in zip(levers, parts, strict=True)
     )
     by_runs = None
     if estimate.basis is None and len(problem.data.runs or ()) > 1:
@@ -393,7 +374,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     ranged = any(one.source == EXPONENT for one in assumed.values())
     if estimate.basis is None and ranged:
         total = np.asarray(sum(every.values()))
-        added = _positive(total - np.asarray(sum(without_exponents.values())))
+        added = positive_part(total - np.asarray(sum(without_exponents.values())))
         every = {**without_exponents, EXPONENT: without_exponents.get(EXPONENT, 0.0) + added}
     if estimate.second is not None:
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
@@ -401,8 +382,8 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         every = _at_least(every, by_chance**2 * by_tests)
     return ErrorModel(
-        optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed), limit,
-        by_runs,
+        optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed),
+        (parts[0][0], parts[1][0]), by_runs,
     )  # fmt: skip
 
 
@@ -449,52 +430,25 @@ def _levers(estimate: WeightedEstimate, assumed: Collection[str]) -> tuple[Float
 
 
 def _by_source(
-    estimate: WeightedEstimate,
+    problem: TableProblem,
     assumed: Mapping[str, Assumption],
     sources: Sequence[Source],
     state: MixedState,
     lever: FloatArray,
-    limit: FloatArray,
+    each: FloatArray,
+    known: FloatArray,
 ) -> dict[str, FloatArray]:
     """Return the covariance of theta that each source makes by the lever (Q, M) of residuals."""
-    problem, noises = estimate.problem, state.model.noises
-    each, known = _limited_shares(sources, state, lever, limit)
+    noises = state.model.noises
     by_source = {NOISE: known[:noises].sum(axis=0)}
     names = [NOISE] * noises + [source.name for source in sources]
     for name, part, variance in zip(names, each, state.variances.tolist(), strict=True):
         by_source[name] = by_source.get(name, 0.0) + variance * part
-    priors = [_CALIBRATIONS.get(name, name) for name in problem.priors]
+    priors = [CHANNELS.get(name, name) for name in problem.priors]
     priors += [one.source for one in assumed.values()]
     for row, name in enumerate(priors, start=problem.n_residuals):
         by_source[name] = by_source.get(name, 0.0) + np.outer(lever[:, row], lever[:, row])
     return by_source
-
-
-def _limited_shares(
-    sources: Sequence[Source], state: MixedState, lever: FloatArray, limit: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return shares of the covariance, those of the model error by its `limit` of parameters."""
-    each, known = shares(state, lever)
-    model = [k for k, s in enumerate(sources, state.model.noises) if s.name == MODEL_ERROR]
-    each[model] *= np.outer(limit, limit)
-    return each, known
-
-
-def _limit_of_model_error(
-    sources: Sequence[Source], state: MixedState, lever: FloatArray, by_tests: FloatArray
-) -> FloatArray:
-    """Return the factors, (Q,), that bring the model error to what tests left out make likely."""
-    each, _ = shares(state, lever)
-    model = [k for k, s in enumerate(sources, state.model.noises) if s.name == MODEL_ERROR]
-    size = np.einsum("kii,k->i", each[model], state.variances[model])
-    most = _SHARED_BY * np.diagonal(by_tests)
-    return np.asarray(np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most)))
-
-
-def _positive(C: FloatArray) -> FloatArray:
-    """Return the positive semidefinite part of a symmetric matrix."""
-    values, vectors = np.linalg.eigh(C)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[str, FloatArray]:
@@ -505,7 +459,7 @@ def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[s
     wider = np.where(np.isfinite(wider), wider, 1.0)
     if not (wider > 1.0).any():
         return contributions
-    return {**contributions, TESTS: _positive(C * np.outer(wider, wider) - C)}
+    return {**contributions, TESTS: positive_part(C * np.outer(wider, wider) - C)}
 
 
 def no_narrower(

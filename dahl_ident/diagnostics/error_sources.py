@@ -22,6 +22,14 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.contributions import (
+    APART,
+    HARMONICS,
+    LEVELS,
+    MODEL_ERROR,
+    NOISE,
+    RUNS,
+)
 from dahl_ident.diagnostics.estimate import WeightedEstimate, tests_of
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import COMPLIANCES
@@ -31,13 +39,6 @@ _MOST_LEVELS = 50  # with an error each: the cost is cubic in their number
 _EQUAL = 1e-9  # of the same: one number, stored twice
 _BY_CHANCE = 0.01  # tables without repeats in which some seem to be
 FEWEST_TESTS = 3  # runs, or labelled levels, that count as tests
-NOISE = "noise"
-MODEL_ERROR = "model error"
-RUNS = "scatter between runs"
-LEVELS = "scatter between repeated levels"
-HARMONICS = "model error of harmonics"
-APART = "suspicious points"
-TESTS = "jackknife over tests"
 
 # Share of tables in which noise alone may look like a model error, or like noisy levels: with less,
 # a spring or an amplifier's gain that is off is overlooked, with more, intervals of a right model

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.contributions import DRIVE_FACTOR, EXPONENT
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, limits
 from dahl_ident.fitting.losses import Loss, loss_named
@@ -39,8 +40,6 @@ from dahl_ident.problem.stiffness import StiffnessData
 
 _NOTICED = 1e-5  # change of residuals over the largest, below which a direction is undetermined
 _OUTSIDE = 1e-3  # share of a direction that the data may leave open, from rounding
-EXPONENT = "exponent"
-DRIVE = "drive factor"
 GAIN = "force_gain"
 _STEPS = 60  # Gauss-Newton steps; five are the rule
 _LITTLE_SAID = 0.25  # of the variance of a range: the data say little more of an exponent
@@ -158,7 +157,7 @@ def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumpt
     u = problem.data.drive_factor_uncertainty
     gain = next(p for p in problem.sensors.parameters if p.name == GAIN)
     if u and not gain.free:
-        assumed[gain.name] = Assumption(DRIVE, float(u))
+        assumed[gain.name] = Assumption(DRIVE_FACTOR, float(u))
     if not assumed:
         return problem, {}
     return problem.assuming({name: one.std for name, one in assumed.items()}), assumed

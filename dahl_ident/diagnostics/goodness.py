@@ -25,8 +25,8 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
+from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.formatting import p_text, with_unit
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.misfit_explanations import (

@@ -356,7 +356,7 @@ class MixedState:
         return XK @ X.swapaxes(1, 2), slopes
 
 
-def shares(state: MixedState, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
+def unit_covariances(state: MixedState, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the covariance of lever . y from each source at unit variance, and from known noise.
 
     For a lever (P, m): (count, P, P), and (groups, P, P).

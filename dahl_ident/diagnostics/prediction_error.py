@@ -20,16 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
-from dahl_ident.diagnostics.error_sources import (
-    MODEL_ERROR,
-    NOISE,
-    TESTS,
-    Source,
-    error_sources,
-    parts,
-    places,
-)
+from dahl_ident.diagnostics.error_sources import Source, error_sources, parts, places
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.problem import TableProblem
 

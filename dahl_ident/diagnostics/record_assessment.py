@@ -14,7 +14,7 @@ from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
 from dahl_ident.diagnostics.assessment import Assessment
 from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
-from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.budget import Budget, parameter_budget
 from dahl_ident.diagnostics.confidence_levels import (
     CONFIDENCE,
     checked_levels,
@@ -22,6 +22,7 @@ from dahl_ident.diagnostics.confidence_levels import (
     coverage_factors,
     level_text,
 )
+from dahl_ident.diagnostics.contributions import NOISE, variances
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
 from dahl_ident.diagnostics.judgement import Finding, Judgement
@@ -33,13 +34,10 @@ from dahl_ident.diagnostics.record_checks import (
     undetermined,
 )
 from dahl_ident.diagnostics.record_errors import (
-    NOISE,
     RecordErrors,
     errors_on_constraints,
     record_assumptions,
-    record_budget,
     record_errors,
-    variances,
 )
 from dahl_ident.diagnostics.verdicts import Identifiability, ParameterVerdict, Verdict
 from dahl_ident.elements import Model
@@ -173,12 +171,14 @@ class RecordAssessment(Assessment):
         array = checked_levels(levels)
         values = self.optimum.values
         assumed = self.errors.assumed
-        dof = [self.errors.dof_for(place) for place in range(values.size)]
+        dof = [self.errors.dof(direction) for direction in np.eye(values.size)]
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
         # of what was assumed, in the logarithm
-        more = coverage_factors(self.errors.dof, array[:, None]) * [one.std for one in assumed]
+        more = coverage_factors(self.errors.least_dof, array[:, None]) * [
+            one.std for one in assumed
+        ]
         held = np.array([one.value for one in assumed])
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
         return ConfidenceIntervals(
@@ -247,10 +247,14 @@ class RecordAssessment(Assessment):
 
     def budget(self) -> Budget:
         """Return the uncertainty budget."""
-        stated = record_budget(self.problem, self.optimum.values, self.errors)
-        motion = self.problem.motion
-        shown = tuple(replace(p, unit=shown_unit(p.unit, motion)) for p in stated.parameters)
-        return replace(stated, parameters=shown)
+        problem, errors, count = self.problem, self.errors, self.problem.n_reported
+        parameters = tuple(
+            parameter_budget(errors, p.name, shown_unit(p.unit, problem.motion), value, direction)
+            for p, value, direction in zip(
+                problem.free, self.optimum.values.tolist(), np.eye(len(self.covar)), strict=False
+            )
+        )
+        return Budget(parameters, errors.covariance[:count, :count], errors.exact)
 
     def derived(
         self, amplitudes: Sequence[float], frequency_hz: float | None
@@ -280,7 +284,7 @@ class RecordAssessment(Assessment):
         share = (0.5 * self.goodness.share_left) ** 0.5 if misses(self) else _LEAST
         optimum = replace(
             self.optimum, problem=problem, theta=theta, values=values, covariance=covariance,
-            scale=share, dof=int(self.errors.dof),
+            scale=share, dof=int(self.errors.least_dof),
         )  # fmt: skip
         return optimum, None, None
 
@@ -321,7 +325,7 @@ class RecordAssessment(Assessment):
         scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
         if misses(self):
             scatter *= max(1.0, problem.level / self.problem.level) ** 2
-        half = coverage_factor(self.errors.dof) * np.sqrt(variance + scatter)
+        half = coverage_factor(self.errors.least_dof) * np.sqrt(variance + scatter)
         return RecordBand(
             problem.records[0].time, output, np.sqrt(variance), output - half, output + half,
             problem.measured[0],

@@ -14,11 +14,15 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.checks import assumed, constraints, reading
-from dahl_ident.diagnostics.error_sources import RUNS
-from dahl_ident.diagnostics.estimate import EXPONENT
+from dahl_ident.diagnostics.contributions import (
+    AFTER_REVERSALS,
+    EXPONENT,
+    MODEL_ERROR,
+    NOISE,
+    RUNS,
+)
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.physics import below_zero, is_single, slight
-from dahl_ident.diagnostics.record_errors import MODEL, NOISE, PATH
 from dahl_ident.elements import Element
 from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.problem.record_noise import share_in_band
@@ -40,8 +44,12 @@ _FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
 _BECAUSE = {  # by the source of most of the uncertainty
     EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
     RUNS: "the records ask for different values: fit each alone, and look at what differs",
-    PATH: "the law misses what the force does after a reversal: choose one that describes it",
-    MODEL: "parts of the records ask for different values: choose a model that describes them",
+    AFTER_REVERSALS: (
+        "the law misses what the force does after a reversal: choose one that describes it"
+    ),
+    MODEL_ERROR: (
+        "parts of the records ask for different values: choose a model that describes them"
+    ),
 }
 _DETERMINED, _DESCRIBED, _ASSUMED = Question
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
@@ -150,7 +158,7 @@ def misses(fit: RecordAssessment) -> bool:
     """Return whether the model misses more than noise."""
     goodness = fit.goodness
     structured = goodness.correlation > _STRUCTURED and goodness.share_in_band > _WELL
-    return structured or not {MODEL, PATH}.isdisjoint(fit.errors.contributions)
+    return structured or not {MODEL_ERROR, AFTER_REVERSALS}.isdisjoint(fit.errors.contributions)
 
 
 def undetermined(fit: RecordAssessment) -> Iterator[Finding]:

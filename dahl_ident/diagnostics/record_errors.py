@@ -6,16 +6,22 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.diagnostics.budget import Budget, BudgetRow, ParameterBudget
-from dahl_ident.diagnostics.confidence_levels import coverage_factor
+from dahl_ident.diagnostics.contributions import (
+    AFTER_REVERSALS,
+    CHANNELS,
+    EXPONENT,
+    MODEL_ERROR,
+    NOISE,
+    RUNS,
+    Errors,
+    positive_part,
+    variances,
+)
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
-from dahl_ident.diagnostics.error_sources import RUNS
-from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import listed
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_sources import (
@@ -44,17 +50,16 @@ _DRAWS = 8  # of noise: the mean square of what they change is known to a half
 _NOT_FOUND = ", though it was not given: with another no motion was found"
 RELATIVE_STEP = 1e-5
 """Relative step of parameters for the slopes of quantities that follow from them."""
-NOISE, DRIVE, FORCE = "noise", "noise in the drive", "force calibration"
-MODEL, DISPLACEMENT = "model error", "noise in the displacement"
-PATH = "model error after each reversal"
+DRIVE = "noise in the drive"
+DISPLACEMENT = "noise in the displacement"
 TURNS = "displacement at turning points"
 SAMPLING = "turning points between samples"
 WINDOW = "window of differentiation"
-DISPLACEMENT_GAIN, DELAY = "displacement calibration", "delay between the channels"
+FORCE, DISPLACEMENT_GAIN, DELAY = CHANNELS.values()
 
 
 @dataclass(frozen=True)
-class RecordErrors:
+class RecordErrors(Errors):
     """Covariance of the estimate, source by source.
 
     Attributes
@@ -70,7 +75,7 @@ class RecordErrors:
     exponents : tuple of HeldValue
         What the records say of exponents that the fit holds.
     groups : int
-        Of the path since the last reversal, from which `PATH` was estimated.
+        Of the path since the last reversal, from which `AFTER_REVERSALS` was estimated.
     """
 
     contributions: Mapping[str, FloatArray]
@@ -86,32 +91,30 @@ class RecordErrors:
         return [one for one in self.exponents if one.assumed]
 
     @property
-    def covariance(self) -> FloatArray:
-        """All sources together."""
-        return np.asarray(sum(self.contributions.values()))
-
-    @property
-    def dof(self) -> float:
+    def least_dof(self) -> float:
         """Degrees of freedom of the whole: of the source that was estimated from the fewest."""
-        return min(self.dof_of(source) for source in self.contributions)
+        return min(map(self.dof_of, self.contributions))
 
     def dof_of(self, source: str) -> float:
         """Degrees of freedom of one source."""
         if source == NOISE:
             return max(self.effective - len(self.covariance), 1.0)
         return {
-            MODEL: BLOCKS - 1.0,
-            PATH: self.groups - 1.0,
+            MODEL_ERROR: BLOCKS - 1.0,
+            AFTER_REVERSALS: self.groups - 1.0,
             RUNS: self.runs - 1.0,
         }.get(source, np.inf)
 
-    def dof_for(self, place: int) -> float:
-        """Degrees of freedom of one value, by Welch and Satterthwaite."""
-        by_source = {name: float(C[place, place]) for name, C in self.contributions.items()}
-        if np.isinf(sum(by_source.values())):  # which an infinite source alone decides
-            return min(self.dof_of(name) for name, u2 in by_source.items() if np.isinf(u2))
-        loss = sum(u2**2 / self.dof_of(name) for name, u2 in by_source.items())
-        return sum(by_source.values()) ** 2 / loss if loss > 0.0 else np.inf
+    def dof(self, direction: FloatArray, source: str | None = None) -> float:
+        """Return the degrees of freedom of direction . values, by Welch and Satterthwaite."""
+        if source is not None:
+            return self.dof_of(source)
+        parts = {name: float(variances(direction, C)) for name, C in self.contributions.items()}
+        total = sum(parts.values())
+        if np.isinf(total):  # which an infinite source alone decides
+            return min(self.dof_of(name) for name, part in parts.items() if np.isinf(part))
+        loss = sum(part**2 / self.dof_of(name) for name, part in parts.items())
+        return total**2 / loss if loss > 0.0 else np.inf
 
 
 def record_errors(
@@ -151,9 +154,9 @@ def record_errors(
     noise = noise_in(white, left)
     covariance, effective = sandwich(white, left, noise)
     sources = {NOISE: covariance}
-    beyond = between_blocks(white, left, covariance, len(problem.free))
-    if beyond is not None:
-        sources[MODEL] = beyond
+    by_model = between_blocks(white, left, covariance, len(problem.free))
+    if by_model is not None:
+        sources[MODEL_ERROR] = by_model
     so_far = np.asarray(sum(sources.values()))
     scatter = between_records(white, left, so_far, len(problem.free), problem.runs)
     if scatter is not None:
@@ -186,15 +189,18 @@ def record_errors(
         if not problem.model.rate_independent:
             count_change(WINDOW, problem.differentiated_in(_OTHER_WINDOW * problem.window))
         if problem.with_memory and not problem.displacement_noise:
+            unit = covariance.diagonal()
+            unit = np.sqrt(np.where(np.isfinite(unit) & (unit > 0.0), unit, 1.0))
             more = noise_at_turns(problem, values, white, left, noise)
-            count(TURNS, _beyond(more, sources.get(DISPLACEMENT, 0.0 * moved), covariance))
+            beyond = (more - sources.get(DISPLACEMENT, 0.0)) / np.outer(unit, unit)
+            count(TURNS, positive_part(beyond) * np.outer(unit, unit))
             count_change(SAMPLING, problem.altered("latest", motions=_beyond_samples(problem)))
     of_motion = {
         name: C for name, C in sources.items() if name in (DISPLACEMENT, TURNS, SAMPLING, DELAY)
     }
     alike = after_reversals(problem, values, white, left, slopes, of_motion.values())
     if alike is not None:
-        sources[PATH] = alike[0]
+        sources[AFTER_REVERSALS] = alike[0]
     scale = np.zeros(values.size)
     for i, parameter in enumerate(problem.free):
         scale[i] = values[i] * parameter.dimension[0]
@@ -324,14 +330,6 @@ def _by_drive(
     return np.asarray(np.where(np.isfinite(known), known, 0.0) * np.outer(size, size))
 
 
-def _beyond(larger: FloatArray, known: FloatArray, unit: FloatArray) -> FloatArray:
-    """Return by how much a covariance exceeds a known one, where it does; counted in a third."""
-    size = unit.diagonal()
-    size = np.sqrt(np.where(np.isfinite(size) & (size > 0.0), size, 1.0))
-    values, vectors = np.linalg.eigh((larger - known) / np.outer(size, size))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size))
-
-
 def _by_displacement(
     problem: RecordProblem,
     values: FloatArray,
@@ -406,47 +404,6 @@ def _change_of(
         return np.asarray(inverse @ sum(J.T @ y for J, y in parts))
 
     return change
-
-
-def record_budget(problem: RecordProblem, values: FloatArray, errors: RecordErrors) -> Budget:
-    """Return the uncertainty budget of the model's free parameters."""
-    count = len(problem.free)
-    total = errors.covariance
-    parameters = []
-    for i, parameter in enumerate(problem.free):
-        u2 = float(total[i, i])
-        rows = []
-        for source, covariance in errors.contributions.items():
-            kind: Literal["A", "B"] = "A" if source in (NOISE, MODEL, RUNS) else "B"
-            part = float(covariance[i, i])
-            dof = errors.dof_of(source)
-            share = float(np.isinf(part)) if np.isinf(u2) else part / u2 if u2 > 0.0 else 0.0
-            rows.append(BudgetRow(source, kind, part**0.5, dof, share))
-        dof = errors.dof_for(i)
-        rows.sort(key=lambda row: -row.u)
-        parameters.append(
-            ParameterBudget(
-                parameter.name, parameter.unit, float(values[i]), tuple(rows), u2**0.5, dof,
-                coverage_factor(dof),
-            )
-        )  # fmt: skip
-    return Budget(tuple(parameters), total[:count, :count], errors.exact)
-
-
-def variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the variances of quantities with these derivatives with respect to the estimate.
-
-    Infinite where one depends on a value that is not determined at all.
-
-    Examples
-    --------
-    >>> variances(np.array([[2.0, 0.0], [0.0, 1.0]]), np.diag([1.0, np.inf])).tolist()
-    [4.0, inf]
-    """
-    endless = np.isinf(covariance.diagonal())
-    finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    sums = np.maximum(np.einsum("ij,jk,ik->i", slopes, finite, slopes), 0.0)
-    return np.where((slopes[:, endless] != 0.0).any(axis=1), np.inf, sums)
 
 
 def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:

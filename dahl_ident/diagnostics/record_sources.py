@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.contributions import positive_part
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements.recursion import stretches
@@ -349,8 +350,7 @@ def _excess(
     ratio = between.diagonal() / by_chance.diagonal()
     if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[judged].any():
         return None
-    variances, vectors = np.linalg.eigh(between - by_chance)
-    return np.asarray((vectors * np.maximum(variances, 0.0)) @ vectors.T * np.outer(size, size))
+    return positive_part(between - by_chance) * np.outer(size, size)
 
 
 def after_reversals(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dahl_ident.bayes.row_errors import RowErrors
+from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.error_sources import NOISE, RUNS
 
 _SAME = 1e-6  # of the noise's variance: as stated
 

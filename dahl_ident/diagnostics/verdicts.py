@@ -29,9 +29,8 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
 from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, coverage_factor, level_text, thresholds
+from dahl_ident.diagnostics.contributions import EXPONENT, MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.error_sources import MODEL_ERROR, RUNS
-from dahl_ident.diagnostics.estimate import EXPONENT
 from dahl_ident.diagnostics.formatting import interval as interval_text
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import Information

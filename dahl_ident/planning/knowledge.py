@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.data import FrequencyResponse
+from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.error_sources import NOISE, RUNS
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.element import as_model
 from dahl_ident.errors import HIGH, LOW, ValidationError, argument, choices

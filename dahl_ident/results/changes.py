@@ -10,7 +10,7 @@ from typing import Any
 
 from scipy import special
 
-from dahl_ident.diagnostics.error_sources import RUNS
+from dahl_ident.diagnostics.contributions import RUNS
 from dahl_ident.diagnostics.formatting import rounded
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.errors import FitError, ValidationError

@@ -24,8 +24,8 @@ from dahl_ident.bayes.sample import (
     starting_points,
 )
 from dahl_ident.data.columns import one_of
-from dahl_ident.diagnostics.error_sources import NOISE
-from dahl_ident.diagnostics.estimate import EXPONENT, with_assumed
+from dahl_ident.diagnostics.contributions import EXPONENT, NOISE
+from dahl_ident.diagnostics.estimate import with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
@@ -438,7 +438,7 @@ def _record_density(
     """Return the density around a fit of records."""
     problem, values, errors = fit.problem, fit.optimum.values, fit.errors
     sources = tuple(name for name, part in errors.contributions.items() if part.any())
-    covariance, dof = fit.covar, errors.dof
+    covariance, dof = fit.covar, errors.least_dof
     if uncertainty == "noise":
         sources, covariance, dof = (NOISE,), errors.contributions[NOISE], errors.dof_of(NOISE)
     prior, count = joint_prior(problem, priors, values), problem.n_reported

@@ -1,0 +1,83 @@
+"""What the sources of error contribute to the uncertainty of an estimate.
+
+Tables and records list their sources each in their own way; a source gives the covariance that it
+adds, and the covariance of the estimate is the sum (JCGM 100:2008).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+
+NOISE = "noise"
+MODEL_ERROR = "model error"
+HARMONICS = "model error of harmonics"
+AFTER_REVERSALS = "model error after each reversal"
+RUNS = "scatter between runs"
+LEVELS = "scatter between repeated levels"
+APART = "suspicious points"
+TESTS = "jackknife over tests"
+TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, AFTER_REVERSALS, RUNS, LEVELS, APART, TESTS)
+"""Sources whose size is estimated from the scatter of the data."""
+EXPONENT = "exponent"
+DRIVE_FACTOR = "drive factor"
+CHANNELS = {
+    "force_gain": "force calibration",
+    "displacement_gain": "displacement calibration",
+    "delay": "delay between the channels",
+}
+"""Sources by the name of the sensors' parameter."""
+
+
+class Errors(ABC):
+    """An estimate's covariance by source of error, in the coordinates of the estimate.
+
+    Examples
+    --------
+    >>> class Two(Errors):
+    ...     contributions = {"noise": np.eye(2), "exponent": np.diag([3.0, np.inf])}
+    ...     def dof(self, direction, source=None):
+    ...         return np.inf
+    >>> Two().std(np.eye(2)).tolist()
+    [2.0, inf]
+    """
+
+    contributions: Mapping[str, FloatArray]  # (Q, Q) each, noise first
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """All sources together, (Q, Q)."""
+        return np.asarray(sum(self.contributions.values()))
+
+    def std(self, directions: FloatArray) -> FloatArray:
+        """Return the combined standard uncertainty of directions . theta, for (..., Q)."""
+        return np.asarray(np.sqrt(variances(directions, self.covariance)))
+
+    @abstractmethod
+    def dof(self, direction: FloatArray, source: str | None = None) -> float:
+        """Return the effective degrees of freedom of u of direction . theta, or of a source's."""
+
+
+def variances(directions: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the variances of directions (..., Q) . theta, infinite where they depend on one.
+
+    Examples
+    --------
+    >>> variances(np.array([[2.0, 0.0], [0.0, 1.0]]), np.diag([1.0, np.inf])).tolist()
+    [4.0, inf]
+    """
+    endless = np.isinf(np.diagonal(covariance))
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    sums = np.maximum(np.einsum("...i,ij,...j->...", directions, finite, directions), 0.0)
+    return np.where((directions[..., endless] != 0.0).any(axis=-1), np.inf, sums)
+
+
+def positive_part(C: FloatArray) -> FloatArray:
+    """Return the positive semidefinite part of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(C)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
