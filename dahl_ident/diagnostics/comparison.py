@@ -29,7 +29,7 @@ from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
 from dahl_ident.diagnostics.physics import is_spring, negative_parameters
 from dahl_ident.diagnostics.predictive_density import PredictiveDensity, predictive_density
-from dahl_ident.diagnostics.record_errors import RELATIVE_STEP
+from dahl_ident.diagnostics.record_channels import RELATIVE_STEP
 from dahl_ident.diagnostics.slip_density import FAR_LESS, least_misfit
 from dahl_ident.diagnostics.verdicts import NOT_IDENTIFIED_ABOVE
 from dahl_ident.elements import (

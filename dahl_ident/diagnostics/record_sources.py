@@ -1,4 +1,4 @@
-"""Sources of error of a fit to records other than noise: model, scatter between runs, exponents.
+"""What records show of a fit's errors: noise, model, scatter between runs, values that it holds.
 
 What a model misses differs from place to place, and what a device does from run to run. Blocks of
 the records, or whole records, then ask for other parameters; the scatter beyond that of noise
@@ -8,7 +8,9 @@ counts as a separate error.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.contributions import positive_part
-from dahl_ident.diagnostics.correlated_residuals import inverse_normal, sandwich
+from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import FitError
@@ -32,6 +34,108 @@ _ALONE = 1e-6  # of a direction, determined by others: a group without others sh
 _PATHS = 5  # groups of the path since the last reversal, by factors of e
 _LONG = 0.05  # step of an exponent's logarithm, beyond which slopes change
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """A fit of records to first order; waves of each record are filtered as the fit weighs them.
+
+    Attributes
+    ----------
+    values : ndarray, shape (P,)
+        The estimate.
+    jacobians, residuals : sequence of ndarray, shapes (n, P) and (n,)
+        Derivatives of each record's prediction, and measured minus predicted.
+    noise : sequence of ndarray
+        Autocovariances of the residuals' noise.
+    judged : ndarray of bool, shape (P,)
+        The parameters in which a misfit shows: not the states and offsets of records.
+    """
+
+    problem: RecordProblem
+    values: FloatArray
+    jacobians: Sequence[FloatArray]
+    residuals: Sequence[FloatArray]
+    noise: Sequence[FloatArray]
+    judged: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        problem: RecordProblem,
+        values: FloatArray,
+        jacobians: Sequence[FloatArray],
+        residuals: Sequence[FloatArray],
+    ) -> LinearFit:
+        """Return the fit with these waves, not filtered yet."""
+        J, e = ([problem.filtered(wave) for wave in waves] for waves in (jacobians, residuals))
+        judged = np.arange(values.size) < len(problem.free)
+        return cls(problem, values, J, e, noise_in(J, e), judged)
+
+    @cached_property
+    def by_noise(self) -> tuple[FloatArray, float]:
+        """Covariance of the estimate from noise, and the effective number of samples."""
+        return sandwich(self.jacobians, self.residuals, self.noise)
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """Inverse of the normal matrix, (P, P)."""
+        return inverse_normal(self.jacobians)
+
+    @cached_property
+    def outputs(self) -> Sequence[FloatArray]:
+        """Predicted outputs."""
+        return self.problem.outputs(self.values)
+
+    @cached_property
+    def exponent_slopes(self) -> Mapping[str, Sequence[FloatArray]]:
+        """Derivatives of the outputs with respect to ln of each exponent that the fit holds.
+
+        Nothing where there is no motion next to the estimate.
+        """
+        problem = self.problem
+        if not problem.exponents:
+            return {}
+        free = problem.freed([p.name for p in problem.exponents])
+        known = {p.name: p.value for p in problem.exponents}
+        known |= dict(zip(problem.names, self.values.tolist(), strict=True))
+        at = np.array([known[name] for name in free.names], dtype=np.float64)
+        try:
+            by = [free.predict(at, number).by for number in range(len(problem.records))]
+        except FitError:
+            return {}
+        places = {p.name: free.names.index(p.name) for p in problem.exponents}
+        return {
+            name: [problem.filtered(at[i] * slopes[:, i]) for slopes in by]
+            for name, i in places.items()
+        }
+
+    def with_freed(self, *slopes: Sequence[FloatArray]) -> LinearFit:
+        """Return the fit with more parameters, which come last, of these derivatives."""
+        joint = [np.column_stack(waves) for waves in zip(self.jacobians, *slopes, strict=True)]
+        judged = np.append(self.judged, np.ones(len(slopes), dtype=bool))
+        return replace(self, jacobians=joint, judged=judged)
+
+    def projected(self, waves: Sequence[FloatArray]) -> FloatArray:
+        """Return the change of the estimate by filtered changes of the measured outputs."""
+        parts = zip(self.jacobians, waves, strict=True)
+        return np.asarray(self.inverse @ sum(J.T @ y for J, y in parts))
+
+    def changed(self, outputs: Sequence[FloatArray]) -> FloatArray:
+        """Return the change of the estimate by changes of the measured outputs."""
+        return self.projected([self.problem.filtered(y) for y in outputs])
+
+    def change_to(self, other: RecordProblem) -> FloatArray:
+        """Return the change of the estimate if another problem is the right one."""
+        ends = zip(self.outputs, other.outputs(self.values), strict=True)
+        return self.changed([b - a for a, b in ends])
+
+    @cached_property
+    def variances(self) -> FloatArray:
+        """Variances of the values by noise and by scatter between blocks, (P,)."""
+        covariance, _ = self.by_noise
+        beyond = between_blocks(self)
+        return np.diagonal(covariance if beyond is None else covariance + beyond)
 
 
 @dataclass(frozen=True)
@@ -84,50 +188,23 @@ class HeldValue:
         return f"{self.name} between {low:g} and {high:g} (here {here})"
 
 
-def held_exponents(
-    problem: RecordProblem,
-    values: FloatArray,
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    noise: Sequence[FloatArray],
-    slopes: Mapping[str, Sequence[FloatArray]],
-) -> tuple[HeldValue, ...]:
+def held_exponents(fit: LinearFit) -> tuple[HeldValue, ...]:
     """Return what the records say of each exponent that the fit holds, stated or not.
 
     By a search with a stated exponent free; with an assumed one, which the estimate fits already,
     by a Gauss-Newton step, and a search where that leads far. As for tables, the range counts as a
     uniform distribution of the logarithm, and for less where the records say more.
-
-    Parameters
-    ----------
-    problem : RecordProblem
-    values : ndarray, shape (P,)
-        The estimate.
-    jacobians, residuals : sequence of ndarray
-        Of each record, filtered as the estimate weighs them.
-    noise : sequence of ndarray
-        Autocovariances of the residuals' noise.
-    slopes : mapping of str to sequence of ndarray
-        Those of `exponent_slopes`.
-
-    Returns
-    -------
-    tuple of HeldValue
     """
-    place = len(problem.free)
     held = []
-    for p in (p for p in problem.exponents if p.name in slopes):
-        waves = zip(jacobians, slopes[p.name], strict=True)
-        joint = [np.insert(J, place, wave, axis=1) for J, wave in waves]
-        step, moved = _freed(joint, residuals, place)
+    for p in (p for p in fit.problem.exponents if p.name in fit.exponent_slopes):
+        freed = _Freed.of(fit, fit.exponent_slopes[p.name])
         value, limits = float(p.value or 1.0), p.prior or (1.0, 1.0)
         low, high = (float(np.log(end / value)) for end in limits)
         low, high = min(low, 0.0), max(high, 0.0)
-        asked, s = float(step[place]), (high - low) / 12.0**0.5
-        mean = float(np.clip(asked, low, high))
-        std, by_records, contribution = _counted(joint, residuals, noise, place, mean, s, moved)
+        asked, by_records = freed.asked, freed.variance**0.5
+        std, contribution = freed.counted(float(np.clip(asked, low, high)), (high - low) / 12**0.5)
         if not p.assumed or abs(asked) > max(_LONG, _CONTRADICTED * by_records):
-            asked, by_records = _asked(problem, p.name, values) or (asked, by_records)
+            asked, by_records = _asked(fit, p.name) or (asked, by_records)
         held.append(
             HeldValue(
                 p.name, p.unit, value, limits, std, asked, by_records, contribution, p.assumed
@@ -136,38 +213,17 @@ def held_exponents(
     return tuple(held)
 
 
-def exponent_slopes(problem: RecordProblem, values: FloatArray) -> dict[str, list[FloatArray]]:
-    """Return the filtered derivatives of each output with respect to ln of each exponent.
-
-    Nothing where there is no exponent that the fit holds, or no motion next to the estimate.
-    """
-    exponents = problem.exponents
-    if not exponents:
-        return {}
-    free = problem.freed([p.name for p in exponents])
-    known = {p.name: p.value for p in exponents} | dict(zip(problem.names, values, strict=True))
-    at = np.array([known[name] for name in free.names], dtype=np.float64)
-    try:
-        by = [free.predict(at, number).by for number in range(len(problem.records))]
-    except FitError:
-        return {}
-    places = {p.name: free.names.index(p.name) for p in exponents}
-    return {
-        name: [problem.filtered(at[i] * slopes[:, i]) for slopes in by]
-        for name, i in places.items()
-    }
-
-
-def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float, float] | None:
+def _asked(fit: LinearFit, name: str) -> tuple[float, float] | None:
     """Return the logarithm of an exponent's estimate over its value, and its standard deviation.
 
     The displacement's noise is estimated anew: what was taken out of the records with the exponent
     held may be misfit. None where that describes the records better.
     """
+    problem = fit.problem
     search, free = RecordSearch("lm", "linear"), problem.freed([name])
     place = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
-    begin = free.to_search(np.insert(values, place, value))
+    begin = free.to_search(np.insert(fit.values, place, value))
     held, free = float(free.quadratic(begin).cost), free.without_noise(0.0)
     end = search.descend(free, begin, STEPS)
     if problem.output == "force":
@@ -176,103 +232,65 @@ def _asked(problem: RecordProblem, name: str, values: FloatArray) -> tuple[float
         return None
     at = free.to_values(end.theta[0])
     predicted = [free.predict(at, number) for number in range(len(problem.records))]
-    J = [free.filtered(p.by) for p in predicted]
-    e = [free.filtered(y - p.output) for y, p in zip(free.measured, predicted, strict=True)]
-    u = _variance(J, e, place) ** 0.5
+    e = [y - p.output for y, p in zip(free.measured, predicted, strict=True)]
+    u = float(LinearFit.of(free, at, [p.by for p in predicted], e).variances[place]) ** 0.5
     return float(np.log(at[place] / value)), u / float(at[place])
 
 
-def by_delay(
-    problem: RecordProblem,
-    values: FloatArray,
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    noise: Sequence[FloatArray],
-) -> FloatArray:
+def by_delay(fit: LinearFit) -> FloatArray:
     """Return the covariance of the estimate through the delay, which the user did not state.
 
     A normal distribution of one sample counts, and for less where the records say more; the
     estimated delay is taken out already.
     """
-    place = len(problem.free)
-    sample = 1.0 / problem.records[0].sample_rate
-    slopes = [problem.filtered(slope * sample) for slope in problem.delay_slopes(values)]
-    joint = [np.insert(J, place, s, axis=1) for J, s in zip(jacobians, slopes, strict=True)]
-    step, moved = _freed(joint, residuals, place)
-    return _counted(joint, residuals, noise, place, float(step[place]), 1.0, moved)[-1]
+    sample = 1.0 / fit.problem.records[0].sample_rate
+    slopes = fit.problem.delay_slopes(fit.values)
+    freed = _Freed.of(fit, [fit.problem.filtered(slope * sample) for slope in slopes])
+    return freed.counted(freed.asked, 1.0)[1]
 
 
-def _freed(
-    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray], place: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step, and how the other values change with that at `place`."""
-    inverse = inverse_normal(jacobians)
-    step = inverse @ sum(J.T @ e for J, e in zip(jacobians, residuals, strict=True))
-    moved = np.delete(inverse[:, place], place)
-    if not any(J[:, place].any() for J in jacobians):  # such as a delay where nothing drives
-        return step, np.zeros(moved.size)
-    return step, moved / inverse[place, place]
+class _Freed(NamedTuple):
+    """A value that a fit holds, estimated too by a Gauss-Newton step."""
+
+    asked: float  # how far the records move it
+    variance: float  # of that
+    moved: FloatArray  # changes of the other values with it
+
+    @classmethod
+    def of(cls, fit: LinearFit, slopes: Sequence[FloatArray]) -> _Freed:
+        """Return the value of which the outputs have these derivatives."""
+        joint = fit.with_freed(slopes)
+        moved = np.zeros(fit.values.size)
+        if any(slope.any() for slope in slopes):  # a delay has none where nothing drives
+            moved = joint.inverse[:-1, -1] / joint.inverse[-1, -1]
+        asked = float(joint.projected(joint.residuals)[-1])
+        return cls(asked, float(joint.variances[-1]), moved)
+
+    def counted(self, mean: float, s: float) -> tuple[float, FloatArray]:
+        """Return the standard deviation of the value, and the covariance that it makes.
+
+        `mean` is the estimate by the records, `s` the standard deviation of what is known
+        beforehand.
+        """
+        std, u2 = s, self.variance
+        if np.isfinite(u2):
+            s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
+            weight = s**2 / (s**2 + u2)
+            mean, std = mean * weight, (u2 * weight) ** 0.5
+        else:
+            mean = 0.0
+        change = self.moved * max(std, abs(mean))
+        return std, np.outer(change, change)
 
 
-def _counted(
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    noise: Sequence[FloatArray],
-    place: int,
-    mean: float,
-    s: float,
-    moved: FloatArray,
-) -> tuple[float, float, FloatArray]:
-    """Return the std of a held value, its std by the records alone, and what it moves.
-
-    `mean` is the estimate by the records, `s` the standard deviation of what is known beforehand.
-    """
-    u2, std = _variance(jacobians, residuals, place, noise), s
-    if np.isfinite(u2):
-        s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
-        weight = s**2 / (s**2 + u2)
-        mean, std = mean * weight, (u2 * weight) ** 0.5
-    else:
-        mean = 0.0
-    change = moved * max(std, abs(mean))
-    return std, u2**0.5, np.outer(change, change)
-
-
-def _variance(
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    place: int,
-    noise: Sequence[FloatArray] | None = None,
-) -> float:
-    """Return the variance of one value by noise and by scatter between blocks."""
-    covariance, _ = sandwich(jacobians, residuals, noise)
-    beyond = between_blocks(jacobians, residuals, covariance, place + 1)
-    return float((covariance if beyond is None else covariance + beyond)[place, place])
-
-
-def between_blocks(
-    jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray], noise: FloatArray, count: int
-) -> FloatArray | None:
-    """Return the covariance between blocks beyond that of noise, or None where it shows none.
-
-    Parameters
-    ----------
-    jacobians, residuals : sequence of ndarray
-        Of each record.
-    noise : ndarray, shape (P, P)
-        Covariance of the estimate from noise.
-    count : int
-        For how many parameters, the first ones, it is judged whether it exceeds noise.
-
-    Returns
-    -------
-    ndarray or None
-    """
-    samples = sum(e.size for e in residuals)
-    if samples < BLOCKS * BLOCKS:
+def between_blocks(fit: LinearFit) -> FloatArray | None:
+    """Return the covariance between blocks beyond that of noise, or None where it shows none."""
+    if sum(e.size for e in fit.residuals) < BLOCKS * BLOCKS:
         return None
-    blocks = [(jacobians[i][rows], residuals[i][rows]) for i, rows in blocks_of(residuals)]
-    return _beyond(blocks, noise, count, _LEVEL)
+    blocks = [
+        (fit.jacobians[i][rows], fit.residuals[i][rows]) for i, rows in blocks_of(fit.residuals)
+    ]
+    return _beyond(blocks, fit.by_noise[0], fit.judged, _LEVEL)
 
 
 def blocks_of(waves: Sequence[FloatArray]) -> list[tuple[int, NDArray[np.intp]]]:
@@ -287,30 +305,28 @@ def blocks_of(waves: Sequence[FloatArray]) -> list[tuple[int, NDArray[np.intp]]]
     ]
 
 
-def between_records(
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    known: FloatArray,
-    count: int,
-    runs: Sequence[int],
-) -> FloatArray | None:
+def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
     """Return the covariance between records beyond the `known` one, or None; see above.
 
     The deviations of a whole record count once, however many samples it has, and in however many
-    parts it is: `runs` says which record each part is of.
+    parts it is: the problem's `runs` say which record each part is of.
     """
-    if len(set(runs)) < 2:
+    runs = np.asarray(fit.problem.runs)
+    if np.ptp(runs) == 0:
         return None
-    whole: list[tuple[FloatArray, FloatArray]] = []
-    for run in sorted(set(runs)):
-        members = [i for i, run_of_record in enumerate(runs) if run_of_record == run]
-        J, e = ([parts[i] for i in members] for parts in (jacobians, residuals))
-        whole.append((J[0], e[0]) if len(members) == 1 else (np.concatenate(J), np.concatenate(e)))
-    return _beyond(whole, known, count, _RUNS_LEVEL)
+    whole = []
+    for run in np.unique(runs):
+        members = np.flatnonzero(runs == run).tolist()
+        J, e = ([waves[i] for i in members] for waves in (fit.jacobians, fit.residuals))
+        whole.append((np.concatenate(J), np.concatenate(e)))
+    return _beyond(whole, known, fit.judged, _RUNS_LEVEL)
 
 
 def _beyond(
-    blocks: Sequence[tuple[FloatArray, FloatArray]], noise: FloatArray, count: int, level: float
+    blocks: Sequence[tuple[FloatArray, FloatArray]],
+    noise: FloatArray,
+    judged: NDArray[np.bool_],
+    level: float,
 ) -> FloatArray | None:
     """Return the covariance between blocks beyond `noise`, or None where chance explains it.
 
@@ -321,7 +337,7 @@ def _beyond(
         return None
     if seen.size < len(noise):
         visible, inside = [(J[:, seen], e) for J, e in blocks], noise[np.ix_(seen, seen)]
-        excess = _beyond(visible, inside, int((seen < count).sum()), level)
+        excess = _beyond(visible, inside, judged[seen], level)
         return None if excess is None else _embedded(excess, seen, len(noise))
     size = np.sqrt(noise.diagonal())
     scores = [size * (J.T @ e) for J, e in blocks]
@@ -330,7 +346,6 @@ def _beyond(
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
     weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
-    judged = np.arange(len(noise)) < count
     return _excess(between, noise / np.outer(size, size), weights, judged, level, size)
 
 
@@ -354,12 +369,7 @@ def _excess(
 
 
 def after_reversals(
-    problem: RecordProblem,
-    values: FloatArray,
-    jacobians: Sequence[FloatArray],
-    residuals: Sequence[FloatArray],
-    slopes: Mapping[str, Sequence[FloatArray]],
-    of_displacement: Iterable[FloatArray],
+    fit: LinearFit, of_displacement: Iterable[FloatArray]
 ) -> tuple[FloatArray, int] | None:
     """Return the covariance by what the model misses alike after every reversal.
 
@@ -371,13 +381,7 @@ def after_reversals(
 
     Parameters
     ----------
-    problem : RecordProblem
-    values : ndarray, shape (P,)
-        The estimate.
-    jacobians, residuals : sequence of ndarray
-        Of each record.
-    slopes : mapping of str to sequence of ndarray
-        Those of `exponent_slopes`.
+    fit : LinearFit
     of_displacement : iterable of ndarray, shape (P, P)
         Covariances by errors of the displacement, which also show after reversals.
 
@@ -387,18 +391,20 @@ def after_reversals(
         What exceeds noise, and the number of groups. None where chance explains it, or nothing
         remembers a reversal.
     """
-    paths = _paths(problem, values) if problem.with_memory else []
+    problem, residuals = fit.problem, fit.residuals
+    paths = _paths(fit) if problem.with_memory else []
     farthest = max((float(path.max()) for path in paths), default=0.0)
     if not farthest > 0.0:
         return None
+    slopes = fit.exponent_slopes
     assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
-    joint = [np.column_stack(parts) for parts in zip(jacobians, *assumed, strict=True)]
-    noise, count = sandwich(joint, residuals)[0], jacobians[0].shape[1]
+    joint = fit.with_freed(*assumed)
+    noise, count = sandwich(joint.jacobians, residuals)[0], fit.values.size
     for covariance in of_displacement:
         noise[:count, :count] += covariance
     seen = np.flatnonzero(np.isfinite(noise.diagonal()) & (noise.diagonal() > 0.0))
     size = np.sqrt(noise.diagonal()[seen])
-    J, e = size * np.concatenate(joint)[:, seen], np.concatenate(residuals)
+    J, e = size * np.concatenate(joint.jacobians)[:, seen], np.concatenate(residuals)
     ends = [path[path.size - len(wave) :] for path, wave in zip(paths, residuals, strict=True)]
     path = np.maximum(np.concatenate(ends), farthest * np.exp(1.0 - _PATHS))
     group = np.floor(np.log(farthest / path) + _ROUNDING)
@@ -414,19 +420,19 @@ def after_reversals(
         shares.append((root @ share @ root).diagonal())
     between = np.array(steps).T @ np.array(steps)
     by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size)
-    judged = (seen < len(problem.free)) | (seen >= count)  # not states and offsets of records
-    beyond = _excess(between, by_chance, np.array(shares), judged, _LEVEL, size)
+    beyond = _excess(between, by_chance, np.array(shares), joint.judged[seen], _LEVEL, size)
     if beyond is None:
         return None
     return _embedded(beyond, seen, len(noise))[:count, :count], len(members)
 
 
-def _paths(problem: RecordProblem, values: FloatArray) -> list[FloatArray]:
+def _paths(fit: LinearFit) -> list[FloatArray]:
     """Return the path of every sample since the last reversal, m; none where it is not known."""
+    problem = fit.problem
     if problem.output == "force":
         return [stretches(x).path for x, _, _ in problem.motions]
     if all(record.motion_channel == "displacement" for record in problem.records):
-        return [stretches(x).path for x in problem.outputs(values)]
+        return [stretches(x).path for x in fit.outputs]
     return []
 
 

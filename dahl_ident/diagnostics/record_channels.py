@@ -1,0 +1,320 @@
+"""What errors of the measured channels do to a fit of records: noise, calibration, delay, window.
+
+A friction force goes on from where the motion turned. So an error of the displacement at a turning
+point stays in the force for some x_c of path, where the parameters show most, while elsewhere it
+passes. White noise is seen in the displacement itself; a correlated error, such as that of an
+encoder between its lines, is hidden by the motion, but not in the residuals after each reversal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, special
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.contributions import CHANNELS, positive_part
+from dahl_ident.diagnostics.correlated_residuals import correlated, sandwich
+from dahl_ident.diagnostics.record_sources import LinearFit, by_delay
+from dahl_ident.elements.recursion import stretches
+from dahl_ident.errors import FitError
+from dahl_ident.problem.record_noise import LEADS, drive_noise
+from dahl_ident.problem.record_problem import RecordProblem
+
+_SLIGHT = 1e-6  # relative: noise of the drive below does not count
+_MATTERS = 0.2  # standard errors that a source may shift without being counted
+_DRIVE_DRAWS = 4, 16  # of the drive's noise, least and most: the latter know it to a third
+_DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
+_BENT = 6.0  # times the displacement's noise: exceeded by a second difference by chance once in 100
+_OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
+_DRAWS = 8  # of noise: the mean square of what they change is known to a half
+_MOST = 40  # turning points of a record that are looked at
+_STEP = 1e-5  # of the displacement's range, for slopes
+_HIDDEN = 10.0  # times the noise in differences: a correlation of 0.98 leaves a tenth
+_FORGOTTEN = 1e-3  # of a pattern's peak, below which the force has forgotten the turn
+RELATIVE_STEP = 1e-5
+"""Relative step of parameters for the slopes of quantities that follow from them."""
+FORCE, DISPLACEMENT_GAIN, DELAY = CHANNELS.values()
+DRIVE = "noise in the drive"
+DISPLACEMENT = "noise in the displacement"
+TURNS = "displacement at turning points"
+SAMPLING = "turning points between samples"
+WINDOW = "window of differentiation"
+
+IntArray = NDArray[np.intp]
+
+
+def motion_sources(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
+    """Yield what errors of the motion contribute, where they widen an interval of the model's.
+
+    Noise in a measured displacement counts as far as it shifts the estimate; where the residuals
+    show larger errors of the displacement at turning points, what these shift beyond that; and so
+    does what samples miss of the turning points that lie between them.
+    """
+    problem = fit.problem
+    if "delay" not in problem.calibration:
+        with suppress(FitError):  # no motion next to the estimate
+            yield from _if_it_matters(fit, DELAY, by_delay(fit))
+    if problem.output != "force":
+        return
+    moved = np.zeros(fit.inverse.shape)
+    for name, moved in _if_it_matters(fit, DISPLACEMENT, _by_displacement(fit)):
+        yield name, moved
+    if not problem.model.rate_independent:
+        other = problem.differentiated_in(_OTHER_WINDOW * problem.window)
+        yield from _if_it_matters(fit, WINDOW, _squared(fit.change_to(other)))
+    if problem.with_memory and not problem.displacement_noise:
+        u2 = fit.by_noise[0].diagonal()
+        unit = np.sqrt(np.where(np.isfinite(u2) & (u2 > 0.0), u2, 1.0))
+        units = np.outer(unit, unit)
+        beyond = positive_part((_at_turns(fit) - moved) / units) * units
+        yield from _if_it_matters(fit, TURNS, beyond)
+        farther = problem.altered("latest", motions=_beyond_samples(problem))
+        yield from _if_it_matters(fit, SAMPLING, _squared(fit.change_to(farther)))
+
+
+def _if_it_matters(
+    fit: LinearFit, name: str, contribution: FloatArray
+) -> Iterator[tuple[str, FloatArray]]:
+    larger = contribution.diagonal() > _MATTERS**2 * fit.by_noise[0].diagonal()
+    if larger[fit.judged].any():
+        yield name, contribution
+
+
+def _squared(change: FloatArray) -> FloatArray:
+    """Return the covariance by a source that makes one change."""
+    return np.outer(change, change)
+
+
+def by_calibration(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
+    """Yield what stated calibrations contribute.
+
+    A gain changes the units of force or of displacement, and every parameter with them, if all were
+    estimated; known ones stay, which changes the others as if they had been given wrongly. A delay
+    shifts the output in time.
+    """
+    problem = fit.problem
+    for name, u in problem.calibration.items():
+        if name == "delay":
+            times = [record.time for record in problem.records]
+            pairs = zip(fit.outputs, times, strict=True)
+            change = fit.changed([np.gradient(y, t) for y, t in pairs])
+        else:
+            change = _by_gain(fit, list(CHANNELS).index(name))
+        yield CHANNELS[name], _squared(u * change)
+    stated = [r.drive_factor_uncertainty for r in problem.records]
+    factor = max((float(u) for u in stated), default=0.0)
+    if factor > 0.0 and (problem.output == "force" or problem.excitation == "force"):
+        yield FORCE, _squared(factor * _with_force(fit))
+
+
+def _by_gain(fit: LinearFit, place: int) -> FloatArray:
+    """Return the change of the estimate with ln of the unit of force (0) or displacement (1)."""
+    problem = fit.problem
+    change = np.array([p.dimension[place] for p in problem.parameters]) * fit.values
+    for p in (p for p in problem.model.parameters if not p.free and p.dimension[place]):
+        low, high = (
+            problem.with_fixed({p.name: (p.value or 0.0) * (1.0 + step)}).outputs(fit.values)
+            for step in (-RELATIVE_STEP, RELATIVE_STEP)
+        )
+        slope = [(b - a) / (2.0 * RELATIVE_STEP) for a, b in zip(low, high, strict=True)]
+        change = change + p.dimension[place] * fit.changed(slope)
+    return change
+
+
+def _with_force(fit: LinearFit) -> FloatArray:
+    """Return the change of the model's parameters with ln of every force."""
+    scale = np.zeros(fit.values.size)
+    for i, parameter in enumerate(fit.problem.free):
+        scale[i] = fit.values[i] * parameter.dimension[0]
+    return scale
+
+
+def by_drive(fit: LinearFit) -> FloatArray | None:
+    """Return what noise in a measured drive contributes; None where it cannot be estimated.
+
+    It makes the response look smaller than it is, by the noise's share of the drive's power within
+    its band, and makes the plant wander.
+    """
+    noise = drive_noise([record.force_samples for record in fit.problem.records])
+    if noise is None:
+        return None
+    wander = _by_wander(fit, noise.stds)
+    return wander + _squared(noise.share * _with_force(fit)) * (noise.share > _SLIGHT)
+
+
+def _by_wander(fit: LinearFit, stds: Sequence[float]) -> FloatArray:
+    """Return the effect of white noise in the drive on the estimate, beyond that in the residuals.
+
+    It moves the plant most where it resonates or where friction slips, and parameters are
+    determined at these places. The covariance by noise takes the residuals as equally large
+    everywhere, so that it shows such noise in part. Draws of the noise have both.
+    """
+    problem, known = fit.problem, fit.by_noise[0]
+    draws = int(np.clip(_DRIVE_SAMPLES // problem.n_residuals, *_DRIVE_DRAWS))
+    moved, seen, none = np.zeros_like(known), np.zeros_like(known), np.zeros_like(known)
+    for draw in range(draws):
+        try:
+            noisy = problem.with_noisier_drive(stds, draw).outputs(fit.values)
+        except FitError:
+            return none
+        wander = [problem.filtered(b - a) for a, b in zip(fit.outputs, noisy, strict=True)]
+        change = fit.projected(wander)
+        if not draw and not (change**2 > _MATTERS**2 * known.diagonal()).any():
+            return none
+        moved += np.outer(change, change) / draws
+        seen += sandwich(fit.jacobians, wander)[0] / draws
+    certain = np.isfinite(known.diagonal()) & (known.diagonal() > 0.0)
+    more = np.where(certain, np.maximum((moved - seen).diagonal(), 0.0), 0.0)
+    size = np.sqrt(more / np.where(certain, known.diagonal(), 1.0))
+    return np.asarray(np.where(np.isfinite(known), known, 0.0) * np.outer(size, size))
+
+
+def _by_displacement(fit: LinearFit) -> FloatArray:
+    """Return the mean square change of the estimate by the displacement's noise.
+
+    As large as that of as much noise again, in addition to the plain prediction; or, with a dead
+    band, from where in it the true displacement may be.
+    """
+    problem, noise = fit.problem, fit.problem.displacement_noise
+    if noise:
+        low, high = (problem.without_noise(noise, lead).outputs(fit.values) for lead in LEADS[::2])
+        return _squared(0.5 * fit.changed([b - a for a, b in zip(low, high, strict=True)]))
+
+    def noisier(noise: float) -> tuple[FloatArray, float]:
+        """Return the mean square change, and the mean sum of squares that the noise leaves."""
+        covariance, squares = np.zeros(fit.inverse.shape), 0.0
+        for draw in range(_DRAWS):
+            noisy = problem.with_more_noise(noise, draw).outputs(fit.values)
+            waves = [problem.filtered(b - a) for a, b in zip(fit.outputs, noisy, strict=True)]
+            change = fit.projected(waves)
+            covariance += np.outer(change, change) / _DRAWS
+            left = (y - J @ change for y, J in zip(waves, fit.jacobians, strict=True))
+            squares += sum(float(e @ e) for e in left) / _DRAWS
+        return covariance, squares
+
+    noise = problem.estimated_noise
+    covariance, left = noisier(noise)
+    squares = sum(float(e @ e) for e in fit.residuals)
+    if left <= squares:
+        return covariance
+    # rough motion looks like noise, but so much noise would leave larger residuals
+    return noisier(noise * (squares / left) ** 0.5)[0]
+
+
+def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...]:
+    """Return the motions with the turning points that lie between samples.
+
+    The motion is taken to turn at a sample. By how much it went farther follows from the parabola
+    through three samples, unless noise bends it as much.
+    """
+    least = _BENT * problem.estimated_noise
+    motions = []
+    for record, (x, v, a) in zip(problem.records, problem.motions, strict=True):
+        slope = np.diff(x) / np.diff(record.time)
+        before, after = slope[:-1], slope[1:]
+        bend = (after - before) / (record.time[2:] - record.time[:-2])
+        gap = np.minimum(np.diff(record.time)[:-1], np.diff(record.time)[1:])
+        turns = (before * after < 0.0) & (np.abs(bend) * gap**2 > least)
+        middle = before + bend * np.diff(record.time)[:-1]  # the slope at the middle sample
+        farther = x.copy()
+        farther[1:-1][turns] -= middle[turns] ** 2 / (4.0 * bend[turns])
+        motions.append((farther, v, a))
+    return tuple(motions)
+
+
+def _at_turns(fit: LinearFit) -> FloatArray:
+    """Return the covariance (P, P) of an estimate by errors of displacements at turning points.
+
+    Their variance is that by which the residuals exceed what their mean spectrum explains in the
+    directions of such errors; as it cannot be negative, its mean over a normal distribution cut
+    off at zero is taken. It is at most ten times what noise the displacement's differences show.
+    """
+    excess, strength, scatter = 0.0, 0.0, 0.0
+    moved = np.zeros(fit.inverse.shape)
+    waves = zip(fit.jacobians, fit.residuals, fit.noise, strict=True)
+    for number, (J, e, covariance) in enumerate(waves):
+        pattern, first, turns = _patterns(fit, number)
+        if not first.size:
+            continue
+        sums = np.add.reduceat(pattern[:, None] * J[first[0] :], first - first[0])
+        change = sums @ fit.inverse  # of the estimate with each turn, (k, P)
+        smooth = correlated(J, covariance)
+        crossed = np.add.reduceat(pattern[:, None] * smooth[first[0] :], first - first[0])
+        mixed = crossed @ change.T
+        explained = _between(pattern, first - first[0], covariance)
+        explained += change @ (J.T @ smooth) @ change.T - mixed - mixed.T
+        seen = np.add.reduceat(pattern * e[first[0] :], first - first[0]) - change @ (J.T @ e)
+        product = np.diag(np.add.reduceat(pattern**2, first - first[0])) - sums @ change.T
+        excess += float((seen**2).sum() - explained.trace())
+        strength += float((product**2).sum())
+        scatter += 2.0 * float((explained**2).sum())
+        moved += change.T @ change * (turns / first.size)
+    if strength == 0.0 or scatter == 0.0:
+        return moved * 0.0
+    error = scatter**0.5
+    a = excess / error
+    positive = a + np.exp(-0.5 * a**2 - special.log_ndtr(a)) / np.sqrt(2.0 * np.pi)
+    variance = min(positive * error / strength, (_HIDDEN * fit.problem.estimated_noise) ** 2)
+    return np.asarray(variance * moved)
+
+
+def _patterns(fit: LinearFit, number: int) -> tuple[FloatArray, IntArray, int]:
+    """Return derivatives of the force with respect to some turns, one after the other.
+
+    All turns are moved at once; of these, so few that each is forgotten before the next. The
+    derivatives begin at the first of them; with it the samples of the turns, and the number of all.
+    """
+    problem = fit.problem
+    x, v, a = problem.motions[number]
+    samples = stretches(x).samples
+    turns = (np.cumsum(samples) - samples)[1:]
+    chosen = turns[np.unique(np.linspace(0, turns.size - 1, min(_MOST, turns.size)).astype(int))]
+    step, pattern = _STEP * float(np.ptp(x)), x[:0]
+    while chosen.size:
+        ends = []
+        for sign in (1.0, -1.0):
+            path = x.copy()
+            path[chosen] += sign * step
+            motions = list(problem.motions)
+            motions[number] = path, v, a
+            turned = problem.altered("latest", motions=tuple(motions))
+            ends.append(turned.predict(fit.values, number, derivatives=False).output[chosen[0] :])
+        pattern = (ends[0] - ends[1]) / (2.0 * step)
+        size = np.abs(pattern)
+        last = np.abs(pattern[np.append(chosen[1:] - chosen[0], pattern.size) - 1])
+        peaks = np.maximum.reduceat(size, chosen - chosen[0])
+        if chosen.size == 1 or (last <= _FORGOTTEN * peaks)[:-1].all():
+            break
+        chosen = chosen[::2]
+    return pattern, chosen, int(turns.size)
+
+
+def _between(pattern: FloatArray, first: IntArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariances of the patterns' products with noise of such autocovariances."""
+    ends = np.append(first[1:], pattern.size)
+    size = np.abs(pattern)
+    windows = []
+    for start, end in zip(first.tolist(), ends.tolist(), strict=True):
+        beyond = size[start:end] > _FORGOTTEN * size[start:end].max()
+        windows.append(pattern[start : start + int(beyond.nonzero()[0].max(initial=0)) + 1])
+    width = max(w.size for w in windows)
+    m = fft.next_fast_len(2 * width, real=True)
+    waves = np.array([fft.rfft(w, m) for w in windows])
+    lags = np.arange(m)
+    lags[lags > m // 2] -= m
+    covariances = np.zeros((first.size, first.size))
+    for apart in range(first.size):
+        earlier = np.arange(first.size - apart)
+        later = np.arange(apart, first.size)
+        distance = np.abs((first[later] - first[earlier])[:, None] + lags)
+        near = distance < covariance.size
+        if not near.any():
+            break
+        crossed = fft.irfft(waves[earlier].conj() * waves[later], m)
+        weights = np.where(near, covariance[np.minimum(distance, covariance.size - 1)], 0.0)
+        covariances[earlier, later] = covariances[later, earlier] = (crossed * weights).sum(axis=1)
+    return covariances
