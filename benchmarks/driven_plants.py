@@ -24,7 +24,7 @@ from scipy import integrate
 
 import dahl_ident as di
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.steady_state import Shooting, Steady
+from dahl_ident.elements.driven_motion import Shooting, Steady
 
 DESTINATION = Path("docs/validation/driven_plants.md")
 SEED = 31

@@ -18,9 +18,9 @@ from benchmarks.harness import Row, median_of_pairs, print_table, seconds
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, fit_many, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element, linear_dahl
+from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.fitting import solve, solve_many
 from dahl_ident.problem import ProblemBatch, TableProblem
-from dahl_ident.steady_state import Steady
 
 TITLE = "Least squares"
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.harness import Row, median_of_pairs, print_table
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, response
+from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.ipopt import solve_ipopt
 from dahl_ident.problem import TableProblem
-from dahl_ident.steady_state import Steady
 
 LEVELS, FREQUENCIES = 12, 60
 ALLOWED = 0.5

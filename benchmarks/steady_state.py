@@ -17,7 +17,7 @@ from scipy.special import i1e
 
 from benchmarks.harness import Row, median_of_pairs, peak_bytes, print_table
 from dahl_ident import Dahl, Damper, Mass, Spring, response
-from dahl_ident.steady_state import Steady
+from dahl_ident.elements.driven_motion import Steady
 
 F_MAX, SIGMA, MASS, DAMPING, STIFFNESS = 0.1, 30.0, 0.3, 0.24, 0.3
 FREQUENCY_HZ = np.geomspace(0.01, 30.0, 500)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dahl_ident import errors, synthetic
     from dahl_ident.campaigns.population import population
     from dahl_ident.campaigns.run import campaign
+    from dahl_ident.control_interop import response
     from dahl_ident.data import FrequencyResponse, Record, read_frequency_response, read_record
     from dahl_ident.diagnostics import compare_models
     from dahl_ident.elements import (
@@ -41,13 +42,13 @@ if TYPE_CHECKING:
     from dahl_ident.reporting import report
     from dahl_ident.results import FitResult, fit, fit_many, posterior
     from dahl_ident.sensors import Sensors
-    from dahl_ident.steady_state import response
     from dahl_ident.synthetic import Experiment, load_dataset, simulate
 
 
 _ROOMS = {
     "campaigns.population": "population",
     "campaigns.run": "campaign",
+    "control_interop": "response",
     "data": "FrequencyResponse Record read_frequency_response read_record",
     "diagnostics": "compare_models",
     "elements": "Backlash BoucWen Dahl Damper Element Friction Iwan LinearSystem LuGre Mass "
@@ -57,7 +58,6 @@ _ROOMS = {
     "reporting": "report",
     "results": "FitResult fit fit_many posterior",
     "sensors": "Sensors",
-    "steady_state": "response",
     "synthetic": "Experiment load_dataset simulate",
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names.split()}

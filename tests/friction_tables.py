@@ -7,7 +7,7 @@ import numpy as np
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, response
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Element
-from dahl_ident.steady_state import Steady
+from dahl_ident.elements.driven_motion import Steady
 
 F_MAX, SIGMA = 0.1, 30.0
 X_C = F_MAX / SIGMA

@@ -8,6 +8,7 @@ import pytest
 import dahl_ident as di
 from dahl_ident import fit
 from dahl_ident.elements import describe_model
+from dahl_ident.elements.facts import Path
 from dahl_ident.errors import ModelError
 from tests.test_generic_friction import Jenkins
 
@@ -90,7 +91,7 @@ def test_a_history_that_starts_in_contact_changes_with_the_gap(start):
     x = 2.0 * np.sin(0.05 * np.arange(300.0))
     law = di.Backlash(di.Dahl(1.0, 3.0, 1.5))
     values = [1.0, 3.0, 1.5, 0.8]
-    by_gap = law.force_history_gradient(values, x, state=start).by_parameter[-1]
+    by_gap = law.history(values, Path(x), start, slopes=True).by_parameter[-1]
     ends = [law.force_history([*values[:3], 0.8 + h], x, state=start) for h in (1e-4, -1e-4)]
     slope = (ends[0] - ends[1]) / 2e-4
     assert np.max(np.abs(slope)) > 0.1
@@ -107,7 +108,7 @@ def test_a_history_behind_a_gap_is_exact(asymmetry, start):
     law = di.Backlash(inner, 0.8)
     values = [float(v) for v in law.known_values()]
     law = law.with_bound(tuple(p if p.name == "alpha" else p.freed() for p in law.parameters))
-    found = law.force_history_gradient(values, x, state=start)
+    found = law.history(values, Path(x), start, slopes=True)
     moved = [v + 1e-12 * (label == "alpha") for label, v in zip(law.labels, values, strict=True)]
     np.testing.assert_allclose(found.value, law.force_history(moved, x, state=start), atol=1e-7)
     for j, label in enumerate(law.labels):

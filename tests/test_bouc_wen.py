@@ -8,6 +8,7 @@ from scipy.integrate import quad, solve_ivp
 
 import dahl_ident as di
 from dahl_ident import BoucWen, Dahl
+from dahl_ident.elements.facts import Path
 
 LAWS = [(3.0, 1.3, 0.5), (5e4, -300.0, 1900.0), (2.0, 0.7, 0.0), (1.0, 0.0, 2.0), (4.0, -0.5, -0.2)]
 
@@ -53,7 +54,7 @@ def test_force_derivatives(law):
     rng = np.random.default_rng(4)
     x = np.cumsum(rng.standard_normal(300)) * 0.3 / max(abs(law[1]), abs(law[2]))
     point = np.array([0.3 * law[0] / max(abs(law[1]), abs(law[2])), *law])
-    gradient = BoucWen().force_history_gradient(law, x, state=point[0])
+    gradient = BoucWen().history(law, Path(x), point[0], slopes=True)
     np.testing.assert_allclose(gradient.value, history(x, point), rtol=1e-12)
     found = np.column_stack([gradient.by_state, *gradient.by_parameter])
     for i in range(4):

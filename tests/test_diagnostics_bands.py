@@ -9,8 +9,8 @@ from scipy import special
 
 import dahl_ident as di
 from dahl_ident import extract, fit, load_dataset
+from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.steady_state import Steady
 from tests.friction_tables import F_MAX, X_C, amplitudes, plant_table, table
 from tests.test_extraction_measured import crank, needs_data
 

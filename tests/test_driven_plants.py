@@ -8,8 +8,8 @@ import pytest
 
 import dahl_ident as di
 from benchmarks.driven_plants import PLANTS, scored, simulated, table
+from dahl_ident.elements.driven_motion import Shooting
 from dahl_ident.engine import band_limited, march
-from dahl_ident.steady_state import Shooting
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(2, marks=pytest.mark.long)])

@@ -6,6 +6,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from dahl_ident import Backlash, Dahl, Friction, Model, Parameter
+from dahl_ident.elements.facts import Path
 from dahl_ident.errors import ModelError
 
 pytestmark = pytest.mark.versions
@@ -172,8 +173,8 @@ def test_derivatives_of_a_law_whose_units_do_not_agree():
 def test_derivatives_of_the_force_over_time_are_those_of_the_closed_form():
     t = np.linspace(0.0, 10.0, 1500)
     x = 3.0 * (np.sin(3.0 * t) + 0.6 * np.sin(7.3 * t))
-    exact = Dahl().force_history_gradient([1.0, 2.0, 1.0], x, state=0.3)
-    ours = SlopeOfDahl(alpha=1.0).force_history_gradient([1.0, 2.0, 1.0], x, state=0.3)
+    exact = Dahl().history([1.0, 2.0, 1.0], Path(x), 0.3, slopes=True)
+    ours = SlopeOfDahl(alpha=1.0).history([1.0, 2.0, 1.0], Path(x), 0.3, slopes=True)
     assert np.max(np.abs(ours.value - exact.value)) < 1e-9
     assert np.max(np.abs(ours.by_state - exact.by_state)) < 1e-8
     for one, other in zip(ours.by_parameter[:2], exact.by_parameter[:2], strict=True):

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import i1e
 
+from dahl_ident.control_interop import response as any_response
+from dahl_ident.control_interop.force_balance import solve
 from dahl_ident.elements import Dahl, Damper, Mass, Model, Spring
 from dahl_ident.errors import (
     ModelError,
@@ -17,8 +19,6 @@ from dahl_ident.errors import (
     NoSteadyMotionWarning,
     ValidationError,
 )
-from dahl_ident.steady_state import response as any_response
-from dahl_ident.steady_state import solve
 
 FIG_7 = Dahl(f_max=0.1, sigma=30.0) + Mass(0.3) + Damper(0.24) + Spring(0.3)
 response = partial(any_response, steady="describing function")

@@ -188,7 +188,7 @@ def plan(
 
 def _known(fit: str | None, options: ModelOptions) -> Any:
     """Return the saved fit, or the model of the options."""
-    from dahl_ident.elements.element import as_model
+    from dahl_ident.elements.model import as_model
 
     if fit is not None:
         if options != ModelOptions():
@@ -377,7 +377,7 @@ def _usual_levels(truth: Element, controlled: str) -> str:
     """Return levels of displacement or force around the knee of the friction."""
     import numpy as np
 
-    from dahl_ident.elements.element import as_model
+    from dahl_ident.elements.model import as_model
 
     laws = [e for e in as_model(truth).elements if not e.is_linear]
     knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])

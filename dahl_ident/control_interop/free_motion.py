@@ -18,11 +18,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element, Model
+from dahl_ident.elements.driven_motion import NEUTRAL
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.equations import law_equations, plant_equations
+from dahl_ident.elements.model import Model
 from dahl_ident.engine import System, march, settled, translate
 from dahl_ident.errors import FitError
-from dahl_ident.steady_state.shooting import NEUTRAL
 
 _STARTS = (1.0, 0.7, 1.4, 0.5, 0.35, 0.25)  # times the estimate, as long as nothing is found
 _EVALUATIONS = 60  # from each; ten are the rule

@@ -1,15 +1,12 @@
 r"""Responses of a plant with friction: at several levels (Fig. 7), and all, with their stability.
 
-Of an exact steady motion Floquet's multipliers are known, and a disturbance grows by ln of the
-largest one each cycle. For the describing function an average over a cycle says as much: near a
-steady motion, to first order in its rate of change, the displacement phasor X obeys
-L'(s) dX/dt + (L + N(|X|)) X = u_0. A disturbance xi of X, seen along X, obeys
+A disturbance of an exact steady motion grows by ln of the largest of Floquet's multipliers each
+cycle. Near a steady motion of the describing function, to first order in its rate of change, a
+disturbance xi of the displacement phasor, seen along X, obeys
 
     L'(s) dxi/dt = -(Z xi + A N'(A) Re xi),    Z = L + N,
 
-two real equations. Their determinant is |Z|^2/|L'|^2 times d ln(A |Z|)/d ln A: a branch on which
-A |Z| falls is unstable. Their trace is -Re((2 Z + A N')/L'): it shows whether the motion is
-oscillatorily unstable.
+two real equations: a branch on which A |Z| falls is unstable.
 """
 
 from __future__ import annotations
@@ -22,14 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
-from dahl_ident.control_interop.limit_cycles import stiffness_of, stiffness_slope
+from dahl_ident.control_interop.cycles import stiffness_of, stiffness_slope
 from dahl_ident.control_interop.linear_part import split
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
+from dahl_ident.control_interop.steady_response import SteadyResponse, response
 from dahl_ident.data.columns import CONTROLLED, one_of
-from dahl_ident.elements.element import Element, Model
+from dahl_ident.elements.driven_motion import NEUTRAL, Steady
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.model import Model
 from dahl_ident.errors import ValidationError
-from dahl_ident.steady_state import Steady, SteadyResponse, response
-from dahl_ident.steady_state.shooting import NEUTRAL
 from dahl_ident.units import QUANTITIES, Quantity, converted, si_unit
 
 Kind = Literal["bode", "nyquist", "nichols"]
@@ -60,12 +58,7 @@ class LevelResponses:
     response: ComplexArray
 
     def to_control(self) -> dict[float, Any]:
-        """Return one python-control frequency response for each level.
-
-        Returns
-        -------
-        dict of float to control.FrequencyResponseData
-            By level; points without a steady amplitude are left out.
+        """Return a control.FrequencyResponseData for each level, without points that hold NaN.
 
         Examples
         --------
@@ -89,16 +82,7 @@ class LevelResponses:
         kind : {"bode", "nyquist", "nichols"}
             Gain and phase over frequency, imaginary over real part, or gain over phase.
         ax : Axes, or a sequence of two for "bode", optional
-            New where left out.
-
-        Returns
-        -------
-        Axes, or a tuple of two for "bode"
-
-        Raises
-        ------
-        ValidationError
-            If `kind` is unknown.
+            New where left out; they are returned.
         """
         from dahl_ident.plots import plot_frequency_response, plot_nichols, plot_nyquist
 
@@ -195,14 +179,6 @@ class Branches:
         Amplitudes, phases, receptances; NaN where a point has fewer than the most.
     growth_rate : ndarray
         Rate at which the worst small disturbance grows, 1/s; negative on stable branches.
-
-    Examples
-    --------
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring
-    >>> from dahl_ident.control_interop import response_branches
-    >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(-0.03) + Spring(3.0)
-    >>> response_branches(plant, 0.525, 0.114).stable.tolist()
-    [True, False, True]
     """
 
     steady: SteadyResponse
@@ -250,10 +226,9 @@ def response_branches(
     Notes
     -----
     The describing function's stability is that of slow changes of one sine; another mode may still
-    start to oscillate, see :func:`limit_cycles`. Passive plants with Dahl friction have one branch;
-    negative damping and laws such as Backlash give several. Near the end of a branch the amplitude
-    depends so steeply on the drive that harmonics of a few per cent shift it by tens of per cent,
-    which the describing function does not see.
+    start to oscillate, see :func:`limit_cycles`. Near the end of a branch the amplitude depends so
+    steeply on the drive that harmonics of a few per cent shift it by tens of per cent, which the
+    describing function does not see.
 
     Examples
     --------

@@ -26,7 +26,8 @@ from dahl_ident.arrays import (
     positive_number,
 )
 from dahl_ident.control_interop.linear_part import controller_response, rational_stiffness, split
-from dahl_ident.elements.element import Element, as_model
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.model import as_model
 from dahl_ident.elements.rational import Rational
 from dahl_ident.errors import ValidationError
 
@@ -97,22 +98,8 @@ class LoopMargins:
     def band(self, name: str, probability: float = 0.95) -> tuple[FloatArray, FloatArray]:
         """Return the central interval of a margin over the draws, at every amplitude.
 
-        Parameters
-        ----------
-        name : {"gain_margin", "phase_margin_deg", "modulus_margin"}
-            Which margin.
-        probability : float, default 0.95
-            Between 0 and 1.
-
-        Returns
-        -------
-        low, high : ndarray, shape (m,)
-            Quantiles.
-
-        Raises
-        ------
-        ValidationError
-            If the margins hold no draws.
+        `name` is that of an attribute. Two arrays of quantiles, (m,); ValidationError if the
+        margins hold no draws.
 
         Examples
         --------
@@ -133,15 +120,7 @@ class LoopMargins:
     def plot(self, ax: Any = None) -> tuple[Any, Any]:
         """Draw gain and phase margin against amplitude, with bands where there are draws.
 
-        Parameters
-        ----------
-        ax : sequence of two Axes, optional
-            For gain and phase; new ones where left out.
-
-        Returns
-        -------
-        tuple of Axes
-            Gain margin above, phase margin below.
+        `ax` are two Axes, for gain and phase, new ones where left out; they are returned.
         """
         from dahl_ident.plots import plot_margins
 

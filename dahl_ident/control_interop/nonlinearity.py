@@ -6,8 +6,9 @@ import control
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, non_negative_array
-from dahl_ident.elements.element import Element, Model, as_model
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import Sine
+from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError
 
 _AT_REST = np.zeros(())
@@ -65,19 +66,7 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return self._model
 
     def describing_function(self, A: float) -> complex:
-        """Return N(A), N/m, at one amplitude A >= 0, m; its limit at A = 0.
-
-        Raises
-        ------
-        ValidationError
-            If the amplitude is negative, NaN or infinite; it is a ValueError too.
-
-        Examples
-        --------
-        >>> from dahl_ident import Dahl
-        >>> print(FrictionNonlinearity(Dahl(f_max=1.0, sigma=3.0)).describing_function(0.0))
-        (3+0j)
-        """
+        """Return N(A), N/m, at one amplitude A >= 0, m; its limit at A = 0."""
         amplitude = non_negative_array(A, "A")
         return complex(self._model.stiffness(self._values, amplitude, _AT_REST))
 
@@ -91,17 +80,7 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return float(self._model.force(self._turns)[-1])
 
     def reset(self) -> None:
-        """Reset the history: displacement and force are zero.
-
-        Examples
-        --------
-        >>> from dahl_ident import Dahl
-        >>> friction = FrictionNonlinearity(Dahl(f_max=1.0, sigma=1.0))
-        >>> first = friction(1.0)
-        >>> friction.reset()
-        >>> friction(1.0) == first
-        True
-        """
+        """Reset the history: displacement and force are zero."""
         self._turns = [0.0]
 
     def _isstatic(self) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import ComplexArray
+from dahl_ident.control_interop import response
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.rows import row_names
 from dahl_ident.diagnostics.formatting import with_unit
@@ -20,7 +21,6 @@ from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
 from dahl_ident.problem.steady_rows import levels
-from dahl_ident.steady_state import response
 from dahl_ident.units import engineering, percent, shown_unit
 
 if TYPE_CHECKING:

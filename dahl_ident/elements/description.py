@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dahl_ident.elements.element import Element, Model, as_model
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.law_files import KINDS, class_named
+from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError, choices
 
 

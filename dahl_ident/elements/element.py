@@ -1,12 +1,12 @@
-"""Elements and their sums: what every law answers, names, plain data, checked calls, and ``+``."""
+"""Elements: what every law answers, its mathematics in plain numbers and in checked calls."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,22 +21,28 @@ from dahl_ident.arrays import (
     real_array,
     whole_number,
 )
-from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.elements.facts import (
+    Alternative,
+    Asymptote,
+    Combination,
     HistoryGradient,
+    Mechanics,
+    Orders,
     Path,
     Sine,
     StiffnessGradient,
+    UniversalCurve,
     Values,
 )
 from dahl_ident.elements.law_files import file_of, register, restored
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
-Value = TypeVar("Value")
+if TYPE_CHECKING:
+    from dahl_ident.elements.model import Model
 
 
-class Element(Behaviour):
+class Element(ABC):
     """Part of a mechanism: Z(A, omega) = F/X, its share of the dynamic stiffness.
 
     Elements act in parallel: ``+`` adds their forces at one displacement. A number given to an
@@ -75,6 +81,24 @@ class Element(Behaviour):
     start : tuple of str
         Name, unit and meaning of the unknown from which the states of a driven motion start.
     """
+
+    kind: ClassVar[str] = ""
+    equation: str = ""
+    is_linear: bool = False
+    rate_independent: bool = True
+    has_memory: bool = False
+    unique_response: bool = False
+    parameters: tuple[Parameter, ...] = ()
+    optional: ClassVar[tuple[Parameter, float] | None] = None
+    linear_parameters: tuple[str, ...] = ()
+    scale_parameters: tuple[str, ...] = ()
+    like_parts: tuple[tuple[str, ...], ...] = ()
+    softens: bool = False
+    holds_at_rest: bool = True
+    starts: tuple[tuple[str, str, str], ...] = (
+        ("initial_force", "N", "friction at the first sample"),
+    )
+    _name: str | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -263,9 +287,9 @@ class Element(Behaviour):
 
     def __add__(self, other: Element) -> Model:
         """Put two elements, or sums of elements, in parallel."""
-        if not isinstance(other, Element):
-            return NotImplemented
-        return Model(self, other)
+        from dahl_ident.elements.model import Model
+
+        return Model(self, other) if isinstance(other, Element) else NotImplemented
 
     def __repr__(self) -> str:
         parts = []
@@ -278,193 +302,212 @@ class Element(Behaviour):
             parts.append(f"name={self.name!r}")
         return f"{type(self).__name__}({', '.join(parts)})"
 
-
-class Model(Element):
-    """Elements in parallel: Z(A, omega) is the sum of theirs, at one displacement.
-
-    Usually written with ``+``. Sums of sums are flattened.
-
-    Parameters
-    ----------
-    *elements : Element
-        One or more elements or sums.
-
-    Raises
-    ------
-    ModelError
-        If there is no element, or two parameters share a name.
-
-    Examples
-    --------
-    >>> from dahl_ident import Dahl, Damper, Mass, Spring
-    >>> plant = Dahl() + Mass(0.3) + Damper() + Spring()
-    >>> [p.name for p in plant.parameters if p.free]
-    ['f_max', 'sigma', 'damping', 'stiffness']
-    """
-
-    def __init__(self, *elements: Element) -> None:
-        flat: list[Element] = []
-        for element in elements:
-            flat.extend(element.elements if isinstance(element, Model) else [element])
-        if not flat:
-            raise ModelError("a model needs at least one element, got none")
-        self._elements = tuple(flat)
-        self.parameters = tuple(p for element in flat for p in element.parameters)
-        self.is_linear = all(element.is_linear for element in flat)
-        self.rate_independent = all(element.rate_independent for element in flat)
-        self.has_memory = any(element.has_memory for element in flat)
-        clashes = [n for n, count in Counter(p.name for p in self.parameters).items() if count > 1]
-        if clashes:
-            raise ModelError(
-                f"two elements share the parameter names {', '.join(clashes)}; "
-                "give each a name, such as Dahl(name='pivot')"
-            )
-        ends = np.cumsum([0, *(len(element.parameters) for element in flat)]).tolist()
-        self._slices = [slice(a, b) for a, b in pairwise(ends)]
+    # The mathematics, in plain numbers: nothing is checked here.
 
     @property
-    def elements(self) -> tuple[Element, ...]:
-        """The elements, in the order in which they were added."""
-        return self._elements
+    def name(self) -> str | None:
+        """The element's name, which prefixes its parameters, or None."""
+        return self._name
 
-    def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
-        """Yield every element with its own part of the model's parameter `values`."""
-        for element, s in zip(self._elements, self._slices, strict=True):
-            yield element, values[s]
+    def label(self, parameter: Parameter) -> str:
+        """Return a parameter's name without the element's prefix."""
+        return parameter.name.removeprefix(f"{self.name}_") if self.name else parameter.name
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The parameters' names without the element's prefix."""
+        return tuple(self.label(p) for p in self.parameters)
+
+    def parameter(self, label: str) -> Parameter:
+        """Return the parameter called `label` within this element."""
+        if label not in self.labels:
+            raise ModelError(f"{self!r} has no parameter {label}; it has {', '.join(self.labels)}")
+        return self.parameters[self.labels.index(label)]
+
+    def named(self, expression: str) -> str:
+        """Return an expression of labels with the parameters' full names."""
+        for label, parameter in zip(self.labels, self.parameters, strict=True):
+            expression = re.sub(rf"\b{label}\b", parameter.name, expression)
+        return expression
+
+    def known_values(self) -> tuple[FloatArray, ...]:
+        """Return the value of every parameter, or name those that have none."""
+        missing = [p.name for p in self.parameters if p.value is None]
+        if missing:
+            raise ModelError(
+                f"{self!r} has no value for {', '.join(missing)}; "
+                "give a number to evaluate the model, or estimate it with fit"
+            )
+        return tuple(np.asarray(p.value) for p in self.parameters)
+
+    @abstractmethod
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return the sum of the elements' F_k/X_1 with its derivatives, unchecked."""
-        parts = [
-            element.settled(numbers, sine, derivatives) for element, numbers in self.of(values)
-        ]
-        value, by_amplitude, _ = parts[0]
-        for part in parts[1:]:
-            value, by_amplitude = value + part.value, by_amplitude + part.by_amplitude
-        return StiffnessGradient(
-            value, by_amplitude, tuple(d for part in parts for d in part.by_parameter)
-        )
+        """Return F_k/X_1 at the parameter `values`, unchecked; all arguments broadcast.
+
+        With as many `derivatives` as are asked for: 0 none, 1 that with respect to the amplitude,
+        2 those with respect to the parameters too.
+        """
+
+    def stiffness(
+        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
+    ) -> ComplexArray:
+        """Return F_k/X_1, unchecked; `harmonic` 0 is the mean force over the amplitude."""
+        return self.settled(values, Sine(amplitude, omega, harmonic), 0).value
+
+    def stiffness_gradient(
+        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
+    ) -> StiffnessGradient:
+        """Return F_k/X_1 with its derivatives, over amplitude and each parameter, unchecked."""
+        return self.settled(values, Sine(amplitude, omega, harmonic), 2)
+
+    def answers(self, harmonic: int) -> bool:
+        """Return whether a sine of displacement may give the force this harmonic, at any values.
+
+        A linear element answers with the fundamental alone, a law that is the same in both
+        directions with odd harmonics.
+        """
+        return harmonic == 1 if self.is_linear else harmonic % 2 == 1
+
+    def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
+        """Return units of force and stiffness in which the law has fewer numbers, and those.
+
+        ``N(A; values) = stiffness * N(A stiffness/force; numbers)``. One and the values
+        themselves where a law has no such units.
+        """
+        return np.ones(()), np.ones(()), values
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
-        parts = [
-            element.history(numbers, path, state if element.has_memory else 0.0, slopes=slopes)
-            for element, numbers in self.of(values)
-        ]
-        value = np.asarray(sum(part.value for part in parts))
-        by_state = np.asarray(sum(part.by_state for part in parts))
-        return HistoryGradient(value, by_state, tuple(d for p in parts for d in p.by_parameter))
+        """Return the force at every sample with its derivatives, unchecked.
 
-    def start_with(self, values: Sequence[Any], force: float) -> float:
-        """Return the unknown of the friction, of which there is one if there is a force."""
-        return sum(e.start_with(numbers, force) for e, numbers in self.of(values) if e.has_memory)
+        `state` is the unknown at the first sample: the force there, in most laws. Without `slopes`
+        the derivatives are not looked at.
+        """
+        raise ModelError(f"{self!r} has no force over time")
+
+    def force_history(
+        self,
+        values: Sequence[Any],
+        displacement: FloatArray,
+        velocity: FloatArray | None = None,
+        state: float = 0.0,
+        *,
+        acceleration: FloatArray | None = None,
+        time: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the force at every sample of one history, unchecked; `state` is the first."""
+        path = Path(displacement, velocity, acceleration, time)
+        return self.history(values, path, state, slopes=False).value
+
+    def mechanics(
+        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
+    ) -> Mechanics:
+        """Return the part in an equation of motion, in plain arithmetic.
+
+        `x` is the displacement, `direction` the sign of the velocity, `states` what
+        :attr:`n_states` counts: the present force of an element with memory, where it needs no
+        more.
+        """
+        raise ModelError(
+            f"{self!r} has no equation of motion, so it cannot be driven by a force over time; "
+            "give records with measured displacement and force"
+        )
+
+    @property
+    def inside(self) -> tuple[Any, ...]:
+        """Elements of which this one is made, such as that behind a gap."""
+        return ()
+
+    @property
+    def n_states(self) -> int:
+        """States in an equation of motion."""
+        return int(self.has_memory)
 
     @property
     def has_inertia(self) -> bool:
-        """Whether a force determines the motion."""
-        return any(element.has_inertia for element in self._elements)
+        """Whether a force determines the motion of the element."""
+        return any(p.is_mass for p in self.parameters)
 
-    def _check_start(self, values: Sequence[float], initial_force: float) -> None:
-        remember = [(e, numbers) for e, numbers in self.of(values) if e.has_memory]
-        if not remember:
-            super()._check_start(values, initial_force)
-        if initial_force and len(remember) > 1:
-            raise ValidationError(
-                f"initial_force is {initial_force!r} for {len(remember)} elements with memory; "
-                "evaluate them one by one, or leave it out"
-            )
-        for element, numbers in remember:
-            element._check_start(numbers, initial_force)
+    def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
+        """Return the states at the first sample, in plain arithmetic, from the unknowns there.
+
+        The states of an element without memory are unknowns themselves.
+        """
+        return starts
+
+    def start_with(self, values: Sequence[Any], force: float) -> float:
+        """Return the unknown at the first sample with which a history starts with a force."""
+        return force
+
+    def coarser(self) -> Self:
+        """Return this element, or one whose motion under a force costs less and is nearly alike."""
+        return self
+
+    def free_responses(self, time: FloatArray) -> FloatArray:
+        """Return the force from each state of a linear element at the first sample, (n, states)."""
+        return np.zeros((time.size, 0))
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return the sums of the elements' bounds of abs(N) and A abs(N)."""
-        bounds = [element.force_bounds(numbers) for element, numbers in self.of(values)]
-        steepest, largest = (np.asarray(sum(b[i] for b in bounds)) for i in (0, 1))
-        return steepest, largest
+        """Return upper bounds of abs(N) and A abs(N) over all amplitudes; inf if unbounded."""
+        return np.full((), np.inf), np.full((), np.inf)
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and highest knee of the elements; NaN where all are linear."""
-        low, high = np.full((), np.nan), np.full((), np.nan)
-        for element, numbers in self.of(values):
-            first, last = element.knee(numbers)
-            low, high = np.fmin(low, first), np.fmax(high, last)
-        return low, high
+        """Return amplitudes between which N changes, m; NaN for a linear element."""
+        return np.full((), np.nan), np.full((), np.nan)
 
     def transient_decay(
         self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
-        """Return the decay of the element that forgets most slowly."""
-        slowest = super().transient_decay(values, amplitude, omega)
-        for element, numbers in self.of(values):
-            slowest = np.maximum(slowest, element.transient_decay(numbers, amplitude, omega))
-        return slowest
+        """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
+        return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
+
+    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
+        """Return the limits at infinity that this law declares, for amplitudes low to high, m."""
+        return ()
+
+    def combinations(self) -> tuple[Combination, ...]:
+        """Return products of powers that data may determine where single parameters are lost."""
+        return ()
+
+    def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
+        """Return, by a few words, what is tried in place of this element; started at `values`.
+
+        `smallest` is the smallest amplitude measured, m.
+        """
+        return {}
+
+    def universal_curve(self) -> UniversalCurve | None:
+        """Return the curve that all values of the scale parameters follow, or None."""
+        return None
+
+    def resembles(
+        self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
+    ) -> tuple[str, float] | None:
+        """Return a simpler law and how far its best N is from this one's at some levels, rms.
+
+        None for a law without a simpler one.
+        """
+        return None
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return the values of all elements, those that no longer matter held where they do."""
-        return [
-            v for element, numbers in self.of(values) for v in element.resolved(numbers, amplitude)
-        ]
+        """Return the values with those that no longer matter at an amplitude held where they do."""
+        return values
 
     def physics(self, values: Sequence[float]) -> tuple[str, ...]:
-        """Return the objections of all elements to their values."""
-        return tuple(
-            text for element, numbers in self.of(values) for text in element.physics(numbers)
-        )
+        """Return the physical objections to the values, in words."""
+        return ()
 
-    def coarser(self) -> Model:
-        """Return the model of elements whose motion under a force costs less, or itself."""
-        elements = [element.coarser() for element in self._elements]
-        same = all(new is old for new, old in zip(elements, self._elements, strict=True))
-        return self if same else Model(*elements)
+    def rational_stiffness(self) -> tuple[FloatArray, FloatArray] | None:
+        """Return numerator and denominator of Z(s), from the highest power of s down.
 
-    def with_parameters(self, changes: Mapping[str, Parameter]) -> Model:
-        """Return this model with some parameters replaced, by name."""
-        self._known(changes)
-        elements = []
-        for element in self._elements:
-            parameters = tuple(changes.get(p.name, p) for p in element.parameters)
-            same = parameters == element.parameters
-            elements.append(element if same else element.with_bound(parameters))
-        return Model(*elements)
+        None for an element that is not linear.
+        """
+        return None
 
-    def with_free(self, names: Iterable[str]) -> Model:
-        """Return this model with the named parameters estimated, started from their values."""
-        names = list(names)
-        known = self._known(names)
-        return self.with_parameters({name: known[name].freed() for name in names})
-
-    def with_fixed(self, values: Mapping[str, float]) -> Model:
-        """Return this model with the named parameters held at the given values."""
-        known = self._known(values)
-        return self.with_parameters({n: known[n].fixed(v) for n, v in values.items()})
-
-    def with_values(self, values: Mapping[str, float]) -> Model:
-        """Return this model with values put in, each parameter staying free or fixed as it was."""
-        known = self._known(values)
-        return self.with_parameters({n: replace(known[n], value=v) for n, v in values.items()})
-
-    def _known(self, names: Iterable[str]) -> dict[str, Parameter]:
-        """Return the parameters by name; refuse unknown names."""
-        known = {p.name: p for p in self.parameters}
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise ModelError(
-                f"the model has no parameter {', '.join(unknown)}; it has {', '.join(known)}"
-            )
-        return known
-
-    def __repr__(self) -> str:
-        return " + ".join(repr(element) for element in self._elements)
-
-
-def as_model(model: Element) -> Model:
-    """Return `model` as a sum, so that one element alone needs no special case."""
-    if isinstance(model, Model):
-        return model
-    if not isinstance(model, Element):
-        raise ModelError(f"expected a model such as Dahl() + Mass(0.3), got {type(model).__name__}")
-    return Model(model)
+    def system_at(self, values: Sequence[float]) -> Any:
+        """Return the python-control system that the element was made from, or None."""
+        return None
 
 
 def prefixed(name: str | None, label: str) -> str:

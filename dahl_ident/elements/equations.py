@@ -21,7 +21,8 @@ from dahl_ident.errors import ModelError
 if TYPE_CHECKING:
     import casadi as ca
 
-    from dahl_ident.elements.element import Element, Model
+    from dahl_ident.elements.element import Element
+    from dahl_ident.elements.model import Model
     from dahl_ident.elements.parameter import Parameter
     from dahl_ident.engine import Equations
 

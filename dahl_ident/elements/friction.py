@@ -120,11 +120,6 @@ class Friction(Element):
             for, the velocity is 0.
         values : sequence of array
             The parameters in their declared order.
-
-        Returns
-        -------
-        array
-            Of the shape to which the arguments broadcast.
         """
 
     def output(self, force: Any, slope: Any, velocity: Any, values: Sequence[Any]) -> Any:
@@ -135,13 +130,7 @@ class Friction(Element):
         return force
 
     def quasi_static_slope(self, force: Any, direction: Any, values: Sequence[Any]) -> Any:
-        """Return dF/dx at vanishing speed.
-
-        Raises
-        ------
-        ModelError
-            If the law uses the velocity without declaring it.
-        """
+        """Return dF/dx at vanishing speed; ModelError if the law needs an undeclared velocity."""
         if not self.rate_independent:
             return self.slope(force, direction, 0.0, values)
         try:
@@ -163,8 +152,7 @@ class Friction(Element):
     def start_bounds(self, values: Values) -> tuple[float, float]:
         """Return between which numbers the unknowns at the first sample are: forces of full slip.
 
-        Beyond them friction falls back within a small part of x_c, so that the data hardly show how
-        far beyond them it began.
+        Friction that begins beyond them falls back within a small part of x_c.
         """
         up, down = (float(force) for force in self.force_limits(values))
         return self.start_with(values, -down), self.start_with(values, up)
@@ -379,30 +367,8 @@ class Friction(Element):
     ) -> tuple[FloatArray, FloatArray]:
         """Return a_k and b_k of F(t) = sum a_k cos(k omega t) + b_k sin(k omega t)  (Eqn. 1).
 
-        Parameters
-        ----------
-        amplitude : array_like
-            Zero-to-peak displacement A >= 0 of x = A cos(omega t), m.
-        harmonic : int, default 1
-            k >= 1.
-
-        Returns
-        -------
-        a, b : ndarray, or float for a scalar
-            N. Dissipation makes b_1 negative.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value, or no loop is steady at an amplitude.
-        ValidationError
-            If an amplitude is negative, NaN, infinite or complex, or `harmonic` is not a whole
-            number of at least 1.
-
-        Notes
-        -----
-        Eqns. 36 and 50; for `Dahl` in closed form, a_k = 2 f_max I_k(beta)/cosh(beta) for
-        alpha = 1.
+        Amplitude and errors as `describing_function`; `harmonic` is k >= 1. N; dissipation makes
+        b_1 negative. Eqns. 36 and 50.
 
         Examples
         --------
@@ -455,24 +421,8 @@ class Friction(Element):
     def equivalent_damping(self, amplitude: ArrayLike, omega: ArrayLike) -> FloatArray:
         """Return -b_1/(A omega) = Im N(A)/omega, the viscous damper with the same loss.
 
-        Parameters
-        ----------
-        amplitude : array_like
-            Zero-to-peak displacement A >= 0, m.
-        omega : array_like
-            Angular frequency > 0, rad/s; broadcast with `amplitude`.
-
-        Returns
-        -------
-        ndarray, or float for scalars
-            N s/m.
-
-        Raises
-        ------
-        ModelError
-            If a parameter has no value.
-        ValidationError
-            If an amplitude is negative or a frequency not positive, or shapes do not fit.
+        `omega` > 0 is in rad/s and broadcast with `amplitude`, N s/m; errors as
+        `describing_function`.
 
         Examples
         --------
@@ -488,8 +438,7 @@ class Friction(Element):
     def dissipated_energy(self, amplitude: ArrayLike) -> FloatArray:
         """Return W = pi A abs(b_1), the energy lost in one cycle.
 
-        W = 4 f_max A (1 - tanh(beta)/beta) for linear Dahl. Arguments and errors as
-        `describing_function`; joules.
+        Arguments and errors as `describing_function`; joules.
 
         Examples
         --------
@@ -521,10 +470,6 @@ class Friction(Element):
             If a parameter has no value.
         ValidationError
             If `amplitude` is not one finite number above zero, or `points` is below 3.
-
-        Notes
-        -----
-        Eqns. 10 and 11 for linear Dahl.
 
         Examples
         --------

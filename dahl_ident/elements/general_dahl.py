@@ -35,11 +35,9 @@ turning points: the midpoint rule for integrals over sin(k theta), Fejer's weigh
 cos(k theta). Both converge geometrically.
 
 **Accuracy**, for alpha from 0.25 to 4 and beta from 1e-6 to 1e6: N and the harmonics up to the
-15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``); alpha from
-0.01 to 100 has so far shown no larger errors. There is one exception. Where full slip sets in, at
-``beta_s = 2^-alpha / (1 - alpha)``, derivatives go as ``|1 - beta/beta_s|^(alpha/p)``; for alpha
-below 1/3 this is so steep that one unit in the last place of beta changes them by up to 1e-5, and
-within 1e-12 of beta_s that is their error.
+15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``), except within
+1e-12 of ``beta_s = 2^-alpha / (1 - alpha)``, where full slip sets in: for alpha below 1/3
+derivatives there change by up to 1e-5 with the last digit of beta.
 """
 
 from __future__ import annotations

@@ -7,8 +7,7 @@ z = 1 - s F/f_max and the travelled path d = sigma |x - x_turn|/f_max is dz/dd =
     z(d) = (z0^(1-alpha) - (1-alpha) d)^(1/(1-alpha))    otherwise; 0 once the bracket is
 
 whatever the speed. Where the motion turns back, the margin becomes 2 - z. So a history is two
-steps: carry z over the turning points, then evaluate every sample from the turning point before
-it. Nothing is integrated numerically, and how densely a stretch is sampled does not matter.
+steps: carry z over the turning points, then evaluate every sample from the turning point before it.
 """
 
 from __future__ import annotations
@@ -90,7 +89,7 @@ def transient_decay(beta: FloatArray, alpha: FloatArray | float) -> FloatArray:
     """Return the factor by which a deviation from the steady loop shrinks in one cycle.
 
     ((1 - f0)/(1 + f0))^(2 alpha), f0 the force at the turning point over f_max; exp(-4 beta)
-    for alpha = 1. Settling takes cycles, not seconds, and the more of them the smaller beta.
+    for alpha = 1.
 
     Examples
     --------

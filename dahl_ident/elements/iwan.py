@@ -171,11 +171,6 @@ class Iwan(Masing):
         """Return sigma."""
         return np.asarray(values[1], dtype=np.float64)
 
-    def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return f_max, for both directions."""
-        top = np.asarray(values[0], dtype=np.float64)
-        return top, top
-
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return where 1 % of the stiffness is gone, and the onset of macroslip."""
         d = _onset(values)

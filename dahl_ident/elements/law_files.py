@@ -16,7 +16,6 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dahl_ident.data.storage import read_text
-from dahl_ident.elements.behaviour import Behaviour
 from dahl_ident.elements.law_checks import check_declarations, is_of_package
 from dahl_ident.errors import DahlIdentError, ModelError
 
@@ -117,6 +116,8 @@ def load_laws(path: str | Path) -> tuple[type[Element], ...]:
 
 def run(file: LawFile) -> tuple[type[Element], ...]:
     """Return the laws of a file, which is run where this process has not done it yet."""
+    from dahl_ident.elements.element import Element
+
     path, name = Path(file.path), file.module
     if name not in _FILES:
         module = ModuleType(name)
@@ -139,7 +140,7 @@ def run(file: LawFile) -> tuple[type[Element], ...]:
     laws: tuple[Any, ...] = tuple(
         value
         for value in vars(sys.modules[name]).values()
-        if isinstance(value, type) and issubclass(value, Behaviour) and value.__module__ == name
+        if isinstance(value, type) and issubclass(value, Element) and value.__module__ == name
         and not inspect.isabstract(value)
     )  # fmt: skip
     if not laws:

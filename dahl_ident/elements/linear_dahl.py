@@ -1,44 +1,20 @@
 """The linear Dahl model (alpha = 1) in closed form.
 
 Everything here is in normalised variables: the amplitude is `beta = sigma A / f_max`, forces
-are over `f_max`, the describing function is over `sigma`. One curve then serves every linear
-Dahl element.
-
-**The steady loop.** For a displacement `x = A cos(w t)` the force on the stretch of falling
-displacement is (Eqn. 11, with `t = x/A` and Eqn. 8 for the reversal force `tanh beta`)
-
-    F/f_max = -1 + (1 + tanh beta) exp(beta (t - 1)) = -1 + exp(beta t) / cosh(beta)
-
-and on the rising stretch the same turned about the origin, so the even harmonics vanish.
-
-**Harmonics.** Eqn. 22, which the paper leaves as a series, is a modified Bessel function of the
-first kind, and the sine coefficients are integrals over a Chebyshev polynomial of the second
-kind. For odd `k`, with `c_k = (a_k - j b_k) / f_max`,
+are over `f_max`, the describing function is over `sigma`. The formulas are those of the page
+"Theory"; for odd `k`, with `c_k = (a_k - j b_k) / f_max` and `h = N/sigma = c_1/beta`,
 
     Re c_k = 2 I_k(beta) / cosh(beta)
     Im c_k = (2/pi) Int_-1^1 U_(k-1)(t) D(t) dt,       D(t) = 1 - cosh(beta t) / cosh(beta)
 
-**Describing function.** `h(beta) = N/sigma = c_1/beta`, where the integral is elementary:
-
-    Re h = 2 I_1(beta) / (beta cosh beta)
-    Im h = (4/pi) (1 - tanh(beta)/beta) / beta
-
-As `beta` goes to 0, `h` goes to `1 - 3 beta^2/8 + j 4 beta/(3 pi)`; as it grows, `Im h` goes to
-`4/(pi beta)` and `Re h` falls faster, as `4 / sqrt(2 pi beta^3)`.
-
-**Derivatives.** `N = sigma h(sigma A / f_max)` depends on the parameters through
-
-    dN/d ln f_max = sigma (-beta h'),        dN/d ln sigma = sigma (h + beta h')
-
-With `q = 1 - tanh(beta)/beta`, `v = tanh(beta)/beta - sech(beta)^2` and the decay
+**Derivatives.** With `q = 1 - tanh(beta)/beta`, `v = tanh(beta)/beta - sech(beta)^2` and the decay
 `p = -d ln(Re h) / d ln(beta)`, which rises from 0 to 3/2,
 
     Re(-beta h') = p Re h              Im(-beta h') = (4/pi) (q - v) / beta
     Re(h + beta h') = (1 - p) Re h     Im(h + beta h') = (4/pi) v / beta
     p = 2 - beta (I_0/I_1 - tanh beta) = beta (tanh beta - I_2/I_1)
 
-Once `q`, `v` and `p` are right, no line loses digits, except where the result itself changes
-sign (`Im h'` at beta = 1.6061, `Re(h + beta h')` at 1.8355). Those three are computed
+`q`, `v` and `p` are computed so that they keep all digits:
 
 - below `beta` of 0.2 from the continued fractions of `beta coth(beta)` and of `I_2/I_1`, whose
   terms are all positive, and from `v = tanh(beta)^2 - q`;
@@ -46,8 +22,8 @@ sign (`Im h'` at beta = 1.6061, `Re(h + beta h')` at 1.8355). Those three are co
 - between from the formulas as they stand, with exponentially scaled Bessel functions,
   `I_1/cosh(beta) = (1 + tanh beta) I_1 exp(-beta)`.
 
-**Arithmetic of the harmonics.** Up to `beta` of 75 (or `k^2/3`, if larger) `Re c_k` is a scaled
-Bessel function and `Im c_k` a Fejer quadrature over equally spaced angles, with the product
+**Harmonics.** Up to `beta` of 75 (or `k^2/3`, if larger) `Re c_k` is a scaled Bessel function and
+`Im c_k` a Fejer quadrature over equally spaced angles, with the product
 
     D(t) = (1 + tanh beta)/2 expm1(-beta (1 - t)) expm1(-beta (1 + t))
 

@@ -24,6 +24,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements.facts import (
@@ -41,7 +42,7 @@ from dahl_ident.errors import ModelError
 
 _SERIES = 0.1  # angle below which y - sin(y) loses digits
 _NEARLY_SLIPS = 1.0 - 1e-6
-_BISECTIONS = 200  # more than a number has digits
+_DIGITS = 4.0 * float(np.finfo(np.float64).eps)  # of a root
 
 
 class Masing(Friction):
@@ -91,8 +92,17 @@ class Masing(Friction):
 
     def start_with(self, values: Sequence[Any], force: float) -> float:
         """Return the way along the backbone curve to a force, over that to full slip."""
+        from scipy.optimize import brentq
+
         at = [np.asarray(v, dtype=np.float64) for v in values]
-        return float(np.sign(force) * self._loaded_to(at, abs(force)) / self.knee(at)[1])
+        end = float(self.knee(at)[1])
+        if abs(force) >= float(self.force_limits(at)[0]):
+            return float(np.sign(force))
+
+        def excess(way: float) -> float:
+            return float(self.backbone(at, np.asarray(way * end))) - abs(force)
+
+        return float(np.sign(force) * brentq(excess, 0.0, 1.0, xtol=1e-300, rtol=_DIGITS))
 
     def start_bounds(self, values: Values) -> tuple[float, float]:
         """Return those of loads, just below slip: at slip a spring forgets its load."""
@@ -108,21 +118,24 @@ class Masing(Friction):
         if slopes:
             return self._differences(values, path, state)
         at = [np.asarray(v, dtype=np.float64) for v in values]
-        x = path.displacement
         start = state * float(self.knee(at)[1])
-        begun = np.sign(start) * self.backbone(at, np.abs(start))
-        if x.size < 2:
-            return HistoryGradient(np.full(x.shape, begun), np.ones(x.shape), ())
-        u = x - x[0] + start
-        paths = _Paths(start)
-        cut = stretches(x)
-        first = 0
-        for heading, last in zip(cut.heading.tolist(), np.cumsum(cut.samples) - 1, strict=True):
-            stop = min(last + 1, u.size - 1)
-            paths.follow(u[first + 1 : stop + 1], heading)
-            first = stop
-        force = np.append(begun, paths.force(lambda x: self.backbone(at, x)))
-        return HistoryGradient(force, force, ())
+        u = path.displacement - path.displacement[0] + start
+        origins, parents, headings, path_of = _paths(u)
+
+        def along(place: FloatArray, path: NDArray[np.intp]) -> FloatArray:
+            """Return the force that is added on a path from its origin to a place."""
+            moved = place - origins[path]
+            scale = np.where(path == 0, 1.0, 2.0)
+            sign = np.where(path == 0, np.sign(moved), headings[path])
+            return np.asarray(scale * sign * self.backbone(at, np.abs(moved) / scale))
+
+        forces = along(origins, parents).tolist()
+        forces[0] = 0.0
+        for number, parent in enumerate(parents.tolist()):
+            if parent:
+                forces[number] += forces[parent]
+        force = np.asarray(forces)[path_of] + along(u, path_of)
+        return HistoryGradient(force, np.ones(force.shape), ())
 
     def _differences(self, values: Sequence[Any], path: Path, state: float) -> HistoryGradient:
         """Return the force with central differences by the state and every value."""
@@ -139,22 +152,6 @@ class Masing(Friction):
             for i, number in enumerate(numbers)
         )
         return HistoryGradient(value, by_state, tuple(by))
-
-    def _loaded_to(self, values: Values, force: float) -> float:
-        """Return where the backbone curve has a force, by bisection."""
-        low = high = force / float(self.rest_stiffness(values))
-        farthest = 1e6 * high  # full slip, to rounding
-        while float(self.backbone(values, np.asarray(high))) < force * (1.0 - 1e-15):
-            low, high = high, 2.0 * high
-            if high > farthest:
-                break
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            if not low < middle < high:
-                break
-            below = float(self.backbone(values, np.asarray(middle))) < force
-            low, high = (middle, high) if below else (low, middle)
-        return high
 
     def answers(self, harmonic: int) -> bool:
         """Return whether the harmonic is odd: both directions are alike."""
@@ -182,71 +179,40 @@ class Masing(Friction):
         return float(self.backbone([np.asarray(v) for v in values], np.asarray(amplitude)))
 
 
-class _Paths:
-    """Masing's rules over displacements u, counted from where the backbone curve begins.
+def _paths(
+    u: FloatArray,
+) -> tuple[FloatArray, NDArray[np.intp], FloatArray, NDArray[np.intp]]:
+    """Return the paths of Masing's rules along displacements that begin on the backbone curve.
 
-    Each path begins at a reversal, or at the origin of the backbone curve; a reversal lies on the
-    path before it. Forces follow at the end, from the backbone curve at all places at once.
+    Each path begins at a reversal, which lies on a path before it, its parent; path 0 is the
+    backbone curve. Of each path the origin, its parent and its direction; of each displacement the
+    path on which it lies.
     """
-
-    def __init__(self, start: float) -> None:
-        self._origin = [0.0]  # of each path
-        self._parent = [0]  # the path on which each path's origin lies
-        self._heading = [1.0]
-        self._open: list[int] = []  # paths that have been left and not yet closed, outermost first
-        self._on = 0
-        self._here = start
-        self._path_of: list[np.ndarray[Any, Any]] = []
-        self._places: list[FloatArray] = []
-
-    def follow(self, places: FloatArray, heading: float) -> None:
-        """Move on in one direction through some places."""
-        on_backbone = not self._open
-        if not (on_backbone and (self._here == 0.0 or heading * self._here > 0.0)) and (
-            on_backbone or heading != self._heading[self._open[-1]]
-        ):
-            self._origin.append(self._here)
-            self._parent.append(self._open[-1] if self._open else 0)
-            self._heading.append(heading)
-            self._open.append(len(self._origin) - 1)
-        path_of = np.zeros(places.size, dtype=np.intp)
-        begin = 0
-        while begin < places.size:
-            if not self._open:
-                break
+    origins, parents, headings = [0.0], [0], [1.0]
+    path_of = np.zeros(u.size, dtype=np.intp)
+    open_paths: list[int] = []  # that have been begun and not yet closed, outermost first
+    cut = stretches(u)
+    first = 0
+    for heading, last in zip(cut.heading.tolist(), np.cumsum(cut.samples) - 1, strict=True):
+        stop = min(int(last) + 1, u.size - 1)
+        here = float(u[first])
+        if open_paths or heading * here < 0.0:
+            parents.append(open_paths[-1] if open_paths else 0)
+            open_paths.append(len(origins))
+            origins.append(here)
+            headings.append(heading)
+        first += 1
+        while open_paths and first <= stop:
             # a path ends where the one before it began; the first one mirrors its own origin
-            path = self._open[-1]
-            limit = self._origin[self._open[-2]] if len(self._open) > 1 else -self._origin[path]
-            inside = int(np.searchsorted(heading * places, heading * limit, side="right"))
-            path_of[begin:inside] = path
-            begin = max(begin, inside)
-            if begin < places.size:
-                del self._open[-2:]
-        self._path_of.append(path_of)
-        self._places.append(places)
-        self._here = float(places[-1])
-
-    def force(self, backbone: Any) -> FloatArray:
-        """Return the force at all places."""
-        origin, parent = np.asarray(self._origin), np.asarray(self._parent)
-        heading = np.asarray(self._heading)
-
-        def beyond(place: FloatArray, path: Any) -> FloatArray:
-            first = path == 0
-            scale = np.where(first, 1.0, 2.0)
-            moved = place - origin[path]
-            sign = np.where(first, np.sign(moved), heading[path])
-            return np.asarray(scale * sign * backbone(np.abs(moved) / scale))
-
-        forces = beyond(origin, parent).tolist()
-        forces[0] = 0.0
-        for path in range(1, len(forces)):
-            if self._parent[path]:
-                forces[path] += forces[self._parent[path]]
-        path_of = np.concatenate(self._path_of)
-        return np.asarray(
-            np.asarray(forces)[path_of] + beyond(np.concatenate(self._places), path_of)
-        )
+            path = open_paths[-1]
+            limit = origins[open_paths[-2]] if len(open_paths) > 1 else -origins[path]
+            inside = np.searchsorted(heading * u[first : stop + 1], heading * limit, side="right")
+            path_of[first : first + inside] = path
+            first += int(inside)
+            if first <= stop:
+                del open_paths[-2:]
+        first = stop
+    return np.asarray(origins), np.asarray(parents), np.asarray(headings), path_of
 
 
 def jenkins(ratio: FloatArray, harmonic: int) -> tuple[ComplexArray, ComplexArray]:

@@ -63,33 +63,21 @@ def stretches(displacement: FloatArray) -> Stretches:
 
 
 def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
-    """Return y with y[0] = first and y[i + 1] = keep[i] y[i] + term[i].
-
-    Notes
-    -----
-    One forward substitution in a banded triangular matrix, by LAPACK.
+    """Return y with y[0] = first, (c,), and y[i + 1] = keep[i] y[i] + term[i], numbers `keep`.
 
     Examples
     --------
     >>> linear_recursion(np.array([0.5, 0.5]), np.ones((2, 1)), np.zeros(1)).ravel().tolist()
     [0.0, 1.0, 1.5]
     """
-    band = np.empty((2, keep.size + 1), order="F")
-    band[0], band[1, -1] = 1.0, 0.0
-    np.negative(keep, out=band[1, :-1])
-    right = np.empty((keep.size + 1, first.size), order="F")
-    right[0], right[1:] = first, term
-    solution, _ = dtbtrs(band, right, uplo="L", diag="U", overwrite_b=1)
-    return np.asarray(solution)
+    return matrix_recursion(keep[:, None, None], term[:, None], first[None])[:, 0]
 
 
 def matrix_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
-    """Return y with y[0] = first and y[i + 1] = keep[i] y[i] + term[i].
+    """Return y with y[0] = first, (order, c), and y[i + 1] = keep[i] y[i] + term[i].
 
-    Examples
-    --------
-    >>> matrix_recursion(np.full((2, 1, 1), 0.5), np.ones((2, 1, 1)), np.zeros((1, 1))).ravel()
-    array([0. , 1. , 1.5])
+    `keep` are matrices, (n, order, order). One forward substitution in a banded triangular matrix,
+    by LAPACK.
     """
     n, order, _ = keep.shape
     band = np.zeros((2 * order, (n + 1) * order), order="F")

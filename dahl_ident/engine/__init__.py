@@ -5,6 +5,7 @@ from __future__ import annotations
 from dahl_ident.engine.differentiation import differentiated
 from dahl_ident.engine.drive import band_limited
 from dahl_ident.engine.motion import Loops, Marched, Settled, loops, march, settled
+from dahl_ident.engine.periodic import SteadyMotion, steady_motions
 from dahl_ident.engine.translate import Equations, System, translate
 
 __all__ = [
@@ -12,11 +13,13 @@ __all__ = [
     "Loops",
     "Marched",
     "Settled",
+    "SteadyMotion",
     "System",
     "band_limited",
     "differentiated",
     "loops",
     "march",
     "settled",
+    "steady_motions",
     "translate",
 ]

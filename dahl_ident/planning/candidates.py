@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident import steady_state
 from dahl_ident.arrays import FloatArray
+from dahl_ident.control_interop import response
 from dahl_ident.elements import Model
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.knowledge import Knowledge
@@ -188,7 +188,7 @@ def _single_valued(
     for values in knowledge.thinned(_CHECKED_DRAWS).values:
         named = zip(knowledge.names, values.tolist(), strict=True)
         plant = knowledge.model.with_values({n: v for n, v in named if n in known})
-        solutions = steady_state.response(
+        solutions = response(
             plant, frequency_hz, drive, all_roots=True, steady="describing function"
         )
         single &= solutions.number_of_solutions == 1

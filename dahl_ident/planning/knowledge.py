@@ -18,13 +18,13 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.elements import Element, Model, Parameter
-from dahl_ident.elements.element import as_model
+from dahl_ident.elements.driven_motion import Steady
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import HIGH, LOW, ValidationError, argument, choices
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.space import Space
 from dahl_ident.sensors import Sensors
-from dahl_ident.steady_state import Steady
 from dahl_ident.units import Motion
 
 # Least relative standard deviation that the search takes from a range. The fit will not have the

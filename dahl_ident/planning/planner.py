@@ -11,6 +11,7 @@ import numpy as np
 from dahl_ident.arrays import non_negative_array, positive_number, whole_number
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements import Element
+from dahl_ident.elements.driven_motion import STEADY, Steady
 from dahl_ident.errors import ValidationError, argument
 from dahl_ident.planning.candidates import CONTROLLED, evaluate
 from dahl_ident.planning.design import Design
@@ -36,7 +37,6 @@ from dahl_ident.planning.question import (
 )
 from dahl_ident.planning.search import Search
 from dahl_ident.planning.trajectories import PlannedMotion
-from dahl_ident.steady_state import STEADY, Steady
 
 
 def plan(

@@ -14,14 +14,14 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
-from dahl_ident.elements.element import as_model
+from dahl_ident.elements.driven_motion import Steady
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.stiffness import checked_table
 from dahl_ident.problem.table_problem import TableProblem
 from dahl_ident.sensors import Sensors
-from dahl_ident.steady_state import Steady
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation

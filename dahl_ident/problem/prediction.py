@@ -28,17 +28,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident import steady_state
 from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.control_interop.force_balance import solve
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
+from dahl_ident.elements.driven_motion import Shooting
 from dahl_ident.elements.facts import Sine
 from dahl_ident.errors import DataError, argument
 from dahl_ident.problem.space import Space
 from dahl_ident.problem.steady_rows import SteadyRows
 from dahl_ident.problem.stiffness import StiffnessData
 from dahl_ident.sensors import Sensors, measured_stiffness_factor
-from dahl_ident.steady_state import Shooting
 from dahl_ident.units import DEFINITIONS, power_of_s
 
 _NONE: ComplexArray = np.zeros((), dtype=np.complex128)
@@ -396,7 +396,7 @@ class Predictor:
         if not group.forced:
             return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
         drive = self._true_drive(group, sensed, error)
-        amplitude = steady_state.solve(self._model, of_model, group.omega, drive, amplitude)
+        amplitude = solve(self._model, of_model, group.omega, drive, amplitude)
         exists = np.isfinite(amplitude)
         return (amplitude, None) if exists.all() else (np.where(exists, amplitude, 1.0), exists)
 

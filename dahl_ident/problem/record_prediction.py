@@ -12,6 +12,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 from dahl_ident.elements import Friction, Model, Parameter
+from dahl_ident.elements.facts import Path
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
@@ -49,18 +50,15 @@ def force_of(
         state: Any = 0.0  # or several
         if isinstance(element, Friction):
             state, moved = states if states.size > 1 else float(states[0]), path
+        history = element.history(at, Path(moved, v, a, time), state, slopes=derivatives)
+        total = total + history.value
         if derivatives:
-            history = element.force_history_gradient(at, moved, v, state, acceleration=a, time=time)
-            total = total + history.value
             for parameter, slope in zip(element.parameters, history.by_parameter, strict=True):
                 if parameter.free:
                     by[:, column] = slope
                     column += 1
             if element.has_memory:
                 by[:, first + start : first + stop] = history.by_state.reshape(x.size, -1)
-        else:
-            force = element.force_history(at, moved, v, state, acceleration=a, time=time)
-            total = total + force
         if element.n_states and not element.has_memory:
             free = element.free_responses(time)
             total = total + free @ states

@@ -22,8 +22,8 @@ from dahl_ident.data.record import at_even_times, cut, unbroken
 from dahl_ident.data.rows import one_run
 from dahl_ident.elements import Element, Friction, Model, Parameter
 from dahl_ident.elements.coefficients import Coefficients
-from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.base import Problem, Quadratic

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Model
-from dahl_ident.steady_state import Shooting
-from dahl_ident.steady_state.shooting import NEUTRAL
+from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
 
 _LEVEL = 0.1  # of ln of the drive: a held level varies by less, and two levels differ by more
 _MICROSLIP = 1e3  # knees over the largest displacement: a third harmonic of 1e-3, off by 1e-6

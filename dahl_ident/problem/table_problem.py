@@ -18,7 +18,8 @@ from dahl_ident.data.frequency_response import fundamental_alone
 from dahl_ident.data.rows import Rows, row_names
 from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element
-from dahl_ident.elements.element import as_model
+from dahl_ident.elements.driven_motion import ACCURACY, STEADY, Shooting, Steady, obstacle
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.noise import (
     ROUNDING,
@@ -36,7 +37,6 @@ from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
 from dahl_ident.sensors import EXACT, Prior, Sensors
-from dahl_ident.steady_state import ACCURACY, STEADY, Shooting, Steady, obstacle
 from dahl_ident.units import shown_unit
 
 _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()

@@ -28,6 +28,7 @@ from dahl_ident.diagnostics.contributions import EXPONENT, NOISE
 from dahl_ident.diagnostics.estimate import with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
+from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.problem import ProblemBatch, kind_of, problem_of, refuse_options
@@ -36,7 +37,6 @@ from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
 from dahl_ident.results.progress import fit_progress, grid_progress, progress_bar
 from dahl_ident.sensors import Sensors
-from dahl_ident.steady_state import Steady
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -32,8 +32,8 @@ from dahl_ident.arrays import (
     whole_number,
 )
 from dahl_ident.data.columns import one_of, set_checked
+from dahl_ident.elements.driven_motion import STEADY, Steady
 from dahl_ident.errors import ValidationError
-from dahl_ident.steady_state import STEADY, Steady
 from dahl_ident.synthetic.mechanism import Signal
 
 _FILTER_OVERSAMPLING = 16  # points for each sample; the signal is linear between them

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, whole_number
+from dahl_ident.control_interop import response
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.errors import ModelError, NoSteadyMotionWarning, ValidationError
-from dahl_ident.steady_state import response
 from dahl_ident.synthetic.acquisition import Draws, Table
 from dahl_ident.synthetic.excitation import SteppedSine
 from dahl_ident.synthetic.experiment import Experiment

@@ -17,7 +17,7 @@ LAYERS = (
     ((("problem", "residuals, likelihood"),), "Problem"),
     ((("noise", "weights"), ("sensors", "gains, delay")), ""),
     ((("extraction", "from waveforms"), ("synthetic", "simulated lab")), "FrequencyResponse"),
-    ((("steady_state", "plants"), ("control_interop", "loops")), ""),
+    ((("control_interop", "responses and loops"),), ""),
     ((("elements", "the model"),), ""),
     ((("engine", "motions of equations"),), ""),
     ((("data", "tables, records, readers"),), "Record, FrequencyResponse"),

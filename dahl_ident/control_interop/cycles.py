@@ -1,4 +1,4 @@
-"""Limit cycles of a linear loop with Dahl friction, and their stability.
+"""Limit cycles of a linear loop with friction, and their stability.
 
 Friction -F(x) acts on a linear loop with the response H(s) of displacement to force. The
 fundamental of a free oscillation x = A cos(omega t) is balanced if
@@ -9,11 +9,9 @@ Both curves, -L over frequency and N over amplitude, are drawn in logarithmic po
 where they are smooth and even; their crossings start Newton's method in (ln A, ln omega). From
 each crossing the exact periodic motion is found by shooting
 (:mod:`dahl_ident.control_interop.free_motion`).
-Since Im N > 0, only an active loop, one with Im L < 0 at some frequency, can oscillate.
 
 A disturbance dA of the amplitude moves the root by ds = -N'(A) dA/L'(s), so dA grows
-at the rate -A Re(N'/L'(s)); a stable cycle has a negative one, which is Loeb's criterion
-U_A V_omega - U_omega V_A > 0 for U + jV = L + N.
+at the rate -A Re(N'/L'(s)); a stable cycle has a negative one, which is Loeb's criterion.
 """
 
 from __future__ import annotations
@@ -32,10 +30,11 @@ from dahl_ident.control_interop.linear_part import (
     rational_stiffness,
 )
 from dahl_ident.control_interop.nonlinearity import friction_alone, friction_and_slope
-from dahl_ident.elements.element import Element, Model, as_model
+from dahl_ident.elements.driven_motion import Steady, obstacle
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.linear_system import LinearSystem, check_system
+from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError, ValidationError
-from dahl_ident.steady_state import Steady, obstacle
 
 _AMPLITUDES_PER_DECADE = 60  # 4 % apart: N is smooth, and crossings are sought between
 _FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get more of their own

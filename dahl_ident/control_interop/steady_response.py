@@ -1,7 +1,13 @@
-"""The public function for the steady response of a known plant, with checked arguments.
+"""The steady response of a known plant to a sinusoidal force: displacement from drive.
 
-All motions are first those of the describing function. Where the plant has an equation of motion
-each is then made exact.
+Under a force u_0 cos(omega t) a plant with friction moves with a displacement amplitude A that is
+not proportional to u_0, because its dynamic stiffness depends on A (Eqn. 53):
+
+    A |Z(A, omega)| = u_0,    Z = L(omega) + N(A),    L = k - m omega^2 + j omega c + ...
+
+All motions are first those of this balance of fundamentals. Where the plant has an equation of
+motion each is then made exact. Where L is passive (Im L >= 0) and the laws allow it, the amplitude
+is unique. An undamped resonance (L = 0) driven with 4 f_max/pi or more has no steady amplitude.
 """
 
 from __future__ import annotations
@@ -20,13 +26,13 @@ from dahl_ident.arrays import (
     non_negative_array,
     positive_array,
 )
+from dahl_ident.control_interop.exact_response import HARMONICS, exact_motions
+from dahl_ident.control_interop.force_balance import BoolArray, IntArray, find_roots, flatten
 from dahl_ident.data.columns import one_of
-from dahl_ident.elements.element import Element, Model, as_model
+from dahl_ident.elements.driven_motion import LINEAR, NEUTRAL, STEADY, Steady, obstacle
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, NoSteadyMotionWarning, ValidationError
-from dahl_ident.steady_state.exact_response import HARMONICS, exact_motions
-from dahl_ident.steady_state.plant import BoolArray, IntArray, flatten
-from dahl_ident.steady_state.roots import find_roots
-from dahl_ident.steady_state.shooting import LINEAR, NEUTRAL, STEADY, Steady, obstacle
 from dahl_ident.units import percent
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)

@@ -6,15 +6,18 @@ each motion is followed in the order of the points, up and down, as far as it go
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Model
-from dahl_ident.steady_state.plant import BoolArray, IntArray
-from dahl_ident.steady_state.shooting import NEUTRAL, Shooting, SteadyMotion
+from dahl_ident.control_interop.force_balance import BoolArray, IntArray
+from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
+from dahl_ident.elements.model import Model
+
+if TYPE_CHECKING:
+    from dahl_ident.engine import SteadyMotion
 
 HARMONICS = tuple(range(10))
 """The harmonics of a motion that are returned."""

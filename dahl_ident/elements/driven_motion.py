@@ -1,0 +1,141 @@
+"""The exact steady motion of a plant under a sinusoidal force, by the engine.
+
+The describing function takes the displacement for a sine. Friction makes it another periodic
+motion, with harmonics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.coefficients import Coefficients
+from dahl_ident.elements.element import Element
+from dahl_ident.elements.equations import plant_equations
+from dahl_ident.elements.model import as_model
+from dahl_ident.errors import ModelError
+
+if TYPE_CHECKING:
+    from dahl_ident.engine import SteadyMotion, System
+
+Steady = Literal["exact", "describing function"]
+STEADY: tuple[Steady, ...] = ("exact", "describing function")
+"""How the response to a force that is held is predicted."""
+
+ACCURACY = 1e-9
+"""Largest relative difference of two solutions of one motion from different starts."""
+
+NEUTRAL = 1e-6
+"""Beyond 1: the multiplier of a motion that may lie anywhere is 1, to rounding."""
+
+LINEAR = "the model is linear"
+"""Why there is no exact motion to compute: the response is a sine."""
+
+
+def obstacle(model: Element) -> str:
+    """Return why a plant has no exact steady motion here; nothing where it has one.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Mass
+    >>> obstacle(Dahl() + Mass(1.0)), obstacle(Dahl())
+    ('', 'the model has no mass')
+    """
+    model = as_model(model)
+    if all(element.is_linear for element in model.elements):
+        return LINEAR
+    try:
+        model = Coefficients(model).model
+        if not model.has_inertia:
+            return "the model has no mass"
+        plant_equations(model)
+    except ModelError as error:
+        return str(error).partition(";")[0].partition(", so")[0]
+    return ""
+
+
+class Shooting:
+    """The steady motions of one model, its equations compiled when first asked for one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> plant = Shooting(Dahl() + Mass() + Damper() + Spring())
+    >>> values = np.array([[0.1, 30.0, 1.0, 0.3, 0.24, 0.3]])
+    >>> steady = plant(values, np.array([2.0 * np.pi]), np.array([0.2]), harmonics=(1, 3))
+    >>> abs(steady.harmonics).round(5).tolist(), bool(steady.multiplier[0] < 1.0)
+    ([[0.01811, 0.00028]], True)
+    """
+
+    def __init__(self, model: Element) -> None:
+        self._model = as_model(model)
+        self._coefficients = Coefficients(self._model)
+        self._system: System | None = None
+
+    @property
+    def system(self) -> System:
+        """The compiled equations."""
+        if self._system is None:
+            from dahl_ident.engine import translate
+
+            self._system = translate(plant_equations(self._coefficients.model))
+        return self._system
+
+    def __call__(
+        self,
+        values: FloatArray,
+        omega: FloatArray,
+        drive: FloatArray,
+        *,
+        chosen: Sequence[int] = (),
+        starts: FloatArray | None = None,
+        cycles: int | None = None,
+        stable: bool = True,
+        **options: Any,
+    ) -> SteadyMotion:
+        """Return the steady motions of many rows, with values that the engine can resolve.
+
+        If `stable`, a motion that is not stable counts as none. Options and result are those of
+        :func:`dahl_ident.engine.steady_motions`.
+        """
+        options["largest"] = 1.0 + NEUTRAL if stable else np.inf
+        result = self._motions(
+            values, omega, drive, chosen, starts=starts, cycles=cycles, **options
+        )
+        with np.errstate(all="ignore"):
+            A = np.hypot(result.starts[:, 0], result.starts[:, 1] / omega)
+            resolved = np.stack(self._model.resolved(list(values.T), A), axis=-1)
+            beyond = (resolved < values) & result.found[:, None]
+        rows = np.flatnonzero(beyond.any(axis=1))
+        if rows.size:
+            repeated = self._motions(
+                resolved[rows], omega[rows], drive[rows], chosen, starts=result.starts[rows],
+                **options,
+            )  # fmt: skip
+            repeated.by_parameter.swapaxes(1, 2)[beyond[rows][:, list(chosen)]] = 0.0
+            for part, new in zip(result, repeated, strict=True):
+                part[rows] = new
+        return result
+
+    def _motions(
+        self,
+        values: FloatArray,
+        omega: FloatArray,
+        drive: FloatArray,
+        chosen: Sequence[int],
+        **options: Any,
+    ) -> SteadyMotion:
+        """Return the steady motions of many rows at these very values."""
+        from dahl_ident.engine import steady_motions
+
+        if self._coefficients.are_values:
+            return steady_motions(self.system, values, omega, drive, chosen=chosen, **options)
+        numbers, slopes = self._coefficients(values)
+        slopes = slopes[:, :, tuple(chosen)]
+        needed = np.flatnonzero(slopes.any(axis=(0, 2))).tolist()
+        result = steady_motions(self.system, numbers, omega, drive, chosen=needed, **options)
+        return result._replace(by_parameter=result.by_parameter @ slopes[:, needed])
