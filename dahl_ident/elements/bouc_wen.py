@@ -1,12 +1,4 @@
-r"""Bouc-Wen hysteresis.
-
-    dF/dx = sigma (1 - sgn(q) |q F/sigma|^n)   while F and the motion have one sign (loading)
-    dF/dx = sigma (1 + sgn(p) |p F/sigma|^n)   while they have opposite signs (unloading)
-
-In the usual letters dz/dt = a v - beta |v| |z|^(n-1) z - gamma v |z|^n: sigma = a,
-beta + gamma = sgn(q) |q|^n a^(1-n) and beta - gamma = sgn(p) |p|^n a^(1-n). With n = 1,
-dF/dx = sigma - q |F| and sigma + p |F|; q = p = sigma/f_max is then the linear Dahl model.
-"""
+"""Bouc-Wen hysteresis, with an exponent."""
 
 from __future__ import annotations
 

@@ -1,11 +1,9 @@
 """The Dahl friction element: describing function, harmonics, loop and force, exactly.
 
-dF/dx = sigma |1 - s F/f_max|^alpha sgn(1 - s F/f_max), s = sgn(dx/dt)   (Eqn. 2)
-
 Under x = A cos(omega t) the force settles into a loop that depends on beta = sigma A / f_max
-alone, up to scale, and not on the frequency. Its Fourier coefficients a_k, b_k (Eqns. 1-50)
-have closed forms for alpha = 1, see :mod:`dahl_ident.elements.linear_dahl`; any other exponent
-takes one quadrature, see :mod:`dahl_ident.elements.general_dahl`.
+alone, up to scale, and not on the frequency. Its Fourier coefficients have closed forms for
+alpha = 1, see :mod:`dahl_ident.elements.linear_dahl`; any other exponent takes one quadrature, see
+:mod:`dahl_ident.elements.general_dahl`.
 """
 
 from __future__ import annotations

@@ -289,7 +289,9 @@ class Element(ABC):
         """Put two elements, or sums of elements, in parallel."""
         from dahl_ident.elements.model import Model
 
-        return Model(self, other) if isinstance(other, Element) else NotImplemented
+        if not isinstance(other, Element):
+            return NotImplemented
+        return Model(self, other)
 
     def __repr__(self) -> str:
         parts = []

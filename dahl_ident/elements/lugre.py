@@ -1,7 +1,4 @@
-r"""LuGre friction: bristles with a sliding force that depends on the speed.
-
-    dz/dt = v - |v| sigma z/g(v),   F = sigma z + micro_damping dz/dt + viscous v,
-    g(v) = f_max (1 + (static_ratio - 1) exp(-(v/stribeck_speed)^2)).
+"""LuGre friction: bristles with a sliding force that depends on the speed.
 
 The state is the bristles' force f = sigma z: df/dx = sigma (1 - s f/g(v)), linear in f, which is
 the linear Dahl law with a limit that follows the speed.
