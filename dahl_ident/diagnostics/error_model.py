@@ -57,6 +57,7 @@ from dahl_ident.diagnostics.estimate import (
     GAIN,
     Assumption,
     WeightedEstimate,
+    jackknife_by_refits,
     weighted_estimate,
     with_assumed,
 )
@@ -74,6 +75,7 @@ from dahl_ident.fitting.optimum import agreed_scale, blanked, information_of, in
 from dahl_ident.problem import TableProblem
 
 _FEWEST_TESTS = 5  # of which each is left out in turn
+_MOST_REFITS = 20  # tests; if there are more, none changes the weights much by being left out
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
 _UPPER = 0.5 * (1.0 + CONFIDENCE)
@@ -380,6 +382,8 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
+        if estimate.misfit > 0.0 and len(tests) <= _MOST_REFITS:
+            by_tests = jackknife_by_refits(estimate, optimum, problem, tests)
         every = _at_least(every, by_chance**2 * by_tests)
     return ErrorModel(
         optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed),

@@ -309,6 +309,28 @@ def weighted_estimate(
     return replace(best, second=np.sqrt(chance) * (second.theta - best.theta))
 
 
+def jackknife_by_refits(
+    estimate: WeightedEstimate,
+    optimum: Optimum,
+    problem: TableProblem,
+    tests: Sequence[NDArray[np.intp]],
+) -> FloatArray:
+    """Return the covariance of theta (Q, Q) by estimating again without each test, weights too.
+
+    `problem` has the stated covariances, to which each estimate adds its own misfit.
+    """
+    moves = []
+    for rows in tests:
+        kept = np.ones(problem.data.n, dtype=bool)
+        kept[rows] = False
+        with suppress(np.linalg.LinAlgError):  # the others do not determine it
+            others = problem.part(kept, problem.data.response[kept])
+            without = _descended(optimum, others, estimate.theta, determined=True)
+            moves.append(without.theta - estimate.theta)
+    each = np.array(moves).reshape(-1, len(estimate.theta))
+    return np.asarray((1.0 - 1.0 / len(tests)) * each.T @ each)
+
+
 def _descended(
     optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
 ) -> WeightedEstimate:

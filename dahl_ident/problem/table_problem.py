@@ -166,6 +166,7 @@ class TableProblem(Problem):
         """Return the problem of some rows, with other responses in place of the data's."""
         data = replace(self.data.select(rows=rows), response=response)
         part = self.like(data=data)
+        part.ranges = self.ranges
         return part if self._misfit is None else part.widened(self._misfit[rows])
 
     def _with_rows(self, kind: type[_Kind], rows: Rows) -> _Kind:
