@@ -1,6 +1,7 @@
 """Measured dampers: what laws beyond Dahl find in whole records, from no guess."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,10 +75,20 @@ def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     assert 0.1 < values["exponent"] < 1.2
 
 
-@pytest.mark.parametrize("pattern", ["ensaio[0-9]*.1.mat", "ensaio.A.*.mat"])
-def test_an_exponent_with_two_minima_lets_no_estimate_jump(pattern):
-    """Of 1.1 and 2.5 the likelier counts; its distance from the other is in the uncertainty."""
+@pytest.mark.parametrize(
+    ("pattern", "labelled", "names"),
+    [
+        # two minima of the exponent, 1.1 and 2.5: the likelier counts, its distance is in u
+        ("ensaio[0-9]*.1.mat", False, ("f_max", "sigma", "alpha", "damping")),
+        ("ensaio.A.*.mat", False, ("f_max", "sigma", "alpha", "damping")),
+        # the test of two rows holds most of what tells friction from damping
+        ("ensaio.vali.*.mat", True, ("f_max", "sigma", "damping")),
+    ],
+)
+def test_no_test_left_out_lets_an_estimate_jump(pattern, labelled, names):
     tests = [extract(record, harmonics=[1]) for record in cranked(pattern, 1)]
+    if labelled:
+        tests = [replace(t, level=np.full(t.n, f"test {i}")) for i, t in enumerate(tests)]
 
     def estimate(some):
         data = FrequencyResponse.concatenate(some)
@@ -85,7 +96,7 @@ def test_an_exponent_with_two_minima_lets_no_estimate_jump(pattern):
 
     whole = estimate(tests)
     others = [estimate([*tests[:i], *tests[i + 1 :]]) for i in range(len(tests))]
-    for name in ("f_max", "sigma", "alpha", "damping"):
+    for name in names:
         value, u = whole[name].value, whole[name].stderr
         estimates = np.array([each[name].value for each in others])
         assert np.abs(estimates - value).max() < 3.0 * u
