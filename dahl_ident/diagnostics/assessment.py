@@ -1,4 +1,4 @@
-"""The assessment of a fit: errors, values, intervals, bands, judgement."""
+"""The assessment of a fit: errors, values, intervals, bands."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bands import DerivedQuantity, derived
 from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget, taken_as_exact
-from dahl_ident.diagnostics.checks import assumptions, judgement
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
+from dahl_ident.diagnostics.error_sources import in_order_of_level
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation
@@ -30,7 +30,7 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
-from dahl_ident.diagnostics.judgement import Finding, Judgement
+from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
 from dahl_ident.elements import Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
@@ -331,14 +331,42 @@ class TableAssessment(Assessment):
         except DahlIdentError:
             return None
 
-    @cached_property
-    def judgement(self) -> Judgement:
-        """Every finding about the fit, and the status that follows from them."""
-        return judgement(self)
-
     def assumptions(self, *, counted: bool = True) -> Iterator[Finding]:
-        """Return the assumptions of the result."""
-        return assumptions(self.optimum, self.errors if counted else None)
+        """Yield one finding with the assumptions that these data cannot test.
+
+        Those of noise alone, unless all sources of error are `counted`.
+        """
+        errors, problem = self.errors if counted else None, self.problem
+        ranges, stated = [], {}
+        for parameter in problem.model.parameters:
+            name = parameter.name
+            if parameter.prior is None or parameter.free:
+                continue
+            if parameter.assumed and errors is not None and name in errors.assumed:
+                low, high = parameter.prior
+                place = {"name": name, "low": low, "high": high, "unit": parameter.unit}
+                ranges.append(
+                    {**place, "value": errors.values[name], "stderr": errors.stderr[name]}
+                )
+            elif parameter.value is not None:
+                stated[name] = parameter.value
+        sensors = {p.name for p in problem.sensors.parameters if p.free}
+        if "delay" in sensors and "force_gain" not in sensors:
+            stated["force_gain"] = 1.0
+        cost = self.constraint_cost
+        runs = len((problem if errors is None else errors.problem).data.runs or ())
+        values = {
+            "ranges": tuple(ranges),
+            "stated": stated,
+            "constraints": () if cost is None else tuple(cost.texts),
+            "exact": self.exact,
+            "single_run": runs < 2,
+            "passes": runs * (problem.data.run is None),
+            "no_drift": in_order_of_level(problem.data),
+            "noise_alone": errors is None,
+        }
+        if any(values.values()):
+            yield Finding(Question.ASSUMED, VerdictStatus.TRUSTED, "assumed", values)
 
     @cached_property
     def _budget(self) -> Budget:

@@ -7,15 +7,14 @@ what the result depends on and the data cannot test.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import doubts
-from dahl_ident.diagnostics.budget import taken_as_exact
+from dahl_ident.diagnostics.assessment import Assessment, TableAssessment
 from dahl_ident.diagnostics.error_model import ErrorModel
-from dahl_ident.diagnostics.error_sources import in_order_of_level
 from dahl_ident.diagnostics.judgement import (
     Finding,
     Judgement,
@@ -32,11 +31,7 @@ from dahl_ident.diagnostics.physics import (
     steady_findings,
 )
 from dahl_ident.elements import Element
-from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import LOSSES
-
-if TYPE_CHECKING:
-    from dahl_ident.diagnostics.assessment import Assessment, TableAssessment
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
@@ -161,7 +156,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 def _reservations(fit: TableAssessment) -> Iterator[Finding]:
     """Yield reasons not to trust a fit although its residuals may look like noise."""
     yield from _beyond_limit(fit)
-    yield from below_zero(fit)
+    yield from below_zero(fit.problem, fit.known)
     yield from _contradicted_priors(fit)
     yield from _beyond_range(fit)
     yield from _moved_by_outliers(fit)
@@ -190,7 +185,7 @@ def _slight(fit: TableAssessment) -> Iterator[Finding]:
         part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
         return float(np.sqrt(np.mean(np.abs(part) ** 2)))
 
-    yield from slight(fit, share_of, within, misfit)
+    yield from slight(fit.problem, fit.known, share_of, within, misfit)
 
 
 def constraints(fit: Assessment) -> Iterator[Finding]:
@@ -280,6 +275,10 @@ def robust_values(
     return robust, by_noise
 
 
+def _steady(fit: TableAssessment) -> Iterator[Finding]:
+    yield from steady_findings(fit.optimum, fit.model)
+
+
 # Assumed?
 
 
@@ -296,38 +295,6 @@ def assumed(fit: Assessment) -> Iterator[Finding]:
     yield from fit.assumptions()
 
 
-def assumptions(optimum: Optimum, errors: ErrorModel | None) -> Iterator[Finding]:
-    """Yield one finding with the assumptions that these data cannot test."""
-    ranges, stated, data = [], {}, optimum.problem.data
-    for parameter in optimum.problem.model.parameters:
-        name = parameter.name
-        if parameter.prior is None or parameter.free:
-            continue
-        if parameter.assumed and errors is not None and name in errors.assumed:
-            low, high = parameter.prior
-            known = {"value": errors.values[name], "stderr": errors.stderr[name]}
-            ranges.append({"name": name, "low": low, "high": high, "unit": parameter.unit, **known})
-        elif parameter.value is not None:
-            stated[name] = parameter.value
-    sensors = {p.name for p in optimum.problem.sensors.parameters if p.free}
-    if "delay" in sensors and "force_gain" not in sensors:
-        stated["force_gain"] = 1.0
-    cost = optimum.constraint_cost
-    runs = len((data if errors is None else errors.problem.data).runs or ())
-    values = {
-        "ranges": tuple(ranges),
-        "stated": stated,
-        "constraints": () if cost is None else tuple(cost.texts),
-        "exact": tuple(taken_as_exact(optimum)),
-        "single_run": runs < 2,
-        "passes": runs * (data.run is None),
-        "no_drift": in_order_of_level(data),
-        "noise_alone": errors is None,
-    }
-    if any(values.values()):
-        yield Finding(Question.ASSUMED, _TRUSTED, "assumed", values)
-
-
 CHECKS: tuple[Callable[[TableAssessment], Iterable[Finding]], ...] = (
     constraints,
     _parameters,
@@ -335,7 +302,7 @@ CHECKS: tuple[Callable[[TableAssessment], Iterable[Finding]], ...] = (
     _bands,
     _reservations,
     _slight,
-    steady_findings,
+    _steady,
     reading,
     assumed,
 )

@@ -425,7 +425,7 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
         tested = replace(tested, neighbours=_side_by_side(optimum, tested))
     if optimum.method == "ipopt" or (optimum.success and not tested.objections):
         return tested  # another solver may have had constraints, which no trial would keep
-    sign = sign_convention(optimum, tested.rms_misfit, _tested_estimate)
+    sign = sign_convention(optimum, tested.rms_misfit, _misfit_if_described)
     if sign:
         return replace(tested, sign=sign, warnings=(*tested.warnings, sign))
     tested = _without_suspicious(optimum, tested)
@@ -438,6 +438,11 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
 def _tested_estimate(optimum: Optimum) -> Goodness:
     """Return the tests of the estimate that belongs to an optimum."""
     return _tested(optimum, error_model(optimum, of_combinations=True))
+
+
+def _misfit_if_described(optimum: Optimum) -> float:
+    tested = _tested_estimate(optimum)
+    return np.inf if tested.objections else tested.rms_misfit
 
 
 def _bound(optimum: Optimum, misfit: float) -> float | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import comb
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -26,9 +26,6 @@ from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.fitting.global_start import own_starts
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import percent
-
-if TYPE_CHECKING:
-    from dahl_ident.diagnostics.goodness import Goodness
 
 _LEVEL = 0.01  # false-alarm rate, of the worst of all points
 _SHARE = 0.1  # of the rows: if more stand out, model or noise is wrong, not single rows
@@ -205,11 +202,12 @@ def rms_misfit_of(problem: TableProblem, fitted: ComplexArray) -> float:
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 
-def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum], Goodness]) -> str:
+def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimum], float]) -> str:
     """Return which sign of the response explains data that the fit does not; "" where none.
 
-    `before` is the misfit of the estimate, and `tested` tests that of another optimum: a missing
-    mass or spring is met better with a turned sign as well, but not to the noise.
+    `before` is the misfit of the estimate, and `misfit_of` returns that of another optimum,
+    infinite where tests object to it: a missing mass or spring is met better with a turned sign as
+    well, but not to the noise.
     """
     fitted = optimum.problem.predict(optimum.theta)
     middle = float(np.median(_misfit(optimum.problem, fitted)))
@@ -227,12 +225,12 @@ def sign_convention(optimum: Optimum, before: float, tested: Callable[[Optimum],
     if not promising:
         return ""
     _, turn, problem = min(promising, key=lambda each: each[0])
-    turned = tested(solve(problem, loss=optimum.loss))
-    if turned.objections or not turned.rms_misfit * EXPLAINS < before:
+    turned = misfit_of(solve(problem, loss=optimum.loss))
+    if not turned * EXPLAINS < before:
         return ""
     return (
         f"With the response {turn.name} the misfit falls from {percent(before)} to "
-        f"{percent(turned.rms_misfit)} rms: {turn.check}"
+        f"{percent(turned)} rms: {turn.check}"
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -22,9 +22,6 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.units import engineering, percent, shown_unit
-
-if TYPE_CHECKING:
-    from dahl_ident.diagnostics.assessment import Assessment, TableAssessment
 
 _SEEN = 1e-3  # relative difference that is worth a place
 _DISTORTED = 0.05  # of a force: less changes the fundamental by well below 1 %
@@ -48,6 +45,8 @@ _TYPICAL_ROTATION = {
 _DIMENSIONS = {(1, 0, 0): "force limit", (1, -1, 0): "contact stiffness"}
 _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
 _ALIKE = 0.05  # relative difference from such a ratio, and spread
+Estimates = tuple[Mapping[str, float], Mapping[str, float]]
+"""Values and their standard uncertainties, by name."""
 
 
 def _steady_difference(optimum: Optimum) -> tuple[int, float]:
@@ -69,9 +68,12 @@ def _steady_difference(optimum: Optimum) -> tuple[int, float]:
     return row, float(apart[row])
 
 
-def steady_findings(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield how driven rows were predicted, the difference from the other method, and jumps."""
-    optimum, problem = fit.optimum, fit.problem
+def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
+    """Yield how driven rows were predicted, the difference from the other method, and jumps.
+
+    `model` has the estimates put in.
+    """
+    problem = optimum.problem
     if not (problem.data.controlled == "force").any():
         return
     if problem.is_exact:
@@ -80,7 +82,7 @@ def steady_findings(fit: TableAssessment) -> Iterator[Finding]:
         seen = apart >= _SEEN
         yield described("steady", difference=apart if seen else 0.0, row=name if seen else "")
         yield from _distorted(problem.data)
-        yield from _jumps(problem.data, fit.model)
+        yield from _jumps(problem.data, model)
         if unstable := problem.unstable_rows(optimum.theta):
             names = tuple(row_names(problem.data, unstable))
             yield described("unstable_rows", _APPROXIMATE, rows=names)
@@ -260,34 +262,40 @@ def is_single(element: Element) -> bool:
     )
 
 
-def _estimated_singles(fit: Assessment) -> Iterator[tuple[Element, Parameter, dict[str, Any]]]:
+def _estimated_singles(
+    problem: Any, known: Estimates
+) -> Iterator[tuple[Element, Parameter, dict[str, Any]]]:
     """Yield every mass, damper and spring that is estimated, with its parameter and estimate."""
-    values, stderr = fit.known
-    for element in fit.problem.model.elements:
+    values, stderr = known
+    for element in problem.model.elements:
         if is_single(element) and element.parameters[0].free:
             (parameter,) = element.parameters
             name = parameter.name
-            unit = shown_unit(parameter.unit, fit.problem.motion)
+            unit = shown_unit(parameter.unit, problem.motion)
             estimate = {"value": values[name], "stderr": stderr[name], "unit": unit}
             yield element, parameter, {"name": name, **estimate}
 
 
-def below_zero(fit: Assessment) -> Iterator[Finding]:
+def below_zero(problem: Any, known: Estimates) -> Iterator[Finding]:
     """Yield a finding for every mass, damping or stiffness clearly below zero, with what to do."""
-    for _, parameter, estimate in _estimated_singles(fit):
+    for _, parameter, estimate in _estimated_singles(problem, known):
         value, instead = estimate["value"], _INSTEAD[parameter.dimension]
         if np.isfinite(value) and value < -_CLEARLY * estimate["stderr"]:
             yield described("negative", _APPROXIMATE, **estimate, instead=instead)
 
 
 def slight(
-    fit: Assessment, share_of: Callable[[Element, float], float], missed: float, misfit: float
+    problem: Any,
+    known: Estimates,
+    share_of: Callable[[Element, float], float],
+    missed: float,
+    misfit: float,
 ) -> Iterator[Finding]:
     """Yield a finding for every mass, damper or spring of less force than the model has `missed`.
 
     `share_of` returns the rms force of an element at its value over the whole; `misfit` is shown.
     """
-    for element, _, estimate in _estimated_singles(fit):
+    for element, _, estimate in _estimated_singles(problem, known):
         share = share_of(element, estimate["value"])
         if share < missed and estimate["value"] >= -_CLEARLY * estimate["stderr"]:
             yield described("slight", **estimate, share=share, misfit=misfit)

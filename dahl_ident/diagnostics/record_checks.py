@@ -250,7 +250,8 @@ def _misfit(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 def _physics(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield physical objections to a law's estimates, and objections to an exponent."""
+    """Yield physical objections to the estimates, and objections to an exponent."""
+    yield from below_zero(fit.problem, fit.known)
     for element in fit.model.elements:
         if not is_single(element):
             for text in element.physics([p.value or 0.0 for p in element.parameters]):
@@ -279,7 +280,7 @@ def _slight(fit: RecordAssessment) -> Iterator[Finding]:
         return float(np.concatenate([f - f.mean() for f in force]).std() / size)
 
     misfit = fit.goodness.share_in_band**0.5
-    yield from slight(fit, share_of, misfit, misfit)
+    yield from slight(problem, fit.known, share_of, misfit, misfit)
 
 
 def _notes(fit: RecordAssessment) -> Iterator[Finding]:
@@ -312,7 +313,6 @@ CHECKS: tuple[Callable[[RecordAssessment], Iterable[Finding]], ...] = (
     constraints,
     _misfit,
     undetermined,
-    below_zero,
     _physics,
     _slight,
     _notes,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -23,6 +24,7 @@ from dahl_ident.diagnostics.bands import (
     response_band,
 )
 from dahl_ident.diagnostics.budget import Budget
+from dahl_ident.diagnostics.checks import judgement
 from dahl_ident.diagnostics.confidence_levels import LEVELS
 from dahl_ident.diagnostics.intervals import (
     ConfidenceIntervals,
@@ -48,6 +50,9 @@ if TYPE_CHECKING:
 
 _ASSESSMENTS: Mapping[str, type[TableAssessment | RecordAssessment]] = {
     "table": TableAssessment, "records": RecordAssessment
+}  # fmt: skip
+_JUDGES: Mapping[str, Callable[[Any], Judgement]] = {
+    "table": judgement, "records": attrgetter("judgement")
 }  # fmt: skip
 
 
@@ -87,6 +92,11 @@ class FitResult(Result):
         """The assessment of the estimate by the data."""
         kind = _ASSESSMENTS[self.problem.kind]
         return kind(self.optimum, first_order=self.first_order)
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Every finding, and the status that follows from them."""
+        return _JUDGES[self.problem.kind](self.assessment)
 
     problem: Any = part("optimum.problem", "Data, model, noise, sensors as fitted.")
     method: str = part("optimum.method", "The solver.")
@@ -138,9 +148,6 @@ class FitResult(Result):
     identifiability: Identifiability = part(
         "assessment.identifiability",
         "Which parameters, or which combinations of them, the data determine.",
-    )
-    judgement: Judgement = part(
-        "assessment.judgement", "Every finding, and the status that follows from them."
     )
     assumed: tuple[str, ...] = part(
         "assessment.assumed",
