@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 _TRIALS = 12  # sets of values
 _SPREAD = 0.5  # decades to either side, of values that are tried
 _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
-_LINE = 201  # forces to either side
+_REST = len(_MAGNITUDES)  # place of force 0 between both signs of them
+_SHARES = np.linspace(0.0, 1.0, 201)  # of the largest force, to either side
 _FAR = 1e3  # times the scale: how far laws without full slip are looked at
 _BEYOND = 1.001  # of the force of full slip: integrators pass it by rounding and by a stage
 _OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
@@ -124,9 +125,12 @@ def check_slope(law: Friction) -> None:
     done = _CHECKED.setdefault(type(law), set())
     if declared in done:
         return
-    trial = _Trial(law)
-    for check in (trial.slip, trial.constant, trial.loops, trial.far):
-        reasons = check()
+    rng = np.random.default_rng(0)
+    count = 1 if all(p.value is not None for p in declared) else _TRIALS
+    columns = np.array([_tried(p, rng, count) for p in declared]).reshape(len(declared), count)
+    trials = [_Trial(law, values) for values in columns.T]
+    for check in (_Trial.slip, _Trial.constant, _Trial.loops, _Trial.far):
+        reasons = [check(trial) for trial in trials]
         if all(reasons):
             raise ModelError(f"{type(law).__name__}.slope {reasons[0]}")
     done.add(declared)
@@ -167,39 +171,35 @@ def _agrees_with_units(law: Friction) -> bool:
 
 
 class _Trial:
-    """A law's slope at several sets of values, one a row."""
+    """A law's slope at one set of values."""
 
-    def __init__(self, law: Friction) -> None:
+    def __init__(self, law: Friction, values: FloatArray) -> None:
         self._law = law
-        rng = np.random.default_rng(0)
-        known = all(p.value is not None for p in law.parameters)
-        self._count = 1 if known else _TRIALS
-        self._values = [_tried(p, rng, self._count)[:, None] for p in law.parameters]
+        self._values = values
         self._size = np.concatenate([-_MAGNITUDES[::-1], [0.0], _MAGNITUDES])
-        zero = len(_MAGNITUDES)
-        force = np.broadcast_to(self._size, (self._count, self._size.size))
-        self._wide = [self._slope(s * force, s) for s in (1.0, -1.0)]
-        self._at_rest = self._wide[0][:, zero]
-        limits = [self._limit(s, wide) for s, wide in zip((1.0, -1.0), self._wide, strict=True)]
-        self._limits = np.stack(limits)
+        self._wide = [self._slope(s * self._size, s) for s in (1.0, -1.0)]
+        ahead = self._wide[0][_REST:]
+        self._at_rest = ahead[0]
+        self._limits = [self._limit(s, w) for s, w in zip((1.0, -1.0), self._wide, strict=True)]
         with np.errstate(all="ignore"):
-            changed = np.abs(self._wide[0][:, zero:] / self._at_rest[:, None] - 1.0) > _CHANGED
-        first = np.where(changed.any(axis=1), self._size[zero + changed.argmax(axis=1)], np.inf)
-        scale = np.fmin(first, self._limits.min(axis=0))
-        self._scale = np.where(np.isfinite(scale), scale, 1.0)
+            changed = np.abs(ahead / self._at_rest - 1.0) > _CHANGED
+        first = self._size[_REST + changed.argmax()] if changed.any() else np.inf
+        scale = min(first, *self._limits)
+        self._scale = float(scale) if math.isfinite(scale) else 1.0
 
-    def _at(self, row: int, force: float, direction: float) -> str:
+    def _at(self, force: float, direction: float) -> str:
         """Return in words where something was found."""
-        numbers = [
-            f"{p.name} = {float(v[row, 0]):.4g}"
-            for p, v in zip(self._law.parameters, self._values, strict=True)
-        ]
-        where = [f"force = {force + 0.0:.4g} N", f"direction = {direction:+g}", *numbers]
-        return f"at {', '.join(where)}"
+        where = [f"force = {force + 0.0:.4g} N", f"direction = {direction:+g}"]
+        return f"at {', '.join([*where, *self._numbers()])}"
+
+    def _numbers(self) -> list[str]:
+        named = zip(self._law.parameters, self._values.tolist(), strict=True)
+        return [f"{p.name} = {v:.4g}" for p, v in named]
 
     def _slope(self, force: FloatArray, direction: float) -> FloatArray:
-        """Return dF/dx of a row of forces for each set of values, checked for its form."""
+        """Return dF/dx of a row of forces, checked for its form."""
         law, name = self._law, f"{type(self._law).__name__}.slope"
+        force = force[None]
         heading = np.full(force.shape, direction)
         arguments = f"an array of {force.shape} forces, and {len(self._values)} values"
         rated = not law.rate_independent
@@ -229,11 +229,12 @@ class _Trial:
                 f"{name} returned the shape {array.shape} for {arguments}; expected "
                 f"{force.shape}, one number for each force"
             )
-        return np.broadcast_to(array.astype(np.float64), force.shape)
+        return np.broadcast_to(array.astype(np.float64), force.shape)[0]
 
     def _called(self, force: FloatArray, direction: FloatArray, velocity: float | None) -> Any:
         with np.errstate(all="ignore"):
-            return self._law.slope(force.copy(), direction, velocity, list(self._values))
+            values = [np.full((1, 1), v) for v in self._values]
+            return self._law.slope(force.copy(), direction, velocity, values)
 
     def _works_with_velocity(self, force: FloatArray, direction: FloatArray) -> bool:
         try:
@@ -242,136 +243,120 @@ class _Trial:
             return False
         return True
 
-    def _limit(self, direction: float, wide: FloatArray) -> FloatArray:
+    def _limit(self, direction: float, wide: FloatArray) -> float:
         """Return the size of the force at which the slope ceases to be positive; inf if never."""
-        size = self._size
-        zero = len(_MAGNITUDES)
-        low, high = np.zeros(self._count), np.full(self._count, np.inf)
-        for row in range(self._count):
-            with np.errstate(invalid="ignore"):
-                stops = np.flatnonzero(~((wide[row, zero:] > 0.0) & (wide[row, zero:] < np.inf)))
-                far = wide[row, zero : zero + stops[0]] if stops.size else wide[row, zero:]
-            if stops.size and not (far.size and far[-1] > _OVERFLOW * far[0]):
-                low[row], high[row] = size[max(zero, zero + stops[0] - 1)], size[zero + stops[0]]
-        open_ended = np.isinf(high)
+        size, ahead = self._size[_REST:], wide[_REST:]
+        with np.errstate(invalid="ignore"):
+            stops = np.flatnonzero(~((ahead > 0.0) & (ahead < np.inf)))
+        before = ahead[: stops[0]] if stops.size else ahead
+        if not stops.size or (before.size and before[-1] > _OVERFLOW * before[0]):
+            return np.inf
+        low, high = size[max(0, stops[0] - 1)], size[stops[0]]
         for _ in range(4):
-            line = (
-                np.where(open_ended, 0.0, low)[:, None]
-                + np.linspace(0.0, 1.0, 33) * np.where(open_ended, 0.0, high - low)[:, None]
-            )
+            line = np.linspace(low, high, 33)
             with np.errstate(invalid="ignore"):
                 positive = self._slope(direction * line, direction) > 0.0
-            last = np.where(positive.all(axis=1), 32, np.maximum(positive.argmin(axis=1), 1))
-            rows = np.arange(self._count)
-            low, high = line[rows, last - 1], np.where(open_ended, np.inf, line[rows, last])
-        return np.asarray(high)
+            last = 32 if positive.all() else max(int(positive.argmin()), 1)
+            low, high = line[last - 1], line[last]
+        return float(high)
 
-    def slip(self) -> list[str]:
-        """Return what is wrong with the slope up to full slip, for each set of values."""
-        ends = np.where(np.isfinite(self._limits), self._limits, self._scale)
-        return self._within(ends[..., None] * np.linspace(0.0, 1.0, _LINE))
+    def slip(self) -> str:
+        """Return what is wrong with the slope up to full slip."""
+        ends = [limit if math.isfinite(limit) else self._scale for limit in self._limits]
+        return self._within([end * _SHARES for end in ends])
 
-    def far(self) -> list[str]:
+    def far(self) -> str:
         """Return what is wrong with the slope at greater forces, of laws without full slip."""
         if np.isfinite(self._limits).all():
-            return [""]
-        return self._within(np.stack([self._reached(0), self._reached(1)]))
+            return ""
+        return self._within([self._reached(0), self._reached(1)])
 
-    def _within(self, reached: FloatArray) -> list[str]:
+    def _within(self, reached: list[FloatArray]) -> str:
         """Return what is wrong with the slope at sizes of forces to either side, from 0 on."""
-        objections = [""] * self._count
-        for i, direction in enumerate((1.0, -1.0)):
-            ahead, behind = reached[i], reached[1 - i]  # after a reversal, the other side's forces
-            size = np.c_[-behind[:, :0:-1], ahead, _BEYOND * ahead[:, -1]]
+        for side, direction in enumerate((1.0, -1.0)):
+            # after a reversal, the other side's forces
+            ahead, behind = reached[side], reached[1 - side]
+            size = np.concatenate([-behind[:0:-1], ahead, _BEYOND * ahead[-1:]])
             slopes = self._slope(direction * size, direction)
             place, peak = self._peak(size, slopes, direction)
-            size, slopes = np.c_[place, size], np.c_[peak, slopes]
-            for row in range(self._count):
-                objections[row] = objections[row] or (
-                    self._not_finite(row, size[row], slopes[row], direction)
-                    or self._positive_again(row, i, direction)
-                    or self._not_positive(row, size[row, :-1], slopes[row, :-1], direction)
-                )
-        return objections
+            size, slopes = np.append(place, size), np.append(peak, slopes)
+            objection = (
+                self._not_finite(size, slopes, direction)
+                or self._positive_again(side, direction)
+                or self._not_positive(size[:-1], slopes[:-1], direction)
+            )
+            if objection:
+                return objection
+        return ""
 
     def _reached(self, side: int) -> FloatArray:
         """Return sizes of the forces that motions reach on one side, from 0 on.
 
         Up to full slip; without it, ever farther apart, until one direction's slope overflows.
         """
-        share = np.linspace(0.0, 1.0, _LINE)
-        zero = len(_MAGNITUDES)
-        before, after = self._wide[side][:, zero + 1 :], self._wide[1 - side][:, zero - 1 :: -1]
         limit, scale = self._limits[side], self._scale
+        if math.isfinite(limit):
+            return _SHARES * limit
+        before, after = self._wide[side][_REST + 1 :], self._wide[1 - side][_REST - 1 :: -1]
         with np.errstate(invalid="ignore"):
             steepest = np.maximum(np.abs(before), np.abs(after))
-            wild = ~(steepest < _OVERFLOW * self._at_rest[:, None])
-        wild &= scale[:, None] < _MAGNITUDES
-        farthest = np.where(wild, _MAGNITUDES, _FAR * scale[:, None]).min(axis=1)
-        sizes: FloatArray = scale[:, None] * np.expm1(share * np.log1p(farthest / scale)[:, None])
-        ends = np.isfinite(limit)
-        sizes[ends] = share * limit[ends, None]
-        return sizes
+            wild = ~(steepest < _OVERFLOW * self._at_rest) & (scale < _MAGNITUDES)
+        farthest = np.where(wild, _MAGNITUDES, _FAR * scale).min()
+        return np.asarray(scale * np.expm1(_SHARES * np.log1p(farthest / scale)))
 
-    def _peak(
-        self, size: FloatArray, slopes: FloatArray, direction: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return where each slope is largest, looked at more and more closely, and its size there.
+    def _peak(self, size: FloatArray, slopes: FloatArray, direction: float) -> tuple[float, float]:
+        """Return where the slope is largest, looked at more and more closely, and its size there.
 
         Infinite where it grows beyond all bounds.
         """
-        bounds, gaps = size[:, [0, -1]].T[..., None], np.pad(np.diff(size), ((0, 0), (1, 1)))
-        widths = np.maximum(gaps[:, :-1], gaps[:, 1:])
-        most = np.sort(np.abs(slopes), axis=1)[:, [-2]]  # the largest may be at a pole
+        ends, gaps = (size[0], size[-1]), np.pad(np.diff(size), 1)
+        widths = np.maximum(gaps[:-1], gaps[1:])
+        most = np.sort(np.abs(slopes))[-2]  # the largest may be at a pole
         for _ in range(_CLOSER):
-            largest = np.argmax(np.abs(slopes), axis=1)[:, None]
-            place, peak, width = (
-                np.take_along_axis(a, largest, axis=1) for a in (size, slopes, widths)
-            )
-            size = np.clip(place + width * np.linspace(-1.0, 1.0, 129), *bounds)
+            largest = np.argmax(np.abs(slopes))
+            place, peak, width = size[largest], slopes[largest], widths[largest]
+            size = np.clip(place + width * np.linspace(-1.0, 1.0, 129), *ends)
             slopes = self._slope(direction * size, direction)
-            widths = np.broadcast_to(width / 64.0, size.shape)
-        return place, np.where(np.abs(peak) > _OVERFLOW * most, np.inf, peak)
+            widths = np.full(size.shape, width / 64.0)
+        return place, np.inf if abs(peak) > _OVERFLOW * most else peak
 
-    def _not_finite(self, row: int, size: FloatArray, slopes: FloatArray, direction: float) -> str:
+    def _not_finite(self, size: FloatArray, slopes: FloatArray, direction: float) -> str:
         wrong = np.flatnonzero(~np.isfinite(slopes))
         if not wrong.size:
             return ""
         first = wrong[np.argmin(np.abs(size[wrong]))]
         return (
-            f"is {slopes[first]} {self._at(row, direction * size[first], direction)}; expected a "
+            f"is {slopes[first]} {self._at(direction * size[first], direction)}; expected a "
             "finite number for every force up to full slip, also after the direction has changed, "
             "and a little beyond it, as from np.sign(m) * np.abs(m)**alpha with "
             "m = 1 - direction*force/f_max"
         )
 
-    def _not_positive(
-        self, row: int, size: FloatArray, slopes: FloatArray, direction: float
-    ) -> str:
+    def _not_positive(self, size: FloatArray, slopes: FloatArray, direction: float) -> str:
         largest = np.max(np.abs(slopes))
         negative = np.flatnonzero(slopes < -_ROUNDING * largest)
-        if not self._at_rest[row] > 0.0:
-            where = self._at(row, 0.0, direction)
+        if not self._at_rest > 0.0:
+            where = self._at(0.0, direction)
             return (
-                f"is {self._at_rest[row]:.4g} N/m {where}; expected a positive slope at rest and "
+                f"is {self._at_rest:.4g} N/m {where}; expected a positive slope at rest and "
                 "up to full slip"
             )
         inner = negative[size[negative] < size[-1] * (1.0 - 1e-3)]
         if not inner.size:
             return ""
         worst = inner[np.argmin(slopes[inner])]
-        where = self._at(row, direction * size[worst], direction)
+        where = self._at(direction * size[worst], direction)
         return (
             f"is {slopes[worst]:.4g} N/m, negative before full slip, {where}; expected a positive "
             "slope until full slip, also after the direction has changed"
         )
 
-    def _positive_again(self, row: int, side: int, direction: float) -> str:
+    def _positive_again(self, side: int, direction: float) -> str:
         """Return what is wrong where a slope is negative, and positive at greater forces."""
-        limit, slopes, size = self._limits[side, row], self._wide[side][row], self._size
+        limit, slopes, size = self._limits[side], self._wide[side], self._size
         near = (size > limit) & (size < 1e3 * limit)
         with np.errstate(invalid="ignore"):
-            smallest = _ROUNDING * self._at_rest[row]
+            smallest = _ROUNDING * self._at_rest
             negative = np.flatnonzero(near & (slopes < -smallest))
             later = np.flatnonzero(near & (slopes > smallest))
         if not (negative.size and later.size and later[-1] > negative[0]):
@@ -379,58 +364,48 @@ class _Trial:
         worst = negative[np.argmin(slopes[negative])]
         return (
             f"is {slopes[worst]:.4g} N/m, negative before full slip, "
-            f"{self._at(row, direction * size[worst], direction)}, and positive again at larger "
+            f"{self._at(direction * size[worst], direction)}, and positive again at larger "
             "forces; expected a positive slope until full slip"
         )
 
-    def constant(self) -> list[str]:
+    def constant(self) -> str:
         """Return that the slope is the same for all forces and directions, if it is."""
-        objections = []
-        for row in range(self._count):
-            slopes = np.concatenate([wide[row] for wide in self._wide])
-            slopes = slopes[np.isfinite(slopes)]  # forces far beyond full slip may overflow
-            same = bool(slopes.size) and np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
-            objections.append(
-                f"is {slopes[0]:.4g} N/m for every force and direction: a constant number, which "
-                "is a spring without friction; expected a slope that depends on force and "
-                "direction, or use di.Spring"
-                if same
-                else ""
-            )
-        return objections if self._law.rate_independent else [""]
+        slopes = np.concatenate(self._wide)
+        slopes = slopes[np.isfinite(slopes)]  # forces far beyond full slip may overflow
+        same = slopes.size and np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
+        if not (same and self._law.rate_independent):
+            return ""
+        return (
+            f"is {slopes[0]:.4g} N/m for every force and direction: a constant number, which "
+            "is a spring without friction; expected a slope that depends on force and "
+            "direction, or use di.Spring"
+        )
 
-    def loops(self) -> list[str]:
-        """Return by how much energy grows over a closed loop, for each set of values.
+    def loops(self) -> str:
+        """Return by how much energy grows over a closed loop, if it does.
 
         Of a loop between two forces, where dx = dF/slope in each direction.
         """
-        share = np.linspace(0.0, _TO_SLIP, _LINE)
-        reach = np.where(np.isfinite(self._limits), self._limits, _SOFT * self._scale)
-        upper, lower = share * reach[0][:, None], -share * reach[1][:, None]
-        objections = []
+        reach = [limit if math.isfinite(limit) else _SOFT * self._scale for limit in self._limits]
+        upper, lower = _TO_SLIP * _SHARES * reach[0], -_TO_SLIP * _SHARES * reach[1]
         with np.errstate(all="ignore"):
-            high, low = self._between(upper), self._between(lower)
-        for row in range(self._count):
-            gap, work, size = (part[row] for part in high)
-            below, taken, whole = (part[row] for part in low)
+            gap, work, size = self._between(upper)
+            below, taken, whole = self._between(lower)
             # the loop closes where both directions need the same displacement
             after = np.diff(np.sign(below - gap[:, None]), axis=1) != 0.0
             place = 1 + after.argmax(axis=1)
             lost = work - taken[place]
-            all_of_it = size + np.abs(whole[place])
-            with np.errstate(all="ignore"):
-                created = np.where(after.any(axis=1), -lost / all_of_it, -np.inf)
-            worst = int(np.nanargmax(np.where(np.arange(_LINE) > 0, created, -np.inf)))
-            numbers = self._at(row, 0.0, 1.0).partition("direction = +1")[2].lstrip(", ")
-            objections.append(
-                f"creates energy: {-lost[worst]:.3g} J in each cycle between "
-                f"{lower[row, place[worst]]:.3g} and {upper[row, worst]:.3g} N, at {numbers}; "
-                "expected a loop that loses energy: the slope after a reversal must not be below "
-                "that before it"
-                if created[worst] > _CREATED
-                else ""
-            )
-        return objections
+            created = np.where(after.any(axis=1), -lost / (size + np.abs(whole[place])), -np.inf)
+        created[0] = -np.inf
+        worst = int(np.nanargmax(created))
+        if not created[worst] > _CREATED:
+            return ""
+        return (
+            f"creates energy: {-lost[worst]:.3g} J in each cycle between "
+            f"{lower[place[worst]]:.3g} and {upper[worst]:.3g} N, at {', '.join(self._numbers())}; "
+            "expected a loop that loses energy: the slope after a reversal must not be below "
+            "that before it"
+        )
 
     def _between(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return three integrals from rest to each force, which the forces of a loop share.
@@ -439,9 +414,8 @@ class _Trial:
         """
         rising, falling = (1.0 / self._slope(force, s) for s in (1.0, -1.0))
         parts = (rising - falling, force * (rising - falling), np.abs(force) * (rising + falling))
-        step = np.diff(force, axis=1)
-        sums = [np.cumsum(0.5 * (p[:, 1:] + p[:, :-1]) * step, axis=1) for p in parts]
-        gap, work, size = (np.c_[np.zeros(self._count), total] for total in sums)
+        step = np.diff(force)
+        gap, work, size = (np.append(0.0, np.cumsum(0.5 * (p[1:] + p[:-1]) * step)) for p in parts)
         return gap, work, size
 
 
