@@ -170,8 +170,8 @@ def _run_laws(folder: Path, laws: Any) -> None:
 
 def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
     """Return the model as plain data, names of its parameters, and digests of files of laws."""
-    from dahl_ident.elements.description import describe_model, model_from_description
     from dahl_ident.elements.law_files import file_of, own_laws
+    from dahl_ident.elements.model import describe_model, model_from_description
 
     if (
         not isinstance(entries, list)

@@ -300,8 +300,8 @@ def campaign(
 
 def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
     """Return the modules and files that define the model's laws, other than this package's."""
-    from dahl_ident.elements.description import model_from_description
     from dahl_ident.elements.law_files import LawFile, file_of, own_laws, source_path
+    from dahl_ident.elements.model import model_from_description
 
     sources: dict[str | LawFile, None] = {}
     for law in own_laws(model_from_description(definition.options["model"]).elements):

@@ -107,7 +107,7 @@ def _load(law: str | LawFile) -> None:
 
 def _done(job: Job, digests: list[str]) -> Row:
     import dahl_ident as di
-    from dahl_ident.elements.description import model_from_description
+    from dahl_ident.elements.model import model_from_description
 
     options = job.options
     with _on_disk(job, digests) as paths:

@@ -214,7 +214,7 @@ def elements(texts: Sequence[str]) -> Element:
 
 
 def _element(text: str) -> Element:
-    from dahl_ident.elements.description import model_from_description
+    from dahl_ident.elements.model import model_from_description
 
     return model_from_description([_entry(text)]).elements[0]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.bouc_wen import BoucWen
 from dahl_ident.elements.dahl import Dahl
-from dahl_ident.elements.description import describe_model, model_from_description
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.equations import Excitation, FirstState, law_equations, plant_equations
 from dahl_ident.elements.facts import Asymptote, Combination, UniversalCurve
@@ -16,7 +15,7 @@ from dahl_ident.elements.linear import Damper, Mass, Spring
 from dahl_ident.elements.linear_system import LinearSystem
 from dahl_ident.elements.lugre import LuGre
 from dahl_ident.elements.maxwell_slip import MaxwellSlip
-from dahl_ident.elements.model import Model
+from dahl_ident.elements.model import Model, describe_model, model_from_description
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.power_damper import PowerDamper
 
