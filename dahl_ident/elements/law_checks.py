@@ -229,7 +229,7 @@ class _Trial:
                 f"{name} returned the shape {array.shape} for {arguments}; expected "
                 f"{force.shape}, one number for each force"
             )
-        return np.broadcast_to(array.astype(np.float64), force.shape)[0]
+        return np.asarray(np.broadcast_to(array.astype(np.float64), force.shape)[0])
 
     def _called(self, force: FloatArray, direction: FloatArray, velocity: float | None) -> Any:
         with np.errstate(all="ignore"):
