@@ -25,12 +25,12 @@ from dahl_ident.bayes.moves import moves_for
 from dahl_ident.errors import ValidationError
 
 _LEAST_STEPS = 20  # with fewer no autocorrelation can be estimated
-_FIRST_CHECK = 200  # steps: three times WARM_UP and LENGTH at an autocorrelation time of 1
-_GROWTH = 1.25  # from check to check: at most a quarter more steps than are needed
-_ROUND = 50  # steps: checks are at round numbers
-_PIECE = 50  # steps between two calls of the listener, at least
-_PIECES = 20  # one piece adds at most this fraction of the chain
-_PARTS = 8  # of the points of one call, distributed over a pool
+_FIRST_CHECK = 200  # steps at the first check: three times WARM_UP and LENGTH where tau is 1
+_GROWTH = 1.25  # ratio of steps from check to check: a quarter more than needed at most
+_ROUND = 50  # checks are at multiples of so many steps
+_PIECE = 50  # fewest steps between two calls of the listeners
+_PIECES = 20  # a long chain calls them after each twentieth of its length
+_PARTS = 8  # parts into which the points of one call are split for a pool
 
 Pool = Any
 """Anything with map: multiprocessing, concurrent.futures, mpi4py."""
@@ -164,10 +164,12 @@ def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
     return replace(chain, points=points, log_density=log_density, random_state=last.random_state)
 
 
-WINDOW = 5.0  # times tau, of Sokal's window: shorter cuts tau off, longer adds noise; as in emcee
-WARM_UP = 10.0  # autocorrelation times until the chain is independent of its start
-LENGTH = 50.0  # autocorrelation times needed for a reliable estimate of tau
-R_HAT = 1.01  # as Vehtari et al. (2021) recommend; the older 1.1 passes chains that differ
+# window of the autocorrelation over tau: a shorter one cuts tau off, a longer one adds noise;
+# as in emcee
+WINDOW = 5.0
+WARM_UP = 10.0  # autocorrelation times after which a chain is independent of its start
+LENGTH = 50.0  # autocorrelation times from which tau is estimated well enough (emcee)
+R_HAT = 1.01  # limit of Vehtari et al. (2021); the older 1.1 passes chains that differ
 
 
 @dataclass(frozen=True)

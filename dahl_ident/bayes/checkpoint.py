@@ -29,9 +29,9 @@ from dahl_ident.data.storage import library, locked, plain_data, put_in_place
 from dahl_ident.elements.model import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
-_FORMAT = "dahl_ident chain", 1  # with the version of the layout; files of others are refused
+_FORMAT = "dahl_ident chain", 1  # name and version of the layout; files of others are refused
 _ARRAYS = ("points", "log_density", "start", "random_key", "random_rest")
-_SHARE = 20.0  # ratio of the time spent sampling to the time spent writing
+_SHARE = 20.0  # time spent sampling over time spent writing
 
 Identity = Mapping[str, str]
 """Everything a chain depends on, part by part, as text or digest."""

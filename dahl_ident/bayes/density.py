@@ -50,8 +50,8 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
-TAIL_DOF = 4.0  # of Student's t: heavy tails for outliers, yet a finite variance
-_FARTHEST = 300.0  # of ln s
+TAIL_DOF = 4.0  # degrees of freedom of Student's t: tails of outliers, yet a finite variance
+_FARTHEST = 300.0  # largest ln s: its square is still a number
 Sums = Callable[[FloatArray], FloatArray]
 _COLUMNS = (  # of a table: what its likelihood depends on
     "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",

@@ -45,17 +45,22 @@ if TYPE_CHECKING:
 Function = Callable[[FloatArray], FloatArray]
 Rows = NDArray[np.intp]
 
-_DOF = 4.0  # of Student's t: tails heavier than those of a posterior, yet few wasted points
-_WIDER = 1.5  # times the covariance of a part, so that parts overlap
-_PARTS, _LEAST = 16, 40  # parts at most, and effective points in each at least
-_ROUND, _ROUNDS = 1024, 12  # points in a round, and rounds at most
-_ALIKE = 0.5  # effective points for each point of the last round, at which the mixture is good
-_REPEATS = 6  # independent randomizations: the fewer, the more each gains from Sobol's evenness
-_FIRST = 128  # points of each component, before their number is doubled
-_COVERAGE = 2.6  # standard errors that are stated: 95 % of Student's t with 5 dof
-_LIMITS = ndtr(np.linspace(-2.0, 2.0, 9))  # probabilities whose error is estimated
-_BLOCK = 256  # points in one call of the density: its arrays then stay in the processor's cache
-_KNOTS = ndtr(np.linspace(-4.5, 4.5, 46))  # of the distribution function behind a density
+# degrees of freedom of the components' Student's t: tails heavier than a posterior's, yet few
+# points are wasted there
+_DOF = 4.0
+_WIDER = 1.5  # covariance of a component over that of its points, so that components overlap
+_PARTS = 16  # most components
+_LEAST = 40  # fewest effective points from which one is made
+_ROUND = 1024  # points drawn before the mixture is fitted again
+_ROUNDS = 12  # most fits; two or three are usual
+_ALIKE = 0.5  # effective points, over the points of a round, at which the mixture is good enough
+# independent randomizations, whose scatter is the error: the fewer, the more even each one's points
+_REPEATS = 6
+_FIRST = 128  # points drawn from each component at first; their number then doubles
+_COVERAGE = 2.6  # standard errors in an error: 95 % of Student's t, six repeats' 5 dof
+_LIMITS = ndtr(np.linspace(-2.0, 2.0, 9))  # probabilities whose error counts
+_BLOCK = 256  # points in one call of the density: its arrays stay in the processor's cache
+_KNOTS = ndtr(np.linspace(-4.5, 4.5, 46))  # probabilities between which a density is smoothed
 
 
 @dataclass(frozen=True)
@@ -305,8 +310,10 @@ def _effective(weights: FloatArray) -> float:
 
 
 _DEGREES = 2, 3, 4
-_POINTS = 8  # at least, for each coefficient; their number doubles with the degree
-_TAILS = 4.0, 1.0  # of Student's t for the coefficients, and for the checks, which see far tails
+_POINTS = 8  # fewest exact points for each coefficient; their number doubles with the degree
+# degrees of freedom of the Student's t whose points give the coefficients, and the checks, which
+# have to see far tails
+_TAILS = 4.0, 1.0
 
 
 @dataclass(frozen=True)

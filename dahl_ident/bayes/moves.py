@@ -44,13 +44,13 @@ Random = np.random.RandomState  # emcee's
 Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArray]]
 """Half and guide, each (ensembles, W/2, D) -> places proposed and ln of the Hastings factor."""
 
-_JITTER = 1e-5  # relative, of the step: keeps walkers off a lattice
-_JUMP = 0.1  # part of the steps that go all the way
+_JITTER = 1e-5  # relative scatter of a step, which keeps walkers off a lattice
+_JUMP = 0.1  # share of the steps that go the whole way between two walkers
 _TAIL = 2.0  # degrees of freedom of the independent proposals: few, to reach far tails
-_SNOOKER = 1.7  # mean of the factors of ter Braak and Vrugt (2008), as in emcee
+_SNOOKER = 1.7  # length of a snooker step: the mean of ter Braak and Vrugt's range, as in emcee
 
 
-_FARTHEST = 1e300  # replaces a shift that is not finite; no prior reaches it
+_FARTHEST = 1e300  # stands for a shift that is not finite; no prior reaches it
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,14 @@ from dahl_ident.elements import Parameter
 from dahl_ident.errors import HIGH, LOW, ModelError, ValidationError, argument, choices
 from dahl_ident.problem import Problem
 
-_DECADES = 1e5  # beyond the data's sizes, either way: as data far from the knee leave open
-_WIDER = 10.0  # a gain that is farther from 1 is a mistake; times an estimate, for its bounds
-_BEYOND = 5.0  # times a declared range that a default prior reaches beyond it
-_RESONANCE = 1e3  # factor by which the parts of a plant may exceed their sum
-_TAIL = 1e-10  # of a distribution of unbounded support that lies beyond its `limits`
+# a positive parameter's default bounds over the sizes of its unit in the data: a knee may lie so
+# far from the data
+_DECADES = 1e5
+# bounds of a gain over 1, beyond which it is a mistake; those of an estimate of either sign over it
+_WIDER = 10.0
+_BEYOND = 5.0  # default bounds over the range that a parameter declares
+_RESONANCE = 1e3  # a plant's parts over their sum: at a resonance they nearly cancel
+_TAIL = 1e-10  # probability that counts as none, where a distribution has no ends
 
 
 PriorLike = Any

@@ -26,8 +26,8 @@ from scipy.special import chdtri
 
 from dahl_ident.arrays import FloatArray
 
-_SIZES = 32  # values of lambda: quantiles of Student's t with 2 dof then err by 2 % at 95 %
-_MANY = 200.0  # degrees of freedom with which Student's t is normal to 1 % at 95 %
+_SIZES = 32  # values of lambda: limits of Student's t with 2 dof then err by 2 % at 95 %
+_MANY = 200.0  # degrees of freedom from which Student's t is normal to 1 % at 95 %
 
 
 @dataclass(frozen=True)

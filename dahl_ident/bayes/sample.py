@@ -38,7 +38,7 @@ from dahl_ident.fitting.record_search import Tell
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors
 
-_MOST_AXES = 3  # the number of points is a power of the number of axes
+_MOST_AXES = 3  # most parameters of a grid: the number of points is a power of theirs
 
 Start = Callable[[int, np.random.Generator], FloatArray]
 """Returns as many points of finite density as there are walkers."""
@@ -259,12 +259,12 @@ def _with_scale(density: Density, sums_of: Function, points: WeightedPoints) -> 
     return np.column_stack([points.theta, ln_s])
 
 
-_WIDER = 2.0  # times the posterior's spread: R-hat needs starts wider than the posterior
-_TRIES = 60  # each 0.8 as wide as the last: in the end a millionth of the posterior
-_INSIDE = 1e-3  # of the prior's width, kept from its ends
-_PRIOR_DRAWS = 4096  # 98 % find a region that holds 1e-3 of the prior
-_POSITIONS = 5  # of the offending parameter, each of which takes a fit of the others
-_EXACT = 1e-13  # relative noise below which a fit is exact to rounding
+_WIDER = 2.0  # spread of the starts over the posterior's: R-hat needs it wider
+_TRIES = 60  # draws of a start, each 0.8 as wide as the last: to a millionth of the posterior
+_INSIDE = 1e-3  # distance of a centre from the prior's ends, over its width
+_PRIOR_DRAWS = 4096  # draws of the prior: 98 % find a region that holds 1e-3 of it
+_POSITIONS = 5  # places tried of a parameter that left its prior, each with a fit of the others
+_EXACT = 1e-13  # relative noise below which residuals are rounding
 
 
 def optimum_of(problem: Problem, tell: Tell | None = None) -> Optimum | None:

@@ -42,26 +42,31 @@ from dahl_ident.problem.stiffness import StiffnessData
 
 IntArray = NDArray[np.intp]
 
-_STEP = 0.01  # of ln(A/length): tables are read at the nearest step
-_LOWEST, _NODES = -3200, 6400  # of ln(A/length) in a table, in steps
-_DECADE = np.log(10.0) / _STEP  # in steps
-_FINE, _COARSE = 58, 230  # steps between nodes of the grid: four a decade, one a decade
-_FINE_ENDS = (6, 4)  # coarse nodes at either end
-_COMPUTED = 10  # steps between the amplitudes at which a table is computed; cubics between
-_AROUND_KNEE = 1e3  # how far a table is computed beyond the knee; power laws beyond that
+_STEP = 0.01  # of ln(A/length) in a table, which is read at the nearest step
+_LOWEST, _NODES = -3200, 6400  # first step and number of steps of a table: 14 decades either way
+_DECADE = np.log(10.0) / _STEP  # steps in a decade
+# steps between nodes of the grid: four a decade near the data, one a decade farther out
+_FINE, _COARSE = 58, 230
+_FINE_ENDS = (6, 4)  # nodes farther out below the fine ones, and above
+# a table is computed at every tenth step, with cubics between; the law is what takes the time
+_COMPUTED = 10
+_AROUND_KNEE = 1e3  # distance from the knee beyond which a curve is a power law
+# values tried of a number whose law names none, by its transform
 _NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
-_LARGEST = 1e150  # weighted columns, whose squares are numbers still
-_DEPENDENT = 1e-12  # of a column's length that others leave
-_MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # of the shortest of several lengths
-_MOST_TABLES = 64  # 6 MB a harmonic in all, and some seconds
-_LEAST, _TOGETHER = 4, 20  # amplitudes of a table; those that are computed together
-_HIGHEST = 3  # harmonic that takes part in a start; higher ones cost more and tell little more
+_LARGEST = 1e150  # weighted stiffness whose square is still a number
+_DEPENDENT = 1e-12  # share of a column that others do not explain, below which it is rounding
+_MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # several lengths are tried at these times the shortest one
+_MOST_TABLES = 64  # tables kept: 6 MB a harmonic in all, and some seconds to compute
+_LEAST = 4  # amplitudes that a table needs for its cubics
+_TOGETHER = 20  # amplitudes computed together, until the law overflows
+_HIGHEST = 3  # highest harmonic in a start; more of them cost time and tell little more
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
-_MOST_OF_ONE = 1000  # of one element whose curves have to be computed node by node
-_MOST_LOOPS, _MOST_ROWS = 10_000, 20  # of a law that depends on the rate: a second or two
-_MOST_STARTS = 4  # searches a table: a limit on their cost
-_HOPELESS = 100.0  # times the lowest sum of squares: no start, even with coarse nodes
-_AROUND = np.array([-1, 0, 1])  # a node and its neighbours, for a parabola
+_MOST_OF_ONE = 1000  # nodes of one element whose curves are computed node by node
+_MOST_LOOPS = 10_000  # loops integrated for a law that depends on the rate: a second or two
+_MOST_ROWS = 20  # rows for which they are
+_MOST_STARTS = 4  # searches of a table, each of which costs as much as the first
+# sum of squares, over the lowest, at which a node is no start, however coarse the grid
+_HOPELESS = 100.0
 _ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
 
 

@@ -33,10 +33,12 @@ from scipy import special
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError, choices
 
-KNEE = 1.345  # 95 % efficient for one number with Gaussian noise (Huber)
-TAIL_DOF = 4.0  # the usual choice: tails of outliers, still a finite variance
-# of the fixed-point iteration for the scale, which is linear and cheap
-_SCALINGS, _SAME_SCALE = 1000, 1e-12
+# residual, in standard deviations, beyond which Huber's loss grows linearly: 95 % efficient for
+# Gaussian noise (Huber)
+KNEE = 1.345
+TAIL_DOF = 4.0  # degrees of freedom of Student's t: tails of outliers, yet a finite variance
+_SCALINGS = 1000  # most steps to the likeliest scale, each of which is cheap
+_SAME_SCALE = 1e-12  # relative change of the variance at which they end
 
 
 @dataclass(frozen=True)

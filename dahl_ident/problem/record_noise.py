@@ -17,10 +17,10 @@ from scipy.special import comb
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 
-HIGHEST_ORDER = 60  # of autoregressions: a limit on time; Akaike's criterion chooses below
-SAMPLES_PER_ORDER = 20  # with fewer, the coefficients follow the noise
-_BAND = 1e-4  # of the drive's largest power: below, the drive is not in its band
-_OUTSIDE = 0.1  # share of frequencies outside the band needed to estimate the noise
+HIGHEST_ORDER = 60  # most coefficients of an autoregression, to limit time; Akaike's chooses
+SAMPLES_PER_ORDER = 20  # samples that each needs: with fewer, it follows the noise
+_BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
+_OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
 
 
 @dataclass(frozen=True)
@@ -151,11 +151,11 @@ def _power(wave: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.fft.rfft(np.hanning(wave.size) * (wave - wave.mean()))) ** 2)
 
 
-_ORDER = 4  # of the differences, which leave little of any motion
-_BLOCKS = 50  # in some of them there is little motion
-_QUIET = 0.25  # quantile of the blocks
-_MEDIAN = 0.6745  # of a normal variable's absolute value, in standard deviations
-_HALF_BAND = 4.0  # standard deviations to either side
+_ORDER = 4  # order of differences: little of any motion is left in them
+_BLOCKS = 50  # parts of a record, in some of which there is little motion
+_QUIET = 0.25  # quantile of the parts, by their noise, that counts as quiet
+_MEDIAN = 0.6745  # median of a normal variable's absolute value, in standard deviations
+_HALF_BAND = 4.0  # standard deviations of noise to either side that are no movement
 LEADS = (1.0, 2.0, 3.0)
 """Least, middle and largest lead of the true displacement over the band's middle."""
 

@@ -97,7 +97,7 @@ def motion_of(
     return Predicted(motion.output + of_record[starts], by, motion.by_delay)
 
 
-_SMALL = 0.1  # of the inverse size of the motion: smaller rates are searched as numbers
+_SMALL = 0.1  # rate of either sign, times the size of the motion, below which ln is not searched
 
 
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from dahl_ident.engine import System
 
 Output = Literal["force", "motion"]
-_SHORTEST = 16  # samples from which noise can be estimated
-_PER_CYCLE = 100.0  # samples that a slow cycle keeps where a record is too long
-_DELAY_STEP = 0.02  # of a sample, for derivatives with respect to the delay
-_LEAST = 1e-300  # of a positive value that has vanished
-_VANISHED = 1e4  # times below a size that matters: held, else it shortens all steps
+_SHORTEST = 16  # fewest samples from which noise is estimated
+_PER_CYCLE = 100.0  # samples of a cycle that a record keeps where it is thinned
+_DELAY_STEP = 0.02  # step of the delay, in samples, for differences
+_LEAST = 1e-300  # stands for a positive value that is zero, which has no logarithm
+_VANISHED = 1e4  # gradient over curvature from which a value has vanished: its steps never end
 
 
 class RecordProblem(Problem):

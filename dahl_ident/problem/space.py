@@ -14,7 +14,7 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 
-_INSIDE = 1.0 - 1e-9  # of the way to a bound: on it the slope is zero, and a search would stay
+_INSIDE = 1.0 - 1e-9  # largest share of the way to a bound: on it the slope is zero
 
 
 class Space:

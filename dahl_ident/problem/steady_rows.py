@@ -21,11 +21,13 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.elements import Model
 from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
 
-_LEVEL = 0.1  # of ln of the drive: a held level varies by less, and two levels differ by more
-_MICROSLIP = 1e3  # knees over the largest displacement: a third harmonic of 1e-3, off by 1e-6
-_SLIP = 1e-9  # knees over the smallest displacement, below which stiffness no longer matters
+_LEVEL = 0.1  # difference of ln of the drive between two levels; a held one varies less
+# knee over the largest displacement from which friction is a spring: its third harmonic is 1e-3,
+# and a sine errs by the square
+_MICROSLIP = 1e3
+_SLIP = 1e-9  # knee over the smallest displacement, below which the stiffness has no effect
 _STIFFNESS = (1, -1, 0)  # powers of force, displacement and time
-_ELSEWHERE = 0.2  # relative difference from the measured displacement: perhaps another branch
+_ELSEWHERE = 0.2  # relative distance from the measurement that may mean another branch
 
 
 class RowMotion(NamedTuple):

@@ -14,7 +14,7 @@ from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DataError, ModelError
 
-_CELL = 0.1  # of ln A, where starts interpolate: a curve bends by about 1 over a unit of ln A
+_CELL = 0.1  # step of ln A between which curves are read; they bend by about 1 over a unit
 
 
 @dataclass(frozen=True)

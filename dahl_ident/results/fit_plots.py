@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.budget import Budget
     from dahl_ident.results.fit_result import FitResult
 
-_POINTS = 200  # of a curve that looks smooth
+_POINTS = 200  # points of a curve, which then looks smooth
 
 
 def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:

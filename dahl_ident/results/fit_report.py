@@ -15,8 +15,8 @@ from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 if TYPE_CHECKING:
     from dahl_ident.results.fit_result import FitResult
 
-_CORRELATED = 0.1  # smaller correlations change an uncertainty by less than 0.5 %
-_BRIEF = 15  # lines that a reader takes in at a glance
+_CORRELATED = 0.1  # least correlation shown; smaller ones change an uncertainty by 0.5 %
+_BRIEF = 15  # lines of a short report: what a reader takes in at a glance
 
 
 def facts(fit: FitResult) -> dict[str, Any]:

@@ -28,8 +28,8 @@ from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
 _SCHEMAS = {"table": "dahl_ident.fit_result", "records": "dahl_ident.record_fit"}
-VERSION = 4  # of the layout; others are refused
-_SAME = 1e-6  # relative: what versions of numerical libraries never change
+VERSION = 4  # version of the layout; files of others are refused
+_SAME = 1e-6  # relative difference that no version of a numerical library makes
 
 _TEXTS = ("level", "run", "controlled", "harmonic")  # labels, words and counts
 _SENSORS = ("force_gain", "displacement_gain", "delay")

@@ -44,10 +44,10 @@ if TYPE_CHECKING:
 
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 
-_NEARLY_AS_WIDE = 0.5  # of the width: the data have not even halved it
-_END = 0.01  # of the prior's probability that counts as its end
-_PRIOR_DRAWS = 1000  # for ArviZ: probabilities to 1.6 %
-_MISFIT = 0.01  # false-alarm rate of one check
+_NEARLY_AS_WIDE = 0.5  # width over the prior's, from which the data tell little
+_END = 0.01  # probability of the prior that counts as its end
+_PRIOR_DRAWS = 1000  # draws of the prior for ArviZ: probabilities to 1.6 %
+_MISFIT = 0.01  # probability at which a check of a right model fails
 _MEANING = {
     "size": "the residuals are larger than the noise that the data state",
     "largest": "single rows lie farther off than the noise explains",

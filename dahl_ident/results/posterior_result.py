@@ -51,8 +51,8 @@ SCHEMA = "dahl_ident.posterior"
 
 RULE_DRAWS = 4000
 """Draws that statements rest on."""
-_CHECK_DRAWS = 1000  # a share of 1 % has an error of 0.3 %
-_END = 1e-6  # of the probability, beyond which draws are few
+_CHECK_DRAWS = 1000  # draws of a check: a share of 1 % errs by 0.3 %
+_END = 1e-6  # probability beyond which there are too few draws for a quantile
 QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
 
 
