@@ -51,6 +51,16 @@ class Prediction(NamedTuple):
     changes: list[ComplexArray]
     by_ln_amplitude: ComplexArray
 
+    @property
+    def arrays(self) -> list[ComplexArray]:
+        """The response, and its derivatives with respect to ln A and to theta."""
+        return [self.value, self.by_ln_amplitude, *self.changes]
+
+    @classmethod
+    def of(cls, arrays: list[ComplexArray]) -> Prediction:
+        """Return the prediction with these `arrays`."""
+        return cls(arrays[0], arrays[2:], arrays[1])
+
 
 class Nearby:
     """The prediction near a point: that of the describing function, corrected to the exact one.
@@ -64,7 +74,7 @@ class Nearby:
     def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:
         self._approximate, self._theta = approximate, theta
         at, near = exact(theta), approximate(theta)
-        self._alone = alone = exact.of_displacement
+        self._alone = alone = exact.rows.of_displacement
         self._correction = np.where(alone, at.value, np.log(at.value / near.value))
         self._slopes = [
             np.where(alone, a, a / at.value - b / near.value)
@@ -72,7 +82,7 @@ class Nearby:
         ]
         level = at.by_ln_amplitude / at.value - near.by_ln_amplitude / near.value
         level = np.where(alone, at.by_ln_amplitude, level)
-        self._by_level = np.where(exact.forced, level, 0.0)
+        self._by_level = np.where(exact.rows.forced, level, 0.0)
 
     def __call__(
         self,
@@ -151,10 +161,7 @@ class Predictor:
         self._neutral = sensors.are_exact
         names = space.names
         self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
-        self._set_rows(rows)
-
-    def _set_rows(self, rows: Rows) -> None:
-        self._rows = rows
+        self.rows = rows
         _check(rows, self._model)
         power, self._exponent = DEFINITIONS[rows.quantity]
         self._operator = power_of_s(rows.omega, power)
@@ -173,32 +180,19 @@ class Predictor:
             for part, forced in _parts(rows)
         ]
 
-    @property
-    def forced(self) -> NDArray[np.bool_]:
-        """Which rows are force-controlled."""
-        return self._rows.forced
-
-    @property
-    def of_displacement(self) -> NDArray[np.bool_]:
-        """Which rows are harmonics of the displacement."""
-        return self._rows.of_displacement
-
     def unstable_rows(self, theta: FloatArray) -> list[int]:
         """Return the rows whose predicted steady motion is not stable, at theta of shape (P,)."""
         unstable: list[int] = []
-        values = [
-            constant if index is None else self._space.to_values(theta)[index]
-            for index, constant in self._slots
-        ]
+        values = self._values(theta)
         for group in self._groups:
             if group.steady is not None and not group.steady.is_linear(values[:-3]).any():
                 drive = self._true_drive(group, values[-3:], None)
                 stable = group.steady.at(values[:-3], drive, []).stable
-                unstable += np.arange(self._rows.n)[group.rows][~stable].tolist()
+                unstable += np.arange(self.rows.n)[group.rows][~stable].tolist()
         return unstable
 
     def _steady_rows(self, part: slice | NDArray[np.intp]) -> SteadyRows | None:
-        rows = self._rows
+        rows = self.rows
         if self._shooting is None or rows.drive is None:
             return None
         ratio = _fundamental(rows, rows.response) / self._operator
@@ -220,7 +214,7 @@ class Predictor:
         With `predicted` responses in place of the measured ones, driven amplitudes are theirs too.
         A harmonic of the displacement stands for its fundamental, without a weight.
         """
-        rows = self._rows
+        rows = self.rows
         response = _fundamental(rows, rows.response if predicted is None else predicted)
         harmonic = np.where(rows.of_displacement, 1, rows.harmonic)
         weights = np.where(rows.of_displacement, 0.0, weights)
@@ -250,24 +244,24 @@ class Predictor:
         `amplitude_error` is the error of ln A, or of ln of the drive where that is controlled:
         the true one is the measured one over its exponential.
         """
-        columns = self._space.to_values(theta)[..., None]
-        values = [
-            constant if index is None else columns[..., index, :] for index, constant in self._slots
-        ]
+        values = self._values(theta)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
             parts = [
                 self._predict(group, values, derivatives, amplitude_error) for group in self._groups
             ]
-        return parts[0] if len(parts) == 1 else self._merge(parts, theta)
-
-    def _merge(self, parts: list[Prediction], theta: FloatArray) -> Prediction:
-        shape = np.broadcast_shapes((*theta.shape[:-1], 1), self._rows.response.shape)
-        whole = [np.empty(shape, dtype=np.complex128) for _ in range(2 + len(parts[0].changes))]
+        if len(parts) == 1:
+            return parts[0]
+        shape = np.broadcast_shapes((*theta.shape[:-1], 1), self.rows.response.shape)
+        whole = [np.empty(shape, dtype=np.complex128) for _ in parts[0].arrays]
         for group, part in zip(self._groups, parts, strict=True):
-            pieces = (part.value, part.by_ln_amplitude, *part.changes)
-            for target, piece in zip(whole, pieces, strict=True):
+            for target, piece in zip(whole, part.arrays, strict=True):
                 target[..., group.rows] = piece
-        return Prediction(whole[0], whole[2:], whole[1])
+        return Prediction.of(whole)
+
+    def _values(self, theta: FloatArray) -> list[FloatArray]:
+        """Return the value of every parameter, those of the three of the sensors last."""
+        columns = self._space.to_values(theta)[..., None]
+        return [constant if i is None else columns[..., i, :] for i, constant in self._slots]
 
     def _predict(
         self,
@@ -276,24 +270,18 @@ class Predictor:
         derivatives: int,
         amplitude_error: FloatArray | None,
     ) -> Prediction:
-        of_model, sensed = values[:-3], values[-3:]
-        if group.steady is not None:
-            linear = group.steady.is_linear(of_model)
-            if not linear.all():
-                moving = [
-                    np.where(linear[..., None], np.nan, v) if linear.any() else v for v in of_model
-                ]
-                exact = self._predict_steady(
-                    group, group.steady, [*moving, *sensed], derivatives, amplitude_error
-                )
-                if not linear.any():
-                    return exact
-                sine = self._predict_sine(group, values, derivatives, amplitude_error)
-                pairs = zip((sine.value, *sine.changes), (exact.value, *exact.changes), strict=True)
-                value, *changes = (np.where(linear[..., None], a, b) for a, b in pairs)
-                level = np.where(linear[..., None], sine.by_ln_amplitude, exact.by_ln_amplitude)
-                return Prediction(value, changes, level)
-        return self._predict_sine(group, values, derivatives, amplitude_error)
+        if group.steady is None:
+            return self._predict_sine(group, values, derivatives, amplitude_error)
+        linear = group.steady.is_linear(values[:-3])[..., None]
+        if linear.all():
+            return self._predict_sine(group, values, derivatives, amplitude_error)
+        if not linear.any():
+            return self._predict_steady(group, group.steady, values, derivatives, amplitude_error)
+        moving = [*(np.where(linear, np.nan, v) for v in values[:-3]), *values[-3:]]
+        exact = self._predict_steady(group, group.steady, moving, derivatives, amplitude_error)
+        sine = self._predict_sine(group, values, derivatives, amplitude_error)
+        pairs = zip(sine.arrays, exact.arrays, strict=True)
+        return Prediction.of([np.where(linear, a, b) for a, b in pairs])
 
     def _predict_sine(
         self,

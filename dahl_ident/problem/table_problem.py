@@ -140,7 +140,7 @@ class TableProblem(Problem):
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
         self._predictor: Predictor | Nearby = self._predicting(exact=self.is_exact)
-        self._predicted: dict[str, tuple[bytes, Prediction]] = {}
+        self._latest: tuple[bytes, Prediction] | None = None
         self._set_noise(noise_for(rows, noise))
         self.n_residuals = 2 * rows.n
         self.n_numbers = self.n_residuals - int(np.count_nonzero(rows.harmonic == 0))
@@ -335,10 +335,10 @@ class TableProblem(Problem):
         """Return the prediction; judging asks for that at one theta many times."""
         if theta.ndim > 1:
             return self._predictor(theta, derivatives=derivatives)
-        key, last = theta.tobytes(), self._predicted.get("last")
-        if last is None or last[0] != key or (derivatives and not last[1].changes):
-            last = self._predicted["last"] = (key, self._predictor(theta, derivatives=derivatives))
-        return last[1]
+        key, latest = theta.tobytes(), self._latest
+        if latest is None or latest[0] != key or (derivatives and not latest[1].changes):
+            latest = self._latest = key, self._predictor(theta, derivatives=derivatives)
+        return latest[1]
 
     def prediction_jacobian(self, theta: ArrayLike) -> ComplexArray:
         """Return dR/dtheta, shape (n, P) or (S, n, P)."""
