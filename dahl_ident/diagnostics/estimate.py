@@ -121,7 +121,7 @@ def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart | None:
     if not reached:
         return None
     chart = min(
-        (one.chart.one for one in reached),
+        (one.chart.of(0) for one in reached),
         key=lambda c: float(np.abs(c.theta(c.phi(optimum.theta)) - optimum.theta).max()),
     )
     of_optimum = [problem.names.index(name) for name in optimum.names]

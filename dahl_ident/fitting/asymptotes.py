@@ -30,8 +30,9 @@ finite. The chart (kappa, x_c, sigma + stiffness) straightens it; where f_max is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,18 +43,23 @@ from dahl_ident.fitting.directions import Direction, Directions, directions, fre
 from dahl_ident.fitting.optimum import DeterminedCombination, Status, blanked
 from dahl_ident.problem import TableProblem
 
-_NO_FRICTION = 1e-18  # friction's stiffness over the median one, where it counts as none
-_LEAST_FRICTION = -60.0  # ln of a scale over that of the data that a search may reach
-_EDGES = (1e-14, 1e8)  # a direction over the data's smallest and largest that a search may reach
-_TIED_EDGE = 1e4  # the same where microslip has a limit: short of it
-_FASTEST = 1e4  # a rate that may be negative over the inverse of the smallest amplitude, likewise
-_NUMBERS = (1.0 / 250.0, 25.0)  # a number over the least and most that its law scans, likewise
+# friction's stiffness over the data's, where a limit lets friction vanish: far below rounding
+_NO_FRICTION = 1e-18
+# ln of the scale of friction over that of the data, below which a search has left friction behind
+_LEAST_FRICTION = -60.0
+# directions with a unit that a search may reach: times the smallest of their sizes in the data, and
+# times the largest; beyond, the curve is its limit to all digits
+_EDGES = (1e-14, 1e8)
+# the upper one where microslip is a limit: there spring and friction already differ by rounding
+_TIED_EDGE = 1e4
+_FASTEST = 1e4  # rates of either sign that a search may reach, times 1/(smallest amplitude)
+# numbers that a search may reach, times the least and the most of those its law starts from
+_NUMBERS = (1.0 / 250.0, 25.0)
+# lengths in a limit, times the largest amplitude and below the smallest: in slip the stiffness that
+# remains of a law decreases only with the square root of the length
 _FAR = (1e9, 1e14)
-"""How far a length lies above the largest amplitude, and below the smallest, in a limit.
-
-In slip the remaining stiffness of a law decreases only with the square root of the length.
-"""
-_FIRMLY = 1e3  # weight of what a limit determines relative to single coordinates, in a chart's phi
+# weight of determined combinations over that of single coordinates, where phi is found from theta
+_FIRMLY = 1e3
 
 
 @dataclass(frozen=True)
@@ -85,14 +91,9 @@ class Chart:
             derivative[..., spring, :] -= size * self.matrix[sigma]
         return derivative
 
-    def of(self, tables: NDArray[np.intp]) -> Chart:
-        """Return the chart of some tables of a batch."""
+    def of(self, tables: NDArray[np.intp] | int) -> Chart:
+        """Return the chart of some tables of a batch, or of one."""
         return self if self.offset.ndim == 1 else replace(self, offset=self.offset[tables])
-
-    @property
-    def one(self) -> Chart:
-        """The chart of one table, of a batch of one."""
-        return self if self.offset.ndim == 1 else replace(self, offset=self.offset[0])
 
     def phi(self, theta: FloatArray) -> FloatArray:
         """Return a phi near theta, (Q,) or (S, Q)."""
@@ -118,9 +119,9 @@ class Limit:
     kept: tuple[tuple[str, FloatArray], ...] = ()
     """Determined combinations: expression, and the powers of theta's parameters in it."""
 
-    def of(self, tables: NDArray[np.intp]) -> Limit:
+    def of(self, table: int) -> Limit:
         """Return the limit of one of a batch's tables."""
-        return replace(self, chart=self.chart.of(tables).one)
+        return replace(self, chart=self.chart.of(table))
 
     def combinations(
         self,
@@ -223,63 +224,39 @@ class Reach:
         return np.asarray((theta @ self._rows > least).all(axis=-1))
 
 
-def _declared(element: Element, problem: TableProblem) -> tuple[Asymptote, ...]:
-    """Return the limits that a law declares, with numbers (S,) for the tables of a batch."""
-    amplitude = problem.stiffness_data.amplitude
-    low, high = amplitude.min(axis=-1), amplitude.max(axis=-1)
-    return element.asymptotes(low, high)
-
-
 def _tying(element: Element) -> Asymptote | None:
     """Return the limit in which a parameter adds to a free spring, if the law has one."""
     every = element.asymptotes(1.0, 1.0)
     return next((a for a in every if a.adds_to_spring is not None), None)
 
 
-def _tied(problem: TableProblem) -> list[tuple[Element, Asymptote, int]]:
-    """Return element, limit and the spring's index for each pair that microslip confounds."""
-    springs = [problem.names.index(p.name) for p in free_springs(problem)]
-    return [
-        (element, asymptote, spring)
-        for element in problem.model.elements
-        for asymptote in _declared(element, problem)
-        if asymptote.adds_to_spring is not None
-        for spring in springs
-    ]
-
-
-def microslip_charts(problem: TableProblem) -> list[Chart]:
+def microslip_charts(problem: TableProblem, *, scale_given: bool = False) -> list[Chart]:
     """Return the straightened charts of microslip: each free law that ties a free spring.
 
     Their coordinates stand in the places of theta's: the determined combination in that of the
-    parameter that adds to the spring, and the logarithm of the ratio that runs away.
+    parameter that adds to the spring, and the logarithm of the ratio that runs away. With
+    `scale_given`, those of laws whose other scale parameter is given: ln sigma, and the sum.
     """
-    return [chart for chart, whole in _straight_charts(problem) if whole]
-
-
-def stiffness_charts(problem: TableProblem) -> list[Chart]:
-    """Return the same for laws whose other scale parameter is given: ln sigma, the sum."""
-    return [chart for chart, whole in _straight_charts(problem) if not whole]
-
-
-def _straight_charts(problem: TableProblem) -> Iterator[tuple[Chart, bool]]:
-    """Yield the charts, and whether both parameters of the combination are free."""
-    for element, asymptote, spring in _tied(problem):
-        if asymptote.follows is None or asymptote.adds_to_spring is None:
+    charts = []
+    for element in problem.model.elements:
+        tying = _tying(element)
+        if tying is None or tying.follows is None or tying.adds_to_spring is None:
             continue
-        tied = element.parameter(asymptote.adds_to_spring)
-        both = [element.parameter(label) for label in asymptote.follows[:2]]
+        tied = element.parameter(tying.adds_to_spring)
+        both = [element.parameter(label) for label in tying.follows[:2]]
+        given = not all(p.free for p in both)
+        if not tied.free or given != scale_given or (not given and len(tying.kept) != 1):
+            continue
         matrix = np.eye(len(problem.parameters))
-        whole = all(p.free for p in both)
-        if not tied.free or (whole and len(asymptote.kept) != 1):
-            continue
-        if whole:
+        if not given:
             pair = [problem.names.index(p.name) for p in both]
-            powers = _powers(element, asymptote.kept[0][1], problem)[pair]
+            powers = _powers(element, tying.kept[0][1], problem)[pair]
             matrix[np.ix_(pair, pair)] = np.linalg.inv(np.array([[1.0, -1.0], powers]))
         sigma = problem.names.index(tied.name)
         back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-        yield Chart(matrix, np.zeros(len(matrix)), back, (spring, sigma)), whole
+        springs = (problem.names.index(p.name) for p in free_springs(problem))
+        charts += [Chart(matrix, np.zeros(len(matrix)), back, (at, sigma)) for at in springs]
+    return charts
 
 
 def limits(problem: TableProblem) -> list[Limit]:
@@ -290,172 +267,137 @@ def limits(problem: TableProblem) -> list[Limit]:
     if "displacement_gain" in problem.names and "displacement_gain" not in problem.priors:
         return []
     springs = free_springs(problem)
-    alone = len(problem.model.elements) == 1
+    amplitude = problem.stiffness_data.amplitude
     every: list[Limit] = []
     for element in problem.model.elements:
         axes = directions(element)
         if element.is_linear or not any(p.free for p in element.parameters):
             continue
-        declared = _declared(element, problem)
-        for asymptote in declared:
-            if asymptote.adds_to_spring is None:
-                every += _plain(problem, element, asymptote, bool(springs))
-            else:
-                every += _microslip(problem, element, asymptote, springs)
-        if not declared:
-            every += _undeclared(problem, axes)
-        if not alone:
-            every += _vanishing(problem, axes)
+        declared = [
+            replace(one, meaning=f"the element is {one.meaning}")
+            for one in element.asymptotes(amplitude.min(axis=-1), amplitude.max(axis=-1))
+        ]
+        vanishing = _vanishing(problem, axes) if len(problem.model.elements) > 1 else []
+        for asymptote in (*(declared or _far_out(problem, axes)), *vanishing):
+            every += _limits_of(problem, element, asymptote, springs)
     return every
 
 
-def _plain(
-    problem: TableProblem, element: Element, asymptote: Asymptote, spring: bool
+def _limits_of(
+    problem: TableProblem, element: Element, asymptote: Asymptote, springs: list[Parameter]
 ) -> list[Limit]:
-    """Return a declared limit, or none where the parameters that run away are not free."""
+    """Return an asymptote's limit, one for each free spring where it needs that.
+
+    There is none where a parameter that it pins, or that runs away, is not free.
+    """
     free = {label for label, p in zip(element.labels, element.parameters, strict=True) if p.free}
-    pins = _pins(element, asymptote)
-    if pins is None or not set(asymptote.runs_away) <= free:
+    if not {*asymptote.pinned, *asymptote.runs_away} <= free:
         return []
+    pins: dict[str, FloatArray | float] = {}
+    for label, value in asymptote.pinned.items():
+        p = element.parameter(label)
+        pins[p.name] = np.log(np.asarray(value)) if p.positive else value
     follow = None
     if asymptote.follows is not None:
         label, followed, factor = asymptote.follows
-        names = [element.parameter(x).name for x in (label, followed)]
+        pair, distance = [element.parameter(x) for x in (label, followed)], np.log(factor)
+        tying = _tying(element)
         if followed in free:
-            tying = _tying(element)
-            if spring and tying is not None and {followed} == {tying.adds_to_spring}:
+            alone = asymptote.adds_to_spring is None and springs
+            if alone and tying is not None and followed == tying.adds_to_spring:
                 return []  # in parallel with a spring the law has no effect
-            follow = names[0], names[1], np.log(np.asarray(factor))
+            follow = pair[0].name, pair[1].name, distance
+        elif asymptote.adds_to_spring is not None:
+            return []
         else:
-            pins[names[0]] = np.log(np.asarray(factor)) + _ln(element.parameter(followed))
-    chart = _chart(problem, pins, follow, _kept(problem, element, asymptote))
-    return [_limit(problem, element, asymptote, chart)]
-
-
-def _microslip(
-    problem: TableProblem, element: Element, asymptote: Asymptote, springs: list[Parameter]
-) -> list[Limit]:
-    """Return a limit that exists only with a free spring, for each of them."""
-    pins = _pins(element, asymptote)
-    if pins is None or asymptote.follows is None or asymptote.adds_to_spring is None:
-        return []
-    label, followed, factor = asymptote.follows
-    both = [element.parameter(x) for x in (label, followed)]
-    if not all(p.free for p in both):
-        return []
+            pins[pair[0].name] = distance + np.log(pair[1].value or np.nan)
+    combined = [(element.named(x), _powers(element, by, problem)) for x, by in asymptote.kept]
+    kept = tuple((text, powers) for text, powers in combined if powers.any())
+    limit = Limit(
+        problem.names,
+        Status.__members__.get(asymptote.name.upper(), Status.RUNS_AWAY),
+        asymptote.meaning,
+        _chart(problem, pins, follow, [powers for _, powers in kept]),
+        {element.parameter(x).name: value for x, value in asymptote.runs_away.items()},
+        kept,
+    )
+    if asymptote.adds_to_spring is None:
+        return [limit]
     sigma = problem.names.index(element.parameter(asymptote.adds_to_spring).name)
-    in_microslip = []
-    for parameter in springs:
-        spring = problem.names.index(parameter.name)
-        follow = both[0].name, both[1].name, np.log(np.asarray(factor))
-        plain = _chart(problem, pins, follow, _kept(problem, element, asymptote))
-        chart = replace(plain, tied=(spring, sigma))
-        limit = _limit(problem, element, asymptote, chart)
-        in_microslip.append(replace(limit, extremes={**limit.extremes, parameter.name: -np.inf}))
-    return in_microslip
+    ties = {p.name: (problem.names.index(p.name), sigma) for p in springs}
+    return [
+        replace(
+            limit,
+            chart=replace(limit.chart, tied=tied),
+            extremes={**limit.extremes, spring: -np.inf},
+        )
+        for spring, tied in ties.items()
+    ]
 
 
-def _vanishing(problem: TableProblem, axes: Directions) -> list[Limit]:
+def _vanishing(problem: TableProblem, axes: Directions) -> list[Asymptote]:
     """Return the limit in which the law has no force: its free scale parameters go to zero."""
-    view = problem.stiffness_data
+    view, label = problem.stiffness_data, axes.element.label
     scale = [p for p in (*axes.scale, *axes.linear) if p.free and p.positive]
-    if not scale:
-        return []
-    pins: dict[str, FloatArray | float] = {}
+    pinned: dict[str, Any] = {}
     for p in scale:  # all together, or the one that is free however large the others are
         ln_size = Direction(p, None, p.dimension).sizes(view)
         middle = ln_size.min(axis=-1) if len(scale) == 1 else ln_size.mean(axis=-1)
-        pins[p.name] = middle + np.log(_NO_FRICTION)
+        pinned[label(p)] = np.exp(middle) * _NO_FRICTION
     for direction in axes.nonlinear:
-        if direction.parameter not in axes.scale:
-            pins[direction.parameter.name] = _middle(problem, direction)
-    gone = dict.fromkeys((p.name for p in scale), 0.0)
-    return [Limit(problem.names, Status.NO_FRICTION, "", _chart(problem, pins), gone)]
+        p = direction.parameter
+        if p in axes.scale:
+            continue
+        if direction.is_number and p.positive:
+            plain = min(p.scan or (1.0,), key=lambda v: abs(np.log(v)) if v > 0.0 else np.inf)
+            pinned[label(p)] = plain
+        else:
+            pinned[label(p)] = np.exp(direction.sizes(view).mean(axis=-1)) if p.positive else 0.0
+    gone = {label(p): 0.0 for p in scale}
+    return [Asymptote("no_friction", "", pinned, None, gone)] if scale else []
 
 
-def _undeclared(problem: TableProblem, axes: Directions) -> list[Limit]:
+def _far_out(problem: TableProblem, axes: Directions) -> list[Asymptote]:
     """Return limits far out in every direction with a unit, on either side of the data."""
-    view = problem.stiffness_data
+    view, label = problem.stiffness_data, axes.element.label
     far_out = []
     for direction in axes.nonlinear:
         if direction.is_number or not direction.parameter.positive:
             continue
         p, over = direction.parameter, direction.over
-        size = direction.sizes(view)
+        size, rising = direction.sizes(view), direction.dimension[1] > 0
         above, below = _FAR if direction.dimension[1] >= 0 else _FAR[::-1]
         for far, value in (
-            (size.max(axis=-1) + np.log(above), np.inf),
-            (size.min(axis=-1) - np.log(below), 0.0),
+            (np.exp(size.max(axis=-1)) * above, np.inf),
+            (np.exp(size.min(axis=-1)) / below, 0.0),
         ):
-            large = np.isinf(value)
-            rising = direction.dimension[1] > 0
-            if over is None or not over.free:
-                base = 0.0 if over is None else _ln(over)
-                chart = _chart(problem, {p.name: far + base})
-                extremes, kept = {p.name: value}, []
-                if axes.is_free and axes.reference is not None:
-                    stuck = large == rising
-                    kept = [_kept_product(problem, axes.reference, direction, -1 if stuck else 0)]
-                    if np.count_nonzero(kept[0][1]) > 1:
-                        extremes[axes.reference.name] = np.inf
-            else:
-                # of two parameters in a fixed ratio, the one with the unit of the limit remains
-                stiff = over.dimension[1] < p.dimension[1]
-                stays = over if (large == rising) == stiff else p
-                goes = p if stays is over else over
-                follow = p.name, over.name, far
-                powers = np.zeros(len(problem.parameters))
-                powers[problem.names.index(stays.name)] = 1.0
-                kept = [(stays.name, powers)]
-                chart = _chart(problem, {}, follow, [powers])
-                extremes = {goes.name: value if goes is p else np.inf if value == 0.0 else 0.0}
-            meaning = "no amplitude reaches slip" if large == rising else "every amplitude slips"
+            sticks = np.isinf(value) == rising
+            meaning = "no amplitude reaches slip" if sticks else "every amplitude slips"
             if direction.dimension[2]:
-                meaning = f"the data lie far {'below' if large else 'above'} {p.name}"
-            far_out.append(
-                Limit(problem.names, Status.RUNS_AWAY, meaning, chart, extremes, tuple(kept))
-            )
+                side = "below" if np.isinf(value) else "above"
+                meaning = f"the data lie far {side} {p.name}"
+            runs_away, kept = {label(p): value}, []
+            if over is not None and over.free:
+                # of two parameters in a fixed ratio, the one with the unit of the limit remains
+                stays = over if sticks == (over.dimension[1] < p.dimension[1]) else p
+                if stays is p:
+                    runs_away = {label(over): np.inf if value == 0.0 else 0.0}
+                kept = [(label(stays), {label(stays): 1.0})]
+            elif axes.is_free and axes.reference is not None:
+                # a law that never slips keeps a stiffness, one that always slips a force
+                unit, reference = -1 if sticks else 0, label(axes.reference)
+                power = (unit - axes.reference.dimension[1]) / direction.dimension[1]
+                times = "" if power == 1.0 else f"^{power:g}"
+                kept = [(reference, {reference: 1.0})]
+                if power:
+                    kept = [(f"{reference} {label(p)}{times}", {reference: 1.0, label(p): power})]
+                    runs_away[reference] = np.inf
+            fixed, follows = {label(p): far}, None
+            if over is not None:
+                fixed, follows = {}, (label(p), label(over), far)
+            limit = Asymptote("runs_away", meaning, fixed, follows, runs_away, tuple(kept))
+            far_out.append(limit)
     return far_out
-
-
-def _kept_product(
-    problem: TableProblem, reference: Parameter, direction: Direction, unit: int
-) -> tuple[str, FloatArray]:
-    """Return the product of scale and length that has a unit: a stiffness (-1), a force (0).
-
-    The stiffness remains of a law that never slips, the force of one that always slips.
-    """
-    power = (unit - reference.dimension[1]) / direction.dimension[1]
-    powers = np.zeros(len(problem.parameters))
-    powers[problem.names.index(reference.name)] = 1.0
-    powers[problem.names.index(direction.parameter.name)] = power
-    text = reference.name
-    if power:
-        times = "" if power == 1.0 else f"^{power:g}"
-        text = f"{reference.name} {direction.parameter.name}{times}"
-    return text, powers
-
-
-def _middle(problem: TableProblem, direction: Direction) -> FloatArray | float:
-    """Return a plain value of a direction, as a search coordinate."""
-    p = direction.parameter
-    if direction.is_number:
-        plain = min(p.scan or (1.0,), key=lambda v: abs(np.log(v)) if v > 0.0 else np.inf)
-        return float(np.log(plain)) if p.positive else 0.0
-    if not p.positive:
-        return 0.0
-    return np.asarray(direction.sizes(problem.stiffness_data).mean(axis=-1))
-
-
-def _pins(element: Element, asymptote: Asymptote) -> dict[str, FloatArray | float] | None:
-    """Return the pinned search coordinates by name; None where one of them is not free."""
-    pins: dict[str, FloatArray | float] = {}
-    for label, value in asymptote.pinned.items():
-        p = element.parameter(label)
-        if not p.free:
-            return None
-        pins[p.name] = np.log(np.asarray(value)) if p.positive else value
-    return pins
 
 
 def _powers(element: Element, powers: Mapping[str, float], problem: TableProblem) -> FloatArray:
@@ -466,24 +408,6 @@ def _powers(element: Element, powers: Mapping[str, float], problem: TableProblem
         if name in problem.names:
             row[problem.names.index(name)] = power
     return row
-
-
-def _kept(problem: TableProblem, element: Element, asymptote: Asymptote) -> list[FloatArray]:
-    rows = [_powers(element, powers, problem) for _, powers in asymptote.kept]
-    return [row for row in rows if row.any()]
-
-
-def _limit(problem: TableProblem, element: Element, asymptote: Asymptote, chart: Chart) -> Limit:
-    """Return a declared limit with the parameters' full names."""
-    status = Status.__members__.get(asymptote.name.upper(), Status.RUNS_AWAY)
-    kept = []
-    for expression, powers in asymptote.kept:
-        row = _powers(element, powers, problem)
-        if row.any():
-            kept.append((element.named(expression), row))
-    extremes = {element.parameter(x).name: v for x, v in asymptote.runs_away.items()}
-    meaning = f"the element is {asymptote.meaning}"
-    return Limit(problem.names, status, meaning, chart, extremes, tuple(kept))
 
 
 def _chart(
@@ -505,7 +429,3 @@ def _chart(
         matrix[names.index(follow[0])] = matrix[names.index(follow[1])]
     rows = np.vstack([_FIRMLY * np.reshape(kept, (-1, len(names))), columns])
     return Chart(matrix, offset, np.linalg.pinv(rows @ matrix) @ rows)
-
-
-def _ln(parameter: Parameter) -> float:
-    return float("nan") if parameter.value is None else float(np.log(parameter.value))

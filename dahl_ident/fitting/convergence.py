@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
-from dahl_ident.fitting.asymptotes import Limit
-from dahl_ident.fitting.levenberg_marquardt import IntArray, Minima
+from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.fitting.optimum import (
     DeterminedCombination,
@@ -21,90 +19,27 @@ from dahl_ident.fitting.optimum import (
 from dahl_ident.problem import Problem
 
 
-class Ends:
-    """Where the searches of S tables ended.
-
-    Attributes
-    ----------
-    minima : Minima
-        By theta, shape (S, P). At a limit, theta so far out that the model is its limit.
-    limits : dict of int to (Limit, ndarray, ndarray)
-        Tables at a limit, with phi and the Hessian with respect to phi.
-    """
-
-    def __init__(self, minima: Minima) -> None:
-        self.minima = minima
-        self.limits: dict[int, tuple[Limit, FloatArray, FloatArray]] = {}
-        self._inverse: tuple[FloatArray, NDArray[np.bool_]] | None = None
-
-    @property
-    def inverse(self) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """The Hessians' inverses, and which parameters are undetermined."""
-        if self._inverse is None:
-            self._inverse = inverse(self.minima.hessian)
-        return self._inverse
-
-    def determined(self, table: int) -> int:
-        """Return the number of parameters that a table's optimum has: fewer than P at a limit."""
-        at = self.limits.get(table)
-        return self.minima.theta.shape[1] if at is None else len(at[1])
-
-    def take(self, tables: IntArray) -> Ends:
-        """Return the ends of some tables."""
-        ends = Ends(self.minima.take(tables))
-        for new, old in enumerate(tables.tolist()):
-            if old in self.limits:
-                ends.limits[new] = self.limits[old]
-        return ends
-
-    def put(self, tables: IntArray, other: Ends) -> None:
-        """Let some tables end where `other` says."""
-        self.minima.assign(tables, other.minima)
-        self._inverse = None
-        for new, old in enumerate(tables.tolist()):
-            self.limits.pop(old, None)
-            if new in other.limits:
-                self.limits[old] = other.limits[new]
-
-    def at_limit(self, table: int, limit: Limit, there: Minima) -> None:
-        """Let one table end at a limit, with the ends of all tables' searches there."""
-        which = np.array([table])
-        limit = limit.of(which)
-        phi, hessian = there.theta[table], there.hessian[table]
-        end = self.minima
-        end.theta[table] = limit.chart.theta(phi)
-        end.cost[table], end.converged[table] = there.cost[table], there.converged[table]
-        end.evaluations[table] += there.evaluations[table]
-        self.limits[table] = limit, phi, hessian
-
-
 def optima(
-    problem: Problem,
-    ends: Ends,
-    scale: float,
-    loss: Loss | None,
-    method: str,
-    evaluations: IntArray,
+    problem: Problem, end: Minima, scale: float, loss: Loss | None, method: str
 ) -> OptimumBatch:
     """Return the optima that searches with residuals divided by `scale` found.
 
     `scale` is 1 where the optimum does not depend on it; it is estimated here then.
     """
-    theta, end = ends.minima.theta.copy(), ends.minima
-    S = len(theta)
+    theta, S = end.theta.copy(), len(end.theta)
+    at_limit = {table: at for table, at in enumerate(end.limit) if at is not None}
     ordered = problem.in_order(theta)
     moved = np.zeros(S, dtype=np.bool_)
     if ordered is not theta:
         moved = (ordered != theta).any(axis=1)
-        moved[list(ends.limits)] = False  # a limit has names
+        moved[list(at_limit)] = False  # a limit has names
         theta[moved] = ordered[moved]
-    determined = np.array([ends.determined(table) for table in range(S)])
-    dof = problem.n_numbers + len(problem.priors) - determined
+    dof = problem.n_numbers + len(problem.priors) - end.determined
     final = np.full(S, scale)
     if not problem.scale_known and loss is None and not problem.priors:
         final = estimated_scale(problem, end.cost, dof)
-    if not ends.limits and loss is None and not moved.any() and problem.gaussian:
-        inner, lost = ends.inverse
+    if not at_limit and loss is None and not moved.any() and problem.gaussian:
+        inner, lost = inverse(end.hessian)
     elif loss is None:
         inner, lost = inverse(problem.information(theta, scale))
     else:  # one table
@@ -120,7 +55,7 @@ def optima(
     if problem.is_bounded:
         outside = np.any(at_bound(problem, theta), axis=1)
     for table in range(S):
-        at = ends.limits.get(table)
+        at = at_limit.get(table)
         if at is not None:
             limit, phi, hessian = at
             one = problem.table(table)
@@ -138,7 +73,7 @@ def optima(
         status.append(
             Status.NOT_CONVERGED
             if not end.converged[table]
-            else at[0].status
+            else at.limit.status
             if at is not None
             else Status.SINGULAR
             if lost[table].any()
@@ -154,11 +89,11 @@ def optima(
         scale=np.asarray(final),
         dof=dof,
         cost=end.cost * scale**2,
-        nfev=evaluations,
+        nfev=end.evaluations,
         status=tuple(status),
         undetermined=lost,
         method=method,
         loss="linear" if loss is None else loss.name,
         combinations=combinations,
-        meanings={table: at[0].meaning for table, at in ends.limits.items()},
+        meanings={table: at.limit.meaning for table, at in at_limit.items()},
     )

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from scipy.linalg import null_space
 
 from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
 from dahl_ident.errors import FitError, ModelError, ValidationError, argument
-from dahl_ident.fitting.convergence import Ends, optima
+from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import (
@@ -43,6 +43,7 @@ from dahl_ident.fitting.optimum import (
     Optimum,
     Status,
     agreed_scale,
+    blanked,
     estimated_scale,
     information_of,
     inverse,
@@ -54,12 +55,18 @@ from dahl_ident.problem import Problem, Quadratic, TableProblem
 if TYPE_CHECKING:
     import casadi as ca
 
-_TOLERANCE = 1e-11  # of the scaled gradient: well below the smallest step that a report shows
-_ITERATIONS = 300  # a limit for searches that do not end
-_LEAST_RESIDUAL = 1e-4  # of the largest change that a parameter's own size makes
-_ACTIVE = 1e-6  # an inequality nearer to its limit than this holds there
+# gradient, over the sum of squares, at which IPOPT ends: a step from there is far below any digit
+# that a report shows
+_TOLERANCE = 1e-11
+_ITERATIONS = 300  # IPOPT takes ten to thirty steps; a search that needs more does not converge
+# residuals count as at least this share of the largest change that a parameter makes to them, so
+# that units exist for data without noise
+_LEAST_RESIDUAL = 1e-4
+_ACTIVE = 1e-6  # an inequality this near to equality, in units of the step, holds with equality
 _STEP = 1e-4  # of ln p, between gradients whose difference is the Hessian
-_MOST_STARTS = 6  # the lowest minima of the global grid, and what the user gave
+_MOST_STARTS = 6  # of the global grid: the lowest minima, and what the user gave
+_SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+_INFEASIBLE = "infeasible problem detected"
 _WORDS = {
     "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
     "Restoration_Failed": "it could not return to a point that satisfies the constraints",
@@ -71,6 +78,8 @@ _WORDS = {
 }
 
 
+_Compute = Callable[[bytes, int], FloatArray]
+"""The bytes of a vector, and the order of a derivative of the cost -> that."""
 Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
 """The user's function of constraints; see the head of this module."""
 
@@ -85,11 +94,6 @@ class Relations:
     texts: tuple[str, ...]
     equal: tuple[bool, ...]
     differences: ca.Function | None
-
-    @property
-    def freedom_lost(self) -> int:
-        """Number of equalities."""
-        return sum(self.equal)
 
     @classmethod
     def of(cls, problem: Problem, constraints: Constraints | None) -> Relations:
@@ -221,213 +225,256 @@ def solve_ipopt(
     # as the search ended: by a sine where no steady motion exists, freed of a record's delay
     problem = begin.problem if problem is plain else problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
-    target = Target(problem, begin.scale if adapts else 1.0, loss)
-    end = _search(target, begin, relations)
-    dof = problem.n_numbers + len(problem.priors) - len(problem.names) + relations.freedom_lost
+    search = _Search(problem, relations, loss, begin.scale if adapts else 1.0)
+    end = search.best(begin)
     if adapts and relations.texts:
 
         def again(scale: float) -> tuple[FloatArray, int]:
-            nonlocal target, end
-            target = replace(target, scale=scale)
-            end = _descend(target, end.theta, relations, end.evaluations)
-            return end.theta, dof
+            nonlocal end
+            search.scale = scale
+            end = search.descend(end.theta)
+            return end.theta, search.dof
 
-        agreed_scale(problem, loss_named(loss, problem.parts), again, target.scale)
-    return _ended(target, end, relations, begin)
-
-
-@dataclass(frozen=True)
-class Target:
-    """The cost to minimise: a problem, the scale of its residuals, and their loss."""
-
-    problem: Problem
-    scale: float = 1.0
-    loss: str = "linear"
-
-    def at(self, theta: FloatArray) -> Quadratic:
-        """Return the cost, half the sum of losses, with its derivatives; theta (P,) or (S, P)."""
-        return self.problem.quadratic(theta, self.scale, loss_named(self.loss, self.problem.parts))
+        agreed_scale(problem, search.loss, again, search.scale)
+    return search.optimum(end, begin)
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Where IPOPT ended, in search coordinates."""
+class _End:
+    """Where one run of IPOPT ended."""
 
     theta: FloatArray
     cost: float
-    return_status: str
-    evaluations: int
+    failure: str
+    """Why IPOPT has no optimum, in words; empty where it has one."""
     slopes: FloatArray
-    """Derivatives of the relations' differences with respect to theta, (C, P)."""
+    """Derivatives of the constraints' differences with respect to theta, (C, P)."""
     active: tuple[bool, ...]
+    """Which inequalities hold with equality."""
+
+
+class _Search:
+    """Runs of IPOPT on one problem with its constraints, loss and scale of the noise."""
+
+    def __init__(self, problem: Problem, relations: Relations, loss: str, scale: float) -> None:
+        self.problem, self.relations, self.scale = problem, relations, scale
+        self.loss = loss_named(loss, problem.parts)
+        self.evaluations = 0
 
     @property
-    def failure(self) -> str:
-        """Why IPOPT has no optimum, in words; nothing where it has one."""
-        if self.return_status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
-            return ""
-        return _WORDS.get(self.return_status, self.return_status.replace("_", " ").lower())
+    def dof(self) -> int:
+        """Degrees of freedom of the residuals; every equality adds one."""
+        problem = self.problem
+        free = len(problem.names) - sum(self.relations.equal)
+        return problem.n_numbers + len(problem.priors) - free
 
+    def at(self, theta: FloatArray) -> Quadratic:
+        """Return half the sum of losses at theta, with its derivatives."""
+        return self.problem.quadratic(theta, self.scale, self.loss)
 
-def _search(target: Target, begin: Optimum, relations: Relations) -> _Found:
-    """Return the best end of IPOPT's searches.
+    def best(self, begin: Optimum) -> _End:
+        """Return the best end of runs from the least-squares optimum and other starts.
 
-    The least-squares optimum is the one start, unless it is not finite or a constraint binds:
-    the minimum on a constraint may lie elsewhere.
-    """
-    problem, ends = target.problem, []
-    if np.isfinite(target.at(begin.theta).cost):
-        ends.append(_descend(target, begin.theta, relations))
-        held = relations.freedom_lost or any(ends[0].active)
-        if begin.success and not ends[0].failure and not held:
-            return ends[0]
-    low, high = problem.bounds()
-    ends += [
-        _descend(target, theta, relations)
-        for theta in np.clip(starts_of(problem)[:_MOST_STARTS], low, high)
-        if np.isfinite(target.at(theta).cost)
-    ]
-    if not ends:
-        raise FitError("no start has a steady response in every row; give another start")
-    best = min(ends, key=lambda end: (bool(end.failure), end.cost))
-    if not best.failure:  # again, in the units of the optimum
-        ends.append(_descend(target, best.theta, relations))
-        best = best if ends[-1].failure else ends[-1]
-    return replace(best, evaluations=sum(end.evaluations for end in ends))
+        The optimum is the one start, unless it is not finite or a constraint binds: the minimum on
+        a constraint may lie elsewhere.
+        """
+        ends = []
+        if np.isfinite(self.at(begin.theta).cost):
+            ends.append(self.descend(begin.theta))
+            held = any(self.relations.equal) or any(ends[0].active)
+            if begin.success and not ends[0].failure and not held:
+                return ends[0]
+        starts = np.clip(starts_of(self.problem)[:_MOST_STARTS], *self.problem.bounds())
+        ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
+        if not ends:
+            raise FitError("no start has a steady response in every row; give another start")
+        best = min(ends, key=lambda end: (bool(end.failure), end.cost))
+        again = best if best.failure else self.descend(best.theta)  # in the units of the optimum
+        return best if again.failure else again
 
+    def descend(self, start: FloatArray) -> _End:
+        """Run IPOPT from `start`."""
+        import casadi as ca
 
-def _descend(
-    target: Target, start: FloatArray, relations: Relations, evaluations: int = 0
-) -> _Found:
-    """Run IPOPT from `start`; `evaluations` were made before."""
-    import casadi as ca
+        equal, (unit, weight, tolerance, step) = self.relations.equal, self._units(start)
 
-    problem = target.problem
-    unit, weight, tolerance, step = _units(target, start)
+        @lru_cache(maxsize=1)  # IPOPT asks for the cost, and then for the gradient
+        def at(xi: bytes) -> Quadratic:
+            return self.at(start + unit * np.frombuffer(xi))
 
-    def value(xi: FloatArray) -> list[FloatArray]:
-        at = target.at(start + unit * xi)
-        return [2.0 * weight * at.cost, 2.0 * weight * unit * at.gradient]
+        def computed(xi: bytes, order: int) -> FloatArray:
+            if order < 2:
+                return 2.0 * weight * (at(xi).gradient * unit if order else at(xi).cost)
+            steps = np.vstack([np.zeros(start.size), np.diag(step)])
+            near = self.at(start + unit * (np.frombuffer(xi) + steps))
+            half = (near.gradient[1:] - near.gradient[0]) / step[:, None] * unit
+            if not np.isfinite(half).all():
+                half = near.hessian[0] * np.outer(unit, unit)
+            return np.asarray(weight * (half + half.T))
 
-    def hessian(xi: FloatArray) -> list[FloatArray]:
-        at = target.at(start + unit * (xi + np.vstack([np.zeros(xi.size), np.diag(step)])))
-        exact = (at.gradient[1:] - at.gradient[0]) / step[:, None] * unit
-        curvature = (
-            exact + exact.T
-            if np.isfinite(exact).all()
-            else 2.0 * at.hessian[0] * np.outer(unit, unit)
+        xi = ca.SX.sym("xi", start.size)
+        differences = self.relations.at(self.problem, ca.DM(start) + ca.DM(unit) * xi)
+        slopes = ca.Function("slopes", [xi], [ca.jacobian(differences, xi)])
+        size = np.linalg.norm(np.asarray(slopes(0.0)), axis=1)
+        size[~np.isfinite(size) | (size == 0.0)] = 1.0
+        constraints = ca.Function("constraints", [xi], [differences / ca.DM(size)])
+        low, high = ((bound - start) / unit for bound in self.problem.bounds())
+        bounded = not all(equal) or bool(np.isfinite([low, high]).any())
+        cost, x = _cost_class()(computed, start.size), ca.MX.sym("x", start.size)
+        solver = ca.nlpsol(
+            "ipopt",
+            "ipopt",
+            {"x": x, "f": cost(x), "g": constraints(x)},
+            {
+                "print_time": False,
+                "show_eval_warnings": False,
+                "ipopt.print_level": 0,
+                "ipopt.sb": "yes",
+                "ipopt.tol": tolerance,
+                "ipopt.max_iter": _ITERATIONS,
+                "ipopt.nlp_scaling_method": "none",
+                "ipopt.bound_relax_factor": 0.0,
+                "ipopt.mu_init": 1e-3 if bounded else tolerance,
+            },
         )
-        return [weight * curvature]
+        least = np.where(equal, 0.0, -np.inf)
+        solution = solver(x0=0.0, lbx=low, ubx=high, lbg=least, ubg=0.0)
+        stats = solver.stats()
+        self.evaluations += int(stats["n_call_nlp_f"])
+        status = str(stats["return_status"])
+        failure = "" if status in _SOLVED else _WORDS.get(status, status.replace("_", " ").lower())
+        end, held = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
+        active = (not e and bool(c > -_ACTIVE) for c, e in zip(held, equal, strict=True))
+        by = np.asarray(slopes(end)) / unit
+        left = 0.5 * float(solution["f"]) / weight
+        return _End(start + unit * end, left, failure, by, tuple(active))
 
-    xi = ca.SX.sym("xi", start.size)
-    differences = relations.at(problem, ca.DM(start) + ca.DM(unit) * xi)
-    slopes = ca.Function("slopes", [xi], [ca.jacobian(differences, xi)])
-    size = np.linalg.norm(np.asarray(slopes(0.0)), axis=1)
-    size[~np.isfinite(size) | (size == 0.0)] = 1.0
-    differences = differences / ca.DM(size)
-    multipliers = ca.SX.sym("lam_g", size.size)
-    curvature, _ = ca.hessian(ca.dot(multipliers, differences), xi)
-    related = ca.Function("related", [xi], [differences, ca.jacobian(differences, xi)])
-    curved = ca.Function("curved", [xi, multipliers], [ca.densify(curvature)])
-    x, p = ca.MX.sym("x", start.size), ca.MX.sym("p", 0)
-    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", size.size)
-    P = start.size
-    computed = [_callback()(value, P, [(1, 1), (P, 1)]), _callback()(hessian, P, [(P, P)])]
-    (f, gradient), (curvature,) = (function.call([x]) for function in computed)
-    g, jacobian = related.call([x])
-    curvature = ca.triu(lam_f * curvature + curved(x, lam_g))
-    low, high = ((bound - start) / unit for bound in problem.bounds())
-    bounded = not all(relations.equal) or bool(np.isfinite([low, high]).any())
-    solver = ca.nlpsol(
-        "ipopt",
-        "ipopt",
-        ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
-        {
-            "grad_f": ca.Function("grad_f", [x, p], [f, gradient], ["x", "p"], ["f", "grad_f_x"]),
-            "jac_g": ca.Function("jac_g", [x, p], [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
-            "hess_lag": ca.Function(
-                "hess_lag", [x, p, lam_f, lam_g], [curvature], ["x", "p", "lam_f", "lam_g"],
-                ["triu_hess_gamma_x_x"],
-            ),
-            "no_nlp_grad": True,
-            "print_time": False,
-            "show_eval_warnings": False,
-            "ipopt.print_level": 0,
-            "ipopt.sb": "yes",
-            "ipopt.tol": tolerance,
-            "ipopt.max_iter": _ITERATIONS,
-            "ipopt.nlp_scaling_method": "none",
-            "ipopt.bound_relax_factor": 0.0,
-            "ipopt.mu_init": 1e-3 if bounded else tolerance,
-        },
-    )  # fmt: skip
-    least = np.where(relations.equal, 0.0, -np.inf)
-    solution = solver(x0=0.0, lbx=low, ubx=high, lbg=least, ubg=0.0)
-    stats = solver.stats()
-    end, held = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
-    return _Found(
-        theta=start + unit * end,
-        cost=0.5 * float(solution["f"]) / weight,
-        return_status=str(stats["return_status"]),
-        evaluations=evaluations + int(stats["n_call_nlp_f"]),
-        slopes=np.asarray(slopes(end)) / unit,
-        active=tuple(
-            not equal and bool(c > -_ACTIVE) for c, equal in zip(held, relations.equal, strict=True)
-        ),
-    )
+    def _units(self, start: FloatArray) -> tuple[FloatArray, float, float, FloatArray]:
+        """Return the units of IPOPT's coordinates xi and of its function.
 
+        The unit of each coordinate, the factor on the sum of losses, the tolerance of the gradient,
+        and steps of xi for differences of the gradient.
+        """
+        problem, at = self.problem, self.at(start)
+        m = problem.n_residuals + len(problem.priors)
+        reach = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms change of the residuals
+        reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
+        whole = np.max(reach * np.where(problem.space.positive, 1.0, np.abs(start)))
+        residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
+        rounding = float(problem.rounding) / self.scale / residual
+        step = _STEP * np.where(problem.space.positive, 1.0, whole / reach) * reach / residual
+        return residual / reach, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
 
-def _units(target: Target, start: FloatArray) -> tuple[FloatArray, float, float, FloatArray]:
-    """Return the units of IPOPT's coordinates xi and function f.
+    def optimum(self, end: _End, begin: Optimum) -> Optimum:
+        """Return the optimum with status, sentence and covariance."""
+        problem, relations = self.problem, self.relations
+        if end.failure == _INFEASIBLE:
+            raise FitError(
+                f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
+                "bounds; IPOPT found the least violation elsewhere: relax one of them"
+            )
+        minima = Minima(
+            end.theta[None],
+            np.array([end.cost]),
+            self.at(end.theta).hessian[None],
+            np.array([not end.failure]),
+            np.array([begin.nfev + self.evaluations]),
+        )
+        result = optima(problem, minima, self.scale, self.loss, "ipopt")[0]
+        if end.failure:
+            return replace(result, message=f"{result.message} IPOPT says: {end.failure}.")
+        return self._constrained(result, end, begin) if relations.texts else result
 
-    The unit of each coordinate, the factor from the sum of losses to f, the tolerance of the
-    gradient, and steps of xi for differences of the gradient.
-    """
-    problem, at = target.problem, target.at(start)
-    m = problem.n_residuals + len(problem.priors)
-    reach = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms change of the residuals
-    reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
-    logarithmic = problem.space.positive
-    whole = np.max(reach * np.where(logarithmic, 1.0, np.abs(start)))
-    residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
-    unit = residual / reach
-    rounding = float(problem.rounding) / target.scale / residual
-    step = _STEP * np.where(logarithmic, 1.0, whole / reach) / unit
-    return unit, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
+    def _constrained(self, result: Optimum, end: _End, begin: Optimum) -> Optimum:
+        """Return `result` not reordered, with status and covariance on the constraints."""
+        problem, relations, scale = self.problem, self.relations, self.scale
+        if not problem.scale_known and self.loss is None and not problem.priors:
+            scale = float(estimated_scale(problem, end.cost, self.dof))
+        covariance, undetermined = _on_constraints(
+            information_of(problem, end.theta, self.scale, self.loss, self.dof),
+            end.slopes[np.array(relations.equal, dtype=np.bool_)],
+        )
+        active = [text for text, hit in zip(relations.texts, end.active, strict=True) if hit]
+        status, message = result.status, result.message
+        if undetermined.any():
+            names = [n for n, lost in zip(problem.names, undetermined, strict=True) if lost]
+            status = Status.SINGULAR
+            message = f"{status.value} Involved: {', '.join(names)}."
+        elif active:
+            status = Status.AT_BOUND
+            message = (
+                f"Converged on the constraint {'; '.join(active)}: the sum of squares falls beyond "
+                "it, so the interval is one-sided. Widen it, or hold it with equality."
+            )
+        elif status is Status.SINGULAR:
+            status = Status.CONVERGED
+            message = status.value
+        return replace(
+            result,
+            theta=end.theta,
+            values=problem.to_values(end.theta),
+            covariance=covariance * (scale / self.scale) ** 2,
+            scale=scale,
+            dof=self.dof,
+            status=status,
+            message=message,
+            constraint_cost=self._constraint_cost(end, begin),
+        )
+
+    def _constraint_cost(self, end: _End, begin: Optimum) -> ConstraintCost | None:
+        """Return the rise of the cost by the constraints over that of least squares without."""
+        of_one_scale = self.problem.scale_known or not self.problem.priors
+        held = zip(self.relations.texts, self.relations.equal, end.active, strict=True)
+        texts = tuple(text for text, equal, active in held if equal or active)
+        known = self.loss is None and of_one_scale and not begin.is_exact and begin.dof > 0
+        if not known or not texts:
+            return None
+        rise = 2.0 * max(end.cost - begin.cost, 0.0) / begin.scale**2
+        return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
 
 
 @cache
-def _callback() -> Any:
+def _cost_class() -> Any:
+    """Return the class of a casadi function whose derivatives numpy computes as well."""
     import casadi as ca
 
     class Computed(ca.Callback):
-        """A casadi function of a vector that numpy computes."""
+        """The cost of a vector (order 0), its gradient, a row (1), or its Hessian (2).
 
-        def __init__(
-            self,
-            work: Callable[[FloatArray], list[FloatArray]],
-            size: int,
-            shapes: list[tuple[int, int]],
-        ) -> None:
+        A derivative also takes the values that it is the derivative of, and does not need them.
+        """
+
+        def __init__(self, compute: _Compute, size: int, order: int = 0) -> None:
             ca.Callback.__init__(self)
-            self._work, self._size, self._shapes = work, size, shapes
-            self._last: tuple[bytes, list[Any]] = (b"", [])
+            self._compute, self._order = compute, order
+            self._shapes = [(size, 1), (1, 1), (1, size), (size, size)]
+            self._derivative = Computed(compute, size, order + 1) if order < 2 else None
             self.construct("computed", {})
 
-        def get_n_out(self) -> int:
-            return len(self._shapes)
+        def get_n_in(self) -> int:
+            return 1 + self._order
 
-        def get_sparsity_in(self, _: int) -> Any:
-            return ca.Sparsity.dense(self._size)
+        def get_n_out(self) -> int:
+            return max(1, self._order)
+
+        def get_sparsity_in(self, which: int) -> Any:
+            shape = self._shapes[which]
+            return ca.Sparsity(*shape) if which else ca.Sparsity.dense(*shape)
 
         def get_sparsity_out(self, which: int) -> Any:
-            return ca.Sparsity.dense(*self._shapes[which])
+            shape = self._shapes[1 + self._order]
+            return ca.Sparsity(shape[0], 1) if which else ca.Sparsity.dense(*shape)
+
+        def has_jacobian(self) -> bool:
+            return self._derivative is not None
+
+        def get_jacobian(self, *_: Any) -> Any:
+            return self._derivative
 
         def eval(self, arguments: Any) -> Any:
-            at = np.asarray(arguments[0]).ravel()
-            if self._last[0] != at.tobytes():
-                self._last = at.tobytes(), [ca.DM(np.asarray(v)) for v in self._work(at)]
-            return self._last[1]
+            at = np.asarray(arguments[0]).tobytes()
+            value = ca.DM(np.atleast_2d(self._compute(at, self._order)))
+            return [value, *(ca.DM(self.sparsity_out(i)) for i in range(1, self.n_out()))]
 
     return Computed
 
@@ -467,86 +514,6 @@ def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArra
     return np.broadcast_to(value, shape)
 
 
-def _ended(target: Target, end: _Found, relations: Relations, begin: Optimum) -> Optimum:
-    """Return the optimum with status, sentence and covariance."""
-    problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
-    if end.return_status == "Infeasible_Problem_Detected":
-        raise FitError(
-            f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
-            "bounds; IPOPT found the least violation elsewhere: relax one of them"
-        )
-    words = end.failure
-    minima = Minima(
-        end.theta[None],
-        np.array([end.cost]),
-        target.at(end.theta).hessian[None],
-        np.array([not words]),
-        np.array([begin.nfev + end.evaluations]),
-    )
-    result = optima(problem, Ends(minima), target.scale, loss, "ipopt", minima.evaluations)[0]
-    if words:
-        return replace(result, message=f"{result.message} IPOPT says: {words}.")
-    if not relations.texts:
-        return result
-    return _constrained(result, target, end, relations, begin)
-
-
-def _constrained(
-    result: Optimum, target: Target, end: _Found, relations: Relations, begin: Optimum
-) -> Optimum:
-    """Return `result` as found, not reordered, with the covariance on the constraints."""
-    problem, loss = target.problem, loss_named(target.loss, target.problem.parts)
-    dof = result.dof + relations.freedom_lost
-    scale = target.scale
-    if not problem.scale_known and loss is None and not problem.priors:
-        scale = float(estimated_scale(problem, end.cost, dof))
-    covariance, undetermined = _on_constraints(
-        information_of(problem, end.theta, target.scale, loss, dof),
-        end.slopes[np.array(relations.equal, dtype=np.bool_)],
-    )
-    active = [text for text, hit in zip(relations.texts, end.active, strict=True) if hit]
-    status, message = result.status, result.message
-    if undetermined.any():
-        names = [n for n, lost in zip(problem.names, undetermined, strict=True) if lost]
-        status = Status.SINGULAR
-        message = f"{status.value} Involved: {', '.join(names)}."
-    elif active:
-        status = Status.AT_BOUND
-        message = (
-            f"Converged on the constraint {'; '.join(active)}: the sum of squares falls beyond "
-            "it, so the interval is one-sided. Widen it, or hold it with equality."
-        )
-    elif status is Status.SINGULAR:
-        status = Status.CONVERGED
-        message = status.value
-    return replace(
-        result,
-        theta=end.theta,
-        values=problem.to_values(end.theta),
-        covariance=covariance * (scale / target.scale) ** 2,
-        scale=scale,
-        dof=dof,
-        status=status,
-        message=message,
-        constraint_cost=_constraint_cost(target, end, relations, begin),
-    )
-
-
-def _constraint_cost(
-    target: Target, end: _Found, relations: Relations, begin: Optimum
-) -> ConstraintCost | None:
-    """Return the rise of the cost by the constraints over `begin`, least squares without them."""
-    of_one_scale = target.problem.scale_known or not target.problem.priors
-    if target.loss != "linear" or not of_one_scale or begin.is_exact or begin.dof <= 0:
-        return None
-    held = zip(relations.texts, relations.equal, end.active, strict=True)
-    texts = tuple(text for text, equal, active in held if equal or active)
-    if not texts:
-        return None
-    rise = 2.0 * max(end.cost - begin.cost, 0.0) / begin.scale**2
-    return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
-
-
 def _on_constraints(
     information: FloatArray, slopes: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -559,6 +526,4 @@ def _on_constraints(
     inner, lost = inverse(along.T @ information @ along)
     undetermined = np.abs(along) @ lost.astype(np.float64) > 0.0
     covariance = along @ np.where(np.isinf(inner), 0.0, inner) @ along.T
-    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
-    covariance[undetermined, undetermined] = np.inf
-    return covariance, undetermined
+    return blanked(covariance, undetermined), undetermined

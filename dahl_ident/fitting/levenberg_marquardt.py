@@ -14,8 +14,8 @@ predictions, leaves of the data; it ends with the next step, which needs no furt
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Self
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,33 +26,39 @@ from dahl_ident.noise import bend
 from dahl_ident.problem import EXPLICIT, Problem, Quadratic
 
 if TYPE_CHECKING:
-    from dahl_ident.fitting.asymptotes import Chart
+    from dahl_ident.fitting.asymptotes import Limit
 
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
-Evaluate = Callable[[FloatArray, IntArray | None], Quadratic]
-"""(theta (S, P), which of the problems they belong to, None for all) -> cost, gradient, Hessian."""
+Evaluate = Callable[[FloatArray, IntArray], Quadratic]
+"""(theta (S, P), which of the searches they belong to (S,)) -> cost, gradient, Hessian."""
 Bounds = tuple[FloatArray, FloatArray]
 """Least and largest coordinates, (P,) each, of steps."""
 Fall = Callable[[FloatArray], FloatArray | float]
 """Costs (S,) -> their falls that are not worth a step."""
 
 _EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
-_FIRST_DAMPING = 1e-9  # almost nothing: the first step is that of Gauss and Newton
-_GAUSS_NEWTON = 1e-3  # with more damping a short step says nothing
-_MOST_DAMPING = 1e12  # steps are below rounding then
-_ROUNDING = 1e-12  # of a scaled Hessian's entries, with room
-_LONGEST_STEP = 2.0  # of a logarithm
-_NOISE_TOLERANCE = 1e-8  # of a standard deviation of the residuals
-_LAST_STEP = 1e-6  # of a logarithm: the Hessian is that before the last step
-_FLAT = 1e-3  # of the residuals' size, by which a coordinate from bound to bound changes them
-_NEAR = 0.01  # of the way between bounds: a last step of theirs
+_FIRST_DAMPING = 1e-9  # lambda at first: almost nothing, so that the step is Gauss and Newton's
+_GAUSS_NEWTON = 1e-3  # lambda above which a step is short because of it, not near a minimum
+_MOST_DAMPING = 1e12  # lambda at which steps change no digit: the search has failed
+_ROUNDING = 1e-12  # rounding errors of a scaled Hessian, some thousand times _EPS
+_LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, within which a quadratic may still hold
+# length of a step, over the residuals' standard deviation, at which a search has converged
+_NOISE_TOLERANCE = 1e-8
+# longest step of a logarithm that may be the last: the Hessian returned is that before it
+_LAST_STEP = 1e-6
+# change of the residuals, over their size, that a coordinate makes from bound to bound, below which
+# it is held: it has no effect
+_FLAT = 1e-3
+_NEAR = 0.01  # longest last step, as a share of the way between the bounds
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
-_OF_ACCURACY = 0.3  # the same, where predictions are less accurate: of that accuracy
-_OVERTIME = 2.0  # times the steps of another search that has converged, and lower
-_OF_COST, _OF_STEP, _OF_SLOPE = 1e-13, 1e-10, 1e-14  # relative changes that end scipy's searches
-_EVALUATIONS = 300  # a limit for searches that do not end
-NEARLY = 1e-4  # relative difference of costs that are nearly alike
+_OF_ACCURACY = 0.3  # the same over the accuracy of predictions, where that is less than rounding's
+# a search that is still higher ends after so many times the steps of one that has converged
+_OVERTIME = 2.0
+# relative changes of cost, step and slope at which scipy's searches end: a few hundred times _EPS
+_OF_COST, _OF_STEP, _OF_SLOPE = 1e-13, 1e-10, 1e-14
+_EVALUATIONS = 300  # of scipy's search, which needs about thirty; more mean that it does not end
+NEARLY = 1e-4  # relative difference of costs within which a search that has converged is preferred
 
 
 @dataclass(frozen=True)
@@ -76,15 +82,36 @@ class _Searches:
         )
 
 
+class AtLimit(NamedTuple):
+    """A limit at which a search ended, in the limit's own coordinates phi."""
+
+    limit: Limit
+    phi: FloatArray
+    hessian: FloatArray
+
+
 @dataclass(frozen=True)
 class Minima(_Searches):
     """The ends of S searches."""
 
     theta: FloatArray
+    """Search coordinates, (S, P); at a limit so far out that the model is its limit."""
     cost: FloatArray
     hessian: FloatArray
     converged: BoolArray
     evaluations: IntArray
+    limit: NDArray[np.object_] = field(default_factory=lambda: np.empty(0, dtype=object))
+    """The :class:`AtLimit` of each search, or None."""
+
+    def __post_init__(self) -> None:
+        if len(self.limit) != len(self.theta):
+            object.__setattr__(self, "limit", np.full(len(self.theta), None))
+
+    @property
+    def determined(self) -> IntArray:
+        """The number of parameters that each optimum has: fewer than P at a limit."""
+        P = self.theta.shape[1]
+        return np.array([P if at is None else len(at.phi) for at in self.limit])
 
     def put(self, which: IntArray, other: Minima) -> None:
         """Replace the ends of some searches by those of `other`, which continued them."""
@@ -113,17 +140,7 @@ class Minima(_Searches):
     def better(self, other: Minima) -> Minima:
         """Return, search by search, the other where it is lower or alone has converged."""
         wins = (other.cost < self.cost) & ~(self.converged & ~other.converged)
-        return self._or(other, wins | (other.converged & ~self.converged))
-
-    def lower(self, other: Minima) -> Minima:
-        """Return, search by search, the other where it is lower, converged or not.
-
-        Where costs are nearly alike, the one that has converged counts as the lower.
-        """
-        ours, others = (m.cost * np.where(m.converged, 1.0, 1.0 + NEARLY) for m in (self, other))
-        return self._or(other, others < ours)
-
-    def _or(self, other: Minima, wins: BoolArray) -> Minima:
+        wins |= other.converged & ~self.converged
         every = self.evaluations + other.evaluations
         return replace(self.where(wins, other), evaluations=every)
 
@@ -153,7 +170,7 @@ def minimise(
     logarithmic: BoolArray,
     n_residuals: int,
     *,
-    inside: Callable[[FloatArray, IntArray | None], BoolArray] | None = None,
+    inside: Callable[[FloatArray, IntArray], BoolArray] | None = None,
     owner: IntArray | None = None,
     tolerance_factor: float = 1.0,
     enough: Fall | None = None,
@@ -175,10 +192,10 @@ def minimise(
     owner = np.arange(len(theta)) if owner is None else owner
     S, P = theta.shape
     unseen_change = _UNSEEN if accuracy <= EXPLICIT else _OF_ACCURACY * accuracy
-    at = _State(theta, *evaluate(theta, None))
-    ends = at.take(np.arange(S))
-    converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
     active = np.arange(S)
+    at = _State(theta, *evaluate(theta, active))
+    ends = at.take(active)
+    converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
     last = np.full(S, 1e-300)
     # steps of each owner's converged search
@@ -195,9 +212,8 @@ def minimise(
         settled = settled | (enough is not None and predicted < enough(at.cost))
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
-        which = None if active.size == S else active
         if inside is not None:
-            lost |= ~inside(at.theta, which)
+            lost |= ~inside(at.theta, active)
         owners = owner[active]
         lost |= (count > _OVERTIME * first[owners]) & (at.cost > lowest[owners])
         ended = settled | lost
@@ -214,8 +230,7 @@ def minimise(
             step, moves, predicted = step[keep], moves[keep], predicted[keep]
             damping, growth, last = damping[keep], growth[keep], last[keep]
         trial = at.theta + step
-        which = None if active.size == S else active
-        new = _State(trial, *evaluate(trial, which))
+        new = _State(trial, *evaluate(trial, active))
         evaluations[active] += 1
         # a fall too small to see next to one enormous row's cost is taken as predicted
         tiny = predicted <= unseen_change * at.cost
@@ -292,38 +307,30 @@ def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: f
 
 
 def minimise_by_scipy(
-    problem: Problem,
-    start: FloatArray,
-    scale: float,
-    loss: Loss | None,
-    chart: Chart | None = None,
+    problem: Problem, start: FloatArray, scale: float, loss: Loss | None
 ) -> Minima:
     """Return the minimum of one table's cost between its bounds, from one start, shape (P,).
 
-    The trust-region reflective algorithm. In a `chart`, from phi and without bounds.
+    The trust-region reflective algorithm.
     """
     from scipy import optimize
 
     last: dict[bytes, FloatArray] = {}  # scipy asks for residuals, and then for their Jacobian
 
-    def rows(phi: FloatArray) -> FloatArray:
-        key = phi.tobytes()
+    def rows(theta: FloatArray) -> FloatArray:
+        key = theta.tobytes()
         if key not in last:
             last.clear()
-            last[key] = evaluated(phi)
+            last[key] = evaluated(theta)
         return last[key]
 
-    def evaluated(phi: FloatArray) -> FloatArray:
-        theta = phi if chart is None else chart.theta(phi)
-        m = problem.n_residuals
-        values = problem.to_values(theta)
+    def evaluated(theta: FloatArray) -> FloatArray:
+        m, values = problem.n_residuals, problem.to_values(theta)
         if not np.isfinite(values).all() or (values[problem.space.positive] == 0.0).any():
-            return np.full((1 + phi.size, m + problem.n_priors), np.nan)
+            return np.full((1 + theta.size, m + problem.n_priors), np.nan)
         at = problem.rows(theta, scale, tails=loss is None)
         if loss is not None:
             at = bend(at, m, loss, problem.parts)
-        if chart is not None:
-            at = np.concatenate([at[:1], chart.derivative(theta).T @ at[1:]])
         if not np.isfinite(at).all():
             at[0] = np.nan  # a step that scipy takes back
         return at
@@ -334,20 +341,15 @@ def minimise_by_scipy(
     def jacobian(at: FloatArray) -> FloatArray:
         return rows(at)[1:].T
 
-    bounds = problem.bounds() if chart is None else (-np.inf, np.inf)
-    phi, converged, nfev = start, False, 1
+    theta, converged, nfev = start, False, 1
     if np.isfinite(rows(start)[0]).all():
         with np.errstate(all="ignore"):
             end = optimize.least_squares(
-                residuals, start, jacobian, bounds=bounds,
+                residuals, start, jacobian, bounds=problem.bounds(),
                 x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
-        phi = np.asarray(end.x)
-        converged = end.status > 0
-        nfev = int(end.nfev)
-    theta = phi if chart is None else chart.theta(phi)
-    slopes = None if chart is None else chart.derivative(theta)
-    there = problem.quadratic(theta, scale, loss, slopes)
+        theta, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
+    there = problem.quadratic(theta, scale, loss)
     cost = float(there.cost) if nfev > 1 or converged else np.inf
     counts = np.array([converged]), np.array([nfev])
-    return Minima(phi[None], np.array([cost]), there.hessian[None], *counts)
+    return Minima(theta[None], np.array([cost]), there.hessian[None], *counts)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,14 +17,17 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.problem import Problem
 
-_RESCALINGS = 100  # of the noise's scale; a handful is the rule
-_SAME_SCALE = 1e-9  # change of ln scale that ends them
-_LONGEST_SECANT = 20.0  # plain steps in one: for steps that shrink slowly
-_AT_BOUND = 1e-8  # relative distance from a bound that is none
-_NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
-_NOTHING = 1e-100  # information on a parameter, as its root, that is none
-_BARELY = 1.001  # of the rounding, below which a scale is that
-_PART = 1e-4  # of a parameter in such a direction that matters
+_RESCALINGS = 100  # searches until the noise's scale agrees; five are usual
+_SAME_SCALE = 1e-9  # change of ln scale at which it agrees
+# longest step of the secant in plain steps, whose sum it stands for where they shrink slowly
+_LONGEST_SECANT = 20.0
+_AT_BOUND = 1e-8  # relative distance from a bound within which an estimate lies at it
+# eigenvalue of the information, scaled to a unit diagonal, below which it is rounding: nothing is
+# known in its direction
+_NULL = 1e-13
+_PART = 1e-4  # part in such a direction from which on a parameter counts as undetermined
+_NOTHING = 1e-100  # root of the information on a parameter, below which there is none
+_BARELY = 1.001  # scale over that of rounding, below which the residuals are rounding
 
 
 class Status(Enum):
@@ -248,8 +251,8 @@ class Optimum:
 
 
 @dataclass(frozen=True)
-class OptimumBatch(Sequence[Optimum]):
-    """The minima of S problems of one shape: a sequence of :class:`Optimum`.
+class OptimumBatch:
+    """The minima of S problems of one shape; ``batch[i]`` is the :class:`Optimum` of one.
 
     Arrays are those of the optima, led by S.
     """
@@ -274,15 +277,10 @@ class OptimumBatch(Sequence[Optimum]):
     def __len__(self) -> int:
         return len(self.theta)
 
-    @overload
-    def __getitem__(self, index: int) -> Optimum: ...
+    def __iter__(self) -> Iterator[Optimum]:
+        return (self[i] for i in range(len(self)))
 
-    @overload
-    def __getitem__(self, index: slice) -> list[Optimum]: ...
-
-    def __getitem__(self, index: int | slice) -> Optimum | list[Optimum]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+    def __getitem__(self, index: int) -> Optimum:
         index = range(len(self))[index]
         return Optimum(
             problem=self.problem.table(index),

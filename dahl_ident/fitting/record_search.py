@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import FitError, FitInterrupted, argument
-from dahl_ident.fitting.convergence import Ends, optima
+from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise, minimise_by_scipy
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, agreed_scale
@@ -344,7 +344,7 @@ class RecordSearch:
             end = replace(end, theta=theta, cost=cost, hessian=hessian)
         end = replace(end, evaluations=np.array([self.evaluations]))
         rho = loss_named(self.loss, problem.parts)
-        return optima(problem, Ends(end), self.scale, rho, self.method, end.evaluations)[0]
+        return optima(problem, end, self.scale, rho, self.method)[0]
 
     def freed(self, problem: RecordProblem, held: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate with assumed exponents free, their ranges as priors.

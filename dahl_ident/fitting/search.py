@@ -3,7 +3,8 @@
 1. Starts by variable projection (:mod:`dahl_ident.fitting.global_start`); what the user gave is
    one more.
 2. Levenberg and Marquardt's method from all of them together, exact Jacobian, search coordinates.
-   With ``method="scipy"``, `scipy.optimize.least_squares` from each of the same starts.
+   With ``method="scipy"``, `scipy.optimize.least_squares` from each of the same starts; only
+   charts and limits are searched as before.
 3. Where a table's search has not converged, or leaves friction badly determined, the charts of
    microslip and the limits at infinity are searched as well
    (:mod:`dahl_ident.fitting.asymptotes`).
@@ -16,7 +17,8 @@ it is then estimated and the search repeated until both agree. One table is a ba
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -31,35 +33,40 @@ from dahl_ident.fitting.asymptotes import (
     Reach,
     limits,
     microslip_charts,
-    stiffness_charts,
 )
-from dahl_ident.fitting.convergence import Ends, optima
+from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts
 from dahl_ident.fitting.levenberg_marquardt import (
     NEARLY,
+    AtLimit,
     IntArray,
     Minima,
     minimise,
     minimise_by_scipy,
 )
 from dahl_ident.fitting.losses import Loss, loss_named
-from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale
+from dahl_ident.fitting.optimum import Optimum, OptimumBatch, agreed_scale, inverse
 from dahl_ident.fitting.record_search import Tell, solve_records, solve_repetitions
 from dahl_ident.fitting.record_start import record_starts
 from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
 
-DOUBTFUL = 0.3  # standard deviation of a friction parameter's logarithm: limits may be as good
-_STEPS = 80  # steps of a search; usually ten
-_BRIEF = 30  # steps where no limit counts
-_SLIGHT = 1e-5  # fall of the cost, over that of one residual, that is not worth a step there
-_FIRST_LOOK, _HOPELESS = 15, 3.0  # steps at a limit, and how much higher it may then still be
-_PATIENCE = 1000  # steps where friction is so faint that each takes little
-_AT_LIMIT = 1e4  # tolerance factor: so far out, large terms cancel
-_MANY = 30.0  # tolerance factor of fleets: steps of 3e-7 standard deviations end a search
-_TIE = 1e-12  # relative difference of costs at which a limit wins over a real optimum
-_SAME = 1e-5  # among limits, of which the one with fewest parameters is then taken
-_ROWS_AT_ONCE = 16384  # of data: their intermediate arrays stay in the processor's cache
-_CURVES_AT_ONCE = 2**20  # rows of data times nodes of the grid where starts are searched
+# standard deviation of the logarithm of a friction parameter, above which other minima and limits
+# are searched as well: they may be as good
+DOUBTFUL = 0.3
+_STEPS = 80  # most steps of a search, of which ten are usual
+_BRIEF = 30  # the same where no limit is searched: a repetition is near its optimum
+# fall of the cost, over that of one residual, for which such a search takes no further step
+_SLIGHT = 1e-5
+_FIRST_LOOK = 15  # steps after which a search at a limit goes on only where it may still win
+_HOPELESS = 3.0  # cost there, over the least so far, at which it may not
+_PATIENCE = 1000  # most steps where friction is so faint that each step gains little
+_AT_LIMIT = 1e4  # factor on the tolerance at a limit, where large terms cancel
+_MANY = 30.0  # factor on the tolerance for many tables: 3e-7 standard deviations are near enough
+_TIE = 1e-12  # relative difference of costs within which a limit wins over a finite optimum
+# relative difference of costs within which limits are alike; the one with fewest parameters counts
+_SAME = 1e-5
+_ROWS_AT_ONCE = 16384  # rows of data searched together: their arrays stay in the processor's cache
+_CURVES_AT_ONCE = 2**20  # the same times the nodes of the grid of starts: 16 MB of complex numbers
 
 
 def solve(
@@ -249,25 +256,22 @@ class TableSearch:
             squares = self.problem.squares(begin.theta)
             size = float(np.sqrt(np.median(squares, axis=-1).min() / np.log(4.0)))
             scale = max(size, float(np.max(self.problem.rounding)))
-        starts = begin
-        ends: list[Ends] = []
-        evaluations = np.zeros(self.problem.n_tables, dtype=np.intp)
-
-        def search(scale: float) -> tuple[FloatArray, int]:
-            nonlocal starts, evaluations
-            ends.append(self._search(starts, scale))
-            end = ends[-1].minima
-            evaluations = evaluations + end.evaluations
-            starts = Starts(np.zeros(1, np.intp), end.theta)
-            return end.theta[0], self.m - ends[-1].determined(0)
-
+        end = self._search(begin, scale)
         if self.rescales:
-            scale = agreed_scale(self.problem.table(0), self.loss, search, scale)
-        else:
-            search(scale)
-        return optima(self.problem, ends[-1], scale, self.loss, self.method, evaluations)
+            every = 0
 
-    def _search(self, begin: Starts, scale: float) -> Ends:
+            def search(scale: float) -> tuple[FloatArray, int]:
+                nonlocal end, every
+                if every:
+                    end = self._search(Starts(np.zeros(1, np.intp), end.theta), scale)
+                every += int(end.evaluations[0])
+                return end.theta[0], self.m - int(end.determined[0])
+
+            scale = agreed_scale(self.problem.table(0), self.loss, search, scale)
+            end.evaluations[:] = every
+        return optima(self.problem, end, scale, self.loss, self.method)
+
+    def _search(self, begin: Starts, scale: float) -> Minima:
         coarser, near = self.problem.coarser(), begin
         several = len(begin.table) > self.problem.n_tables
         if coarser is not self.problem and (several or not self.limits):
@@ -281,22 +285,22 @@ class TableSearch:
                 )
                 theta = np.where((began <= ended)[:, None], begin.theta, theta)
             near = Starts(np.arange(self.problem.n_tables), theta)
-        ends = Ends(self._descend(near, scale))
+        end = self._descend(near, scale)
         if not self.limits:
-            return ends
+            return end
         begin = near if self.problem.is_exact else begin  # whose searches far out cost too much
-        doubtful = ~ends.minima.converged | (self._friction_error(ends, scale) > DOUBTFUL)
-        if doubtful.any() and self.problem.is_exact:
-            self._look_wider_by_sine(ends, begin, scale, np.flatnonzero(doubtful))
-        elif doubtful.any():
-            where = np.flatnonzero(doubtful)
-            part = self._of(where)
-            ends.put(where, part._look_wider(ends.take(where), begin.of(where), scale))
-        for table in np.flatnonzero(self._strayed | ~ends.minima.converged).tolist():
-            if table not in ends.limits:
-                end = self._trust_region(table, ends, begin, scale)
-                ends.put(np.array([table]), Ends(end))
-        return ends
+        error = self._friction_error(end, scale)
+        doubtful = np.flatnonzero(~end.converged | (error > DOUBTFUL))
+        if doubtful.size and self.problem.is_exact:
+            self._look_wider_by_sine(end, begin, scale, doubtful)
+        elif doubtful.size:
+            wider = self._of(doubtful)._look_wider(end.take(doubtful), begin.of(doubtful), scale)
+            end.assign(doubtful, wider)
+        for table in np.flatnonzero(self._strayed | ~end.converged).tolist():
+            if end.limit[table] is None:
+                bounded = self._trust_region(table, end, begin, scale)
+                end.assign(np.array([table]), bounded)
+        return end
 
     def _of(self, tables: IntArray) -> TableSearch:
         """Return the same search for some of the tables."""
@@ -316,82 +320,57 @@ class TableSearch:
         steps: int | None = None,
     ) -> Minima:
         """Return the best end of each table's searches; with a chart, they are in its phi."""
-        problem, loss, S = self.problem, self.loss, self.problem.n_tables
-        each = len(begin.table) == S and bool((begin.table == np.arange(S)).all())
-
-        def tables(which: IntArray | None) -> IntArray | None:
-            if which is None:
-                return None if each else begin.table
-            return which if each else begin.table[which]
-
-        def evaluate(at: FloatArray, which: IntArray | None) -> Quadratic:
-            chosen = tables(which)
-            part = problem if chosen is None else problem.take(chosen)
-            if chart is None:
-                return part.quadratic(at, scale, loss)
-            shape = chart if chosen is None else chart.of(chosen)
-            theta = shape.theta(at)
-            return part.quadratic(theta, scale, loss, shape.derivative(theta))
-
+        problem, table = self.problem, begin.table
         logarithmic, phi = self.logarithmic, begin.theta
         if chart is not None:
             logarithmic = ~((chart.matrix != 0.0).T @ ~self.logarithmic)
-            phi = (chart if each else chart.of(begin.table)).phi(begin.theta)
+            phi = chart.of(table).phi(begin.theta)
 
-        def inside(at: FloatArray, which: IntArray | None) -> NDArray[np.bool_]:
-            chosen = tables(which)
-            if chart is not None:
-                at = (chart if chosen is None else chart.of(chosen)).theta(at)
-            return self.reach(at, chosen)
+        def theta_at(at: FloatArray, which: IntArray) -> FloatArray:
+            return at if chart is None else chart.of(table[which]).theta(at)
 
-        minima = None
-        if self.method == "scipy":
-            minima = self._by_scipy(begin, phi, scale, chart, None if limit else inside)
-        minima = minima or minimise(
-            evaluate,
-            phi,
-            logarithmic,
-            self.m,
-            inside=None if limit else inside,
-            owner=begin.table,
-            tolerance_factor=_AT_LIMIT if limit else self.tolerance,
-            enough=None if self.limits else lambda cost: _SLIGHT * cost / self.m,
-            steps=steps or (_STEPS if self.limits else _BRIEF),
-            accuracy=problem.accuracy,
-            bounds=problem.bounds() if self.bounded and chart is None else None,
-        )
+        def evaluate(at: FloatArray, which: IntArray) -> Quadratic:
+            theta = theta_at(at, which)
+            slopes = None if chart is None else chart.derivative(theta)
+            return problem.take(table[which]).quadratic(theta, scale, self.loss, slopes)
+
+        def inside(at: FloatArray, which: IntArray) -> NDArray[np.bool_]:
+            return self.reach(theta_at(at, which), table[which])
+
+        if self.method == "scipy" and chart is None:
+            minima = self._by_scipy(begin, scale)
+        else:
+            minima = minimise(
+                evaluate,
+                phi,
+                logarithmic,
+                self.m,
+                inside=None if limit else inside,
+                owner=table,
+                tolerance_factor=_AT_LIMIT if limit else self.tolerance,
+                enough=None if self.limits else lambda cost: _SLIGHT * cost / self.m,
+                steps=steps or (_STEPS if self.limits else _BRIEF),
+                accuracy=problem.accuracy,
+                bounds=(self.low, self.high) if self.bounded and chart is None else None,
+            )
         if self.bounded:
-            theta = minima.theta if chart is None else chart.of(begin.table).theta(minima.theta)
-            within = self._within(theta)
+            theta = theta_at(minima.theta, np.arange(len(table)))
+            within = ((theta >= self.low) & (theta <= self.high)).all(axis=1)
             minima.converged[:] &= within
-            self._strayed[begin.table[~within]] = True
-        return minima if each else minima.best(begin.table, S)
+            self._strayed[table[~within]] = True
+        return minima.best(table, problem.n_tables)
 
-    def _within(self, theta: FloatArray) -> NDArray[np.bool_]:
-        """Return which searches are within the parameters' bounds."""
-        return np.asarray(((theta >= self.low) & (theta <= self.high)).all(axis=1))
-
-    def _by_scipy(
-        self,
-        begin: Starts,
-        phi: FloatArray,
-        scale: float,
-        chart: Chart | None,
-        inside: Callable[[FloatArray, IntArray | None], NDArray[np.bool_]] | None,
-    ) -> Minima:
+    def _by_scipy(self, begin: Starts, scale: float) -> Minima:
         """Return where `scipy.optimize.least_squares` ends from each start."""
         parts = []
-        for index, table in enumerate(begin.table):
-            one = self.problem.table(int(table))
-            one_chart = None if chart is None else chart.of(np.array([table])).one
-            end = minimise_by_scipy(one, phi[index], scale, self.loss, one_chart)
-            if inside is not None and end.converged[0]:
-                end.converged[:] = inside(end.theta, np.array([index]))
+        for table, theta in zip(begin.table.tolist(), begin.theta, strict=True):
+            end = minimise_by_scipy(self.problem.table(table), theta, scale, self.loss)
+            end.converged[:] &= self.reach(end.theta, np.array([table]))
             parts.append(end)
         return Minima.stacked(parts)
 
     def _look_wider_by_sine(
-        self, ends: Ends, begin: Starts, scale: float, doubtful: IntArray
+        self, end: Minima, begin: Starts, scale: float, doubtful: IntArray
     ) -> None:
         """Look for other optima, and for limits, with the describing function.
 
@@ -402,47 +381,43 @@ class TableSearch:
             self.problem.with_steady("describing function"), self.loss, self.method, self.tolerance
         )
         by_sine = sine._search(begin, scale)
-        lost = doubtful[~ends.minima.converged[doubtful]]
+        lost = doubtful[~end.converged[doubtful]]
         if lost.size:
-            again = Starts(np.arange(lost.size), by_sine.minima.theta[lost])
+            again = Starts(np.arange(lost.size), by_sine.theta[lost])
             further = self._of(lost)._descend(again, scale)
-            better = np.flatnonzero(further.converged | (further.cost < ends.minima.cost[lost]))
-            ends.put(lost[better], Ends(further.take(better)))
-        infinite = ~np.isfinite(self._friction_error(ends, scale))
-        for table in doubtful.tolist():
-            if table in by_sine.limits and (infinite[table] or not ends.minima.converged[table]):
-                one = np.array([table])
-                ends.put(one, by_sine.take(one))
+            better = np.flatnonzero(further.converged | (further.cost < end.cost[lost]))
+            end.assign(lost[better], further.take(better))
+        infinite = ~np.isfinite(self._friction_error(end, scale))
+        at_limit = [by_sine.limit[table] is not None for table in doubtful]
+        chosen = doubtful[at_limit & (infinite | ~end.converged)[doubtful]]
+        end.assign(chosen, by_sine.take(chosen))
 
-    def _look_wider(self, ends: Ends, begin: Starts, scale: float) -> Ends:
-        """Return the best of `ends`, of searches in microslip's charts, and of the limits."""
-        problem, S = self.problem, self.problem.n_tables
-        end = ends.minima
-        every = np.arange(S)
+    def _look_wider(self, end: Minima, begin: Starts, scale: float) -> Minima:
+        """Return the best of `end`, of searches in microslip's charts, and of the limits."""
+        problem, every = self.problem, np.arange(self.problem.n_tables)
         if self.starts_given:
             begin = begin.joined(own_starts(problem))
             end = end.better(self._descend(begin, scale))
         begin = Starts(every, end.theta).joined(begin)
-        for chart in (*microslip_charts(problem), *stiffness_charts(problem)):
+        charts = microslip_charts(problem) + microslip_charts(problem, scale_given=True)
+        for chart in charts:
             there = self._descend(begin, scale, chart)
             theta = chart.theta(there.theta)
             hessian = problem.quadratic(theta, scale, self.loss).hessian
-            end = end.better(Minima(theta, there.cost, hessian, there.converged, there.evaluations))
+            end = end.better(replace(there, theta=theta, hessian=hessian))
         faint = np.flatnonzero(~end.converged & self.reach(end.theta))
         if faint.size:
             part = self._of(faint)
             further = Starts(np.arange(faint.size), end.theta[faint])
             end.put(faint, part._descend(further, scale, steps=_PATIENCE))
-        ends = Ends(end)
         edges = Starts(every, end.theta)
         for theta in edge_starts(problem):
             edges = edges.joined(Starts(every, np.broadcast_to(theta, end.theta.shape)))
-        self._put_limits(ends, edges, scale)
-        return ends
+        self._put_limits(end, edges, scale)
+        return end
 
-    def _put_limits(self, ends: Ends, edges: Starts, scale: float) -> None:
+    def _put_limits(self, end: Minima, edges: Starts, scale: float) -> None:
         """Let the tables end at the best limit whose cost is no higher than where they are."""
-        end = ends.minima
         candidates: list[tuple[Limit, Minima]] = []
         for limit in sorted(limits(self.problem), key=lambda lim: lim.chart.matrix.shape[1]):
             there = self._descend(edges, scale, limit.chart, limit=True, steps=_FIRST_LOOK)
@@ -459,16 +434,20 @@ class TableSearch:
         alike = (costs <= costs.min(axis=0) * (1.0 + _SAME)) & np.isfinite(costs)
         fewest = np.where(alike, sizes, np.inf).min(axis=0)
         chosen = np.where(alike & (sizes == fewest), costs, np.inf).argmin(axis=0)
-        real = end.converged & np.isfinite(self._friction_error(ends, scale))
+        real = end.converged & np.isfinite(self._friction_error(end, scale))
         ceiling = end.cost * (1.0 + np.where(real, _TIE, NEARLY))
         for table in np.flatnonzero(costs.min(axis=0, initial=np.inf) < np.inf):
             limit, there = candidates[chosen[table]]
             if there.cost[table] <= ceiling[table]:
-                ends.at_limit(int(table), limit, there)
+                limit, phi = limit.of(int(table)), there.theta[table]
+                end.theta[table] = limit.chart.theta(phi)
+                end.cost[table], end.converged[table] = there.cost[table], True
+                end.evaluations[table] += there.evaluations[table]
+                end.limit[table] = AtLimit(limit, phi, there.hessian[table])
 
-    def _trust_region(self, table: int, ends: Ends, begin: Starts, scale: float) -> Minima:
+    def _trust_region(self, table: int, end: Minima, begin: Starts, scale: float) -> Minima:
         """Return the best end of scipy's bounded searches for one table."""
-        problem, best = self.problem.table(table), ends.minima.take(np.array([table]))
+        problem, best = self.problem.table(table), end.take(np.array([table]))
         starts = np.vstack([best.theta, begin.theta[begin.table == table]])
         for start in np.clip(starts, self.low, self.high):
             end = minimise_by_scipy(problem, start, scale, self.loss)
@@ -477,13 +456,12 @@ class TableSearch:
                 best = end
         return best
 
-    def _friction_error(self, ends: Ends, scale: float) -> FloatArray:
+    def _friction_error(self, end: Minima, scale: float) -> FloatArray:
         """Return the largest standard deviation of the logarithm of a friction parameter."""
         variance: FloatArray | float = 1.0
         if not self.problem.scale_known and not self.rescales:
-            P = ends.minima.theta.shape[1]
-            variance = 2.0 * ends.minima.cost / max(self.m - P, 1)
-        covariance, _ = ends.inverse
+            variance = 2.0 * end.cost / max(self.m - end.theta.shape[1], 1)
+        covariance, _ = inverse(end.hessian)
         spread = np.diagonal(covariance, axis1=1, axis2=2)[:, self.friction]
         with np.errstate(invalid="ignore"):
             largest = np.asarray(np.sqrt(variance * spread.max(axis=1, initial=0.0)))
