@@ -354,7 +354,14 @@ def posterior(
     one_of(method, "method", METHODS)
     source = data if isinstance(data, FitResult) else None
     refuse_options(kind_of(data) if source is None else type(source.problem), options, posterior)
-    _refuse_for_method(method, options)
+    defaults = signature(posterior).parameters
+    refused = [n for n in _NOT_OF_METHODS[method] if options[n] != defaults[n].default]
+    if refused:
+        names = ", ".join(argument(name).rstrip("=") for name in refused)
+        raise ValidationError(
+            f"{names} given with {argument('method', method)}, which has no such option; leave it "
+            "out"
+        )
     if pool is not None and not callable(getattr(pool, "map", None)):
         raise ValidationError(f"pool is {pool!r}; expected an object with map, such as a Pool")
     one_of(uncertainty, "uncertainty", UNCERTAINTIES)
@@ -401,18 +408,6 @@ _NOT_OF_METHODS = {
     "mcmc": ("tolerance",),
     "grid": ("steps", "max_steps", "ess", "walkers", "ensembles", "resume", "pool"),
 }
-
-
-def _refuse_for_method(method: str, options: Mapping[str, Any]) -> None:
-    """Refuse options of the other method, unless they are left as they are."""
-    defaults = signature(posterior).parameters
-    refused = _NOT_OF_METHODS[method]
-    if named := [name for name in refused if options[name] != defaults[name].default]:
-        names = ", ".join(argument(name).rstrip("=") for name in named)
-        raise ValidationError(
-            f"{names} given with {argument('method', method)}, which has no such option; leave it "
-            "out"
-        )
 
 
 def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.fitting import OptimumBatch, Status
+from dahl_ident.fitting import OptimumBatch
 from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.result import part
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,20 @@ class FitBatch(Sequence[FitResult]):
             return [self[i] for i in range(*index.indices(len(self)))]
         return FitResult(self.optima[index])
 
-    def __iter__(self) -> Iterator[FitResult]:
-        return (self[i] for i in range(len(self)))
-
     @property
     def var_names(self) -> list[str]:
         """Names of the P free parameters."""
         return list(self.optima.names)
 
-    @property
-    def values(self) -> FloatArray:
-        """Estimates, shape (S, P); infinite or zero where an optimum lies there."""
-        return self.optima.values
-
-    @property
-    def stderr_noise(self) -> FloatArray:
-        """Standard errors of `values` from noise alone, first order, shape (S, P)."""
-        return self.optima.stderr
+    values = part(
+        "optima.values", "Estimates, shape (S, P); infinite or zero where an optimum lies there."
+    )
+    stderr_noise = part(
+        "optima.stderr", "Standard errors of `values` from noise alone, first order, shape (S, P)."
+    )
+    scale = part("optima.scale", "Standard deviation of the residuals, shape (S,).")
+    status = part("optima.status", "How each search ended.")
+    success = part("optima.success", "Whether each table has a finite optimum, shape (S,).")
 
     @cached_property
     def _combined(self) -> FloatArray:
@@ -91,21 +88,6 @@ class FitBatch(Sequence[FitResult]):
         Those from noise alone where a table leaves nothing to estimate other errors from.
         """
         return np.asarray(self._combined[..., 1])
-
-    @property
-    def scale(self) -> FloatArray:
-        """Standard deviation of the residuals, shape (S,)."""
-        return self.optima.scale
-
-    @property
-    def status(self) -> tuple[Status, ...]:
-        """How each search ended."""
-        return self.optima.status
-
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """Whether each table has a finite optimum, shape (S,)."""
-        return self.optima.success
 
     def to_frame(self, *, combined: bool = False) -> Any:
         """Return a pandas table: one row a table, value and error of each parameter.
