@@ -77,6 +77,22 @@ def variances(directions: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.where((directions[..., endless] != 0.0).any(axis=-1), np.inf, sums)
 
 
+def satterthwaite(variance: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return the degrees of freedom of variances that have the variances `spread`.
+
+    Twice the square of one over the other, at least 1; infinite where the spread is zero.
+
+    Examples
+    --------
+    >>> satterthwaite(np.array([1.0, 1.0]), np.array([0.1, 0.0])).tolist()
+    [20.0, inf]
+    """
+    dof = np.divide(
+        2.0 * variance**2, spread, out=np.full(np.shape(spread), np.inf), where=spread > 0.0
+    )
+    return np.asarray(np.maximum(dof, 1.0))
+
+
 def positive_part(C: FloatArray) -> FloatArray:
     """Return the positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh(C)

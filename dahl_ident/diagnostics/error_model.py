@@ -44,6 +44,7 @@ from dahl_ident.diagnostics.contributions import (
     TESTS,
     Errors,
     positive_part,
+    satterthwaite,
 )
 from dahl_ident.diagnostics.error_sources import (
     Source,
@@ -183,7 +184,7 @@ class ErrorModel(Errors):
         if TESTS in sizes:
             spread += 2.0 * sizes[TESTS] ** 2 / (self.tests - 1)
         total = sum(sizes.values())
-        dof = max(1.0, 2.0 * total**2 / spread) if spread > 0.0 else np.inf
+        dof = float(satterthwaite(np.asarray(total), np.asarray(spread)))
         if self.by_runs is None or source is not None:
             return dof
         of_runs = float(direction @ self.by_runs.covariance @ direction)

@@ -61,12 +61,12 @@ class Basis:
     size: FloatArray
     directions: FloatArray
     slopes: FloatArray  # (Q, C): derivatives of theta with respect to the coordinates
-    chart: Chart | None = None  # gives theta at the coordinates; None where they are theta
+    chart: Chart  # gives theta at the coordinates
 
     @classmethod
-    def of(cls, J: FloatArray, theta: FloatArray, chart: Chart | None) -> Basis:
+    def of(cls, J: FloatArray, theta: FloatArray, chart: Chart) -> Basis:
         """Return the directions that residuals with the Jacobian J determine."""
-        slopes = np.eye(len(theta)) if chart is None else chart.derivative(theta)
+        slopes = chart.derivative(theta)
         by_coordinates = J @ slopes
         size = 1.0 / np.maximum(np.linalg.norm(by_coordinates, axis=0), np.finfo(float).tiny)
         _, singular, directions = np.linalg.svd(by_coordinates * size, full_matrices=False)
@@ -79,17 +79,14 @@ class Basis:
 
     def at(self, theta: FloatArray) -> Basis:
         """Return the same changes of the coordinates at another theta."""
-        return self if self.chart is None else replace(self, slopes=self.chart.derivative(theta))
+        return replace(self, slopes=self.chart.derivative(theta))
 
     def moved(
         self, theta: FloatArray, step: FloatArray, part: Callable[[FloatArray], float]
     ) -> FloatArray:
         """Return theta after the part of a step (r,) that a move of the coordinates allows."""
         move = self.size * (self.directions @ step)
-        move = move * part(move)
-        if self.chart is None:
-            return np.asarray(theta + move)
-        return self.chart.theta(self.chart.phi(theta) + move)
+        return self.chart.theta(self.chart.phi(theta) + move * part(move))
 
     def holds(self, slopes: FloatArray) -> NDArray[np.bool_]:
         """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
@@ -105,8 +102,8 @@ class Basis:
         return np.asarray(known & ((whole > 0.0) | ~slopes.any(axis=-1)))
 
 
-def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart | None:
-    """Return the coordinates of the limit at which an optimum lies; None where it is finite.
+def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
+    """Return the coordinates of the limit at which an optimum lies; theta where it is finite.
 
     `problem` may have more free parameters, coordinates in addition to those of the limit.
     """
@@ -115,11 +112,10 @@ def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart | None:
         for p, value in zip(optimum.problem.parameters, optimum.values.tolist(), strict=True)
         if np.isinf(value) or (value == 0.0 and p.positive)
     }
-    if not gone:
-        return None
-    reached = [one for one in limits(optimum.problem) if one.extremes == gone]
+    reached = [one for one in limits(optimum.problem) if one.extremes == gone] if gone else []
     if not reached:
-        return None
+        unit = np.eye(len(problem.names))
+        return Chart(unit, np.zeros(len(unit)), unit)
     chart = min(
         (one.chart.of(0) for one in reached),
         key=lambda c: float(np.abs(c.theta(c.phi(optimum.theta)) - optimum.theta).max()),

@@ -34,6 +34,7 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
+from dahl_ident.diagnostics.contributions import satterthwaite
 from dahl_ident.diagnostics.error_sources import FEWEST_TESTS, rows_of_tests
 from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
@@ -121,8 +122,7 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
         missed = turn @ (refit.residuals[index] - predicted).reshape(-1, 2, 1)
         variance = np.maximum(by_source[0], 0.0)
         spread = np.einsum("kra,kl,lra->ra", by_source[1:], W, by_source[1:])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            dof = np.where(spread > 0.0, np.maximum(2.0 * variance**2 / spread, 1.0), np.inf)
+        dof = satterthwaite(variance, spread)
         std = np.sqrt(variance)
         std = np.where((std > 0.0) & (std < _WIDEST), std, np.nan)
         kept = first[rows]

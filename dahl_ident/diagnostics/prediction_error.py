@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS
+from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS, satterthwaite
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
 from dahl_ident.diagnostics.error_sources import Source, error_sources, parts, places
 from dahl_ident.diagnostics.mixed_model import MixedModel
 from dahl_ident.problem import TableProblem
 
-_LEAST_DOF = 1.0  # with fewer, quantiles of Student's t are too large to be of use
 _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
 
 
@@ -80,15 +79,14 @@ def prediction_error(
                 by_variance[model.noises + k] += _diagonal(drawn)
     total = _diagonal(covariance)
     spread = np.einsum("kni,kl,lni->ni", by_variance, state.variances_covariance, by_variance)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        dof = np.where(spread > 0.0, 2.0 * total**2 / spread, np.inf)
+    dof = satterthwaite(total, spread)
     if errors.by_runs is not None:  # a new run scatters about the mean of the others
         mean = _diagonal(by_theta @ errors.by_runs.covariance @ by_theta.swapaxes(1, 2))
         runs = errors.by_runs.runs
         dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
     if basis is not None:
         covariance[~basis.holds(by_theta).all(axis=1)] = np.inf
-    return PredictionError(X @ state.predicted, covariance, np.maximum(dof, _LEAST_DOF))
+    return PredictionError(X @ state.predicted, covariance, dof)
 
 
 def _diagonal(covariance: FloatArray) -> FloatArray:
