@@ -23,7 +23,7 @@ from dahl_ident.diagnostics.residual_space import ResidualSpace
 from dahl_ident.diagnostics.trends import covariates
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum, Status, solve
-from dahl_ident.fitting.global_start import own_starts
+from dahl_ident.fitting.global_start import global_starts
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import percent
 
@@ -216,7 +216,7 @@ def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimu
         try:
             problem = optimum.problem.like(data=turn(optimum.problem.data))
             # single rows near a resonance may miss at a start: the median is not bent by them
-            started = problem.predict(own_starts(problem).theta[0])
+            started = problem.predict(global_starts(problem).theta[0])
             first = float(np.median(_misfit(problem, started)))
         except DahlIdentError:
             continue

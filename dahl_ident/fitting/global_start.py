@@ -86,7 +86,7 @@ class Starts(NamedTuple):
         return Starts(np.searchsorted(tables, self.table[chosen]), self.theta[chosen])
 
 
-def own_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
+def global_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
     """Return the best starts of every table of a problem, best first.
 
     Values that the user gave to free parameters make one more start, the last. `resistant` starts

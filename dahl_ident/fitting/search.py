@@ -35,7 +35,7 @@ from dahl_ident.fitting.asymptotes import (
     microslip_charts,
 )
 from dahl_ident.fitting.convergence import optima
-from dahl_ident.fitting.global_start import Starts, edge_starts, grid_size, own_starts
+from dahl_ident.fitting.global_start import Starts, edge_starts, global_starts, grid_size
 from dahl_ident.fitting.levenberg_marquardt import (
     NEARLY,
     AtLimit,
@@ -118,7 +118,7 @@ def _solve_table(
     stated = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(stated) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(stated)[None]))[0]
-    begin = own_starts(problem, resistant=loss != "linear")
+    begin = global_starts(problem, resistant=loss != "linear")
     if start:
         values = zip(problem.names, problem.to_values(begin.theta[0]), strict=True)
         theta = problem.to_search([start.get(name, value) for name, value in values])
@@ -135,7 +135,9 @@ def _solve_table(
 def starts_of(problem: Problem) -> FloatArray:
     """Return the search coordinates of global starts."""
     one: Any = problem
-    return one.to_search(record_starts(one)) if problem.kind == "records" else own_starts(one).theta
+    if problem.kind == "records":
+        return np.asarray(one.to_search(record_starts(one)))
+    return global_starts(one).theta
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
@@ -178,7 +180,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
         part = batch.take(slice(first, first + at_once))
         search = TableSearch(part, None, tolerance=_MANY)
         if begin is None:
-            parts.append(search.run(own_starts(part)))
+            parts.append(search.run(global_starts(part)))
         else:
             some = begin[first : first + at_once]
             parts.append(search.run(Starts(np.arange(len(some)), some), starts_given=True))
@@ -396,7 +398,7 @@ class TableSearch:
         """Return the best of `end`, of searches in microslip's charts, and of the limits."""
         problem, every = self.problem, np.arange(self.problem.n_tables)
         if self.starts_given:
-            begin = begin.joined(own_starts(problem))
+            begin = begin.joined(global_starts(problem))
             end = end.better(self._descend(begin, scale))
         begin = Starts(every, end.theta).joined(begin)
         charts = microslip_charts(problem) + microslip_charts(problem, scale_given=True)

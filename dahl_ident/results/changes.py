@@ -89,15 +89,15 @@ def changes(fits: Mapping[str, FitResult]) -> list[Change]:
 
 def headline(changed: list[Change]) -> list[str]:
     """Return what changed in sentences, and what the comparison leaves open."""
-    told = [f"{c}." for c in changed if math.isfinite(c.p) and c.p < SIGNIFICANT]
-    if not told:
+    sentences = [f"{c}." for c in changed if math.isfinite(c.p) and c.p < SIGNIFICANT]
+    if not sentences:
         return ["No parameter changes significantly between the measurements."]
     if not all(c.runs_known for c in changed):
-        told.append(
+        sentences.append(
             "Each fit is of a single run, so scatter between runs (a new mounting, another day) "
             "may be the reason: repeat runs, and fit them together."
         )
-    return told
+    return sentences
 
 
 def is_usable(fit: FitResult, name: str) -> bool:

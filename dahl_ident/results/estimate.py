@@ -386,8 +386,8 @@ def posterior(
     density, optimum = _density(problem, fitted, priors, likelihood, uncertainty)
     begin = partial(centre_and_covariance, density, optimum, np.random.default_rng(0))
     if method == "grid":
-        with grid_progress() if progress else nullcontext() as told:
-            points = sample_points(density, begin, problem.names, tolerance, told)
+        with grid_progress() if progress else nullcontext() as show:
+            points = sample_points(density, begin, problem.names, tolerance, show)
         return Posterior(density, points, fitted, uncertainty)
     settings = ChainSettings(
         len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,

@@ -117,5 +117,5 @@ class FitBatch(Sequence[FitResult]):
 
     def __repr__(self) -> str:
         ends = Counter(status.name.lower() for status in self.status)
-        told = ", ".join(f"{count} {name}" for name, count in ends.items())
-        return f"<FitBatch: {len(self)} tables, free {', '.join(self.var_names)}; {told}>"
+        outcomes = ", ".join(f"{count} {name}" for name, count in ends.items())
+        return f"<FitBatch: {len(self)} tables, free {', '.join(self.var_names)}; {outcomes}>"
