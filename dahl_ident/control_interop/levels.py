@@ -179,6 +179,14 @@ class Branches:
         Amplitudes, phases, receptances; NaN where a point has fewer than the most.
     growth_rate : ndarray
         Rate at which the worst small disturbance grows, 1/s; negative on stable branches.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> from dahl_ident.control_interop import response_branches
+    >>> plant = Dahl(f_max=0.1, sigma=30) + Mass(0.3) + Damper(-0.03) + Spring(3.0)
+    >>> response_branches(plant, 0.525, 0.114).stable.tolist()
+    [True, False, True]
     """
 
     steady: SteadyResponse

@@ -66,7 +66,14 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return self._model
 
     def describing_function(self, A: float) -> complex:
-        """Return N(A), N/m, at one amplitude A >= 0, m; its limit at A = 0."""
+        """Return N(A), N/m, at one amplitude A >= 0, m; its limit at A = 0.
+
+        Examples
+        --------
+        >>> from dahl_ident import Dahl
+        >>> print(FrictionNonlinearity(Dahl(f_max=1.0, sigma=3.0)).describing_function(0.0))
+        (3+0j)
+        """
         amplitude = non_negative_array(A, "A")
         return complex(self._model.stiffness(self._values, amplitude, _AT_REST))
 
@@ -80,7 +87,17 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         return float(self._model.force(self._turns)[-1])
 
     def reset(self) -> None:
-        """Reset the history: displacement and force are zero."""
+        """Reset the history: displacement and force are zero.
+
+        Examples
+        --------
+        >>> from dahl_ident import Dahl
+        >>> friction = FrictionNonlinearity(Dahl(f_max=1.0, sigma=1.0))
+        >>> first = friction(1.0)
+        >>> friction.reset()
+        >>> friction(1.0) == first
+        True
+        """
         self._turns = [0.0]
 
     def _isstatic(self) -> bool:
