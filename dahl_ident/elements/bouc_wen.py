@@ -112,10 +112,10 @@ class BoucWen(Friction):
             size = np.fabs(ahead)  # each side's sum or difference is exact: p does not hide q
             return sigma - 0.5 * (q * (ahead + size) + p * (ahead - size))
         (n,) = exponent
-        softening, stiffening = (np.sign(rate) * np.fabs(rate) ** n for rate in (q, p))
         side = np.sign(ahead)
-        rate = 0.5 * (softening * (1.0 + side) - stiffening * (1.0 - side))
-        return sigma * (1.0 - rate * np.fabs(force / sigma) ** n)
+        rate = 0.5 * (np.fabs(q) * (1.0 + side) + np.fabs(p) * (1.0 - side))
+        sign = 0.5 * (np.sign(q) * (1.0 + side) - np.sign(p) * (1.0 - side))
+        return sigma * (1.0 - sign * (rate * np.fabs(force / sigma)) ** n)
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
         """Return the values with p times amplitude at most `_AT_ONCE`.

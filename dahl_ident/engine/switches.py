@@ -18,9 +18,15 @@ _OF_POSITIVE = (ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_LOG)
 
 
 def on_one_branch(
-    inputs: Sequence[ca.SX], outputs: ca.SX, motion: tuple[ca.SX, ca.SX] | None = None
+    variables: Sequence[ca.SX],
+    outputs: ca.SX,
+    motion: tuple[ca.SX, ca.SX] | None = None,
+    constants: Sequence[ca.SX] = (),
 ) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
     """Return an expression with every switch held, its switching functions and their sides.
+
+    `motion` is a switching function that is known already, with its side. What depends on none of
+    the `variables`, only on `constants` and on sides, is no switch.
 
     Examples
     --------
@@ -28,7 +34,8 @@ def on_one_branch(
     >>> on_one_branch([x], ca.fabs(x - 1) * x)
     (SX(((side0*(x-1))*x)), [SX((x-1))], [SX(side0)])
     """
-    function = ca.Function("f", list(inputs), [ca.densify(outputs)])
+    inputs, moving = [*variables, *constants], ca.vertcat(*variables)
+    function = ca.Function("f", inputs, [ca.densify(outputs)])
     work: dict[int, ca.SX] = {}
     whole: dict[int, ca.SX] = {}  # with switches that are not held: roots take them beyond one too
     functions, sides = ([motion[0]], [motion[1]]) if motion else ([], [])
@@ -64,10 +71,11 @@ def on_one_branch(
             whole.pop(target[0], None)
             if switched and code not in _OF_POSITIVE:
                 whole[target[0]] = (ca.SX.unary if len(a) == 1 else ca.SX.binary)(code, *unheld)
-            if code in _SIGNED:
+            kink = code in (*_SIGNED, *_COMPARED) and ca.depends_on(ca.vertcat(*a), moving)
+            if kink and code in _SIGNED:
                 side = side_of(a[0])
                 work[target[0]] = side * a[0] if code == ca.OP_FABS else side
-            elif code in _COMPARED:
+            elif kink:
                 side = side_of(a[0] - a[1])
                 larger, smaller = (1.0 + side) / 2.0, (1.0 - side) / 2.0
                 if code in (ca.OP_LT, ca.OP_LE):

@@ -108,9 +108,10 @@ def translate(equations: Equations) -> System:
     (3, [2], True)
     """
     states, drive, parameters = equations.states, equations.drive, equations.parameters
-    inputs = [*states, drive, equations.direction, *parameters]
     whole = ca.vertcat(equations.rates, equations.output)
-    held, switches, sides = on_one_branch(inputs, whole, (states[1], equations.direction))
+    held, switches, sides = on_one_branch(
+        [*states, drive, equations.direction], whole, (states[1], equations.direction), parameters
+    )
     rows = ca.vertcat(held, *switches)
     y = ca.vertcat(*states)
     by_state = ca.jacobian(rows, y)
