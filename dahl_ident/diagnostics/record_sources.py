@@ -398,8 +398,8 @@ def after_reversals(
         return None
     slopes = fit.exponent_slopes
     assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
-    joint = fit.with_freed(*assumed)
-    noise, count = sandwich(joint.jacobians, residuals)[0], fit.values.size
+    joint = fit.with_freed(*assumed) if assumed else fit
+    noise, count = joint.by_noise[0].copy(), fit.values.size
     for covariance in of_displacement:
         noise[:count, :count] += covariance
     seen = np.flatnonzero(np.isfinite(noise.diagonal()) & (noise.diagonal() > 0.0))
