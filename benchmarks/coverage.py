@@ -29,14 +29,17 @@ from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Model, Spring, res
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.bootstrap import bootstrap_intervals
 from dahl_ident.diagnostics.confidence_levels import LEVELS
-from dahl_ident.diagnostics.intervals import profile_intervals, wald_intervals
+from dahl_ident.diagnostics.intervals import (
+    natural_sizes,
+    profile_intervals,
+    wald_intervals,
+)
 from dahl_ident.diagnostics.profile import Profiler
 from dahl_ident.diagnostics.verdicts import (
     IDENTIFIED_BELOW,
     NOT_IDENTIFIED_ABOVE,
     Verdict,
     judged,
-    natural_sizes,
 )
 from dahl_ident.fitting import Optimum, Status, solve
 from dahl_ident.problem import TableProblem

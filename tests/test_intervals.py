@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, special, stats
 
-from dahl_ident import Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
+from dahl_ident import BoucWen, Dahl, FrequencyResponse, Sensors, Spring, fit, load_dataset
 from dahl_ident.diagnostics import identifiability
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Status
@@ -388,3 +388,14 @@ def test_an_interval_is_no_narrower_than_the_means_of_few_runs_say(runs):
         error = np.std(means, ddof=1) / np.sqrt(runs)
         least = stats.t.ppf(0.97725, runs - 1) * error
         assert limits.upper - limits.lower > 1.99 * least
+
+
+def test_profiles_are_searched_only_where_noise_leaves_a_parameter_vague():
+    A, rng = np.geomspace(1e-4, 0.1, 12), np.random.default_rng(1)
+    N = BoucWen(30.0, 200.0, 150.0).describing_function(A)
+    N *= np.exp(0.005 * (rng.standard_normal(12) + 1j * rng.standard_normal(12)))
+    found = fit(FrequencyResponse(np.ones(12), N, A), BoucWen())
+    assert str(found.verdict).startswith("Trusted")
+    p = found.params["p"]  # not a logarithm: its error counts over its size
+    assert 1.0 < p.stderr < 0.1 * abs(p.value)
+    assert [one.method for one in found.assessment.intervals_run(0.9545)] == ["combined"]

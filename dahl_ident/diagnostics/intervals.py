@@ -49,6 +49,7 @@ from dahl_ident.problem.space import Space
 Method = Literal["combined", "wald", "profile", "bootstrap"]
 _BY_FACTOR = 0.2  # u of a logarithm, above which an interval is a factor either way
 _LARGE = 0.1  # the same from noise alone, above which a side may be open
+_SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
 _ROUNDING = 1e-9  # relative difference of limits that counts as none
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -172,7 +173,7 @@ def combined_intervals(
     positive = optimum.problem.space.positive
     noise = errors.by_noise
     by_noise = np.sqrt(np.diagonal(noise.covariance))
-    doubtful = ~held | ~(by_noise <= _LARGE)
+    doubtful = ~held | ~(by_noise <= _LARGE * natural_sizes(noise))
     if doubtful.any():
         shape = profile()
         values = np.where(held, values, shape.estimate)
@@ -202,6 +203,17 @@ def combined_intervals(
         "combined", array, (*optimum.names, *assumed), units,
         np.append(values, estimates[also]), lower, upper, note,
     )  # fmt: skip
+
+
+def natural_sizes(optimum: Optimum) -> FloatArray:
+    """Return the size in theta that a standard deviation is compared with: 1 for logarithms."""
+    problem = optimum.problem
+    slope = np.abs(problem.prediction_jacobian(optimum.theta))
+    response = np.abs(problem.predict(optimum.theta))[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whole = 1.0 / np.nanmax(slope / response, axis=0)
+    size = np.maximum(np.abs(optimum.theta), _SIZE_THAT_MATTERS * whole)
+    return np.where(problem.space.positive | ~np.isfinite(size) | (size == 0.0), 1.0, size)
 
 
 def around(

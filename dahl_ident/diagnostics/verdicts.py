@@ -37,6 +37,7 @@ from dahl_ident.diagnostics.information import Information
 from dahl_ident.diagnostics.intervals import (
     ConfidenceIntervals,
     Interval,
+    natural_sizes,
     search_coordinates,
     wald_intervals,
 )
@@ -46,7 +47,6 @@ from dahl_ident.fitting import Optimum, Status
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
 _NEARLY_LINEAR = 0.15  # u of every logarithm: below it, profiles differ in the second digit
-_SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 # u of a logarithm that what is assumed makes, not the data: the exponent's range, and how smooth a
 # model error is
 _MOST_BY = {EXPONENT: 0.1, MODEL_ERROR: IDENTIFIED_BELOW}
@@ -361,17 +361,6 @@ def _exchanges(optimum: Optimum) -> Iterator[NDArray[np.intp]]:
                     for i, j in chosen:
                         order[[i, j]] = j, i
                     yield order
-
-
-def natural_sizes(optimum: Optimum) -> FloatArray:
-    """Return the size in theta that a standard deviation is compared with: 1 for logarithms."""
-    problem = optimum.problem
-    slope = np.abs(problem.prediction_jacobian(optimum.theta))
-    response = np.abs(problem.predict(optimum.theta))[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        whole = 1.0 / np.nanmax(slope / response, axis=0)
-    size = np.maximum(np.abs(optimum.theta), _SIZE_THAT_MATTERS * whole)
-    return np.where(problem.space.positive | ~np.isfinite(size) | (size == 0.0), 1.0, size)
 
 
 def _profile_std(
