@@ -202,12 +202,61 @@ def test_declarations_are_checked(parameters, message):
         law(dahl, parameters)()
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"scan": "abc"}, r"a has the scan 'abc'; expected a tuple of numbers, such as \(0.5"),
+        ({"scan": ("low", 2.0)}, "expected a tuple of numbers"),
+        ({"scan": None}, "expected a tuple of numbers"),
+        ({"name": [1, 2]}, "called .* expected letters"),
+        ({"description": [1, 2]}, "the description of a is"),
+    ],
+)
+def test_parameters_of_the_wrong_type_are_named(changed, message):
+    declared: dict[str, Any] = {"name": "a", "unit": "N", "description": "", **changed}
+    with pytest.raises(ValidationError, match=message):
+        law(dahl, (di.Parameter(**declared), positive("sigma", "N/m")))()
+
+
 def test_several_states_are_refused():
     class Two(law(dahl)):  # type: ignore[misc]
         states = ("f", "g")
 
     with pytest.raises(ValidationError, match=r"Two declares states = \('f', 'g'\); a law has one"):
         Two(0.2, 3.0)
+
+
+@pytest.mark.parametrize("rate_independent", [True, False])
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        (lambda _, F, slope, v, p: None, "output, of Mine is None for one force; expected one"),
+        (lambda _, F, slope, v, p: "much", "output, of Mine is 'much' for one force"),
+        (lambda _, F, slope, v, p: np.array([F, F]), "output, of Mine is array"),
+        (lambda _, F, slope, v, p: F * np.nan, r"Mine\.output is nan at every force"),
+        (lambda _, F, slope, v, p: np.sum(F), r"Mine\.output cannot be compiled: with symbols"),
+        (lambda _, F, slope, v, p: math.sin(F), "cannot be compiled: TypeError"),
+        (lambda _, F, slope, v, p: F if F > 0 else -F, "asks a Python question"),
+    ],
+)
+def test_an_output_that_is_not_one_number_is_named(output, message, rate_independent):
+    mine = law(dahl, output=output, rate_independent=rate_independent)(0.2, 3.0)
+    with pytest.raises(ModelError, match=message):
+        mine.dynamic_stiffness(0.1, 1.0)
+    with pytest.raises(ModelError, match=message):
+        drive(mine + di.Mass(1.0))
+
+
+@pytest.mark.parametrize("method", ["rest_stiffness", "force_limits", "force_bounds", "knee"])
+def test_methods_that_return_nothing_are_named(method):
+    with pytest.raises(ModelError, match=rf"Mine\.{method} returned None; expected .* arra"):
+        law(dahl, **{method: lambda _, values: None})(0.2, 3.0)
+
+
+def test_mechanics_that_return_nothing_are_named():
+    mine = law(dahl, mechanics=lambda _, p, x, v, s, states: None)(0.2, 3.0)
+    with pytest.raises(ModelError, match=r"Mine\.mechanics returned None; expected an inertia"):
+        drive(mine + di.Mass(1.0))
 
 
 def test_a_law_is_checked_once():

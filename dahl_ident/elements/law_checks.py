@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.facts import Mechanics
 from dahl_ident.elements.parameter import UNITS, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
 if TYPE_CHECKING:
     from dahl_ident.elements.element import Element
-    from dahl_ident.elements.facts import Mechanics
     from dahl_ident.elements.friction import Friction
 
 _TRIALS = 12  # sets of values
@@ -44,6 +44,8 @@ _SOFT = 3.0  # times the scale: that of a law without full slip
 _CREATED = 0.01  # of the work of both directions: energy that the steps of an integral may create
 _AGREE = 1e-8  # relative: symbols and numbers
 _FORCE_UNIT = 32.0  # N, a unit in which a law has the same form; a power of 2 changes no digit
+_OVERRIDDEN = {"rest_stiffness": 1, "force_limits": 2, "force_bounds": 2, "knee": 2}
+"""Methods that a law may override, and how many arrays they return."""
 _RESERVED = ("name", "kind", "element")  # keys of an element in files
 
 _CHECKED: WeakKeyDictionary[type, set[tuple[Parameter, ...]]] = WeakKeyDictionary()
@@ -71,11 +73,6 @@ def check_declarations(law: type[Element]) -> None:
             f"{name} declares states = {law.states!r}; a law has one state, its force. Write it as "
             "dF/dx = slope(force, ...), and add laws in parallel where several forces are needed"
         )
-    for label, count in Counter(p.name for p in declared).items():
-        if count > 1:
-            raise ValidationError(
-                f"{name} declares the parameter {label} {count} times; give each its own name"
-            )
     for p in declared:
         usable = isinstance(p.name, str) and p.name.isidentifier() and not iskeyword(p.name)
         if not usable or p.name in _RESERVED:
@@ -84,10 +81,11 @@ def check_declarations(law: type[Element]) -> None:
                 f"underscores, such as 'f_max', no word of Python, and none of "
                 f"{', '.join(_RESERVED)}"
             )
-        if not isinstance(p.unit, str):
-            raise ValidationError(
-                f"{name}: the unit of {p.name} is {p.unit!r}; expected text, such as 'N/m'"
-            )
+        for what, text in {"unit": p.unit, "description": p.description}.items():
+            if not isinstance(text, str):
+                raise ValidationError(
+                    f"{name}: the {what} of {p.name} is {text!r}; expected text, such as 'N/m'"
+                )
         for what, pair in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
             numbers = isinstance(pair, tuple) and len(pair) == 2
             if not (numbers and all(isinstance(x, Real) for x in pair) and pair[0] < pair[1]):
@@ -95,6 +93,11 @@ def check_declarations(law: type[Element]) -> None:
                     f"{name}: {p.name} has the {what} {pair!r}; expected two numbers, the lower "
                     "one first"
                 )
+        if not (isinstance(p.scan, tuple) and all(isinstance(x, Real) for x in p.scan)):
+            raise ValidationError(
+                f"{name}: {p.name} has the scan {p.scan!r}; expected a tuple of numbers, such as "
+                "(0.5, 1.0, 2.0)"
+            )
         beyond = [value for value in p.scan if not p.lower <= value <= p.upper]
         if beyond:
             raise ValidationError(
@@ -115,6 +118,11 @@ def check_declarations(law: type[Element]) -> None:
                 f"{name}: the unit of {p.name} is {p.unit!r}; expected a product of powers of "
                 f"{', '.join(UNITS)}, such as 'N/m' or 'N s/m', or '' for a pure number"
             )
+    for label, count in Counter(p.name for p in declared).items():
+        if count > 1:
+            raise ValidationError(
+                f"{name} declares the parameter {label} {count} times; give each its own name"
+            )
 
 
 def check_slope(law: Friction) -> None:
@@ -133,7 +141,28 @@ def check_slope(law: Friction) -> None:
         reasons = [check(trial) for trial in trials]
         if all(reasons):
             raise ModelError(f"{type(law).__name__}.slope {reasons[0]}")
+    _check_overridden(law, list(columns))
     done.add(declared)
+
+
+def _check_overridden(law: Friction, values: list[FloatArray]) -> None:
+    """Refuse a method of the user's that does not return as many numbers as the package's does."""
+    for method, count in _OVERRIDDEN.items():
+        if is_of_package(next(c for c in type(law).__mro__ if method in vars(c))):
+            continue
+        name, wanted = f"{type(law).__name__}.{method}", "an array" if count == 1 else "two arrays"
+        try:
+            with np.errstate(all="ignore"):
+                returned: Any = getattr(law, method)(values)
+        except Exception as exc:  # whatever a user's code raises
+            raise ModelError(f"{name} failed: {_in_words(exc)}") from exc
+        parts = (returned,) if count == 1 else returned
+        fits = isinstance(parts, tuple) and len(parts) == count
+        if not fits or any(np.asarray(part).dtype.kind not in "fiu" for part in parts):
+            raise ModelError(
+                f"{name} returned {_shown(returned)}; expected {wanted} of real numbers, one for "
+                "each set of values: end it with return"
+            )
 
 
 def scaling_the_force(law: Friction) -> tuple[str, ...]:
@@ -473,35 +502,69 @@ def traced(
         return element.mechanics(values, x, v, s, states)
     try:
         part = element.mechanics(values, x, v, s, states)
+        _check_part(type(element).__name__, part, len(states))
+        if getattr(element, "one_state", False):
+            _compare(element, values, v, s, states[0])
     except ModelError:
         raise
     except Exception as exc:  # whatever a user's code raises
         raise ModelError(
             f"{type(element).__name__} cannot be compiled: {_in_words(exc)}, and on symbols"
         ) from exc
-    if getattr(element, "one_state", False):
-        _compare(element, values, v, s, states[0])
     return part
 
 
+def _check_part(name: str, part: Any, n_states: int) -> None:
+    """Refuse a part in an equation of motion that is not made of single numbers or symbols."""
+    import casadi as ca
+
+    if not isinstance(part, Mechanics) or len(part.rates) != n_states:
+        raise ModelError(
+            f"{name}.mechanics returned {_shown(part)}; expected an inertia, a force, and as many "
+            f"rates as the element has states, which is {n_states}"
+        )
+    for what, value in (
+        ("force, or output,", part.force),
+        *(("rate", rate) for rate in part.rates),
+    ):
+        try:
+            fits = ca.SX(value).is_scalar()
+        except (NotImplementedError, TypeError):  # casadi's, for what it cannot take
+            fits = False
+        if not fits:
+            raise ModelError(
+                f"the {what} of {name} is {_shown(value)} for one force; expected one number, N: "
+                "end the method with return, and use plain arithmetic"
+            )
+
+
 def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
-    """Refuse a slope that differs between symbols and numbers."""
+    """Refuse a slope or an output that differs between symbols and numbers."""
     import casadi as ca
 
     rng = np.random.default_rng(1)
     numbers = [_tried(p, rng, _TRIALS) for p in law.parameters]
     free = [(v, n) for v, n in zip(values, numbers, strict=True) if not v.is_constant()]
     slope = law.slope(force, s, v, values)
-    function = ca.Function("slope", [force, s, v, *(v for v, _ in free)], [slope])
+    output = law.output(force, slope, v, values)
+    function = ca.Function("law", [force, s, v, *(v for v, _ in free)], [slope, output])
     forces, direction = rng.uniform(-0.5, 0.5, _TRIALS), np.resize([1.0, -1.0], _TRIALS)
     speed = direction * 10.0 ** rng.uniform(-_SPREAD, _SPREAD, _TRIALS)
     with np.errstate(all="ignore"):
-        expected = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
+        slopes = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
+        expected = slopes, law.output(forces, slopes, speed, numbers)
         rows = zip(forces, direction, speed, *(n for _, n in free), strict=True)
-        computed = np.array([float(function(*row)) for row in rows])
-    if not np.allclose(computed, expected, rtol=_AGREE, atol=0.0, equal_nan=True):
-        raise ModelError(
-            f"{type(law).__name__}.slope cannot be compiled: with symbols in place of numbers it "
-            "gives another result; expected plain arithmetic, comparisons and numpy's functions, "
-            "without math.*, float(), new arrays that are filled, or random numbers"
-        )
+        computed = np.array([[float(number) for number in function(*row)] for row in rows]).T
+    for method, one, other in zip(("slope", "output"), computed, expected, strict=True):
+        name = f"{type(law).__name__}.{method}"
+        if not np.allclose(one, other, rtol=_AGREE, atol=0.0, equal_nan=True):
+            raise ModelError(
+                f"{name} cannot be compiled: with symbols in place of numbers it "
+                "gives another result; expected plain arithmetic, comparisons and numpy's "
+                "functions, without math.*, float(), new arrays that are filled, or random numbers"
+            )
+        if not np.isfinite(one).any():
+            raise ModelError(
+                f"{name} is {one[0]} at every force that was tried, such as {forces[0]:.3g} N; "
+                "expected finite numbers, N"
+            )
