@@ -2,6 +2,7 @@
 
 import time
 
+import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
@@ -144,3 +145,46 @@ def test_a_force_that_vanishes_at_once_on_reversal(p):
 
     found = complex(BoucWen(sigma, q, p).describing_function(A))
     assert abs(found - (fourier(np.cos) - 1j * fourier(np.sin)) / A) < 2e-4 * abs(found)
+
+
+def way(force, rate, n):
+    """Return the displacement from rest to a force, for sigma = 1: loading, or -rate unloading."""
+    u = mpmath.mpf(abs(rate)) * force
+    return force * mpmath.hyp2f1(1.0, 1.0 / n, 1.0 + 1.0 / n, np.sign(rate) * u**n)
+
+
+class Root(di.Friction):
+    """Bouc-Wen with q = p and the exponent 0.5, as users write it."""
+
+    parameters = BoucWen.parameters[:2]
+
+    def slope(self, force, direction, velocity, values):
+        sigma, q = values
+        root = np.sqrt(np.abs(q * force / sigma))
+        return sigma * (1.0 - direction * np.sign(force) * root)
+
+
+def fundamental(A, p, n):
+    """Return N for sigma = q = 1 by its integral over the force."""
+    with mpmath.workdps(20):
+        A, low, high = mpmath.mpf(A), mpmath.mpf(0), mpmath.mpf(1)
+        for _ in range(75):
+            tip = (low + high) / 2
+            beyond = way(tip, -p, n) + way(tip, 1.0, n) > 2 * A
+            low, high = (low, tip) if beyond else (tip, high)
+
+        def turned(force):
+            moved = way(tip, -p, n) - (way(force, -p, n) if force > 0 else -way(-force, 1.0, n))
+            return mpmath.exp(-1j * mpmath.acos(max(-1, min(1, 1 - moved / A))))
+
+        near = min(tip / 2, 10 / mpmath.mpf(p))
+        whole = mpmath.quad(turned, [tip, tip / 2, near, 0, -tip / 2, -tip])
+        return complex(2 / (mpmath.pi * 1j) * whole / A)
+
+
+@pytest.mark.parametrize("A", [1e-3, 0.1, 2.0, 20.0])
+def test_roots_of_the_force_bend_without_bounds_at_zero(A):
+    """At 0 N, where a loop begins, the slope of a root has no finite derivative."""
+    expected = fundamental(A, 1.0, 0.5)
+    for law in (BoucWen(1.0, 1.0, 1.0, exponent=0.5), Root(1.0, 1.0)):
+        assert abs(complex(law.describing_function(A)) - expected) < 1e-9 * abs(expected)

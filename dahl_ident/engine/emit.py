@@ -127,12 +127,16 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
         result.add_incoming(negative, there)
         return builder.select(builder.fcmp_ordered("==", a, zero), at_zero, result)
 
-    def logarithm(a: Any) -> Any:  # finite at 0, where a power's slope multiplies it by 0
+    def not_zero(a: Any) -> Any:  # at 0 a logarithm and the slope of a root stay finite
         least = ir.Constant(number, float(np.finfo(np.float64).tiny))
-        return call("llvm.log.f64", builder.select(builder.fcmp_ordered("==", a, zero), least, a))
+        return builder.select(builder.fcmp_ordered("==", a, zero), least, a)
+
+    def logarithm(a: Any) -> Any:
+        return call("llvm.log.f64", not_zero(a))
 
     operations: Mapping[str, Callable[..., Any]] = {
         "LOG": logarithm,
+        "SQRT": lambda a: call("llvm.sqrt.f64", not_zero(a)),
         "ASSIGN": lambda a: a,
         "NEG": lambda a: builder.fsub(ir.Constant(number, -0.0), a),
         "SQ": lambda a: builder.fmul(a, a),

@@ -56,8 +56,10 @@ def on_one_branch(
         target, source = function.instruction_output(k), function.instruction_input(k)
         if code == ca.OP_CONST:
             work[target[0]] = ca.SX(function.instruction_constant(k))
+            whole.pop(target[0], None)
         elif code == ca.OP_INPUT:
             work[target[0]] = inputs[source[0]]
+            whole.pop(target[0], None)
         elif code == ca.OP_OUTPUT:
             held[target[1]] = work[source[0]]
         else:
