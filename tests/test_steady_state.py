@@ -1,5 +1,6 @@
 """The describing function's steady response: accuracy, uniqueness, several amplitudes, none."""
 
+import time
 import warnings
 from functools import partial
 
@@ -212,6 +213,19 @@ def test_undamped_resonance_has_no_amplitude_above_the_friction_limit():
     friction = Dahl(1.0, 1.0)
     force = result.amplitude[:2] * friction.gain(result.amplitude[:2])
     np.testing.assert_allclose(force, drive[:2], rtol=1e-12)
+
+
+def test_friction_that_differs_by_direction_drifts_without_a_spring():
+    """Nothing brings the mean displacement back: said at once, and with the right reason."""
+    plant = Dahl(0.1, 30.0, asymmetry=0.2) + Mass(1.0) + Damper(0.1)
+    begun = time.process_time()
+    with pytest.warns(NoSteadyMotionWarning, match="friction differs between the directions"):
+        result = any_response(plant, np.geomspace(0.5, 5.0, 60), 0.3)
+    assert time.process_time() - begun < 5.0
+    assert not result.found.any()
+    assert "add a spring" in result.message
+    assert any_response(plant + Spring(0.3), 1.0, 0.3).found
+    assert any_response(Dahl(0.1, 30.0) + Mass(1.0) + Damper(0.1), 1.0, 0.3).found
 
 
 def test_resonance_that_rounding_hides_has_no_amplitude_either():

@@ -29,7 +29,7 @@ from dahl_ident.arrays import (
 from dahl_ident.control_interop.exact_response import HARMONICS, exact_motions
 from dahl_ident.control_interop.force_balance import BoolArray, IntArray, find_roots, flatten
 from dahl_ident.data.columns import one_of
-from dahl_ident.elements.driven_motion import LINEAR, NEUTRAL, STEADY, Steady, obstacle
+from dahl_ident.elements.driven_motion import LINEAR, NEUTRAL, STEADY, Shooting, Steady, obstacle
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, NoSteadyMotionWarning, ValidationError
@@ -233,8 +233,10 @@ def response(
     exists = np.isfinite(harmonics[..., 1])
     count = exists.sum(axis=1).reshape(shape)
     active = points.linear.imag < 0.0
+    values = np.array([float(v) for v in plant.known_values()])
+    drifts = bool(np.any(exact & (count.ravel() == 0))) and Shooting(plant).drifts(values)
     message = _message(
-        count, active.reshape(shape), ((chosen < 0) & exists.any(axis=1)).reshape(shape),
+        count, drifts, active.reshape(shape), ((chosen < 0) & exists.any(axis=1)).reshape(shape),
         np.broadcast_to(f, shape), np.broadcast_to(u0, shape),
     )  # fmt: skip
     if steady == "exact" and not exact.all() and why != LINEAR:
@@ -315,6 +317,7 @@ def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
 
 def _message(
     count: IntArray,
+    drifts: bool,
     active: BoolArray,
     unstable: BoolArray,
     frequency_hz: FloatArray,
@@ -324,12 +327,15 @@ def _message(
 
     Empty where all have one that is; `active` says where the linear part feeds energy in.
     """
+    why = (
+        "friction differs between the directions, and no spring brings the motion back: it goes "
+        "further in each cycle; add a spring"
+        if drifts
+        else "an undamped resonance, or rest without a spring, driven with at "
+        "least 4/pi times the friction limit; add damping or a spring, or lower the drive"
+    )
     verdicts = (
-        (
-            count == 0,
-            "no steady amplitude (an undamped resonance, or rest without a spring, driven with at "
-            "least 4/pi times the friction limit; add damping or a spring, or lower the drive)",
-        ),
+        (count == 0, f"no steady amplitude ({why})"),
         (
             (count > 1) & active,
             "several steady amplitudes (the linear part has negative damping there)",

@@ -7,6 +7,7 @@ motion, with harmonics.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -30,6 +31,8 @@ ACCURACY = 1e-9
 
 NEUTRAL = 1e-6
 """Beyond 1: the multiplier of a motion that may lie anywhere is 1, to rounding."""
+
+_STATES, _ALIKE = 24, 1e-9  # where two directions are compared; relative difference of rates
 
 LINEAR = "the model is linear"
 """Why there is no exact motion to compute: the response is a sine."""
@@ -85,6 +88,35 @@ class Shooting:
             self._system = translate(plant_equations(self._coefficients.model))
         return self._system
 
+    def drifts(self, values: FloatArray) -> bool:
+        """Return whether the motion goes further in each cycle, at one vector of values.
+
+        So it does where no spring brings it back, and friction differs between the directions: no
+        motion has the drive's period then.
+        """
+        if self.system.odd or self._compared is None or not np.isfinite(values).all():
+            return False
+        if not self._coefficients.are_values:
+            values = self._coefficients(values[None])[0][0]
+        rng = np.random.default_rng(0)
+        size = (self.system.order + 1, _STATES)
+        states = rng.standard_normal(size) * 10.0 ** rng.uniform(-3.0, 3.0, size)
+        rates, sums = self._compared(np.vstack([states, np.sign(states[1])]), values)
+        return bool(np.any(np.abs(sums.full()) > _ALIKE * np.abs(rates.full())))
+
+    @cached_property
+    def _compared(self) -> Any:
+        """The rates, and their sum with those in the other direction; None if a spring acts."""
+        import casadi as ca
+
+        equations = plant_equations(self._coefficients.model)
+        rates = equations.rates
+        if ca.depends_on(rates, equations.states[0]):
+            return None
+        states = ca.vertcat(*equations.states, equations.drive, equations.direction)
+        sums = rates + ca.substitute(rates, states, -states)
+        return ca.Function("compared", [states, ca.vertcat(*equations.parameters)], [rates, sums])
+
     def __call__(
         self,
         values: FloatArray,
@@ -102,6 +134,8 @@ class Shooting:
         If `stable`, a motion that is not stable counts as none. Options and result are those of
         :func:`dahl_ident.engine.steady_motions`.
         """
+        if omega.size and self.drifts(values[0]):
+            values = np.full(values.shape, np.nan)  # for which none are sought
         options["largest"] = 1.0 + NEUTRAL if stable else np.inf
         result = self._motions(
             values, omega, drive, chosen, starts=starts, cycles=cycles, **options
