@@ -122,8 +122,11 @@ def _dahl(F: float, s: float, distance: float, f_max: float, sigma: float) -> fl
     return s * f_max + (F - s * f_max) * float(np.exp(-sigma * distance / f_max))
 
 
-def lugre(seed: int) -> Case:
-    """Return a driven plant with LuGre friction whose speed is on both sides of Stribeck's."""
+def lugre(seed: int, speed: float = 0.20, noise: float = 1e-3) -> Case:
+    """Return a driven plant with LuGre friction whose speed is on both sides of Stribeck's.
+
+    `speed` is in m/s rms.
+    """
     n, rate = 1024, 100.0
     f_max, sigma, ratio, v_s = 0.1, 30.0, 1.5, 0.05
     force, drive = multisine(n, rate, 0.3, 6.0, 1.0, seed)
@@ -141,13 +144,13 @@ def lugre(seed: int) -> Case:
         return integrated(rates, np.zeros(3), lambda t: scale * drive(t), n, rate)
 
     scale = 1.0
-    for _ in range(2):  # the drive at which the speed is 0.20 m/s rms
+    for _ in range(2):  # the drive of that speed
         y = moved(scale)
-        scale *= 0.20 / float(y[1].std())
+        scale *= speed / float(y[1].std())
     y = moved(scale)
     truth = di.LuGre(f_max, sigma, ratio, v_s) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
     record = di.Record(
-        np.arange(n) / rate, displacement=noisy(y[0], 1e-3, seed), force=scale * force
+        np.arange(n) / rate, displacement=noisy(y[0], noise, seed), force=scale * force
     )
     return Case(record, truth, di.LuGre() + di.Mass() + di.Damper() + di.Spring())
 
@@ -166,6 +169,23 @@ def slips(seed: int, samples: int = 512) -> Case:
     truth = di.MaxwellSlip(d, k) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(50.0)
     record = di.Record(np.arange(samples) / rate, displacement=noisy(x, 1e-3, seed), force=force)
     return Case(record, truth, di.MaxwellSlip(d) + di.Mass() + di.Damper() + di.Spring())
+
+
+def unknown_slips(seed: int, count: int = 3, samples: int = 1000) -> Case:
+    """Return the force of Jenkins elements, drawn at random, under four sines of displacement."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples) / 100.0
+    f, phase = np.exp(rng.uniform(np.log(0.4), np.log(4.0), 4)), 2.0 * np.pi * rng.random(4)
+    x = np.sin(2.0 * np.pi * np.outer(t, f) + phase).sum(axis=1)
+    x *= 1e-3 / np.abs(x).max()
+    d = 3e-5 * np.cumprod(np.exp(rng.uniform(np.log(1.5), np.log(3.0), count)))
+    k = 0.1 * rng.dirichlet(np.full(count, 3.0)) / d
+    force, springs = np.zeros(samples), np.zeros(count)
+    for i, step in enumerate(np.diff(x), 1):
+        springs = np.clip(springs + k * step, -k * d, k * d)
+        force[i] = springs.sum()
+    record = di.Record(t, displacement=x, force=noisy(force, 5e-3, seed))
+    return Case(record, Model(di.MaxwellSlip(d.tolist(), k.tolist())), Model(di.MaxwellSlip(count)))
 
 
 def joint(f_max: float, sigma: float, chi: float, ratio: float) -> tuple[FloatArray, FloatArray]:

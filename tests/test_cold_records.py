@@ -43,6 +43,32 @@ def test_backlash_with_measured_displacement(gap, seed):
     assert_found(cold.play(gap, seed))
 
 
+def assert_lowest(case):
+    """Check that no search from the truth ends lower than a cold one by more than chance."""
+    cold_fit = di.fit(case.record, case.model, throw=False)
+    assert cold_fit.status.usable, cold_fit.verdict
+    varied = [p for p in case.truth.parameters if cold_fit.params[p.name].vary]
+    start = {p.name: float(p.value) for p in varied}
+    near = di.fit(case.record, case.model, start=start, throw=False)
+    lowest = near.optimum.cost
+    assert cold_fit.optimum.cost - lowest < 4.0 * lowest / len(case.record), near.verdict
+
+
+def seeds(*short):
+    """Return 30 seeds, all but some for long runs alone."""
+    return [i if i in short else pytest.param(i, marks=pytest.mark.long) for i in range(30)]
+
+
+@pytest.mark.parametrize("seed", seeds(0, 6))
+def test_slips_that_are_unknown(seed):
+    assert_lowest(cold.unknown_slips(seed))
+
+
+@pytest.mark.parametrize("seed", seeds(0))
+def test_a_stribeck_speed_in_much_noise(seed):
+    assert_lowest(cold.lugre(seed, speed=0.06, noise=1e-2))
+
+
 @pytest.mark.parametrize(("made", "seed"), [(cold.lugre, 0), (cold.slips, 1), (cold.iwan, 1)])
 def test_driven_plants(made, seed):
     assert_found(made(seed))

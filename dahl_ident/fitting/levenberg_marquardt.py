@@ -178,6 +178,7 @@ def minimise(
     accuracy: float = EXPLICIT,
     bounds: Bounds | None = None,
     unseen: bool = True,
+    restrained: bool = False,
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
@@ -187,7 +188,9 @@ def minimise(
     same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
     search has converged; `enough` gives the fall of a cost that is not worth a step, however long:
     the search ends before it. `accuracy` is that of predictions, relative to the data. No step
-    leads beyond the `bounds` of theta; a coordinate at its bound that would go on stays there.
+    leads beyond the `bounds` of theta; a coordinate at its bound that would go on stays there. In
+    `restrained` searches a logarithmic step of 1 counts like residuals of one standard deviation:
+    coordinates that hardly have an effect wait where they are until the others have converged.
     """
     owner = np.arange(len(theta)) if owner is None else owner
     S, P = theta.shape
@@ -201,7 +204,9 @@ def minimise(
     # steps of each owner's converged search
     first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
     for count in range(steps if P else 0):
-        step, moves, predicted, longest = _step(at, damping, logarithmic, bounds)
+        noise = 2.0 * at.cost / max(n_residuals - P, 1)
+        restraint = restrained * noise[:, None] * logarithmic
+        step, moves, predicted, longest = _step(at, damping, logarithmic, bounds, restraint)
         shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
@@ -252,6 +257,7 @@ def _step(
     damping: FloatArray,
     logarithmic: BoolArray,
     bounds: Bounds | None,
+    restraint: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the next step, its squared length, the fall of cost predicted, the longest log step.
 
@@ -268,7 +274,7 @@ def _step(
         held |= size * (high - low) <= _FLAT * np.sqrt(at.cost)[:, None]
         g = np.where(held, 0.0, g)
         H = np.where(held[:, :, None] | held[:, None, :], np.eye(P), H)
-    damped = H + damping[:, None, None] * np.eye(P)
+    damped = H + (damping[:, None] + restraint / size**2)[:, None] * np.eye(P)
     if not np.isfinite(damped).all():
         bad = ~np.isfinite(damped).all(axis=(1, 2))
         damped[bad], g[bad] = np.eye(P), 0.0

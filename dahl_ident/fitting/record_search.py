@@ -13,16 +13,27 @@ from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise, minimise_by_scipy
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.fitting.optimum import Optimum, agreed_scale
-from dahl_ident.fitting.record_start import MORE_STARTS, STARTS, record_starts, started_at
+from dahl_ident.fitting.record_start import (
+    MORE_STARTS,
+    STARTS,
+    alternatives,
+    record_starts,
+    started_at,
+)
 from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
 _SHORT = {"force": 8192, "motion": 4096}  # samples with which a long record is begun
 _COMPARED = 8  # steps after which starts of a driven motion are compared
-_GOOD = 0.01  # share of variance left at which no further start is tried, if it may be noise
-_BETTER = 0.1  # relative fall of the cost, after which first states are begun once more
-_SAME = 1e-3  # relative difference of the costs of one minimum
+_GOOD = 0.01  # share of variance left beyond which a search that stagnates is not driven on
+_LAGS = 20  # of the residuals' correlations
+_CORRELATED = 5.0  # standard deviations of white noise's statistic, beyond which they are not white
+_IDLE = 0.5  # standard error of a logarithm
+_ROUNDS = 8  # of looking elsewhere: a limit on time
+_WORTH = 3  # searches in each
+_ALIKE = 1e-8  # share of the largest eigenvalue below which parameters act alike
+_FARTHEST = 10.0  # factor by which a value is adapted
 _PRIORS = 4  # descents until the noise is known, of which a prior is one more sample
 _SAME_NOISE = 1.3  # factor within which it is
 _SETTLING = 2000  # samples after which simulated noise has forgotten its start
@@ -187,7 +198,11 @@ class RecordSearch:
             steps=most,
             bounds=within,
             unseen=False,
+            restrained=True,
         )
+        theta, signs = problem.space.unfolded(end.theta)
+        turned = end.hessian * (signs[:, :, None] * signs[:, None, :])
+        end = replace(end, theta=theta, hessian=turned)
         if end.cost[0] < EXACT * problem.n_residuals:  # by a last step that may lead nowhere
             end = replace(end, cost=self.evaluated(problem, end.theta).cost)
         return end
@@ -392,45 +407,76 @@ class RecordSearch:
     def searched(self, problem: RecordProblem, start: Mapping[str, float]) -> Minima:
         """Return the best end of searches from automatic starts, some of their values given."""
         try:
-            best = self.best(problem, _changed(record_starts(problem, 2 * STARTS), problem, start))
+            best = self.best(problem, _changed(record_starts(problem), problem, start))
         except FitError:
-            more = record_starts(problem, MORE_STARTS)[2 * STARTS :]
+            more = record_starts(problem, MORE_STARTS)[STARTS:]
             if not len(more):
                 raise
             best = self.best(problem, _changed(more, problem, start))
-        near = 2.0 * best.cost[0] < _GOOD * problem.n_residuals
-        while near and (_slips_at_first(problem, best.theta[0]) or _structured(problem, best)):
-            end = self.descend(problem, _first_states_again(problem, best.theta[0]), STEPS)
-            near = bool(end.cost[0] < (1.0 - _BETTER) * best.cost[0])
-            best = end if end.cost[0] < best.cost[0] else best
+        several = any(len(element.starts) > 1 for element in problem.with_memory)
+        if several or _has_idle(problem, best) or not _leaves_noise(problem, best):
+            return self.elsewhere(problem, best)
         return best
 
-    def best(self, problem: RecordProblem, starts: FloatArray, steps: int = STEPS) -> Minima:
-        """Return the best end of searches from the starts, in their order; few where one is good.
+    @np.errstate(all="ignore")  # laws far off may overflow
+    def elsewhere(self, problem: RecordProblem, end: Minima) -> Minima:
+        """Return the lowest end that searches from other values of one parameter at a time find.
 
-        A driven motion is expensive where nothing fits: its starts are compared after a few steps,
-        and the best one alone is followed to its end. Where one fits nearly, but leaves residuals
-        that are not noise, the search goes on until two starts lead to the same end.
+        A wrong minimum is often one in which a parameter has lost its effect: a slip beyond the
+        motion, a Stribeck speed far above it; or one of loads of springs at the first sample, which
+        are moved by kinks. Of other values those with the lowest predicted costs are tried.
         """
-        finite, best, again = 0, None, False
-        driven = problem.output == "motion" and len(starts) > 1
-        for one in starts:
-            theta = problem.to_search(one)
-            end = self.minimise(problem, theta[None], _COMPARED) if driven else None
-            if end is None or 2.0 * end.cost[0] < _GOOD * problem.n_residuals:
-                end = self.descend(problem, theta if end is None else end.theta[0], steps)
-            finite += bool(np.isfinite(end.cost[0]))
-            if best is not None:
-                again |= bool(abs(end.cost[0] - best.cost[0]) < _SAME * best.cost[0])
-            if np.isfinite(end.cost[0]) and (best is None or end.cost[0] < best.cost[0]):
-                again &= best is None or bool(end.cost[0] > (1.0 - _SAME) * best.cost[0])
-                best = end
-            near = best is not None and 2.0 * best.cost[0] < _GOOD * problem.n_residuals
-            if best is not None and near:
-                if again or len(starts) == 1 or not _structured(problem, best):
-                    break
-            elif driven and finite == STARTS:
+        for _ in range(_ROUNDS):
+            values, places = problem.to_values(end.theta[0]), []
+            for index, value in alternatives(problem, values):
+                other = values.copy()
+                other[index] = value
+                places.append(self._adapted(problem, problem.to_search(other), index))
+            places.sort(key=lambda place: place[0])
+            worth = [theta for cost, theta in places if cost < np.inf][:_WORTH]
+            ends = [self.minimise(problem, theta[None], ROUGH) for theta in worth]
+            lowest = min(ends, key=lambda one: float(one.cost[0]), default=end)
+            residuals = problem.split_residuals(values)
+            chance = by_chance(float(end.cost[0]), problem.n_residuals, residuals)
+            better = 2.0 * (end.cost[0] - lowest.cost[0]) > chance
+            if better or (lowest.cost[0] < end.cost[0] and not end.converged[0]):
+                end = self.descend(problem, lowest.theta[0], STEPS)
+            if not better:
                 break
+        return end
+
+    def _adapted(
+        self, problem: RecordProblem, theta: FloatArray, index: int
+    ) -> tuple[float, FloatArray]:
+        """Return where a Gauss-Newton step of all coordinates but one leads, and its cost."""
+        at = problem.quadratic(theta)
+        self.evaluations += 1
+        if not np.isfinite(at.cost):
+            return np.inf, theta
+        size = np.sqrt(at.hessian.diagonal())
+        size[size == 0.0] = 1.0
+        slope, matrix = at.gradient / size, at.hessian / np.outer(size, size)
+        slope[index], matrix[index], matrix[:, index] = 0.0, 0.0, 0.0
+        step = -np.linalg.pinv(matrix, rcond=_ALIKE, hermitian=True) @ slope
+        predicted = float(at.cost) + 0.5 * float(step @ slope)
+        step /= size
+        # forces are linear in most values, not in their logarithms
+        relative = problem.space.relative
+        step[relative] = np.log(np.clip(1.0 + step[relative], 1.0 / _FARTHEST, _FARTHEST))
+        return predicted, theta + step
+
+    def best(self, problem: RecordProblem, starts: FloatArray, steps: int = STEPS) -> Minima:
+        """Return the end of a search from the start that is lowest after a few steps.
+
+        No further start is tried where one leaves nothing but noise.
+        """
+        best: Minima | None = None
+        for one in starts:
+            end = self.minimise(problem, problem.to_search(one)[None], _COMPARED)
+            if np.isfinite(end.cost[0]) and (best is None or end.cost[0] < best.cost[0]):
+                best = end
+                if len(starts) == 1 or _leaves_noise(problem, best):
+                    break
         if best is None:
             predict = argument("output", "force", option="predicted")
             imposed = f", or, if the exciter imposes the motion, fit the force: {predict}"
@@ -439,10 +485,7 @@ class RecordSearch:
                 f"{argument('start')}, or check the units"
                 + (imposed if problem.output == "motion" else "")
             )
-        if driven and not best.converged[0]:
-            end = self.descend(problem, best.theta[0], STEPS)
-            best = end if end.cost[0] <= best.cost[0] else best
-        return best
+        return self.descend(problem, best.theta[0], steps)
 
 
 def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
@@ -479,24 +522,31 @@ def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, flo
     return starts
 
 
-def _slips_at_first(problem: RecordProblem, theta: FloatArray) -> bool:
-    """Return whether friction at a first sample is at full slip or beyond.
-
-    There it has hardly an effect, so that a search cannot come back.
-    """
-    low, high = problem.step_bounds(problem.to_values(theta), of_starts=True)
-    return bool(((theta <= low) | (theta >= high)).any())
-
-
-def _first_states_again(problem: RecordProblem, theta: FloatArray) -> FloatArray:
-    """Return a point with first states as at a start."""
-    values = problem.to_values(theta)
-    again = started_at(problem, values[: len(problem.free)].tolist())
-    return problem.to_search(again)
-
-
-def _structured(problem: RecordProblem, end: Minima) -> bool:
-    """Return whether a search has left residuals more correlated than noise is likely to be."""
+def _leaves_noise(problem: RecordProblem, end: Minima) -> bool:
+    """Return whether the correlations of the residuals are those of white noise, by Box-Pierce."""
     if 2.0 * end.cost[0] < EXACT * problem.n_residuals:
-        return False
-    return correlation(problem.split_residuals(problem.to_values(end.theta[0]))) > SLOW
+        return True
+    products = np.zeros(_LAGS + 1)
+    for e in problem.split_residuals(problem.to_values(end.theta[0])):
+        products += [float(e[k:] @ e[: max(e.size - k, 0)]) for k in range(_LAGS + 1)]
+    statistic = problem.n_residuals * float(((products[1:] / products[0]) ** 2).sum())
+    return bool(statistic < _LAGS + _CORRELATED * (2.0 * _LAGS) ** 0.5)
+
+
+def _has_idle(problem: RecordProblem, end: Minima) -> bool:
+    """Return whether a value, or friction at a first sample, has hardly an effect on the output.
+
+    That is a value whose logarithm has a standard error above a half, and friction that begins at
+    full slip or beyond.
+    """
+    theta, hessian = end.theta[0], end.hessian[0]
+    low, high = problem.step_bounds(problem.to_values(theta), of_starts=True)
+    if ((theta <= low) | (theta >= high)).any():
+        return True
+    noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+    size = np.sqrt(hessian.diagonal())
+    size[size == 0.0] = 1.0
+    inverse = np.linalg.pinv(hessian / np.outer(size, size), rcond=EXACT, hermitian=True)
+    idle = (noise * inverse.diagonal() / size**2 > _IDLE**2) & problem.space.relative
+    idle |= (hessian == np.eye(len(hessian))).all(axis=1)  # as the problem holds what has vanished
+    return bool(idle[: len(problem.free)].any())

@@ -23,9 +23,9 @@ from dahl_ident.problem.record_problem import RecordProblem
 _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
 _SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
 _LONGEST = 8192  # samples that the scan looks at
-_COMBINATIONS = 600  # linear solutions on the grid: a limit on their cost
+_COMBINATIONS = 100  # on the grid: each costs nearly as much as a step of a search
 STARTS = 4
-"""Starts that are tried at first, as for tables."""
+"""Starts that are tried at first."""
 MORE_STARTS = 24
 """Where no motion from those is finite: a contact too stiff for the samples' interval is one."""
 _LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: at rest, or nearly slipping
@@ -40,6 +40,30 @@ def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
     """
     with np.errstate(all="ignore"):  # laws far off may overflow; such combinations are left out
         return _Scan(problem).starts(count)
+
+
+def alternatives(problem: RecordProblem, values: FloatArray) -> Iterator[tuple[int, float]]:
+    """Yield the places and other values of parameters that the output is not linear in.
+
+    Those of the scan, in proportion to the size that the law has, and loads at first samples.
+    """
+    scan, place = _Scan(problem), 0
+    for element in problem.model.elements:
+        size = 1.0
+        grids = zip(element.labels, element.parameters, scan.grids(element), strict=True)
+        for label, parameter, grid in grids:
+            if not parameter.free:
+                continue
+            scales = bool(label in element.scale_parameters and parameter.dimension[0])
+            if len(grid) > 1:
+                yield from ((place, value * size if scales else value) for value in grid)
+            elif scales:
+                size = float(values[place])
+            place += 1
+    low, high = problem.step_bounds(values, of_starts=True)
+    for i in range(place, values.size):
+        if np.isfinite(high[i] - low[i]):
+            yield from ((i, 0.5 * (low[i] + high[i] + s * (high[i] - low[i]))) for s in _LOADS)
 
 
 class _Start(NamedTuple):
@@ -90,7 +114,7 @@ class _Scan:
     def starts(self, count: int) -> FloatArray:
         """Return the best starts of the scan."""
         elements = self.problem.model.elements
-        choices = [list(self._choices(e)) for e in elements]
+        choices = [list(product(*self.grids(e))) for e in elements]
         while np.prod([float(len(c)) for c in choices]) > _COMBINATIONS:
             longest = int(np.argmax([len(c) for c in choices]))
             choices[longest] = choices[longest][::2]
@@ -122,8 +146,8 @@ class _Scan:
         a, b = np.array(first), np.array(second)
         return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
 
-    def _choices(self, element: Element) -> Iterator[tuple[float, ...]]:
-        """Yield values for an element's parameters at which its force is to be computed.
+    def grids(self, element: Element) -> list[list[float]]:
+        """Return values of an element's parameters at which its force is to be computed.
 
         The first parameter that scales the force is 1. In units of it, the following parameters are
         lengths and times: with 1 N/m, a force is the length at which a spring exerts it.
@@ -164,7 +188,7 @@ class _Scan:
                     grids.append([*(-v for v in some), 0.0, *some])
                 else:
                     grids.append([unit * s for s in _LENGTHS])
-        yield from product(*grids)
+        return grids
 
     def _force_size(self) -> float:
         return max(float(np.std(h[3])) for h in self.histories)

@@ -22,8 +22,9 @@ class Space:
 
     Coordinates are the logarithms of `positive` parameters and the values of the others. Parameters
     with a size above 0 in `bends`, (P,), are searched by the inverse hyperbolic sine of the value
-    over it, and those `inside`, between two finite bounds, by an angle (`angular`), so that no step
-    leaves the bounds. `relative` coordinates change by relative changes of the values.
+    over it, and those `inside`, between two finite bounds, by an angle (`angular`) whose sine gives
+    the value, or its logarithm where that is the transform, so that no step leaves the bounds.
+    A step of 1 of `relative` coordinates is large for any data.
     """
 
     def __init__(
@@ -39,14 +40,16 @@ class Space:
         self._upper = np.array([p.upper for p in self.parameters])
         self.angular = between = inside & np.isfinite(self._lower) & np.isfinite(self._upper)
         self._angles = np.flatnonzero(between)
-        low, high = self._lower[between], self._upper[between]
+        logarithmic = np.array([p.positive for p in self.parameters], dtype=np.bool_)
+        self._by_log = (logarithmic & (self._lower > 0.0))[between]
+        low, high = self._scaled(self._lower[between]), self._scaled(self._upper[between])
         self._middle, self._reach = 0.5 * (low + high), 0.5 * (high - low)
         bends = np.zeros(len(self.parameters)) if bends is None else bends
         self._bent = np.flatnonzero(bends > 0.0)
         self._size = bends[self._bent]
         self._curved = bool(self._angles.size or self._bent.size)
-        self.positive = ~between & np.array([p.positive for p in self.parameters])
-        self.relative = self.positive | (bends > 0.0)
+        self.positive = ~between & logarithmic
+        self.relative = logarithmic | between | (bends > 0.0)
         self._all_positive = bool(self.positive.all())
 
     def checked(self, theta: ArrayLike, name: str = "theta") -> FloatArray:
@@ -67,7 +70,7 @@ class Space:
             positive_array(array[..., index], self.names[index])
         theta = np.where(self.positive, np.log(np.where(self.positive, array, 1.0)), array)
         if self._curved:
-            part = (array[..., self._angles] - self._middle) / self._reach
+            part = (self._scaled(array[..., self._angles]) - self._middle) / self._reach
             theta[..., self._angles] = np.arcsin(np.clip(part, -_INSIDE, _INSIDE))
             theta[..., self._bent] = np.arcsinh(array[..., self._bent] / self._size)
         return theta
@@ -79,9 +82,8 @@ class Space:
                 return np.exp(theta)
             values = np.where(self.positive, np.exp(np.where(self.positive, theta, 0.0)), theta)
             if self._curved:
-                values[..., self._angles] = self._middle + self._reach * np.sin(
-                    theta[..., self._angles]
-                )
+                between = self._middle + self._reach * np.sin(theta[..., self._angles])
+                values[..., self._angles] = np.where(self._by_log, np.exp(between), between)
                 values[..., self._bent] = self._size * np.sinh(theta[..., self._bent])
         return values
 
@@ -91,7 +93,8 @@ class Space:
             return math.exp(coordinate)
         if self.angular[index]:
             place = self._angles.tolist().index(index)
-            return self._middle[place] + self._reach[place] * math.sin(coordinate)
+            between = self._middle[place] + self._reach[place] * math.sin(coordinate)
+            return math.exp(between) if self._by_log[place] else between
         if self.relative[index]:
             return self._size[self._bent.tolist().index(index)] * math.sinh(coordinate)
         return coordinate
@@ -100,10 +103,24 @@ class Space:
         """Return d value / d theta at parameter values."""
         slopes = np.where(self.positive, values, 1.0)
         if self._curved:
-            aside = values[..., self._angles] - self._middle
-            slopes[..., self._angles] = np.sqrt(np.maximum(self._reach**2 - aside**2, 0.0))
+            of_angles = values[..., self._angles]
+            aside = self._scaled(of_angles) - self._middle
+            unit = np.where(self._by_log, of_angles, 1.0)
+            slopes[..., self._angles] = unit * np.sqrt(np.maximum(self._reach**2 - aside**2, 0.0))
             slopes[..., self._bent] = np.hypot(values[..., self._bent], self._size)
         return slopes
+
+    def _scaled(self, values: FloatArray) -> FloatArray:
+        """Return values of parameters that are searched by angles, or their logarithms."""
+        return np.where(self._by_log, np.log(np.where(self._by_log, values, 1.0)), values)
+
+    def unfolded(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return theta, (S, P), its angles within a right angle, and the signs of derivatives."""
+        theta, signs = theta.copy(), np.ones(theta.shape)
+        angles = theta[:, self._angles]
+        theta[:, self._angles] = np.arcsin(np.sin(angles))
+        signs[:, self._angles] = np.where(np.cos(angles) < 0.0, -1.0, 1.0)
+        return theta, signs
 
     @cached_property
     def is_bounded(self) -> bool:
