@@ -255,7 +255,6 @@ class RecordProblem(Problem):
                 usual, (low, high) = float(p.value or 1.0), p.prior or (1.0, 1.0)
                 low, high = min(low, usual), max(high, usual)
                 ranges[name] = np.log(usual), np.log(high / low) / 12.0**0.5 / noise
-                chosen[name] = replace(p, lower=low, upper=high)
         return self._of_model(self.model.with_parameters(chosen), ranges)
 
     def held(self, values: Mapping[str, float]) -> RecordProblem:
@@ -460,8 +459,10 @@ class RecordProblem(Problem):
         sample below slip, and on request other friction there below full slip at the values.
         """
         low, high = np.full((2, values.size), np.inf) * [[-1.0], [1.0]]
-        for i in map(self.names.index, self.ranges):
-            low[i], high[i] = (end[i] for end in self.bounds())
+        for name, (usual, _) in self.ranges.items():
+            i = self.names.index(name)
+            span = [usual, *np.log(self.parameters[i].prior or (1.0, 1.0))]
+            low[i], high[i] = min(span), max(span)
         of_model = zip(self.model.parameters, self.full_values(values), strict=True)
         by_name = {p.name: np.asarray(value) for p, value in of_model}
         for element in self.with_memory:
