@@ -189,16 +189,12 @@ def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted():
 
 
 def test_the_posterior_of_an_approximate_fit_is_approximate():
-    clean = recorded(DAHL, "random", 1000, 0.0)
-    level = np.repeat(1.0 + 0.05 * np.random.default_rng(3).standard_normal(20), 50)
-    noise = 1e-3 * np.random.default_rng(0).standard_normal(1000)
-    force = level * clean.force_samples + noise
-    fit = di.fit(di.Record(clean.time, displacement=clean.displacement, force=force), di.Dahl())
+    fit = di.fit(held(DAHL, 1, power=0.1), di.Dahl())
     assert fit.status.value == "approximate"
     found = di.posterior(fit, seed=1, steps=400, walkers=32)
     assert found.converged
     assert found.status.value == "approximate"
-    assert "The misfit exceeds the noise." in found.verdict
+    assert "The misfit exceeds the noise" in found.verdict
     assert "alpha between 0.5 and 2" in found.verdict
 
 
@@ -210,30 +206,40 @@ def moving(seed, size=8e-3, samples=1500):
     return t, np.asarray(size / 12**0.5 * np.sin(2.0 * np.pi * lines).sum(axis=0))
 
 
-def held(law, seed, *, delay=0.0, power=0.0, size=8e-3, noise=5e-4):
+def held(law, seed, *, delay=0.0, power=0.0, size=8e-3, noise=5e-4, damping=0.0, samples=1500):
     """Return a record with noise, by default 0.5 %, whose motion lags the force by some samples.
 
-    The friction rises with a power of the speed.
+    The friction rises with a power of the speed; a damper is in parallel.
     """
-    t, x = moving(seed, size)
-    force = law.force(x) * (np.abs(np.gradient(x, t)) / 0.05) ** power
+    t, x = moving(seed, size, samples)
+    v = np.gradient(x, t)
+    force = law.force_history([p.value for p in law.parameters], x, v, 0.0)
+    force = force * (np.abs(v) / 0.05) ** power + damping * v
     at = t[2000::10]
     shown = CubicSpline(t, x)(at - delay / RATE)
     errors = noise * np.random.default_rng(seed + 100).standard_normal(at.size)
     return di.Record(at, displacement=shown, force=force[2000::10] + errors)
 
 
+TRUTH = {"f_max": 0.1, "sigma": 30.0}
+
+
+def doubts(fit):
+    return [f.code for f in fit.findings if f.severity != "trusted"]
+
+
 @pytest.mark.parametrize("delay", [-0.5, 0.5, pytest.param(0.05, marks=pytest.mark.long)])
 def test_a_delay_that_nobody_stated_is_estimated(delay):
     for seed in range(3):
         fit = di.fit(held(DAHL, seed, delay=delay), di.Dahl())
-        assert fit.trusted, fit.verdict
+        assert doubts(fit) == (["delay"] if abs(delay) == 0.5 else []), fit.verdict
         for name, value in (("f_max", 0.1), ("sigma", 30.0)):
             assert abs(fit.params[name].value - value) < 3.0 * fit.params[name].stderr
     assert "delay between the channels" in sources(fit, "sigma")
     if abs(delay) == 0.5:
         side = "lags" if delay > 0.0 else "leads"
         assert f"The motion {side} the force by" in fit.verdict
+        assert "A damper missing in the model acts alike" in fit.verdict
     again = di.FitResult.from_json(fit.to_json())
     assert again.params["sigma"].stderr == pytest.approx(fit.params["sigma"].stderr, rel=1e-6)
 
@@ -256,7 +262,7 @@ def test_motions_that_turn_between_samples_are_covered():
     away = []
     for seed in range(8):
         fit = di.fit(held(DAHL, seed, delay=0.5, noise=1e-4), di.Dahl(alpha=1.0))
-        assert fit.trusted, fit.verdict
+        assert doubts(fit) == ["delay"], fit.verdict
         away += [
             (fit.params[name].value - value) / fit.params[name].stderr
             for name, value in (("f_max", 0.1), ("sigma", 30.0))
@@ -278,8 +284,8 @@ def test_a_delay_of_a_driven_motion_is_estimated():
 @pytest.mark.parametrize("power", [0.02, 0.1])
 def test_friction_that_rises_a_little_with_speed_is_covered(power):
     fit = di.fit(held(DAHL, 1, power=power), di.Dahl())
-    assert fit.status.usable
-    assert fit.trusted == (power == 0.02)
+    assert fit.status == "approximate"
+    assert "the residuals follow the velocity" in fit.verdict
     for name, value in (("f_max", 0.1), ("sigma", 30.0)):
         assert abs(fit.params[name].value - value) < 2.5 * fit.params[name].stderr
 
@@ -381,3 +387,57 @@ def test_few_effective_samples_are_not_trusted():
     fit = di.fit(replace(record, force=drifting), di.Dahl())
     assert fit.effective_samples < 20
     assert not fit.trusted
+
+
+OTHER_LAWS = {
+    "Bouc-Wen": (di.BoucWen(30.0, 300.0, 300.0, exponent=2.0), 0.0),
+    "damper": (DAHL, 0.03),
+    "backlash": (di.Backlash(DAHL, 0.2 * 0.1 / 30.0), 0.0),
+    "LuGre": (di.LuGre(0.1, 30.0, 1.3, 0.05), 0.0),
+}
+
+
+@pytest.mark.parametrize("samples", [300, 600])
+@pytest.mark.parametrize("other", OTHER_LAWS)
+def test_a_short_record_of_another_law_is_not_trusted(other, samples):
+    """Most residuals are below 3 % rms, and slow: worth 13 to 80 samples.
+
+    A motion of 0.6 s that turns five times may be described by both laws.
+    """
+    law, damping = OTHER_LAWS[other]
+    inside = trusted = 0
+    for seed in range(5):
+        fit = di.fit(held(law, seed, damping=damping, samples=samples), di.Dahl(), throw=False)
+        interval = fit.conf_interval().at(0.9545)
+        trusted += fit.trusted
+        inside += interval["f_max"].lower < 0.1 < interval["f_max"].upper
+    assert trusted <= (samples == 300)
+    if samples == 600:
+        assert inside >= 4
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_slow_noise_does_not_speak_against_a_law(slow):
+    """Noise of 0.5 % with a spectrum that falls as 1/f."""
+    away, samples = [], 600
+    for seed in range(5):
+        clean = held(DAHL, seed, noise=0.0, samples=samples)
+        noise = np.random.default_rng(seed).standard_normal(4 * samples)
+        if slow:
+            frequency = np.maximum(np.fft.rfftfreq(noise.size), 1.0 / noise.size)
+            noise = np.fft.irfft(np.fft.rfft(noise) / np.sqrt(frequency))
+        force = clean.force_samples + 5e-4 * noise[:samples] / noise.std()
+        fit = di.fit(replace(clean, force=force), di.Dahl(alpha=1.0))
+        assert fit.trusted, fit.verdict
+        assert (fit.effective_samples < 200) == slow
+        away += [(fit.params[n].value - v) / fit.params[n].stderr for n, v in TRUTH.items()]
+    assert np.sqrt(np.mean(np.square(away))) < 1.5
+
+
+def test_a_driven_motion_shows_the_damper_that_its_model_lacks():
+    record = driven(2, 1e-3, 1024)
+    plant = di.Dahl(alpha=1.0) + di.Mass(0.3) + di.Spring()
+    fit = di.fit(record, plant, start={"f_max": 0.1, "sigma": 300.0, "stiffness": 50.0})
+    assert not fit.trusted
+    right = di.fit(record, plant + di.Damper())
+    assert right.trusted, right.verdict

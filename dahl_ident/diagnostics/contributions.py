@@ -17,12 +17,12 @@ from dahl_ident.arrays import FloatArray
 NOISE = "noise"
 MODEL_ERROR = "model error"
 HARMONICS = "model error of harmonics"
-AFTER_REVERSALS = "model error after each reversal"
+ALONG_MOTION = "model error along the motion"
 RUNS = "scatter between runs"
 LEVELS = "scatter between repeated levels"
 APART = "suspicious points"
 TESTS = "jackknife over tests"
-TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, AFTER_REVERSALS, RUNS, LEVELS, APART, TESTS)
+TYPE_A = (NOISE, MODEL_ERROR, HARMONICS, ALONG_MOTION, RUNS, LEVELS, APART, TESTS)
 """Sources whose size is estimated from the scatter of the data."""
 EXPONENT = "exponent"
 DRIVE_FACTOR = "drive factor"

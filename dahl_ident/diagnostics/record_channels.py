@@ -63,17 +63,24 @@ def motion_sources(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
     moved = np.zeros(fit.inverse.shape)
     for name, moved in _if_it_matters(fit, DISPLACEMENT, _by_displacement(fit)):
         yield name, moved
-    if not problem.model.rate_independent:
-        other = problem.differentiated_in(_OTHER_WINDOW * problem.window)
-        yield from _if_it_matters(fit, WINDOW, _squared(fit.change_to(other)))
+    for name, other in other_motions(problem):
+        yield from _if_it_matters(fit, name, _squared(fit.change_to(other)))
     if problem.with_memory and not problem.displacement_noise:
         u2 = fit.by_noise[0].diagonal()
         unit = np.sqrt(np.where(np.isfinite(u2) & (u2 > 0.0), u2, 1.0))
         units = np.outer(unit, unit)
         beyond = positive_part((_at_turns(fit) - moved) / units) * units
         yield from _if_it_matters(fit, TURNS, beyond)
-        farther = problem.altered("latest", motions=_beyond_samples(problem))
-        yield from _if_it_matters(fit, SAMPLING, _squared(fit.change_to(farther)))
+
+
+def other_motions(problem: RecordProblem) -> Iterator[tuple[str, RecordProblem]]:
+    """Yield problems whose motion may as well be the right one, by the source of the difference."""
+    if problem.output != "force":
+        return
+    if not problem.model.rate_independent:
+        yield WINDOW, problem.differentiated_in(_OTHER_WINDOW * problem.window)
+    if problem.with_memory and not problem.displacement_noise:
+        yield SAMPLING, problem.altered("latest", motions=_beyond_samples(problem))
 
 
 def _if_it_matters(

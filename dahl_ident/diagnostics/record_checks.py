@@ -15,7 +15,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.checks import assumed, constraints, reading
 from dahl_ident.diagnostics.contributions import (
-    AFTER_REVERSALS,
+    ALONG_MOTION,
     EXPONENT,
     MODEL_ERROR,
     NOISE,
@@ -23,6 +23,7 @@ from dahl_ident.diagnostics.contributions import (
 )
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.physics import below_zero, is_single, slight
+from dahl_ident.diagnostics.record_misfit import REMEDY
 from dahl_ident.elements import Element
 from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.problem.record_noise import share_in_band
@@ -36,17 +37,13 @@ _SEGMENTS = 50  # the worst one is 2 % of a record
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near a reversal
 _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
-_WELL = 1e-3  # share of variance left at which structure in the residuals does not matter
 _FAIRLY = 0.04  # share of variance that a model misses: beyond it, intervals do not hold
 _TOO_LARGE = 0.25  # share of variance left, of noise too: half of the output is not the model's
-_STRUCTURED = 0.5  # correlation of neighbouring residuals
 _FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
 _BECAUSE = {  # by the source of most of the uncertainty
     EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
     RUNS: "the records ask for different values: fit each alone, and look at what differs",
-    AFTER_REVERSALS: (
-        "the law misses what the force does after a reversal: choose one that describes it"
-    ),
+    ALONG_MOTION: "the residuals follow the motion: choose a model that describes what it does",
     MODEL_ERROR: (
         "parts of the records ask for different values: choose a model that describes them"
     ),
@@ -156,9 +153,7 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
 
 def misses(fit: RecordAssessment) -> bool:
     """Return whether the model misses more than noise."""
-    goodness = fit.goodness
-    structured = goodness.correlation > _STRUCTURED and goodness.share_in_band > _WELL
-    return structured or not {MODEL_ERROR, AFTER_REVERSALS}.isdisjoint(fit.errors.contributions)
+    return not {MODEL_ERROR, ALONG_MOTION}.isdisjoint(fit.errors.contributions)
 
 
 def undetermined(fit: RecordAssessment) -> Iterator[Finding]:
@@ -243,7 +238,10 @@ def _misfit(fit: RecordAssessment) -> Iterator[Finding]:
     if fit.problem.output == "motion" and (far or not converged) and displaced:
         yield Finding(_DESCRIBED, _NOT_DESCRIBED, "motion_may_be_imposed")
     if misses(fit) and not far:
-        yield Finding(_DESCRIBED, _APPROXIMATE, "records_misfit")
+        misfit = fit.errors.misfit
+        follows = misfit.follows if misfit else ""
+        values = {"follows": follows, "remedy": REMEDY.get(follows, "")}
+        yield Finding(_DESCRIBED, _APPROXIMATE, "records_misfit", values)
     if fit.errors.dof_of(NOISE) < _FEW:
         few = {"effective": fit.errors.effective, "unknowns": len(fit.problem.names)}
         yield Finding(_DESCRIBED, _APPROXIMATE, "few_effective_samples", few)
@@ -283,6 +281,18 @@ def _slight(fit: RecordAssessment) -> Iterator[Finding]:
     yield from slight(problem, fit.known, share_of, misfit, misfit)
 
 
+def _delay(fit: RecordAssessment) -> Iterator[Finding]:
+    """Yield the delay that was taken out: a doubt where it moves the output by more than noise."""
+    problem = fit.problem
+    if not problem.delay:
+        return
+    moved = problem.delay * np.concatenate(problem.delay_slopes(fit.optimum.values))
+    doubtful = bool(np.sqrt(np.mean(moved**2)) > fit.goodness.rms)
+    samples = problem.delay * problem.records[0].sample_rate
+    lag = {"delay": problem.delay, "samples": samples, "doubtful": doubtful}
+    yield Finding(_DESCRIBED, _APPROXIMATE if doubtful else _TRUSTED, "delay", lag)
+
+
 def _notes(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield the size of the residuals, and what was done with the records."""
     problem, goodness = fit.problem, fit.goodness
@@ -300,10 +310,6 @@ def _notes(fit: RecordAssessment) -> Iterator[Finding]:
             "travel": problem.noise_travel,
         }
         yield Finding(_DESCRIBED, _TRUSTED, "displacement_noise", noise)
-    if problem.delay:
-        samples = problem.delay * problem.records[0].sample_rate
-        lag = {"delay": problem.delay, "samples": samples}
-        yield Finding(_DESCRIBED, _TRUSTED, "delay", lag)
     yield from reading(fit)
     size = {"effective": fit.errors.effective, "samples": problem.n_samples}
     yield Finding(_DESCRIBED, _TRUSTED, "effective_samples", size)
@@ -315,6 +321,7 @@ CHECKS: tuple[Callable[[RecordAssessment], Iterable[Finding]], ...] = (
     undetermined,
     _physics,
     _slight,
+    _delay,
     _notes,
     assumed,
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.contributions import (
-    AFTER_REVERSALS,
+    ALONG_MOTION,
     EXPONENT,
     MODEL_ERROR,
     NOISE,
@@ -24,16 +24,15 @@ from dahl_ident.diagnostics.record_channels import (
     DISPLACEMENT_GAIN,
     DRIVE,
     FORCE,
-    WINDOW,
     by_calibration,
     by_drive,
     motion_sources,
 )
+from dahl_ident.diagnostics.record_misfit import MotionMisfit, motion_misfit
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
     HeldValue,
     LinearFit,
-    after_reversals,
     between_blocks,
     between_records,
     held_exponents,
@@ -42,6 +41,7 @@ from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # standard deviation along a direction over the largest, that counts as none
+_SHORTENS = 0.5  # of u: without a source of less, intervals are at most a tenth too short
 _NOT_FOUND = ", though it was not given: with another no motion was found"
 
 
@@ -61,8 +61,8 @@ class RecordErrors(Errors):
         Records that were fitted together.
     exponents : tuple of HeldValue
         What the records say of exponents that the fit holds.
-    groups : int
-        Of the path since the last reversal, from which `AFTER_REVERSALS` was estimated.
+    misfit : MotionMisfit or None
+        What the residuals follow, from which `ALONG_MOTION` was estimated.
     """
 
     contributions: Mapping[str, FloatArray]
@@ -70,7 +70,7 @@ class RecordErrors(Errors):
     exact: tuple[str, ...]
     runs: int
     exponents: tuple[HeldValue, ...]
-    groups: int = 0
+    misfit: MotionMisfit | None = None
 
     @property
     def assumed(self) -> list[HeldValue]:
@@ -88,7 +88,7 @@ class RecordErrors(Errors):
             return max(self.effective - len(self.covariance), 1.0)
         return {
             MODEL_ERROR: BLOCKS - 1.0,
-            AFTER_REVERSALS: self.groups - 1.0,
+            ALONG_MOTION: float(self.misfit.functions) if self.misfit else np.inf,
             RUNS: self.runs - 1.0,
         }.get(source, np.inf)
 
@@ -114,7 +114,7 @@ def record_errors(
 
     A model that misses more than noise does so differently from place to place: where the blocks of
     a record ask for parameters that scatter more than noise explains, the excess is the model
-    error; what it misses alike after every reversal is a source of its own. Where several records
+    error; what it misses along the motion is a source of its own. Where several records
     ask for parameters that scatter more than that explains, the excess is the scatter between runs.
     What an assumed exponent changes counts with its range and with what the records say of it.
     Errors of the channels are those of :mod:`dahl_ident.diagnostics.record_channels`.
@@ -142,12 +142,14 @@ def record_errors(
     exponents = held_exponents(fit)
     if assumed := [one.contribution for one in exponents if one.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
-    of_motion = dict(motion_sources(fit))
-    sources |= of_motion
-    seen_after_reversals = [C for name, C in of_motion.items() if name != WINDOW]
-    alike, groups = after_reversals(fit, seen_after_reversals) or (None, 0)
-    if alike is not None:
-        sources[AFTER_REVERSALS] = alike
+    sources |= dict(motion_sources(fit))
+    known, misfit = np.asarray(sum(sources.values())), motion_misfit(fit)
+    if misfit is not None:
+        larger = misfit.covariance.diagonal() > _SHORTENS**2 * known.diagonal()
+        if larger[fit.judged].any():
+            sources[ALONG_MOTION] = misfit.covariance
+        else:
+            misfit = None
     for name, contribution in by_calibration(fit):
         sources[name] = sources.get(name, 0.0) + contribution
     exact = [name for name in (FORCE, DISPLACEMENT_GAIN) if name not in sources]
@@ -158,7 +160,7 @@ def record_errors(
         elif of_drive.any():
             sources[DRIVE] = of_drive
     runs = len(set(problem.runs))
-    return RecordErrors(sources, effective, tuple(exact), runs, exponents, groups)
+    return RecordErrors(sources, effective, tuple(exact), runs, exponents, misfit)
 
 
 def errors_on_constraints(

@@ -7,7 +7,7 @@ counts as a separate error.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,7 +20,6 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.contributions import positive_part
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
-from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import FitError
 from dahl_ident.fitting.record_search import STEPS, RecordSearch
 from dahl_ident.problem.record_problem import RecordProblem
@@ -29,9 +28,6 @@ BLOCKS = 20
 """Number of blocks of all records together, from which the model error is estimated."""
 _LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
 _RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
-_ROUNDING = 1e-9  # of a logarithm
-_ALONE = 1e-6  # of a direction, determined by others: a group without others shows no misfit there
-_PATHS = 5  # groups of the path since the last reversal, by factors of e
 _LONG = 0.05  # step of an exponent's logarithm, beyond which slopes change
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
@@ -366,74 +362,6 @@ def _excess(
     if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[judged].any():
         return None
     return positive_part(between - by_chance) * np.outer(size, size)
-
-
-def after_reversals(
-    fit: LinearFit, of_displacement: Iterable[FloatArray]
-) -> tuple[FloatArray, int] | None:
-    """Return the covariance by what the model misses alike after every reversal.
-
-    Every cycle repeats it, so that blocks in time do not differ by it. Groups of the path since the
-    last reversal do: a law's misfit changes over about a factor of e of path, as a table's does
-    with its amplitude. Their scatter is that of Bell and McCaffrey, Survey Methodology 28 (2002)
-    169-181, for few groups of which some matter much. An assumed exponent is estimated with the
-    other values, as it is in the fit.
-
-    Parameters
-    ----------
-    fit : LinearFit
-    of_displacement : iterable of ndarray, shape (P, P)
-        Covariances by errors of the displacement, which also show after reversals.
-
-    Returns
-    -------
-    tuple of ndarray, shape (P, P), and int; or None
-        What exceeds noise, and the number of groups. None where chance explains it, or nothing
-        remembers a reversal.
-    """
-    problem, residuals = fit.problem, fit.residuals
-    paths = _paths(fit) if problem.with_memory else []
-    farthest = max((float(path.max()) for path in paths), default=0.0)
-    if not farthest > 0.0:
-        return None
-    slopes = fit.exponent_slopes
-    assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
-    joint = fit.with_freed(*assumed) if assumed else fit
-    noise, count = joint.by_noise[0].copy(), fit.values.size
-    for covariance in of_displacement:
-        noise[:count, :count] += covariance
-    seen = np.flatnonzero(np.isfinite(noise.diagonal()) & (noise.diagonal() > 0.0))
-    size = np.sqrt(noise.diagonal()[seen])
-    J, e = size * np.concatenate(joint.jacobians)[:, seen], np.concatenate(residuals)
-    ends = [path[path.size - len(wave) :] for path, wave in zip(paths, residuals, strict=True)]
-    path = np.maximum(np.concatenate(ends), farthest * np.exp(1.0 - _PATHS))
-    group = np.floor(np.log(farthest / path) + _ROUNDING)
-    members = [group == k for k in np.unique(group)]
-    w, V = np.linalg.eigh(J.T @ J)
-    root = (V / np.sqrt(np.maximum(w, w[-1] * np.finfo(float).eps))) @ V.T  # of the inverse
-    steps, shares = [], []
-    for rows in members:
-        share = root @ (J[rows].T @ J[rows]) @ root
-        b, U = np.linalg.eigh(share)
-        larger = (U / np.sqrt(np.maximum(1.0 - b, _ALONE))) @ U.T
-        steps.append(root @ (larger @ (root @ (J[rows].T @ e[rows]))))
-        shares.append((root @ share @ root).diagonal())
-    between = np.array(steps).T @ np.array(steps)
-    by_chance = noise[np.ix_(seen, seen)] / np.outer(size, size)
-    beyond = _excess(between, by_chance, np.array(shares), joint.judged[seen], _LEVEL, size)
-    if beyond is None:
-        return None
-    return _embedded(beyond, seen, len(noise))[:count, :count], len(members)
-
-
-def _paths(fit: LinearFit) -> list[FloatArray]:
-    """Return the path of every sample since the last reversal, m; none where it is not known."""
-    problem = fit.problem
-    if problem.output == "force":
-        return [stretches(x).path for x, _, _ in problem.motions]
-    if all(record.motion_channel == "displacement" for record in problem.records):
-        return [stretches(x).path for x in fit.outputs]
-    return []
 
 
 def _embedded(part: FloatArray, places: NDArray[np.intp], size: int) -> FloatArray:

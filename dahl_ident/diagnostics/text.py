@@ -340,7 +340,10 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
         f"({argument('output', 'force', option='predicted')}): what it moves hardly depends on the "
         "force, and the model cannot follow it."
     ),
-    "records_misfit": "The misfit exceeds the noise.",
+    "records_misfit": lambda follows, remedy: (
+        "The misfit exceeds the noise"
+        + (f": the residuals follow {follows}; {remedy}." if follows else ".")
+    ),
     "record_parameter": _record_parameter,
     "unphysical": "Physically doubtful: {objection}.",
     "exponent": lambda name, wanted: (
@@ -351,9 +354,11 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "{wanted}.",
     "few_effective_samples": "The residuals are so slow that they are worth {effective:.0f} "
     "samples, few for {unknowns} unknowns: record for longer.",
-    "delay": lambda delay, samples: (
+    "delay": lambda delay, samples, doubtful: (
         f"The motion {'lags' if delay > 0.0 else 'leads'} the force by {abs(samples):.2g} samples "
         f"({abs(delay):.2g} s): taken out."
+        + doubtful
+        * " A damper missing in the model acts alike; state the sensors' delay."
     ),
     "record_residuals": "The residuals are {rms:percent} rms of the measured {output}; {worst}.",
     "slow_residuals": "Most of this varies slowly, as noise in the drive causes it: {rms:percent} "

@@ -412,12 +412,17 @@ class RecordProblem(Problem):
 
     def with_noisier_drive(self, stds: Sequence[float], draw: int) -> RecordProblem:
         """Return the same problem, white noise added to the drive of each record."""
+        rng = np.random.default_rng(draw)
+        sizes = zip(self.records, stds, strict=True)
+        return self.driven_more([std * rng.standard_normal(len(record)) for record, std in sizes])
+
+    def driven_more(self, waves: Sequence[FloatArray]) -> RecordProblem:
+        """Return the same problem, waves added to the drive of each record."""
         from dahl_ident.engine import band_limited
 
-        rng = np.random.default_rng(draw)
         drives = tuple(
-            (time, drive + band_limited(std * rng.standard_normal(time.size), 1.0 / r.sample_rate))
-            for (time, drive), r, std in zip(self.drives, self.records, stds, strict=True)
+            (time, drive + band_limited(wave, 1.0 / record.sample_rate))
+            for (time, drive), record, wave in zip(self.drives, self.records, waves, strict=True)
         )
         return self.altered("latest", drives=drives)
 

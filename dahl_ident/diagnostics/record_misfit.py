@@ -1,0 +1,211 @@
+"""What the residuals of records follow: the friction force, the velocity or the displacement.
+
+Residuals of a right model are noise, white or not, and noise does not follow the motion. Those of a
+wrong model are a function of the motion's state. So functions of the state are fitted to the
+residuals together with the parameters, and judged by the noise that then remains: where it is slow,
+it has few effective samples, and may look like a function of the state by chance.
+
+What the functions do to the parameters is the model error: the misfit is taken to be as large in
+directions of the parameters, where no residual shows it, as it is in others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from dahl_ident.arrays import FloatArray
+from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in
+from dahl_ident.diagnostics.record_channels import other_motions
+from dahl_ident.diagnostics.record_sources import LinearFit
+from dahl_ident.elements import Friction
+from dahl_ident.elements.recursion import linear_recursion, stretches
+from dahl_ident.errors import FitError
+from dahl_ident.problem.record_noise import in_band
+from dahl_ident.problem.record_problem import RecordProblem
+
+_FALSE_ALARM = 1e-3  # of all functions together; wrong laws are far beyond it
+_SEEN = 0.01  # of a function's size: less of it is not a parameter's doing, or rounding
+_LEVELS = np.linspace(-1.0, 1.0, 7)  # of the friction force in the direction of motion
+_SPEEDS = 2.0 ** np.arange(1, 4)  # of the highest speed, inverse
+_STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
+FRICTION, VELOCITY, DISPLACEMENT = "the friction force", "the velocity", "the displacement"
+REMEDY = {
+    FRICTION: "fit another friction law",
+    VELOCITY: "add a damper, or fit a law that changes with the speed",
+    DISPLACEMENT: "add a spring, or look for a stiffness that is not linear",
+}
+"""What may help where the residuals follow it."""
+
+
+@dataclass(frozen=True)
+class MotionMisfit:
+    """What the residuals follow beyond chance.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (P, P)
+        Of the estimate, by the functions that the residuals follow.
+    follows : str
+        What explains most of the residuals.
+    share : float
+        Of their variance that it explains.
+    functions : int
+        From which the covariance was estimated.
+    """
+
+    covariance: FloatArray
+    follows: str
+    share: float
+    functions: int
+
+
+def motion_misfit(fit: LinearFit) -> MotionMisfit | None:
+    """Return the model error that the residuals show as functions of the motion's state.
+
+    None where chance explains what the residuals follow.
+    """
+    problem, values, residuals = fit.problem, fit.values, fit.residuals
+    slopes = fit.exponent_slopes
+    assumed = [slopes[p.name] for p in problem.exponents if p.assumed and p.name in slopes]
+    freed = fit.with_freed(*assumed)
+    ends, count = np.cumsum([e.size for e in residuals])[:-1], values.size
+    J, e = np.concatenate(freed.jacobians), np.concatenate(residuals)
+    known = _basis(np.column_stack([J, *_by_channels(fit)]))
+    e = e - known @ (known.T @ e)
+    waves = dict[str, FloatArray]()
+    try:
+        parts = [_functions(problem, values, number) for number in range(len(problem.records))]
+    except FitError:  # no motion next to the estimate
+        return None
+    for name in parts[0]:
+        wave = np.concatenate([problem.filtered(part[name]) for part in parts])
+        waves[name] = _basis(wave, _SEEN)
+    beyond = {name: _part(B - known @ (known.T @ B), _SEEN) for name, B in waves.items()}
+    gain = freed.inverse[:count] @ J.T
+    covariance, found = np.zeros((count, count)), dict[str, tuple[float, int]]()
+    for name, Q in beyond.items():
+        left = e - Q @ (Q.T @ e)
+        if not (Q.shape[1] and left.any()):
+            continue
+        whole = np.column_stack([known, Q])
+        noise = noise_in(np.split(whole, ends), np.split(left, ends))
+        dof = max(_samples_of(noise, residuals) - whole.shape[1], 1.0)
+        pieces = zip(np.split(Q, ends), noise, strict=True)
+        by_noise = sum(q.T @ correlated(q, c) for q, c in pieces)
+        seen = Q.T @ e
+        square = float(seen @ np.linalg.solve(by_noise, seen))
+        chance = special.fdtrc(Q.shape[1], dof, square / Q.shape[1])
+        if not chance < _FALSE_ALARM / len(beyond):
+            continue
+        along = Q.T @ waves[name]
+        unit = float(np.trace(np.linalg.solve(by_noise, along @ along.T)))
+        moved = gain @ waves[name]
+        covariance += (square - Q.shape[1]) / unit * moved @ moved.T
+        found[name] = float(seen @ seen) / float(e @ e), Q.shape[1]
+    if not found:
+        return None
+    follows = max(found, key=lambda name: found[name][0])
+    return MotionMisfit(covariance, follows, *found[follows])
+
+
+def _by_channels(fit: LinearFit) -> Iterator[FloatArray]:
+    """Yield how errors of the motion that need no model error change the outputs, (n,) each."""
+    problem = fit.problem
+    with suppress(FitError):  # no motion next to the estimate
+        slopes = problem.delay_slopes(fit.values)
+        yield np.concatenate([problem.filtered(slope) for slope in slopes])
+    for _, other in other_motions(problem):
+        ends = zip(fit.outputs, other.outputs(fit.values), strict=True)
+        yield np.concatenate([problem.filtered(b - a) for a, b in ends])
+
+
+def _samples_of(noise: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> float:
+    """Return how many samples of white noise would show the noise's variance as well."""
+    lost, total = 0.0, 0.0
+    for c, e in zip(noise, residuals, strict=True):
+        lost += e.size * float(2.0 * c @ c - c[0] ** 2)
+        total += e.size * float(c[0])
+    return total**2 / lost
+
+
+def _basis(waves: FloatArray, least: float = 1e-9) -> FloatArray:
+    """Return an orthonormal basis of columns of one length, without what is small or rounding."""
+    length = np.linalg.norm(waves, axis=0)
+    return _part(waves[:, length > 0.0] / length[length > 0.0], least)
+
+
+def _part(waves: FloatArray, least: float) -> FloatArray:
+    """Return an orthonormal basis of the directions that are not smaller than `least`."""
+    vectors, sizes, _ = np.linalg.svd(waves, full_matrices=False)
+    return np.asarray(vectors[:, sizes > least])
+
+
+def _functions(problem: RecordProblem, values: FloatArray, number: int) -> dict[str, FloatArray]:
+    """Return what forces that depend on the state add to the output of record `number`, (n, k)."""
+    record = problem.records[number]
+    plain = problem.outputs(values)[number]
+    if problem.output == "force":
+        x, v, _ = problem.motions[number]
+        x = x if problem.paths is None else problem.paths[number]
+        return _forces(problem, values, x, v if v.size else np.gradient(x, record.time))
+    step = _STEP * float(problem.unit_sizes((1, 0, 0))[number])
+
+    def moved(force: FloatArray) -> FloatArray:
+        more = [step * force if r is record else np.zeros(len(r)) for r in problem.records]
+        return problem.driven_more(more).predict(values, number, derivatives=False).output - plain
+
+    forces = _forces(problem, values, *in_band(record, plain)[:2])
+    return {
+        name: np.column_stack(
+            [moved(wave / np.std(wave)) for wave in waves.T if np.std(wave) > 0.0]
+        )
+        for name, waves in forces.items()
+    }
+
+
+def _forces(
+    problem: RecordProblem, values: FloatArray, x: FloatArray, v: FloatArray
+) -> dict[str, FloatArray]:
+    """Return forces that depend on the state of a motion, (n, k), by what they depend on.
+
+    Where friction goes on from its force in another way than the law says, by a function of the
+    force or of the speed, it forgets the difference as it forgets everything: over its
+    characteristic displacement.
+    """
+    parts = stretches(x)
+    heading, farthest = parts.spread(parts.heading), float(parts.path.max()) or 1.0
+    friction, lengths = 0.0 * x, set[float]()
+    for element, at in problem.model.of(problem.full_values(values)):
+        if isinstance(element, Friction):
+            start: Any = np.zeros(len(element.starts)) if len(element.starts) > 1 else 0.0
+            friction = friction + np.asarray(element.force_history(at, x, v, start))
+            lengths |= {float(knee) for knee in element.knee([np.asarray(a) for a in at])}
+    if not friction.any():
+        friction = heading
+    lengths = {min(length, farthest) for length in lengths if length > 0.0} or {farthest}
+    ahead = heading * friction / (np.abs(friction).max() or 1.0)
+    speed, place = v / (np.abs(v).max() or 1.0), (x - x.mean()) / (np.ptp(x) or 1.0)
+    width = _LEVELS[1] - _LEVELS[0]
+    levels = np.maximum(1.0 - np.abs(ahead[:, None] - _LEVELS) / width, 0.0)
+    limits = ahead[:, None] * np.exp(-((speed[:, None] * _SPEEDS) ** 2))
+
+    def remembered(slopes: FloatArray) -> FloatArray:
+        steps = np.diff(x)
+        term = 0.5 * (slopes[1:] + slopes[:-1]) * steps[:, None]
+        zero = np.zeros(slopes.shape[1])
+        return np.column_stack(
+            [linear_recursion(np.exp(-np.abs(steps) / one), term, zero) for one in sorted(lengths)]
+        )
+
+    damping = np.column_stack([speed, speed * np.abs(speed), speed**3])
+    return {
+        FRICTION: remembered(levels),
+        VELOCITY: np.column_stack([damping, remembered(limits)]),
+        DISPLACEMENT: np.column_stack([place, place**2, place**3]),
+    }
