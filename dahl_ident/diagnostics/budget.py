@@ -16,7 +16,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data.storage import library as data_library
 from dahl_ident.diagnostics.combinations import candidates, runaway
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, MANY, coverage_factor
-from dahl_ident.diagnostics.contributions import CHANNELS, TYPE_A, Errors, variances
+from dahl_ident.diagnostics.contributions import CHANNELS, TYPE_A, ErrorContributions, variances
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import (
     degrees_text,
@@ -287,7 +287,7 @@ def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
 
 
 def parameter_budget(
-    errors: Errors, name: str, unit: str, value: float, direction: FloatArray
+    errors: ErrorContributions, name: str, unit: str, value: float, direction: FloatArray
 ) -> ParameterBudget:
     """Return the budget of a value with the derivatives `direction`, source by source."""
     u2 = float(errors.std(direction)) ** 2

@@ -34,12 +34,12 @@ CHANNELS = {
 """Sources by the name of the sensors' parameter."""
 
 
-class Errors(ABC):
+class ErrorContributions(ABC):
     """An estimate's covariance by source of error, in the coordinates of the estimate.
 
     Examples
     --------
-    >>> class Two(Errors):
+    >>> class Two(ErrorContributions):
     ...     contributions = {"noise": np.eye(2), "exponent": np.diag([3.0, np.inf])}
     ...     def dof(self, direction, source=None):
     ...         return np.inf

@@ -42,7 +42,7 @@ from dahl_ident.diagnostics.contributions import (
     NOISE,
     RUNS,
     TESTS,
-    Errors,
+    ErrorContributions,
     positive_part,
     satterthwaite,
 )
@@ -92,7 +92,7 @@ class RunJackknife(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ErrorModel(Errors):
+class ErrorModel(ErrorContributions):
     """The estimate, and its covariance by every source of error."""
 
     optimum: Optimum  # the least-squares fit that it started from

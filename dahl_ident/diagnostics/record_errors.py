@@ -14,7 +14,7 @@ from dahl_ident.diagnostics.contributions import (
     MODEL_ERROR,
     NOISE,
     RUNS,
-    Errors,
+    ErrorContributions,
     variances,
 )
 from dahl_ident.diagnostics.correlated_residuals import sandwich
@@ -46,7 +46,7 @@ _NOT_FOUND = ", though it was not given: with another no motion was found"
 
 
 @dataclass(frozen=True)
-class RecordErrors(Errors):
+class RecordErrors(ErrorContributions):
     """Covariance of the estimate, source by source.
 
     Attributes

@@ -225,7 +225,7 @@ def solve_ipopt(
     # as the search ended: by a sine where no steady motion exists, freed of a record's delay
     problem = begin.problem if problem is plain else problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
-    search = _Search(problem, relations, loss, begin.scale if adapts else 1.0)
+    search = _Descent(problem, relations, loss, begin.scale if adapts else 1.0)
     end = search.best(begin)
     if adapts and relations.texts:
 
@@ -253,7 +253,7 @@ class _End:
     """Which inequalities hold with equality."""
 
 
-class _Search:
+class _Descent:
     """Runs of IPOPT on one problem with its constraints, loss and scale of the noise."""
 
     def __init__(self, problem: Problem, relations: Relations, loss: str, scale: float) -> None:
