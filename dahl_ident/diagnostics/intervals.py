@@ -208,6 +208,8 @@ def combined_intervals(
 def natural_sizes(optimum: Optimum) -> FloatArray:
     """Return the size in theta that a standard deviation is compared with: 1 for logarithms."""
     problem = optimum.problem
+    if problem.space.positive.all():
+        return np.ones(optimum.theta.size)
     slope = np.abs(problem.prediction_jacobian(optimum.theta))
     response = np.abs(problem.predict(optimum.theta))[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):

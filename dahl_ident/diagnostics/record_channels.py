@@ -8,7 +8,7 @@ encoder between its lines, is hidden by the motion, but not in the residuals aft
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -47,12 +47,14 @@ WINDOW = "window of differentiation"
 IntArray = NDArray[np.intp]
 
 
-def motion_sources(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
+def motion_sources(
+    fit: LinearFit, other_motions: Mapping[str, Sequence[FloatArray]]
+) -> Iterator[tuple[str, FloatArray]]:
     """Yield what errors of the motion contribute, where they widen an interval of the model's.
 
     Noise in a measured displacement counts as far as it shifts the estimate; where the residuals
     show larger errors of the displacement at turning points, what these shift beyond that; and so
-    does what samples miss of the turning points that lie between them.
+    do the changes of the outputs by `other_motions`.
     """
     problem = fit.problem
     if "delay" not in problem.calibration:
@@ -63,8 +65,8 @@ def motion_sources(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
     moved = np.zeros(fit.inverse.shape)
     for name, moved in _if_it_matters(fit, DISPLACEMENT, _by_displacement(fit)):
         yield name, moved
-    for name, other in other_motions(problem):
-        yield from _if_it_matters(fit, name, _squared(fit.change_to(other)))
+    for name, changes in other_motions.items():
+        yield from _if_it_matters(fit, name, _squared(fit.projected(changes)))
     if problem.with_memory and not problem.displacement_noise:
         u2 = fit.by_noise[0].diagonal()
         unit = np.sqrt(np.where(np.isfinite(u2) & (u2 > 0.0), u2, 1.0))
@@ -73,14 +75,19 @@ def motion_sources(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
         yield from _if_it_matters(fit, TURNS, beyond)
 
 
-def other_motions(problem: RecordProblem) -> Iterator[tuple[str, RecordProblem]]:
-    """Yield problems whose motion may as well be the right one, by the source of the difference."""
-    if problem.output != "force":
-        return
-    if not problem.model.rate_independent:
-        yield WINDOW, problem.differentiated_in(_OTHER_WINDOW * problem.window)
-    if problem.with_memory and not problem.displacement_noise:
-        yield SAMPLING, problem.altered("latest", motions=_beyond_samples(problem))
+def by_other_motions(fit: LinearFit) -> dict[str, Sequence[FloatArray]]:
+    """Return how the outputs change by motions that may as well be right, by what makes them.
+
+    That is what samples miss of the turning points between them, and the window of differentiation.
+    """
+    problem, changes = fit.problem, dict[str, Sequence[FloatArray]]()
+    if problem.output == "force" and not problem.model.rate_independent:
+        other = problem.differentiated_in(_OTHER_WINDOW * problem.window)
+        changes[WINDOW] = fit.difference_to(other)
+    if problem.output == "force" and problem.with_memory and not problem.displacement_noise:
+        other = problem.altered("latest", motions=_beyond_samples(problem))
+        changes[SAMPLING] = fit.difference_to(other)
+    return changes
 
 
 def _if_it_matters(

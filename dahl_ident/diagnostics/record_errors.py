@@ -26,6 +26,7 @@ from dahl_ident.diagnostics.record_channels import (
     FORCE,
     by_calibration,
     by_drive,
+    by_other_motions,
     motion_sources,
 )
 from dahl_ident.diagnostics.record_misfit import MotionMisfit, motion_misfit
@@ -142,8 +143,10 @@ def record_errors(
     exponents = held_exponents(fit)
     if assumed := [one.contribution for one in exponents if one.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
-    sources |= dict(motion_sources(fit))
-    known, misfit = np.asarray(sum(sources.values())), motion_misfit(fit)
+    other_motions = by_other_motions(fit)
+    sources |= dict(motion_sources(fit, other_motions))
+    known = np.asarray(sum(sources.values()))
+    misfit = motion_misfit(fit, other_motions.values())
     if misfit is not None:
         larger = misfit.covariance.diagonal() > _SHORTENS**2 * known.diagonal()
         if larger[fit.judged].any():

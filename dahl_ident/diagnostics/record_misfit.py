@@ -11,7 +11,7 @@ directions of the parameters, where no residual shows it, as it is in others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,6 @@ from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in
-from dahl_ident.diagnostics.record_channels import other_motions
 from dahl_ident.diagnostics.record_sources import LinearFit
 from dahl_ident.elements import Friction
 from dahl_ident.elements.recursion import linear_recursion, stretches
@@ -65,10 +64,13 @@ class MotionMisfit:
     functions: int
 
 
-def motion_misfit(fit: LinearFit) -> MotionMisfit | None:
+def motion_misfit(
+    fit: LinearFit, other_motions: Collection[Sequence[FloatArray]]
+) -> MotionMisfit | None:
     """Return the model error that the residuals show as functions of the motion's state.
 
-    None where chance explains what the residuals follow.
+    What the delay explains needs no model error, nor do the changes of the outputs by
+    `other_motions`. None where chance explains what the residuals follow.
     """
     problem, values, residuals = fit.problem, fit.values, fit.residuals
     slopes = fit.exponent_slopes
@@ -76,11 +78,14 @@ def motion_misfit(fit: LinearFit) -> MotionMisfit | None:
     freed = fit.with_freed(*assumed)
     ends, count = np.cumsum([e.size for e in residuals])[:-1], values.size
     J, e = np.concatenate(freed.jacobians), np.concatenate(residuals)
-    known = _basis(np.column_stack([J, *_by_channels(fit)]))
+    channels = [np.concatenate(changes) for changes in other_motions]
+    with suppress(FitError):  # no motion next to the estimate
+        channels.append(np.concatenate(fit.delay_slopes))
+    known = _basis(np.column_stack([J, *channels]))
     e = e - known @ (known.T @ e)
     waves = dict[str, FloatArray]()
     try:
-        parts = [_functions(problem, values, number) for number in range(len(problem.records))]
+        parts = [_functions(fit, number) for number in range(len(problem.records))]
     except FitError:  # no motion next to the estimate
         return None
     for name in parts[0]:
@@ -114,17 +119,6 @@ def motion_misfit(fit: LinearFit) -> MotionMisfit | None:
     return MotionMisfit(covariance, follows, *found[follows])
 
 
-def _by_channels(fit: LinearFit) -> Iterator[FloatArray]:
-    """Yield how errors of the motion that need no model error change the outputs, (n,) each."""
-    problem = fit.problem
-    with suppress(FitError):  # no motion next to the estimate
-        slopes = problem.delay_slopes(fit.values)
-        yield np.concatenate([problem.filtered(slope) for slope in slopes])
-    for _, other in other_motions(problem):
-        ends = zip(fit.outputs, other.outputs(fit.values), strict=True)
-        yield np.concatenate([problem.filtered(b - a) for a, b in ends])
-
-
 def _samples_of(noise: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> float:
     """Return how many samples of white noise would show the noise's variance as well."""
     lost, total = 0.0, 0.0
@@ -146,14 +140,15 @@ def _part(waves: FloatArray, least: float) -> FloatArray:
     return np.asarray(vectors[:, sizes > least])
 
 
-def _functions(problem: RecordProblem, values: FloatArray, number: int) -> dict[str, FloatArray]:
+def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
     """Return what forces that depend on the state add to the output of record `number`, (n, k)."""
+    problem, values = fit.problem, fit.values
     record = problem.records[number]
-    plain = problem.outputs(values)[number]
     if problem.output == "force":
         x, v, _ = problem.motions[number]
         x = x if problem.paths is None else problem.paths[number]
         return _forces(problem, values, x, v if v.size else np.gradient(x, record.time))
+    plain = fit.outputs[number]
     step = _STEP * float(problem.unit_sizes((1, 0, 0))[number])
 
     def moved(force: FloatArray) -> FloatArray:

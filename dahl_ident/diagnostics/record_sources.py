@@ -121,10 +121,15 @@ class LinearFit:
         """Return the change of the estimate by changes of the measured outputs."""
         return self.projected([self.problem.filtered(y) for y in outputs])
 
-    def change_to(self, other: RecordProblem) -> FloatArray:
-        """Return the change of the estimate if another problem is the right one."""
+    def difference_to(self, other: RecordProblem) -> Sequence[FloatArray]:
+        """Return how the filtered outputs change if another problem is the right one."""
         ends = zip(self.outputs, other.outputs(self.values), strict=True)
-        return self.changed([b - a for a, b in ends])
+        return [self.problem.filtered(b - a) for a, b in ends]
+
+    @cached_property
+    def delay_slopes(self) -> Sequence[FloatArray]:
+        """Derivatives of the filtered outputs with respect to the delay, per second."""
+        return [self.problem.filtered(slope) for slope in self.problem.delay_slopes(self.values)]
 
     @cached_property
     def variances(self) -> FloatArray:
@@ -240,8 +245,7 @@ def by_delay(fit: LinearFit) -> FloatArray:
     estimated delay is taken out already.
     """
     sample = 1.0 / fit.problem.records[0].sample_rate
-    slopes = fit.problem.delay_slopes(fit.values)
-    freed = _Freed.of(fit, [fit.problem.filtered(slope * sample) for slope in slopes])
+    freed = _Freed.of(fit, [sample * slope for slope in fit.delay_slopes])
     return freed.counted(freed.asked, 1.0)[1]
 
 
@@ -334,37 +338,22 @@ def _beyond(
     if seen.size < len(noise):
         visible, inside = [(J[:, seen], e) for J, e in blocks], noise[np.ix_(seen, seen)]
         excess = _beyond(visible, inside, judged[seen], level)
-        return None if excess is None else _embedded(excess, seen, len(noise))
+        if excess is None:
+            return None
+        whole = np.zeros(noise.shape)
+        whole[np.ix_(seen, seen)] = excess
+        return whole
     size = np.sqrt(noise.diagonal())
     scores = [size * (J.T @ e) for J, e in blocks]
     parts = [np.outer(size, size) * (J.T @ J) for J, _ in blocks]
     inverse = np.linalg.inv(sum(parts))
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
+    by_chance = noise / np.outer(size, size)
+    # how much each block says of each parameter
     weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
-    return _excess(between, noise / np.outer(size, size), weights, judged, level, size)
-
-
-def _excess(
-    between: FloatArray,
-    by_chance: FloatArray,
-    weights: FloatArray,
-    judged: NDArray[np.bool_],
-    level: float,
-    size: FloatArray,
-) -> FloatArray | None:
-    """Return what scatter exceeds that by chance, both in units of `size`; None where it does not.
-
-    Of each of the parameters that are judged, `weights` (blocks, P) say how much each block says.
-    """
     dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
     ratio = between.diagonal() / by_chance.diagonal()
     if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[judged].any():
         return None
-    return positive_part(between - by_chance) * np.outer(size, size)
-
-
-def _embedded(part: FloatArray, places: NDArray[np.intp], size: int) -> FloatArray:
-    whole = np.zeros((size, size))
-    whole[np.ix_(places, places)] = part
-    return whole
+    return np.asarray(positive_part(between - by_chance) * np.outer(size, size))
