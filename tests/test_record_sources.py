@@ -191,7 +191,7 @@ def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted():
 def test_the_posterior_of_an_approximate_fit_is_approximate():
     fit = di.fit(held(DAHL, 1, power=0.1), di.Dahl())
     assert fit.status.value == "approximate"
-    found = di.posterior(fit, seed=1, steps=400, walkers=32)
+    found = di.posterior(fit, seed=1, steps=600, walkers=32)
     assert found.converged
     assert found.status.value == "approximate"
     assert "The misfit exceeds the noise" in found.verdict

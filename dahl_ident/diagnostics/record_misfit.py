@@ -17,11 +17,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in
-from dahl_ident.diagnostics.record_sources import LinearFit
+from dahl_ident.diagnostics.record_sources import LinearFit, blocks_of
 from dahl_ident.elements import Friction
 from dahl_ident.elements.recursion import linear_recursion, stretches
 from dahl_ident.errors import FitError
@@ -32,6 +33,7 @@ _FALSE_ALARM = 1e-3  # of all functions together; wrong laws are far beyond it
 _SEEN = 0.01  # of a function's size: less of it is not a parameter's doing, or rounding
 _LEVELS = np.linspace(-1.0, 1.0, 7)  # of the friction force in the direction of motion
 _SPEEDS = 2.0 ** np.arange(1, 4)  # of the highest speed, inverse
+_BLOCKS = 60  # of all records, in which the noise may differ: many more than functions
 _STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
 FRICTION, VELOCITY, DISPLACEMENT = "the friction force", "the velocity", "the displacement"
 REMEDY = {
@@ -93,6 +95,8 @@ def motion_misfit(
         waves[name] = _basis(wave, _SEEN)
     beyond = {name: _part(B - known @ (known.T @ B), _SEEN) for name, B in waves.items()}
     gain = freed.inverse[:count] @ J.T
+    starts = np.append(0, ends)
+    blocks = [starts[number] + rows for number, rows in blocks_of(residuals, _BLOCKS)]
     covariance, found = np.zeros((count, count)), dict[str, tuple[float, int]]()
     for name, Q in beyond.items():
         left = e - Q @ (Q.T @ e)
@@ -102,21 +106,36 @@ def motion_misfit(
         noise = noise_in(np.split(whole, ends), np.split(left, ends))
         dof = max(_samples_of(noise, residuals) - whole.shape[1], 1.0)
         pieces = zip(np.split(Q, ends), noise, strict=True)
-        by_noise = sum(q.T @ correlated(q, c) for q, c in pieces)
+        by_noise = np.asarray(sum(q.T @ correlated(q, c) for q, c in pieces))
         seen = Q.T @ e
         square = float(seen @ np.linalg.solve(by_noise, seen))
-        chance = special.fdtrc(Q.shape[1], dof, square / Q.shape[1])
+        expected = Q.shape[1] * max(_between_blocks(Q, left, blocks, by_noise), 1.0)
+        chance = special.fdtrc(Q.shape[1], dof, square / expected)
         if not chance < _FALSE_ALARM / len(beyond):
             continue
         along = Q.T @ waves[name]
         unit = float(np.trace(np.linalg.solve(by_noise, along @ along.T)))
         moved = gain @ waves[name]
-        covariance += (square - Q.shape[1]) / unit * moved @ moved.T
+        covariance += (square - expected) / unit * moved @ moved.T
         found[name] = float(seen @ seen) / float(e @ e), Q.shape[1]
     if not found:
         return None
     follows = max(found, key=lambda name: found[name][0])
     return MotionMisfit(covariance, follows, *found[follows])
+
+
+def _between_blocks(
+    Q: FloatArray, left: FloatArray, blocks: Sequence[NDArray[np.intp]], by_noise: FloatArray
+) -> float:
+    """Return the variance of what is fitted to the residuals, by blocks, over that `by_noise`.
+
+    Noise that a plant lets pass while it slips, and not while it sticks, is not the same all along
+    a record. Each block's residuals are those of a fit without it.
+    """
+    one = np.eye(Q.shape[1])
+    scores = [np.linalg.pinv(one - Q[b].T @ Q[b]) @ Q[b].T @ left[b] for b in blocks]
+    squares = [float(score @ np.linalg.solve(by_noise, score)) for score in scores]
+    return float(sum(squares) / Q.shape[1])
 
 
 def _samples_of(noise: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> float:

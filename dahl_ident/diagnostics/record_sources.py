@@ -293,14 +293,16 @@ def between_blocks(fit: LinearFit) -> FloatArray | None:
     return _beyond(blocks, fit.by_noise[0], fit.judged, _LEVEL)
 
 
-def blocks_of(waves: Sequence[FloatArray]) -> list[tuple[int, NDArray[np.intp]]]:
+def blocks_of(
+    waves: Sequence[FloatArray], blocks: int = BLOCKS
+) -> list[tuple[int, NDArray[np.intp]]]:
     """Return the number of each block's record, and the block's samples in it."""
     samples = sum(len(wave) for wave in waves)
     return [
         (number, rows)
         for number, wave in enumerate(waves)
         for rows in np.array_split(
-            np.arange(len(wave)), max(1, round(BLOCKS * len(wave) / samples))
+            np.arange(len(wave)), max(1, round(blocks * len(wave) / samples))
         )
     ]
 
