@@ -211,6 +211,7 @@ def minimise(
         settled = moves * np.minimum(1.0, moves / last) <= shortest
         settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
+        settled &= predicted <= at.cost  # a larger fall is rounding
         short = settled
         if bounds is not None:  # far steps of what hardly has an effect may lead anywhere
             short = short & (np.abs(step) <= _NEAR * (bounds[1] - bounds[0])).all(axis=1)
