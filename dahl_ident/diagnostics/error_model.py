@@ -24,7 +24,7 @@ Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Huber, *Robu
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -55,8 +55,6 @@ from dahl_ident.diagnostics.error_sources import (
     rows_of_tests,
 )
 from dahl_ident.diagnostics.estimate import (
-    GAIN,
-    Assumption,
     WeightedEstimate,
     jackknife_by_refits,
     weighted_estimate,
@@ -64,7 +62,7 @@ from dahl_ident.diagnostics.estimate import (
 )
 from dahl_ident.diagnostics.held_out import HeldOut, held_out
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood, suspicious_points
-from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState, unit_covariances
+from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.residual_space import (
     ResidualSpace,
     RunDeviations,
@@ -133,11 +131,12 @@ class ErrorModel(ErrorContributions):
     @property
     def distinguishes_noise(self) -> bool:
         """Whether there are enough residuals to distinguish a model error from noise."""
-        return _distinguishes_noise(self.problem, self.assumed)
+        return self.problem.n_numbers - len(self.names) + len(self.assumed) >= _LEAST_DOF
 
-    def _of_theta(self, changes: FloatArray) -> FloatArray:
-        basis = self.estimate.basis
-        return changes if basis is None else basis.matrix @ changes
+    @property
+    def labels(self) -> list[str]:
+        """The name of the source that each variance is of."""
+        return [NOISE] * self.state.model.noises + [source.name for source in self.sources]
 
     @cached_property
     def values(self) -> Mapping[str, float]:
@@ -178,8 +177,7 @@ class ErrorModel(ErrorContributions):
         if source == EXPONENT:
             slopes = slopes - exact
         elif source is not None:
-            names = [NOISE] * self.state.model.noises + [s.name for s in self.sources]
-            slopes = exact * [name == source for name in names]
+            slopes = exact * [name == source for name in self.labels]
         spread = float(slopes @ self.state.variances_covariance @ slopes)
         if TESTS in sizes:
             spread += 2.0 * sizes[TESTS] ** 2 / (self.tests - 1)
@@ -199,10 +197,7 @@ class ErrorModel(ErrorContributions):
             value if self.holds(name) else known.get(name, value)
             for name, value in self.values.items()
         ]
-        C = self.covariance.copy()
-        open_ = [i for i, name in enumerate(self.names) if not self.holds(name)]
-        C[open_] = C[:, open_] = 0.0
-        C[open_, open_] = np.inf
+        C = blanked(self.covariance, np.array([not self.holds(name) for name in self.names]))
         y, m = problem.residuals(theta), problem.n_residuals
         scale, loss = 1.0, self.estimate.loss
         if not problem.scale_known:
@@ -246,7 +241,7 @@ class ErrorModel(ErrorContributions):
             place = places.index(self.sources[k].per_test)
             effects[:, place] = predicted[self.state.model.columns(k)]
             spread[place] = self.variances[k] ** 0.5
-        mean = -self._of_theta(predicted[: self.state.model.parameters])
+        mean = -self.estimate.directions @ predicted[: self.state.model.parameters]
         noise = float(self.noises[0] ** 0.5) * self.estimate.scale
         return run_deviations(self.estimate, mean, effects, spread, noise)
 
@@ -290,7 +285,7 @@ class ErrorModel(ErrorContributions):
             return 1.0
         model = self.state.model
         shared = [k for k, source in enumerate(self.sources) if source.per_test]
-        null = model.without(set(range(len(self.sources))) - set(shared))
+        null = model.only(shared)
         variances = np.zeros(model.count)
         kept = [*range(model.noises), *(model.noises + k for k in shared)]
         variances[kept] = null.reml(np.ones(len(shared))).variances
@@ -344,51 +339,55 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
 def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) -> ErrorModel:
     problem, assumed = with_assumed(problem)
     estimate = weighted_estimate(optimum, problem, determined=determined)
+    few = problem.n_numbers - len(problem.names) + len(assumed) < _LEAST_DOF
     sources: tuple[Source, ...] = ()
-    if _distinguishes_noise(problem, assumed):
+    if not few:
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
     state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
-    as_stated = problem.scale_known and estimate.misfit == 0.0
-    if as_stated and not _distinguishes_noise(problem, assumed):  # too few to doubt the noise
+    if few and problem.scale_known and estimate.misfit == 0.0:  # too few to doubt the noise
         state = state.model.at(np.zeros(state.model.count))
     noises = state.model.noises
-    kept = np.flatnonzero(state.variances[noises:] > 0.0)
-    sources = tuple(sources[k] for k in kept)
-    state = _mixed(estimate, sources).at(state.variances[[*range(noises), *(noises + kept)]])
-    levers = _levers(estimate, assumed)
+    shown = np.flatnonzero(state.variances[noises:] > 0.0)
+    sources = tuple(sources[k] for k in shown)
+    state = state.model.only(shown).at(state.variances[[*range(noises), *(noises + shown)]])
+    regular, exponents = estimate.basis is None, set[str]()
+    if regular:
+        exponents = {name for name, one in assumed.items() if one.source == EXPONENT}
     tests = rows_of_tests(problem.data)
-    by_tests = None if estimate.basis is not None else estimate.jackknife(tests)
-    parts = [unit_covariances(state, lever) for lever in levers]
+    by_tests = estimate.jackknife(tests) if regular else None
+    parts = [_propagated(estimate.lever(exact), state) for exact in (set[str](), exponents)]
+    model = [k for k, one in enumerate(sources, noises) if one.name == MODEL_ERROR]
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
-        model = [k for k, s in enumerate(sources, noises) if s.name == MODEL_ERROR]
-        size = np.einsum("kii,k->i", parts[0][0][model], state.variances[model])
+        size = np.einsum("kii,k->i", parts[0].units[model], state.variances[model])
         most = _SHARED_BY * np.diagonal(by_tests)
         limit = np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most))
-        for each, _ in parts:
-            each[model] *= np.outer(limit, limit)
-    every, without_exponents = (
-        _by_source(problem, assumed, sources, state, lever, *part)
-        for lever, part in zip(levers, parts, strict=True)
-    )
-    by_runs = None
-    if estimate.basis is None and len(problem.data.runs or ()) > 1:
-        runs = rows_of(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
-        by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
-    ranged = any(one.source == EXPONENT for one in assumed.values())
-    if estimate.basis is None and ranged:
-        total = np.asarray(sum(every.values()))
-        added = positive_part(total - np.asarray(sum(without_exponents.values())))
-        every = {**without_exponents, EXPONENT: without_exponents.get(EXPONENT, 0.0) + added}
+        for part in parts:
+            part.units[model] *= np.outer(limit, limit)
+    names = [source.name for source in sources]
+    priors = [CHANNELS.get(name, name) for name in problem.priors]
+    priors += [one.source for one in assumed.values()]
+    every, exact = (part.by_source(names, priors, state) for part in parts)
+    if exponents:
+        added = np.asarray(sum(every.values())) - np.asarray(sum(exact.values()))
+        every = {**exact, EXPONENT: positive_part(added)}
     if estimate.second is not None:
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
         if estimate.misfit > 0.0 and len(tests) <= _MOST_REFITS:
             by_tests = jackknife_by_refits(estimate, optimum, problem, tests)
-        every = _at_least(every, by_chance**2 * by_tests)
+        C, least = np.asarray(sum(every.values())), by_chance**2 * np.diagonal(by_tests)
+        u2 = np.diagonal(C)
+        wider = np.sqrt(np.divide(least, u2, out=np.ones(len(C)), where=(least > u2) & (u2 > 0.0)))
+        if (wider > 1.0).any():
+            every[TESTS] = positive_part(C * np.outer(wider, wider) - C)
+    by_runs = None
+    if regular and len(problem.data.runs or ()) > 1:
+        runs = rows_of(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
+        by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     return ErrorModel(
         optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed),
-        (parts[0][0], parts[1][0]), by_runs,
+        (parts[0].units, parts[1].units), by_runs,
     )  # fmt: skip
 
 
@@ -419,52 +418,39 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
     return MixedModel(estimate.y, estimate.columns, Z, group, np.array(known), 1 + both, most)
 
 
-def _levers(estimate: WeightedEstimate, assumed: Collection[str]) -> tuple[FloatArray, FloatArray]:
-    """Return d theta/d residuals, (Q, M), with assumed exponents estimated and with them exact."""
-    G = estimate.lever()
-    if estimate.basis is not None:
-        G = estimate.basis.matrix @ G
-        return G, G
-    ranged = [name in assumed and name != GAIN for name in estimate.problem.names]
-    if not any(ranged):
-        return G, G
-    kept = np.flatnonzero(~np.array(ranged))
-    without_exponents = np.zeros(G.shape)
-    without_exponents[kept] = estimate.lever(estimate.jacobian[:, kept])
-    return G, without_exponents
+class _Propagated(NamedTuple):
+    """Covariances of theta that residuals make by a lever."""
+
+    units: FloatArray  # (count, Q, Q): by each variance at unit size
+    known: FloatArray  # (Q, Q): by known noise
+    priors: FloatArray  # (Q, n_priors): changes of theta by priors
+
+    def by_source(
+        self, sources: Sequence[str], priors: Sequence[str], state: MixedState
+    ) -> dict[str, FloatArray]:
+        """Return the covariance of theta by the name of a source."""
+        by_source, noises = {NOISE: self.known}, [NOISE] * state.model.noises
+        parts = [
+            *zip([*noises, *sources], state.variances[:, None, None] * self.units, strict=True),
+            *zip(priors, map(_square, self.priors.T[:, :, None]), strict=True),
+        ]
+        for name, part in parts:
+            by_source[name] = by_source.get(name, 0.0) + part
+        return by_source
 
 
-def _by_source(
-    problem: TableProblem,
-    assumed: Mapping[str, Assumption],
-    sources: Sequence[Source],
-    state: MixedState,
-    lever: FloatArray,
-    each: FloatArray,
-    known: FloatArray,
-) -> dict[str, FloatArray]:
-    """Return the covariance of theta that each source makes by the lever (Q, M) of residuals."""
-    noises = state.model.noises
-    by_source = {NOISE: known[:noises].sum(axis=0)}
-    names = [NOISE] * noises + [source.name for source in sources]
-    for name, part, variance in zip(names, each, state.variances.tolist(), strict=True):
-        by_source[name] = by_source.get(name, 0.0) + variance * part
-    priors = [CHANNELS.get(name, name) for name in problem.priors]
-    priors += [one.source for one in assumed.values()]
-    for row, name in enumerate(priors, start=problem.n_residuals):
-        by_source[name] = by_source.get(name, 0.0) + np.outer(lever[:, row], lever[:, row])
-    return by_source
+def _propagated(lever: FloatArray, state: MixedState) -> _Propagated:
+    """Return the covariances that the lever (Q, M) makes of noise, sources and priors."""
+    model, G = state.model, state.model.noises
+    noise = [_square(lever[:, model.group == g]) for g in range(G)]
+    moved = lever @ model.U
+    sources = [_square(moved[:, model.columns(k)]) for k in range(model.count - G)]
+    known = np.tensordot(model.known[:G], np.array(noise), 1)
+    return _Propagated(np.array([*noise, *sources]), known, lever[:, model.group >= G])
 
 
-def _at_least(contributions: dict[str, FloatArray], least: FloatArray) -> dict[str, FloatArray]:
-    """Return the contributions with one more where they are below the `least` covariance."""
-    C = np.asarray(sum(contributions.values()))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        wider = np.sqrt(np.maximum(np.diagonal(least) / np.diagonal(C), 1.0))
-    wider = np.where(np.isfinite(wider), wider, 1.0)
-    if not (wider > 1.0).any():
-        return contributions
-    return {**contributions, TESTS: positive_part(C * np.outer(wider, wider) - C)}
+def _square(columns: FloatArray) -> FloatArray:
+    return np.asarray(columns @ columns.T)
 
 
 def no_narrower(
@@ -485,7 +471,3 @@ def no_narrower(
     narrow = least > np.where(np.isinf(dof), special.ndtri(_UPPER), special.stdtrit(dof, _UPPER))
     fewer = special.stdtridf(_UPPER, np.where(narrow, least, 3.0))  # 3: any above 2
     return np.where(narrow, np.maximum(fewer, 1.0), dof)
-
-
-def _distinguishes_noise(problem: TableProblem, assumed: Collection[str]) -> bool:
-    return problem.n_numbers - len(problem.names) + len(assumed) >= _LEAST_DOF

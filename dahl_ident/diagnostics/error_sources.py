@@ -214,6 +214,11 @@ class Source:
         """Whether it is a force in parallel with the model."""
         return self.shapes is not None and self.shapes.parallel
 
+    @property
+    def kind(self) -> tuple[bool, str]:
+        """What distinguishes it from other model errors."""
+        return self.parallel, "" if self.rate_of is None else self.rate_of[0]
+
     def changes(
         self,
         names: Sequence[str],
@@ -236,14 +241,19 @@ class Source:
         made = parts(self.shapes.changes(where, ratio).T)
         return made if self.absorbed is None else made - parts(slopes) @ self.absorbed
 
-    def drawn(self, names: Sequence[str], slopes: ComplexArray) -> FloatArray:
-        """Return the covariance of ln gain and phase that a new test draws at unit variance."""
+    def drawn(
+        self, names: Sequence[str], slopes: ComplexArray, near: NDArray[np.intp], units: FloatArray
+    ) -> FloatArray | None:
+        """Return ln gain and phase (n, 2, q) that a new test draws at unit variance, if it does.
+
+        Its noise is that of the rows `near`, where `units` turn residuals into ln gain and phase.
+        """
+        if self.name == NOISE:
+            return np.asarray(units @ self.columns[2 * near[:, None] + np.arange(2)])
         if self.per_test in names:
-            part = parts(slopes[:, [names.index(self.per_test)]])
-            return np.asarray(part @ part.swapaxes(1, 2))
-        return np.diag(
-            [float(self.per_test not in ("", "phase")), float(self.per_test not in ("", "gain"))]
-        )
+            return parts(slopes[:, [names.index(self.per_test)]])
+        kept = [self.per_test not in ("", "phase"), self.per_test not in ("", "gain")]
+        return np.diag(np.array(kept, dtype=np.float64)) if any(kept) else None
 
 
 def parts(relative: ComplexArray) -> FloatArray:

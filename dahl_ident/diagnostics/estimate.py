@@ -18,7 +18,7 @@ Journal of Research of the National Bureau of Standards 87 (1982) 377.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -191,9 +191,14 @@ class WeightedEstimate:
         return scores_of(self.residuals, self.problem.n_residuals, self.loss)
 
     @property
+    def directions(self) -> FloatArray:
+        """Changes of theta that the data determine, (Q, r)."""
+        return np.eye(len(self.theta)) if self.basis is None else self.basis.matrix
+
+    @property
     def columns(self) -> FloatArray:
         """Derivatives with respect to what the data determine, (M, r)."""
-        return self.jacobian if self.basis is None else self.jacobian @ self.basis.matrix
+        return self.jacobian @ self.directions
 
     def changed(self, changes: ComplexArray) -> FloatArray:
         """Return the changes of `y`, (M, k), by changes (k, n) of the measured responses."""
@@ -228,13 +233,13 @@ class WeightedEstimate:
         units = np.linalg.pinv(both[: self.problem.n_residuals].reshape(-1, 2, 2))
         return np.asarray(units, dtype=np.float64)
 
-    def lever(
-        self, columns: FloatArray | None = None, kept: NDArray[np.bool_] | None = None
-    ) -> FloatArray:
-        """Return G = (J'J)^-1 J' (r, M), for other columns or of some rows."""
-        J = self.columns if columns is None else columns
-        Q, R = np.linalg.qr(J if kept is None else J * kept[:, None])
-        return np.linalg.solve(R, Q.T)
+    def lever(self, left_out: Collection[str] = ()) -> FloatArray:
+        """Return G = (J'J)^-1 J', d theta/d y (Q, M), some parameters left out: exact."""
+        kept = self.directions
+        if left_out:
+            kept = kept[:, [name not in left_out for name in self.problem.names]]
+        Q, R = np.linalg.qr(self.jacobian @ kept)
+        return np.asarray(kept @ np.linalg.solve(R, Q.T))
 
     def without(self, left_out: NDArray[np.intp]) -> WeightedEstimate:
         """Return the estimate without some residuals: a Gauss-Newton step, which is short."""

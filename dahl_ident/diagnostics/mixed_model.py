@@ -19,7 +19,7 @@ Henderson, Biometrics 31 (1975) 423; Searle, Casella and McCulloch, *Variance Co
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -72,15 +72,17 @@ class MixedModel:
         ends = [*self.starts.tolist(), self.U.shape[1]]
         return slice(ends[k], ends[k + 1])
 
-    def without(self, left_out: Collection[int]) -> MixedModel:
-        """Return the model without some of its sources."""
-        return self.elsewhere(self.y, self.U[:, : self.parameters], left_out)
+    def only(self, kept: Iterable[int]) -> MixedModel:
+        """Return the model with some of its sources."""
+        return self.elsewhere(self.y, self.U[:, : self.parameters], kept)
 
-    def elsewhere(self, y: FloatArray, J: FloatArray, left_out: Collection[int] = ()) -> MixedModel:
-        """Return the sources with residuals and derivatives at other parameters."""
-        kept = [k for k in range(len(self.starts)) if k not in left_out]
-        Z = [self.U[:, self.columns(k)] for k in kept]
-        most = self.most[self.noises :][kept]
+    def elsewhere(
+        self, y: FloatArray, J: FloatArray, kept: Iterable[int] | None = None
+    ) -> MixedModel:
+        """Return the sources, or some, with residuals and derivatives at other parameters."""
+        those = list(range(len(self.starts)) if kept is None else kept)
+        Z = [self.U[:, self.columns(k)] for k in those]
+        most = self.most[self.noises :][those]
         return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
 
     def at(self, variances: FloatArray) -> MixedState:
@@ -354,17 +356,3 @@ class MixedState:
             if s > 0.0:
                 slopes[model.noises + k] = np.sum(XK[..., model.columns(k)] ** 2, 2) / s**2
         return XK @ X.swapaxes(1, 2), slopes
-
-
-def unit_covariances(state: MixedState, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of lever . y from each source at unit variance, and from known noise.
-
-    For a lever (P, m): (count, P, P), and (groups, P, P).
-    """
-    model = state.model
-    parts = [lever[:, model.group == g] for g in range(len(model.known))]
-    squares = np.array([part @ part.T for part in parts])
-    moved = lever @ model.U
-    sources = [moved[:, model.columns(k)] for k in range(len(model.starts))]
-    each = [*squares[: model.noises], *(part @ part.T for part in sources)]
-    return np.array(each), model.known[:, None, None] * squares

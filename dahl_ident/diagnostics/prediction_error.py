@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS, satterthwaite
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
-from dahl_ident.diagnostics.error_sources import Source, error_sources, parts, places
-from dahl_ident.diagnostics.mixed_model import MixedModel
+from dahl_ident.diagnostics.error_sources import error_sources, parts, places
 from dahl_ident.problem import TableProblem
 
 _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
@@ -52,7 +51,7 @@ def prediction_error(
     where = places(amplitude, omega)
     by_theta = parts(slopes)
     X = np.zeros((len(slopes), 2, model.U.shape[1]))
-    X[..., : model.parameters] = -by_theta if basis is None else -by_theta @ basis.matrix
+    X[..., : model.parameters] = -by_theta @ errors.estimate.directions
     for k, source in enumerate(errors.sources):
         made = source.changes(names, slopes, where, stiffness)
         if made is not None:
@@ -61,22 +60,16 @@ def prediction_error(
     if TESTS in errors.contributions:
         covariance = covariance + by_theta @ errors.contributions[TESTS] @ by_theta.swapaxes(1, 2)
     if of_a_test:
-        for k, source in enumerate(errors.sources):
-            if source.per_test:
-                drawn = np.broadcast_to(source.drawn(names, slopes), covariance.shape)
-                covariance = covariance + errors.variances[k] * drawn
-                by_variance[model.noises + k] += _diagonal(drawn)
         near = _nearest(errors.problem, amplitude, omega)
-        noise = _row_noise(errors.estimate.relative_units[near])
-        covariance = covariance + errors.noises[0] * noise
-        by_variance[0] += _diagonal(noise)
-        for k, source in enumerate(errors.sources):
-            if source.name == NOISE:
-                n = errors.problem.data.n
-                rows = source.columns[: 2 * n].reshape(n, 2, -1)
-                drawn = _row_noise(errors.estimate.relative_units[near] @ rows[near])
-                covariance = covariance + errors.variances[k] * drawn
-                by_variance[model.noises + k] += _diagonal(drawn)
+        units = errors.estimate.relative_units[near]
+        sizes = [*errors.noises, *errors.variances]
+        drawn = [units, *[None] * (model.noises - 1)]
+        drawn += [source.drawn(names, slopes, near, units) for source in errors.sources]
+        for k, made in enumerate(drawn):
+            if made is not None:
+                square = np.broadcast_to(made @ made.swapaxes(-1, -2), covariance.shape)
+                covariance = covariance + sizes[k] * square
+                by_variance[k] += _diagonal(square)
     total = _diagonal(covariance)
     spread = np.einsum("kni,kl,lni->ni", by_variance, state.variances_covariance, by_variance)
     dof = satterthwaite(total, spread)
@@ -93,11 +86,6 @@ def _diagonal(covariance: FloatArray) -> FloatArray:
     return np.diagonal(covariance, axis1=1, axis2=2)
 
 
-def _row_noise(units: FloatArray) -> FloatArray:
-    """Return the covariance of ln gain and phase by noise of unit variance, (n, 2, 2)."""
-    return np.asarray(units @ units.swapaxes(1, 2))
-
-
 def stated_noise(
     problem: TableProblem, theta: FloatArray, amplitude: FloatArray, omega: FloatArray
 ) -> FloatArray:
@@ -108,7 +96,8 @@ def stated_noise(
     problem, predicted = problem.widened(np.zeros(problem.data.n)), problem.predict(theta)
     sides = [-problem.residual_change(theta, f * predicted) for f in (1.0, 1j)]
     units = np.linalg.pinv(np.stack([one.reshape(-1, 2) for one in sides], axis=-1))
-    return _row_noise(units[_nearest(problem, amplitude, omega)])
+    units = units[_nearest(problem, amplitude, omega)]
+    return np.asarray(units @ units.swapaxes(1, 2))
 
 
 def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) -> NDArray[np.intp]:
@@ -142,25 +131,20 @@ def departures(
 
     Where residuals are too few to distinguish it from noise, it is assumed as large as the noise.
     """
-    sized = {
-        _kind(source): variance
-        for source, variance in zip(errors.sources, errors.variances.tolist(), strict=True)
-        if source.name == MODEL_ERROR
-    }
+    variances = zip(errors.sources, errors.variances.tolist(), strict=True)
+    sized = {source.kind: size for source, size in variances if source.name == MODEL_ERROR}
     assumed = not errors.distinguishes_noise
     if assumed:
         sized = {(False, ""): errors.rms(NOISE) ** 2}
     if not any(sized.values()):
         return None
     where, estimate = places(amplitude, omega), errors.estimate
-    wider = [
-        (source, sized[_kind(source)] ** 0.5)
-        for source in error_sources(estimate, where)
-        if source.name == MODEL_ERROR and sized.get(_kind(source))
-    ]
-    made = [(s.changes(errors.names, slopes, where, stiffness), v) for s, v in wider]
+    wider = [s for s in error_sources(estimate, where) if s.name == MODEL_ERROR]
+    pairs = [(source, sized.get(source.kind, 0.0) ** 0.5) for source in wider]
+    pairs = [(source, std) for source, std in pairs if std]
+    made = [(s.changes(errors.names, slopes, where, stiffness), v) for s, v in pairs]
     there = np.concatenate([v * c for c, v in made if c is not None], axis=-1)
-    missed = np.concatenate([v * source.columns for source, v in wider], axis=-1)
+    missed = np.concatenate([v * source.columns for source, v in pairs], axis=-1)
     n = errors.problem.n_residuals // 2
     rows = estimate.relative_units @ missed[: 2 * n].reshape(n, 2, -1)
     every = np.concatenate([rows, there]).reshape(-1, there.shape[-1])
@@ -169,18 +153,12 @@ def departures(
     left = np.cumsum(singular[::-1] ** 2)[::-1] / len(every)
     turned = turned[left > _NEGLIGIBLE * noise].T
     others = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
-    model, noises = errors.state.model, errors.state.model.noises
-    Z = [errors.sources[k].columns for k in others]
+    state, noises = errors.state, errors.state.model.noises
     # residuals fall where a prediction rises
     X = np.hstack([-estimate.jacobian, missed @ turned])
-    most = np.array([errors.sources[k].largest for k in others])
-    joint = MixedModel(estimate.y, X, Z, model.group, model.known, noises, most)
-    kept = errors.state.variances[[*range(noises), *(noises + np.array(others, dtype=np.intp))]]
+    joint = state.model.elsewhere(estimate.y, X, others)
+    kept = state.variances[[*range(noises), *(noises + k for k in others)]]
     prior = np.repeat([0.0, 1.0], [len(errors.names), turned.shape[1]])
     return Departures(
         there @ turned, joint.information_of_parameters(kept) + np.diag(prior), assumed
     )
-
-
-def _kind(source: Source) -> tuple[bool, str]:
-    return source.parallel, "" if source.rate_of is None else source.rate_of[0]
