@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,9 +30,9 @@ from dahl_ident.diagnostics.intervals import (
     profile_intervals,
     wald_intervals,
 )
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.verdicts import Identifiability, judged
-from dahl_ident.elements import Model
+from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DahlIdentError, FitError, ValidationError, choices
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
@@ -47,11 +47,22 @@ _OF_ONE_KIND = {
     "residuals": "residuals sample by sample",
 }
 """Texts that depend on the kind of data."""
+_OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
 _NOISE = {
     "measured": "measured: the data's covariance, scale known",
     "relative": "relative: constant variance of (ln gain, phase)",
     "absolute": "absolute: constant variance of (real, imaginary part)",
 }
+
+
+class ContradictedExponent(NamedTuple):
+    """An exponent at its range's end or as stated, and what the data ask for instead."""
+
+    name: str
+    held: float
+    asked: float
+    stderr: float
+    range: tuple[float, float] | None  # None where the user stated the value
 
 
 class Assessment(ABC):
@@ -331,42 +342,51 @@ class TableAssessment(Assessment):
         except DahlIdentError:
             return None
 
-    def assumptions(self, *, counted: bool = True) -> Iterator[Finding]:
-        """Yield one finding with the assumptions that these data cannot test.
+    @cached_property
+    def is_determined(self) -> bool:
+        """Whether the data determine every parameter and can test the model."""
+        optimum, goodness = self.optimum, self.goodness
+        tested = optimum.success and optimum.dof > 0 and goodness.judged and not goodness.sign
+        return tested and self.identifiability.complete
 
-        Those of noise alone, unless all sources of error are `counted`.
-        """
-        errors, problem = self.errors if counted else None, self.problem
-        ranges, stated = [], {}
-        for parameter in problem.model.parameters:
-            name = parameter.name
-            if parameter.prior is None or parameter.free:
+    @property
+    def contradicted_exponents(self) -> Iterator[ContradictedExponent]:
+        """The assumed exponents that the data put outside their range."""
+        errors = self.errors
+        parameters = () if errors is None else errors.problem.parameters
+        for p in parameters:
+            if errors is None or p.name not in errors.problem.ranges:
                 continue
-            if parameter.assumed and errors is not None and name in errors.assumed:
-                low, high = parameter.prior
-                place = {"name": name, "low": low, "high": high, "unit": parameter.unit}
-                ranges.append(
-                    {**place, "value": errors.values[name], "stderr": errors.stderr[name]}
-                )
-            elif parameter.value is not None:
-                stated[name] = parameter.value
-        sensors = {p.name for p in problem.sensors.parameters if p.free}
-        if "delay" in sensors and "force_gain" not in sensors:
-            stated["force_gain"] = 1.0
-        cost = self.constraint_cost
-        runs = len((problem if errors is None else errors.problem).data.runs or ())
-        values = {
-            "ranges": tuple(ranges),
-            "stated": stated,
-            "constraints": () if cost is None else tuple(cost.texts),
-            "exact": self.exact,
-            "single_run": runs < 2,
-            "passes": runs * (problem.data.run is None),
-            "no_drift": in_order_of_level(problem.data),
-            "noise_alone": errors is None,
-        }
-        if any(values.values()):
-            yield Finding(Question.ASSUMED, VerdictStatus.TRUSTED, "assumed", values)
+            low, high = p.prior or (0.0, np.inf)
+            value, u = errors.values[p.name], errors.stderr[p.name]
+            if max(low - value, value - high) > _OUTSIDE * u:
+                yield ContradictedExponent(p.name, value, value, u, (low, high))
+
+    @property
+    def missed(self) -> tuple[float, float] | None:
+        """The misfit within runs, and in all; None where there is none that counts."""
+        rows = self.problem.stiffness_data.harmonic == 1
+        if not (self.goodness.objections and self.is_determined and rows.any()):
+            return None
+        misfit = within = self.goodness.rms_misfit
+        if self.errors is not None:  # differences between runs are not part of the misfit
+            within = min(misfit, rms_misfit_of(self.errors.problem, self.errors.within_runs))
+        return within, misfit
+
+    def force_share(self, element: Element, value: float) -> float:
+        """Return the rms stiffness of an element of one parameter over that of the whole."""
+        view = self.problem.stiffness_data
+        rows = view.harmonic == 1
+        part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
+        return float(np.sqrt(np.mean(np.abs(part) ** 2)))
+
+    def design(self, *, counted: bool) -> dict[str, Any]:
+        """Return what the order of the rows assumes, with all sources of error or noise alone."""
+        data = self.problem.data
+        errors = self.errors if counted else None
+        runs = len((data if errors is None else errors.problem.data).runs or ())
+        passes = runs * (data.run is None)
+        return {"single_run": runs < 2, "passes": passes, "no_drift": in_order_of_level(data)}
 
     @cached_property
     def _budget(self) -> Budget:

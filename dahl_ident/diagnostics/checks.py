@@ -1,20 +1,24 @@
 """The checks of a fit: each yields findings, of which the worst is the status.
 
 Determined: every parameter, or which combinations. Described: size and kind of the misfit. Assumed:
-what the result depends on and the data cannot test.
+what the result depends on and the data cannot test. A check asks for quantities that fits of tables
+and of records both have, or says for which of the two it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import wraps
 from typing import Any
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.tabular import doubts
-from dahl_ident.diagnostics.assessment import Assessment, TableAssessment
+from dahl_ident.diagnostics.assessment import TableAssessment
+from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_model import ErrorModel
+from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.judgement import (
     Finding,
     Judgement,
@@ -27,25 +31,49 @@ from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
     below_zero,
     beyond_friction_limit,
+    is_single,
     slight,
     steady_findings,
 )
-from dahl_ident.elements import Element
+from dahl_ident.diagnostics.record_assessment import RecordAssessment
+from dahl_ident.diagnostics.record_misfit import REMEDY
 from dahl_ident.fitting.losses import LOSSES
+from dahl_ident.units import si_unit
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
+_FAIRLY = 0.2  # rms that a model of records misses: beyond it, intervals do not hold
+_FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # held-out values; of so many, 80 % lie in bands of 95 % once in 100 times
 _DOUBTS_SHOWN = 5  # more would hide the verdict
 _CHANCE = 0.0027  # probability that data contradict a right constraint or prior as much
-_OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
 _PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
 
-_TRUSTED, _APPROXIMATE, _, _NOT_DESCRIBED = VerdictStatus
+_TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
+Assessed = TableAssessment | RecordAssessment
+_Check = Callable[[Any], Iterable[Finding]]
 
 
-def judgement(fit: TableAssessment) -> Judgement:
+def of_tables(check: _Check) -> _Check:
+    """Return a check that applies to fits of tables only."""
+    return _of("table", check)
+
+
+def of_records(check: _Check) -> _Check:
+    """Return a check that applies to fits of records only."""
+    return _of("records", check)
+
+
+def _of(kind: str, check: _Check) -> _Check:
+    @wraps(check)
+    def limited(fit: Assessed) -> Iterable[Finding]:
+        return check(fit) if fit.problem.kind == kind else ()
+
+    return limited
+
+
+def judgement(fit: Assessed) -> Judgement:
     """Return the findings of every check, and with them the status.
 
     Neither harmonics nor a covariance hide what the fundamentals show without them.
@@ -65,6 +93,15 @@ def judgement(fit: TableAssessment) -> Judgement:
 # Determined?
 
 
+@of_records
+def _parameters_of_records(fit: RecordAssessment) -> Iterator[Finding]:
+    """Yield the parameters that are not determined, the reasons, and a motion that would do it."""
+    for name, why in fit.undetermined.items():
+        stderr, unit = fit.known[1][name], fit.identifiability.parameters[name].unit
+        yield undetermined("record_parameter", name=name, stderr=stderr, unit=unit, why=why)
+
+
+@of_tables
 def _parameters(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
@@ -92,27 +129,55 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
 # Described?
 
 
-def _is_determined(fit: TableAssessment) -> bool:
-    optimum, goodness = fit.optimum, fit.goodness
-    determined = optimum.success and optimum.dof > 0 and goodness.judged and not goodness.sign
-    return determined and fit.identifiability.complete
+def _misfit(fit: Assessed) -> Iterator[Finding]:
+    """Yield size and kind of the misfit, and reasons for doubt whether there is one or not."""
+    reservations = [finding for check in RESERVATIONS for finding in check(fit)]
+    if isinstance(fit, TableAssessment):
+        yield from _misfit_of_table(fit, reservations)
+    else:
+        yield from _misfit_of_records(fit)
+    yield from reservations
 
 
-def _residuals(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield the size and kind of the misfit."""
+def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
+    """Yield whether the model describes the records."""
+    problem, converged = fit.problem, fit.optimum.converged
+    far = fit.goodness.rms_in_band > (_FAIRLY if fit.misses else _TOO_LARGE)
+    if far:
+        yield described("records_not_described", _NOT_DESCRIBED)
+    if not converged:
+        yield described("no_optimum", _NOT_DESCRIBED, message=fit.optimum.message)
+    displaced = all(record.displacement is not None for record in problem.records)
+    if problem.output == "motion" and (far or not converged) and displaced:
+        yield described("motion_may_be_imposed", _NOT_DESCRIBED)
+    if fit.misses and not far:
+        follows = fit.errors.misfit.follows if fit.errors.misfit else ""
+        remedy = REMEDY.get(follows, "")
+        yield described("records_misfit", _APPROXIMATE, follows=follows, remedy=remedy)
+    if fit.errors.dof_of(NOISE) < _FEW:
+        few = {"effective": fit.errors.effective, "unknowns": len(problem.names)}
+        yield described("few_effective_samples", _APPROXIMATE, **few)
+
+
+def _misfit_of_table(fit: TableAssessment, reservations: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield size and kind of the misfit, and whether bands hold where anything is doubted."""
     goodness = fit.goodness
+    bands = list[Finding]()
+    if not goodness.sign and (goodness.objections or goodness.flagged or reservations):
+        bands = list(_bands(fit))
     lost = (
-        (fit.errors is None and _is_determined(fit))
+        (fit.errors is None and fit.is_determined)
         or _stated_exponent_is_wrong(fit)
         or goodness.beyond_any_sensor
         or goodness.of_several
-        or any(finding.severity is _NOT_DESCRIBED for finding in _bands(fit))
+        or any(finding.severity is _NOT_DESCRIBED for finding in bands)
     )
     large = goodness.rms_misfit > _TOO_LARGE
     severity = _NOT_DESCRIBED if lost or large else _APPROXIMATE
-    yield from goodness.findings(severity, counted=severity is _APPROXIMATE and _is_determined(fit))
+    yield from goodness.findings(severity, counted=severity is _APPROXIMATE and fit.is_determined)
     if large and not goodness.objections:
         yield described("large_misfit", severity, rms=goodness.rms_misfit)
+    yield from bands
 
 
 def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
@@ -124,18 +189,15 @@ def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
 
 
 def _bands(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield whether the bands hold for what was held out, where anything speaks against the fit."""
-    goodness = fit.goodness
-    if goodness.sign or not (goodness.objections or goodness.flagged or any(_reservations(fit))):
-        return
+    """Yield whether the bands hold for what was held out."""
     check = fit.cross_validation
     if check is None:
         return
     enough = check.count >= _ENOUGH_HELD_OUT
     if enough and fit.errors is not None:
-        misfit = min(_misfit_within_runs(fit.errors), goodness.rms_misfit)
+        misfit = min(_misfit_within_runs(fit.errors), fit.goodness.rms_misfit)
         if check.width < misfit:  # misfits inside a band have an rms below its half width
-            width, rms = check.width, goodness.rms_misfit
+            width, rms = check.width, fit.goodness.rms_misfit
             yield described("narrow_bands", _NOT_DESCRIBED, width=width, misfit=rms)
             return
     outside = enough and check.inside < _FEWEST_INSIDE * check.count
@@ -153,15 +215,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     return min(rms_misfit_of(errors.problem, each) for each in fitted)
 
 
-def _reservations(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield reasons not to trust a fit although its residuals may look like noise."""
-    yield from _beyond_limit(fit)
-    yield from below_zero(fit.problem, fit.known)
-    yield from _contradicted_priors(fit)
-    yield from _beyond_range(fit)
-    yield from _moved_by_outliers(fit)
-
-
+@of_tables
 def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
     """Yield where a force exceeds what friction can carry; not rows that a loss sets aside."""
     errors, differ = fit.errors, fit.goodness.runs_differ
@@ -171,24 +225,22 @@ def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
     yield from beyond_friction_limit(optimum, scatter, aside)
 
 
-def _slight(fit: TableAssessment) -> Iterator[Finding]:
+def _below_zero(fit: Assessed) -> Iterator[Finding]:
+    """Yield every mass, damping or stiffness below zero, and what else no mechanism has."""
+    yield from below_zero(fit.problem, fit.known)
+    for element in fit.model.elements if fit.problem.kind == "records" else ():
+        if not is_single(element):
+            for text in element.physics([p.value or 0.0 for p in element.parameters]):
+                yield described("unphysical", _APPROXIMATE, objection=text)
+
+
+def _slight(fit: Assessed) -> Iterator[Finding]:
     """Yield a finding for every mass, damper or spring of less force than the model misses."""
-    view = fit.problem.stiffness_data
-    rows = view.harmonic == 1
-    if not (fit.goodness.objections and _is_determined(fit) and rows.any()):
-        return
-    misfit = within = fit.goodness.rms_misfit
-    if fit.errors is not None:  # differences between runs are not part of the misfit
-        within = min(misfit, rms_misfit_of(fit.errors.problem, fit.errors.within_runs))
-
-    def share_of(element: Element, value: float) -> float:
-        part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
-        return float(np.sqrt(np.mean(np.abs(part) ** 2)))
-
-    yield from slight(fit.problem, fit.known, share_of, within, misfit)
+    if fit.missed is not None:
+        yield from slight(fit.problem, fit.known, fit.force_share, *fit.missed)
 
 
-def constraints(fit: Assessment) -> Iterator[Finding]:
+def _constraints(fit: Assessed) -> Iterator[Finding]:
     """Yield the constraints that the data contradict: their cost is not due to chance."""
     cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
@@ -198,31 +250,29 @@ def constraints(fit: Assessment) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _contradicted_priors(fit: TableAssessment) -> Iterator[Finding]:
+def _priors(fit: Assessed) -> Iterator[Finding]:
     """Yield every prior that the data contradict."""
     estimates = dict(zip(fit.optimum.names, fit.optimum.values.tolist(), strict=True))
     for name, prior in fit.problem.priors.items():
-        value = estimates[name]
-        mean = float(prior.mean())
-        std = float(prior.std())
+        value, mean, std = estimates[name], float(prior.mean()), float(prior.std())
         if abs(value - mean) > _CONTRADICTED * std:
             yield described("prior", _APPROXIMATE, name=name, value=value, mean=mean, std=std)
 
 
-def _beyond_range(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield every assumed exponent that the data put outside its range."""
-    errors = fit.errors
-    if errors is None:
-        return
-    ranged = {p.name: p.prior for p in errors.problem.parameters}
-    for name in errors.problem.ranges:
-        low, high = ranged[name] or (0.0, np.inf)
-        value, u = errors.values[name], errors.stderr[name]
-        if max(low - value, value - high) > _OUTSIDE * u:
-            ends = {"low": low, "high": high}
-            yield described("beyond_range", _APPROXIMATE, name=name, value=value, stderr=u, **ends)
+def _exponents(fit: Assessed) -> Iterator[Finding]:
+    """Yield every exponent that the data put outside its range, or contradict."""
+    for one in fit.contradicted_exponents:
+        if one.range is None:
+            wanted = with_unit(one.asked, one.stderr, "")
+            stated = {"name": one.name, "held": one.held, "wanted": wanted}
+            yield described("stated_exponent", _NOT_DESCRIBED, **stated)
+        else:
+            low, high = one.range
+            asked = {"name": one.name, "value": one.asked, "stderr": one.stderr}
+            yield described("beyond_range", _APPROXIMATE, **asked, low=low, high=high)
 
 
+@of_tables
 def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters a robust fit moves by more than one uncertainty."""
     optimum, errors = fit.optimum, fit.errors
@@ -275,8 +325,39 @@ def robust_values(
     return robust, by_noise
 
 
+@of_tables
 def _steady(fit: TableAssessment) -> Iterator[Finding]:
     yield from steady_findings(fit.optimum, fit.model)
+
+
+@of_records
+def _delay(fit: RecordAssessment) -> Iterator[Finding]:
+    """Yield the delay that was taken out: a doubt where it moves the output by more than noise."""
+    problem = fit.problem
+    if not problem.delay:
+        return
+    moved = problem.delay * np.concatenate(problem.delay_slopes(fit.optimum.values))
+    doubtful = bool(np.sqrt(np.mean(moved**2)) > fit.goodness.rms)
+    samples = problem.delay * problem.records[0].sample_rate
+    lag = {"delay": problem.delay, "samples": samples, "doubtful": doubtful}
+    yield described("delay", _APPROXIMATE if doubtful else _TRUSTED, **lag)
+
+
+@of_records
+def _notes(fit: RecordAssessment) -> Iterator[Finding]:
+    """Yield the size of the residuals, and what was done with the records."""
+    problem, goodness = fit.problem, fit.goodness
+    size = {"rms": goodness.rms_misfit, "output": problem.output, "worst": goodness.worst}
+    yield described("record_residuals", **size)
+    if problem.whitening.size > 1:
+        yield described("slow_residuals", rms=goodness.rms_in_band)
+    if problem.displacement_noise:
+        yield described(
+            "displacement_noise", noise=problem.displacement_noise,
+            unit=si_unit("displacement", problem.motion), travel=problem.noise_travel,
+        )  # fmt: skip
+    size = {"effective": fit.errors.effective, "samples": problem.n_samples}
+    yield described("effective_samples", **size)
 
 
 # Assumed?
@@ -290,19 +371,43 @@ def reading(fit: Any) -> Iterator[Finding]:
         yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)
 
 
-def assumed(fit: Assessment) -> Iterator[Finding]:
-    """Yield the assumptions of a fit."""
-    yield from fit.assumptions()
+def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
+    """Yield one finding with the assumptions that the data of a fit cannot test.
+
+    Those of noise alone, unless all sources of error are `counted`.
+    """
+    counted, (values, stderr) = counted and fit.errors is not None, fit.known
+    ranges, stated = [], dict[str, float]()
+    for p in fit.problem.model.parameters:
+        if p.prior is None or p.free:
+            continue
+        if counted and p.name in fit.assumed:
+            low, high = p.prior
+            place = {"name": p.name, "low": low, "high": high, "unit": p.unit}
+            ranges.append({**place, "value": values[p.name], "stderr": stderr[p.name]})
+        elif p.value is not None:
+            stated[p.name] = p.value
+    sensors = {p.name for p in fit.problem.sensors.parameters if p.free}
+    if "delay" in sensors and "force_gain" not in sensors:
+        stated["force_gain"] = 1.0
+    cost = fit.constraint_cost
+    assumed = {
+        "ranges": tuple(ranges),
+        "stated": stated,
+        "constraints": () if cost is None else tuple(cost.texts),
+        "exact": fit.exact,
+        "noise_alone": not counted,
+        **fit.design(counted=counted),
+    }
+    if any(assumed.values()):
+        yield Finding(Question.ASSUMED, _TRUSTED, "assumed", assumed)
 
 
-CHECKS: tuple[Callable[[TableAssessment], Iterable[Finding]], ...] = (
-    constraints,
-    _parameters,
-    _residuals,
-    _bands,
-    _reservations,
-    _slight,
-    _steady,
-    reading,
-    assumed,
-)
+RESERVATIONS: tuple[_Check, ...] = (
+    _beyond_limit, _below_zero, _priors, _exponents, _moved_by_outliers
+)  # fmt: skip
+"""Reasons not to trust a fit although its residuals may look like noise."""
+CHECKS: tuple[_Check, ...] = (
+    _constraints, _parameters, _parameters_of_records, _misfit, _slight, _steady, _delay, _notes,
+    reading, assumptions,
+)  # fmt: skip

@@ -16,7 +16,7 @@ A fit can be statistically perfect and physically impossible; this gives a warni
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray
+from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import p_text, with_unit
@@ -34,7 +34,6 @@ from dahl_ident.diagnostics.misfit_explanations import (
     SuspiciousPoint,
     at_an_end,
     flagged_rows,
-    least_misfit_without,
     neighbourhood,
     rms_misfit,
     set_aside,
@@ -59,6 +58,8 @@ from dahl_ident.diagnostics.trends import (
 from dahl_ident.elements import Parameter
 from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
+from dahl_ident.problem.record_noise import share_in_band
+from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.units import percent
 
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
@@ -68,6 +69,7 @@ _NO_SENSOR = 0.15  # noise over the response
 _MEDIAN_SQUARE = 2.0 * np.log(2.0)  # of two normal numbers' sum of squares
 _CLOSE = 0.8  # of the misfit: a bound above shows that no such law helps
 _OF_ONE_DEVICE = 0.25  # u of a logarithm: 95 % within a factor of 1.6, see verdicts.py
+_SEGMENTS = 50  # of a record: the worst one is 2 % of it
 _WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
 
 
@@ -170,63 +172,7 @@ _Test = (
 
 @dataclass(frozen=True)
 class Goodness:
-    """Residuals after the fit, and what they mean.
-
-    Attributes
-    ----------
-    rms_misfit : float
-        Root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there
-        are any.
-    chi_square : ChiSquare or None
-        None where the noise's scale was estimated: nothing is known to compare with.
-    noise_share : float or None
-        Estimated noise over the size of the response; None where the noise's scale is known.
-    dof : int
-        Degrees of freedom.
-    stiffening : Stiffening or None
-        Largest rise of stiffness with amplitude, where there is one.
-    trends : tuple of Trend
-        Departure over each covariate that varies.
-    runs : tuple of Runs
-        Runs of sign over each covariate.
-    groups : tuple of GroupsDiffer
-        Differences between the labels of each column, such as devices in one table.
-    exponent : Exponent or None
-        Where one Dahl element has a fixed exponent.
-    third_harmonic : ThirdHarmonic or None
-        Where rows hold it.
-    scatter : Scatter or None
-        Where the data have a covariance that the noise model does not use.
-    suspicious : tuple of SuspiciousPoint
-        Points that stand apart.
-    warnings : tuple of str
-        What no mechanism does.
-    flagged : tuple of str
-        Rows that the extraction flagged, with the reason.
-    fundamentals : int
-        Rows of the fundamental.
-    runs_differ : RunsDiffer or None
-        Where the scatter between runs exceeds the noise. The other tests then judge the residuals
-        within runs.
-    sign : str
-        The sign convention that explains data which the fit does not; empty where none does.
-    apart : tuple of str
-        The suspicious rows, where they alone contradict the model.
-    without_them : str
-        How the model describes the data without those rows.
-    neighbours : str
-        Where the suspicious rows lie, if they alone depart from the model, but side by side; of a
-        robust fit also if a single one is at an end.
-    bound : float or None
-        Where it helps with data that are not described: the least misfit of parallel Jenkins
-        elements.
-    untested : bool
-        Whether the amplitudes give no more numbers than friction has free parameters, which then
-        meet them whatever the mechanism is.
-    smooth : SmoothMisfit or None
-        Where the error model has a smooth misfit that exceeds the noise.
-    level : float
-        p-value below which one test counts.
+    """Residuals after the fit, and what they mean; a test that does not apply is None, or missing.
 
     Examples
     --------
@@ -236,30 +182,39 @@ class Goodness:
     (True, 0.014, ())
     """
 
+    # root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there are any;
+    # of records, of the residuals over that of the measured output's variation
     rms_misfit: float
-    chi_square: ChiSquare | None
-    noise_share: float | None
-    dof: int
-    stiffening: Stiffening | None
-    trends: tuple[Trend, ...]
-    runs: tuple[Runs, ...]
-    groups: tuple[GroupsDiffer, ...]
-    exponent: Exponent | None
-    third_harmonic: ThirdHarmonic | None
-    scatter: Scatter | None
-    suspicious: tuple[SuspiciousPoint, ...]
-    warnings: tuple[str, ...]
-    flagged: tuple[str, ...]
-    untested: bool
-    fundamentals: int = 0
+    warnings: tuple[str, ...] = ()  # what no mechanism does
+    flagged: tuple[str, ...] = ()  # rows that the extraction flagged, with the reason
+    chi_square: ChiSquare | None = None  # where the noise's scale is known
+    # estimated noise over the size of the response; None where the noise's scale is known
+    noise_share: float | None = None
+    dof: int = 0
+    stiffening: Stiffening | None = None  # largest rise of stiffness with amplitude
+    trends: tuple[Trend, ...] = ()  # departure over each covariate that varies
+    runs: tuple[Runs, ...] = ()  # runs of sign over each covariate
+    groups: tuple[GroupsDiffer, ...] = ()  # differences between labels, such as devices
+    exponent: Exponent | None = None  # where one Dahl element has a fixed exponent
+    third_harmonic: ThirdHarmonic | None = None
+    scatter: Scatter | None = None  # where the data have a covariance that is not used
+    smooth: SmoothMisfit | None = None  # where it exceeds the noise
+    # where the scatter between runs exceeds the noise; other tests then judge what is within runs
     runs_differ: RunsDiffer | None = None
-    sign: str = ""
-    apart: tuple[str, ...] = ()
-    without_them: str = ""
-    neighbours: str = ""
-    bound: float | None = None
+    suspicious: tuple[SuspiciousPoint, ...] = ()  # points that stand apart
+    # whether the amplitudes give no more numbers than friction has free parameters, which then
+    # meet them whatever the mechanism is
+    untested: bool = False
     rows: int = 0
-    smooth: SmoothMisfit | None = None
+    fundamentals: int = 0  # rows of the fundamental
+    sign: str = ""  # the sign convention that explains data which the fit does not
+    apart: tuple[str, ...] = ()  # suspicious rows, where they alone contradict the model
+    without_them: str = ""  # how the model describes the data without those rows
+    # where the suspicious rows lie, if they alone depart from the model, but side by side; of a
+    # robust fit also if a single one is at an end
+    neighbours: str = ""
+    # where it helps with data that are not described: least misfit of parallel Jenkins elements
+    bound: float | None = None
 
     @cached_property
     def level(self) -> float:
@@ -466,17 +421,9 @@ def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
     rows = [point.row for point in tested.suspicious]
     if not (rows and tested.objections and not at_an_end(optimum, rows)):
         return tested
-    if not least_misfit_without(optimum, rows) * EXPLAINS < tested.rms_misfit:
-        return tested
     optimum_without = set_aside(optimum, rows)
     without = None if optimum_without is None else _tested_estimate(optimum_without)
-    if (
-        without is None
-        or without.objections
-        or without.hints
-        or without.untested
-        or not without.judged
-    ):
+    if without is None or without.hints or not without.judged:  # hints hold the objections
         return tested
     if not without.rms_misfit * EXPLAINS < tested.rms_misfit:
         return tested
@@ -485,7 +432,7 @@ def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
         return replace(tested, neighbours=where)
     (remaining,) = (str(f) for f in without.findings() if f.code == "noise")
     names = tuple(point.name for point in tested.suspicious)
-    return replace(tested, apart=names, without_them=remaining, rows=optimum.problem.data.n)
+    return replace(tested, apart=names, without_them=remaining)
 
 
 def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
@@ -538,6 +485,8 @@ def _tested(
     chi_square = _chi_square(optimum, space)
     return Goodness(
         rms_misfit(problem, optimum.theta),
+        tuple(physical_warnings(optimum)),
+        flagged_rows(problem.data),
         chi_square,
         _noise_share(optimum),
         optimum.dof,
@@ -548,12 +497,11 @@ def _tested(
         _exponent(optimum, space, chi_square),
         _third_harmonic(optimum, space),
         _scatter(optimum),
-        suspicious_points(optimum, space),
-        tuple(physical_warnings(optimum)),
-        flagged_rows(problem.data),
-        _untested(optimum),
-        int((problem.data.harmonic == 1).sum()),
-        smooth=_smooth(errors) if within is None else None,
+        _smooth(errors) if within is None else None,
+        suspicious=suspicious_points(optimum, space),
+        untested=_untested(optimum),
+        rows=problem.data.n,
+        fundamentals=int((problem.data.harmonic == 1).sum()),
     )
 
 
@@ -661,3 +609,68 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
     third = rows.astype(np.complex128)
     ratio, error = space.coefficient(third)
     return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([third, 1j * third])))
+
+
+@dataclass(frozen=True)
+class RecordGoodness(Goodness):
+    """Residuals of all records, by their size, place and correlation."""
+
+    share_left: float = 0.0  # variance of the residuals over that of the measured output
+    # root mean square over that of the output, at the drive's frequencies where residuals are
+    # weighted by their spectrum
+    rms_in_band: float = 0.0
+    rms: float = 0.0  # of the residuals, in the output's unit
+    # the segment, a fiftieth of a record, with the largest residuals: record (from 1), times in s
+    worst_record: int = 1
+    worst: str = ""  # the same in words
+    correlation: float = 0.0  # of residuals of neighbouring samples
+
+    @property
+    def details(self) -> list[str]:
+        """The numbers as text."""
+        return [
+            f"unexplained share of variance {self.share_left:.3g} ({percent(self.rms_misfit)} rms)",
+            f"residuals {self.rms:.3g} rms; {self.worst}",
+            f"correlation of neighbouring residuals {self.correlation:.2f}",
+        ]
+
+
+def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> RecordGoodness:
+    """Return the statistics of the residuals of records, measured minus predicted output of each.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Record
+    >>> t = np.arange(100.0)
+    >>> record = Record(t, displacement=t, force=np.sin(t))
+    >>> problem = RecordProblem([record], Dahl())
+    >>> print(record_goodness(problem, [0.1 * np.sin(t)]).details[0])
+    unexplained share of variance 0.01 (10 % rms)
+    """
+    records, measured = problem.records, problem.measured
+    together = np.concatenate(list(residuals))
+    total = float(together @ together)
+    rms = float(np.sqrt(total / together.size))
+    share = total / sum(float(np.sum((y - y.mean()) ** 2)) for y in measured)
+    in_band = share
+    if problem.whitening.size > 1:
+        in_band = share_in_band([r.force_samples for r in records], measured, residuals)
+    segments = []
+    for number, (record, e) in enumerate(zip(records, residuals, strict=True), 1):
+        width = max(1, e.size // _SEGMENTS)
+        sums = np.concatenate([[0.0], np.cumsum(e**2)])
+        mean = (sums[width:] - sums[:-width]) / width
+        place = int(np.argmax(mean))
+        stop = min(place + width, e.size) - 1
+        segments.append((float(mean[place]), number, record.time[place], record.time[stop]))
+    square, number, start, stop = max(segments, key=lambda segment: segment[0])
+    which = f" of record {number}" if len(records) > 1 else ""
+    worst = (
+        f"most between {start:.4g} and {stop:.4g} s{which}, where the residuals are "
+        f"{square**0.5 / rms if rms else 0.0:.2g} times larger"
+    )
+    products = sum(float(e[1:] @ e[:-1]) for e in residuals)
+    return RecordGoodness(
+        share**0.5, share_left=share, rms_in_band=in_band**0.5, rms=rms, worst_record=number,
+        worst=worst, correlation=products / total if total else 0.0,
+    )  # fmt: skip

@@ -246,22 +246,6 @@ def set_aside(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
     return None if refit.status is Status.NOT_CONVERGED else refit
 
 
-def least_misfit_without(optimum: Optimum, rows: Sequence[int]) -> float:
-    """Return the least misfit of the other rows' fundamentals, to first order in the parameters."""
-    problem, theta = optimum.problem, optimum.theta
-    response, predicted = problem.data.response, problem.predict(theta)
-    kept = (problem.data.harmonic == 1) & (response != 0.0) & np.isfinite(predicted)
-    kept[list(rows)] = False
-    if not kept.any():
-        return 0.0
-    y = (1.0 - predicted[kept] / response[kept]).view(np.float64)
-    J = np.ascontiguousarray((problem.prediction_jacobian(theta)[kept] / response[kept, None]).T)
-    J = J.view(np.float64).T
-    J = J[:, np.isfinite(J).all(axis=0)]
-    left = y - J @ np.linalg.lstsq(J, y, rcond=None)[0]
-    return float(np.sqrt(2.0 * np.mean(left**2)))
-
-
 def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:
     """Return where several rows lie closer together than rows at random do; "" if they do not."""
     k, n = len(rows), optimum.problem.data.n

@@ -12,7 +12,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
-from dahl_ident.diagnostics.assessment import Assessment
+from dahl_ident.diagnostics.assessment import Assessment, ContradictedExponent
 from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
 from dahl_ident.diagnostics.budget import Budget, parameter_budget
 from dahl_ident.diagnostics.confidence_levels import (
@@ -22,25 +22,18 @@ from dahl_ident.diagnostics.confidence_levels import (
     coverage_factors,
     level_text,
 )
-from dahl_ident.diagnostics.contributions import NOISE, variances
+from dahl_ident.diagnostics.contributions import ALONG_MOTION, MODEL_ERROR, NOISE, variances
 from dahl_ident.diagnostics.formatting import table
+from dahl_ident.diagnostics.goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
-from dahl_ident.diagnostics.judgement import Finding, Judgement
-from dahl_ident.diagnostics.record_checks import (
-    CHECKS,
-    RecordGoodness,
-    misses,
-    record_goodness,
-    undetermined,
-)
+from dahl_ident.diagnostics.record_advice import reasons
 from dahl_ident.diagnostics.record_errors import (
     RecordErrors,
     errors_on_constraints,
-    record_assumptions,
     record_errors,
 )
 from dahl_ident.diagnostics.verdicts import Identifiability, ParameterVerdict, Verdict
-from dahl_ident.elements import Model
+from dahl_ident.elements import Element, Model
 from dahl_ident.errors import FitError, ValidationError
 from dahl_ident.fitting import solve
 from dahl_ident.fitting.losses import loss_named
@@ -80,6 +73,8 @@ class RecordAssessment(Assessment):
 
     problem: RecordProblem
     instead = "it has errors, residuals and hold_out() of the samples"
+
+    with_less = None
 
     @property
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
@@ -189,15 +184,19 @@ class RecordAssessment(Assessment):
         )  # fmt: skip
 
     @cached_property
+    def undetermined(self) -> Mapping[str, str]:
+        """Why parameters are not determined, by name."""
+        return reasons(self.model, self.problem, self.errors)
+
+    @cached_property
     def identifiability(self) -> Identifiability:
         """Which parameters the records determine."""
-        lost = {finding.values["name"]: str(finding) for finding in undetermined(self)}
-        limits = self.intervals("combined")
+        why, limits = self.undetermined, self.intervals("combined")
         verdicts: dict[str, ParameterVerdict] = {}
         for name, unit in zip(self.problem.names, limits.units, strict=False):
-            verdict = Verdict.NOT_IDENTIFIED if name in lost else Verdict.IDENTIFIED
-            reason = lost.get(name, verdict.value)
-            verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], reason)
+            verdict = Verdict.NOT_IDENTIFIED if name in why else Verdict.IDENTIFIED
+            known = f"not determined{why[name]}" if name in why else verdict.value
+            verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], known)
         return Identifiability(verdicts, (), {})
 
     @property
@@ -212,14 +211,40 @@ class RecordAssessment(Assessment):
         """Statistics of the residuals."""
         return record_goodness(self.problem, self.residuals)
 
-    @cached_property
-    def judgement(self) -> Judgement:
-        """Every finding about the fit, and the status that follows from them."""
-        return Judgement(finding for check in CHECKS for finding in check(self))
+    @property
+    def misses(self) -> bool:
+        """Whether the model misses more than noise."""
+        return not {MODEL_ERROR, ALONG_MOTION}.isdisjoint(self.errors.contributions)
 
-    def assumptions(self, *, counted: bool = True) -> tuple[Finding, ...]:
-        """Return the assumptions of the result."""
-        return (record_assumptions(self.problem, self.errors),)
+    @property
+    def contradicted_exponents(self) -> Iterator[ContradictedExponent]:
+        """The exponents that the records contradict, or put outside their range."""
+        for one in (one for one in self.errors.exponents if one.contradicted):
+            asked = one.value * float(np.exp(one.asked))
+            limits = one.range if one.assumed else None
+            yield ContradictedExponent(one.name, one.value, asked, asked * one.by_records, limits)
+
+    @property
+    def missed(self) -> tuple[float, float] | None:
+        """The misfit, twice; None where there is none, or the output is a motion."""
+        if self.problem.output == "motion" or not self.misses:
+            return None
+        return (self.goodness.rms_in_band,) * 2
+
+    def force_share(self, element: Element, value: float) -> float:
+        """Return the rms force of an element of one parameter over that of the whole."""
+        size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
+        force = [
+            element.force_history([value], x, v, 0.0, acceleration=a)
+            for x, v, a in self.problem.motions
+        ]
+        return float(np.concatenate([f - f.mean() for f in force]).std() / size)
+
+    def design(self, *, counted: bool) -> dict[str, Any]:
+        """Return what the number of records assumes."""
+        exponents = self.problem.exponents
+        unfound = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
+        return {"single_run": self.errors.runs < 2, "unfound": tuple(unfound * counted)}
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -281,7 +306,7 @@ class RecordAssessment(Assessment):
             covariance = self.covar[:count, :count] / np.outer(slopes, slopes)
         unknown = ~np.isfinite(covariance)
         covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
-        share = (0.5 * self.goodness.share_left) ** 0.5 if misses(self) else _LEAST
+        share = (0.5 * self.goodness.share_left) ** 0.5 if self.misses else _LEAST
         optimum = replace(
             self.optimum, problem=problem, theta=theta, values=values, covariance=covariance,
             scale=share, dof=int(self.errors.least_dof),
@@ -323,7 +348,7 @@ class RecordAssessment(Assessment):
         What a model misses is a share of the output: its scatter grows with the record's level.
         """
         scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
-        if misses(self):
+        if self.misses:
             scatter *= max(1.0, problem.level / self.problem.level) ** 2
         half = coverage_factor(self.errors.least_dof) * np.sqrt(variance + scatter)
         return RecordBand(

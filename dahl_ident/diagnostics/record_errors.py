@@ -18,8 +18,6 @@ from dahl_ident.diagnostics.contributions import (
     variances,
 )
 from dahl_ident.diagnostics.correlated_residuals import sandwich
-from dahl_ident.diagnostics.formatting import listed
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.record_channels import (
     DISPLACEMENT_GAIN,
     DRIVE,
@@ -43,7 +41,6 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # standard deviation along a direction over the largest, that counts as none
 _SHORTENS = 0.5  # of u: without a source of less, intervals are at most a tenth too short
-_NOT_FOUND = ", though it was not given: with another no motion was found"
 
 
 @dataclass(frozen=True)
@@ -184,21 +181,3 @@ def errors_on_constraints(
     exact = ("every source other than noise",)
     runs = len(set(optimum.problem.runs))
     return RecordErrors({NOISE: covariance}, effective, exact, runs, ())
-
-
-def record_assumptions(problem: RecordProblem, errors: RecordErrors) -> Finding:
-    """Return the assumptions of the estimate that the records cannot test."""
-    parts = [str(one) for one in errors.assumed]
-    known = {one.name for one in errors.assumed}
-    parts += [
-        f"{p.name} = {p.value:g} exactly" + (_NOT_FOUND if p.assumed else "")
-        for p in problem.model.parameters
-        if p.prior is not None and not p.free and p.name not in known
-    ]
-    if errors.exact:
-        parts.append(f"{listed(errors.exact)} exact")
-    if errors.runs < 2:
-        parts.append("a single run")
-    return Finding(
-        Question.ASSUMED, VerdictStatus.TRUSTED, "records_assumed", {"parts": tuple(parts)}
-    )

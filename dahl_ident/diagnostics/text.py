@@ -262,10 +262,11 @@ def _assumed(
     stated: Mapping[str, float],
     constraints: Sequence[str],
     exact: Sequence[str],
-    single_run: bool,
-    passes: int,
-    no_drift: bool,
     noise_alone: bool,
+    single_run: bool,
+    passes: int = 0,
+    no_drift: bool = False,
+    unfound: Sequence[str] = (),
 ) -> str:
     parts = []
     for r in ranges:
@@ -273,7 +274,8 @@ def _assumed(
         where = "here" if within else "the data ask for"
         value = with_unit(r["value"], r["stderr"], r["unit"])
         parts.append(f"{r['name']} between {r['low']:g} and {r['high']:g} ({where} {value})")
-    parts += [f"{name} = {value:g} exactly" for name, value in stated.items()]
+    other = ", though it was not given: with another no motion was found"
+    parts += [f"{n} = {value:g} exactly{other * (n in unfound)}" for n, value in stated.items()]
     parts += [f"the constraint {listed(constraints)}"] if constraints else []
     parts += [f"{listed(exact)} exact"] if exact else []
     parts += [f"each of {passes} passes over the levels a run of its own"] if passes else []
@@ -318,9 +320,9 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "constraint": _constraint,
     "prior": _prior,
     "beyond_range": lambda name, value, stderr, low, high: (
-        f"The data ask for {name} = {with_unit(value, stderr, '')}, outside the range assumed "
-        f"({low:g} to {high:g}): estimate it ({name}=None; {name}=free on the command line), or "
-        "use another law."
+        f"The data ask for {name} = {with_unit(value, stderr, '')}, beyond the range that is "
+        f"assumed ({low:g} to {high:g}): estimate it ({spelled(f'{name}=None', f'{name}=free')}), "
+        "or use another law."
     ),
     "moved": _moved,
     "negative": _negative,
@@ -346,10 +348,6 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     ),
     "record_parameter": _record_parameter,
     "unphysical": "Physically doubtful: {objection}.",
-    "exponent": lambda name, wanted: (
-        f"The records ask for {name} = {wanted}, beyond the range that is assumed: estimate it "
-        f"({spelled(f'{name}=None', f'{name}=free')})."
-    ),
     "stated_exponent": "The records contradict {name} = {held:g}, which was stated: they ask for "
     "{wanted}.",
     "few_effective_samples": "The residuals are so slow that they are worth {effective:.0f} "
@@ -377,7 +375,6 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "counted": "Counted: {sources:parts}.",
     "noise_alone": "Noise alone is counted; with every source of the budget, u is {compared:list}.",
     "evidence": "ln evidence: {ln:.4f}",
-    "records_assumed": "Assumed: {parts:parts}.",
     "warning": "Warning on reading: {text}.",
     "more_warnings": "{count} more warnings on reading.",
     "assumed": _assumed,

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -51,9 +50,6 @@ if TYPE_CHECKING:
 _ASSESSMENTS: Mapping[str, type[TableAssessment | RecordAssessment]] = {
     "table": TableAssessment, "records": RecordAssessment
 }  # fmt: skip
-_JUDGES: Mapping[str, Callable[[Any], Judgement]] = {
-    "table": judgement, "records": attrgetter("judgement")
-}  # fmt: skip
 
 
 class FitResult(Result):
@@ -96,7 +92,7 @@ class FitResult(Result):
     @cached_property
     def judgement(self) -> Judgement:
         """Every finding, and the status that follows from them."""
-        return _JUDGES[self.problem.kind](self.assessment)
+        return judgement(self.assessment)
 
     problem: Any = part("optimum.problem", "Data, model, noise, sensors as fitted.")
     method: str = part("optimum.method", "The solver.")

@@ -35,7 +35,7 @@ from dahl_ident.bayes.priors import JointPrior, ParameterPrior
 from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.storage import library
-from dahl_ident.diagnostics.checks import reading
+from dahl_ident.diagnostics.checks import assumptions, reading
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def _notes(posterior: Posterior) -> Iterator[Finding]:
             known = ((n, s) for n, s in std if n in fit.var_names)
             u = [f"{fit.params[n].stderr:.2g} instead of {s:.2g} for {n}" for n, s in known]
             yield Finding(assumed, VerdictStatus.TRUSTED, "noise_alone", {"compared": tuple(u)})
-        yield from fit.assessment.assumptions(counted=counted)
+        yield from assumptions(fit.assessment, counted=counted)
     if not posterior.is_chain and posterior.normalised:
         evidence = {"ln": posterior.log_evidence}
         yield Finding(Question.DESCRIBED, VerdictStatus.TRUSTED, "evidence", evidence)
