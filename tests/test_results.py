@@ -460,7 +460,7 @@ def test_a_list_of_fits_is_sent_to_the_report():
     with pytest.raises(
         ValidationError, match=r"got several fits; .* di\.report\(\[fit, \.\.\.\]\)"
     ):
-        compare_models([found, found])  # type: ignore[arg-type]
+        compare_models([found, found])
 
 
 @pytest.mark.parametrize("ln_f_max", [441.0, -441.0])

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -62,45 +62,16 @@ _OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
-class ComparableFit(Protocol):
-    """A fit whose model is compared with others."""
-
-    @property
-    def optimum(self) -> Optimum:
-        """The solver's result."""
-
-    @property
-    def assessment(self) -> Any:
-        """The estimate, as an optimum."""
-
-    @property
-    def params(self) -> Mapping[str, Any]:
-        """Every parameter with its estimate, which counts every source of error."""
-
-
 @dataclass(frozen=True)
 class ComparedModel:
-    """One model's fit to the data.
+    """One model's fit to the data."""
 
-    Attributes
-    ----------
-    name : str
-        What distinguishes it.
-    optimum : Optimum
-        Its estimate.
-    density : PredictiveDensity
-        How it predicts tests left out.
-    reason : str
-        What in the data speaks for trying it.
-    stated : mapping of str to Estimate or None
-        The parameters as the fit states them, every source of error counted, of the model that was
-        fitted. The others count noise alone.
-    """
-
-    name: str
-    optimum: Optimum
-    density: PredictiveDensity
-    reason: str = ""
+    name: str  # what distinguishes it
+    optimum: Optimum  # its estimate
+    density: PredictiveDensity  # how it predicts tests left out
+    reason: str = ""  # what in the data speaks for trying it
+    # of the model that was fitted: its parameters as the fit states them, every source of error
+    # counted; the others count noise alone
     stated: Mapping[str, Any] | None = None
 
     @property
@@ -196,13 +167,6 @@ class ComparedModel:
 class ModelComparison:
     """Models side by side; the first is the one that was fitted, with what it states.
 
-    Attributes
-    ----------
-    models : tuple of ComparedModel
-        Those that could be fitted.
-    failed : mapping of str to str
-        Why the others could not.
-
     Examples
     --------
     >>> import dahl_ident as di
@@ -211,8 +175,8 @@ class ModelComparison:
     'exponent free'
     """
 
-    models: tuple[ComparedModel, ...]
-    failed: Mapping[str, str]
+    models: tuple[ComparedModel, ...]  # those that could be fitted
+    failed: Mapping[str, str]  # why the others could not
 
     @cached_property
     def best(self) -> ComparedModel:
@@ -220,9 +184,8 @@ class ModelComparison:
 
         Apart from the one that was fitted, only models count whose parameters are determined and
         physical, and whose force limit and stiffness are not a hundred times those of the fit. It
-        is the one that was fitted
-        where models that are alike disagree (`undecided`), and where one that the data do not
-        determine leaves far less (`undetermined`).
+        is the one that was fitted where models that are alike disagree (`undecided`), and where
+        one that the data do not determine leaves far less (`undetermined`).
         """
         return self.models[0] if self.undecided or self.undetermined else self._simplest
 
@@ -446,9 +409,7 @@ def _change(value: float, before: float) -> str:
     return percent(ratio, sign=True)
 
 
-def compare_models(
-    fit: ComparableFit, models: Mapping[str, Element] | None = None
-) -> ModelComparison:
+def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> ModelComparison:
     """Fit other models to the same data and compare how they predict tests left out.
 
     Parameters
@@ -496,13 +457,15 @@ def compare_models(
     optimum, problem = fit.assessment.estimate, fit.optimum.problem
     fitted = [ComparedModel("as fitted", optimum, predictive_density(optimum), stated=fit.params)]
     if models is None:
-        offered = dict(_candidates(optimum, problem, fitted[0].density))
+        offered = list(_candidates(optimum, problem, fitted[0].density))
     else:
-        offered = {name: ("", (model,)) for name, model in models.items()}
-    for name, (reason, elements) in offered.items():
+        offered = [(name, "", (model,)) for name, model in models.items()]
+    for name, reason, elements in offered:
         try:
-            candidate = _solved(problem, optimum.loss, Model(*elements), limits=models is not None)
-            errors = error_model(candidate) if candidate.problem.kind == "table" else None
+            of_model = problem.like(model=Model(*elements))
+            # parameters at their limits at infinity are those of simpler candidates
+            candidate = solve(of_model, loss=optimum.loss, limits=models is not None)
+            errors = error_model(candidate) if problem.kind == "table" else None
             candidate = candidate if errors is None else errors.at_estimate
             density = predictive_density(candidate, optimum)
             fitted.append(ComparedModel(name, candidate, density, reason))
@@ -511,72 +474,60 @@ def compare_models(
     return ModelComparison(tuple(fitted), failed)
 
 
-def _solved(problem: Problem, loss: str, model: Model, *, limits: bool) -> Optimum:
-    """Return a candidate's optimum; `limits` at infinity are those of simpler candidates."""
-    return solve(problem.like(model=model), loss=loss, limits=limits)
-
-
 def _candidates(
     optimum: Optimum, problem: Problem, left: PredictiveDensity
-) -> Iterator[tuple[str, tuple[str, Sequence[Element]]]]:
-    """Yield the name of each candidate, its reason and the model's elements."""
-    model = problem.model
-    values = parameter_values(optimum)
+) -> Iterator[tuple[str, str, Sequence[Element]]]:
+    """Yield the name of each candidate, its reason and the model's elements.
+
+    `optimum` is the estimate, with assumed exponents free, and `problem` that of the fit.
+    """
+    model, values = problem.model, parameter_values(optimum)
     misfit = f"{percent(left.misfit)} of {problem.output_in_words} left"
     if np.isfinite(left.harmonic_misfit):
         misfit += f", {percent(left.harmonic_misfit)} in harmonics"
     smallest = float(_levels(problem)[0].min())
-    offers: list[tuple[Element, dict[str, Alternative]]] = []
+    offers: list[tuple[Element, Mapping[str, Alternative]]] = []
     for e in model.elements:
         at_element = [values[p.name] for p in e.parameters]
-        known = np.all(np.isfinite(at_element)) and all(at_element[:2])
-        stays = e.started(at_element) if np.all(np.isfinite(at_element)) else e
+        finite = bool(np.all(np.isfinite(at_element)))
+        known = finite and all(at_element[:2])
+        stays = e.started(at_element) if finite else e
         offers.append((stays, e.alternatives(at_element, smallest) if known else {}))
-    shown = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
+    reasons = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
     if problem.response is not None:
-        shown |= {
-            "asymmetry": _even(optimum),
-            "speed": _falling_force(optimum),
-            "masing": _jenkins(optimum, left),
-        }
+        reasons["asymmetry"] = _even(optimum)
+        reasons["speed"] = _falling_force(optimum)
+        reasons["masing"] = _jenkins(optimum, left)
     exponent_is_assumed = any(p.assumed for e in model.elements for p in e.parameters)
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
-        if name == "exponent free" and exponent_is_assumed:
-            continue  # the fit estimates it
         taken = [offered[name] for _, offered in offers if name in offered]
-        if len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken):
-            continue  # more elements of one law in place of several would share their names
-        reason = next((shown[i.shows] for i in taken if i.shows != "shape"), misfit)
-        if not reason:
-            continue
-        yield (
-            name,
-            (
-                reason,
-                [n for e, o in offers for n in (o[name].elements if name in o else (e,))],
-            ),
-        )
-    f = None if problem.response is None else problem.response.frequency_hz
-    span = misfit
-    added: dict[str, Element] = {}
+        reason = next((reasons[i.shows] for i in taken if i.shows != "shape"), misfit)
+        # the fit estimates an assumed exponent; more elements of one law in place of several would
+        # share their names
+        estimated = name == "exponent free" and exponent_is_assumed
+        named_twice = len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken)
+        if reason and not estimated and not named_twice:
+            yield name, reason, [
+                n for e, offered in offers
+                for n in (offered[name].elements if name in offered else (e,))
+            ]  # fmt: skip
     if not any(is_spring(e) for e in model.elements):
-        added["spring added"] = Spring()
-    kinds = {e.kind for e in model.elements}
-    rated: tuple[Element, ...] = ()
-    several = f is None or f.max() > _RATES * f.min()
-    if several or optimum.loss == "linear":  # else outliers at large amplitudes look like a damper
-        rated = (PowerDamper(),)
+        yield "spring added", misfit, (model, Spring())
+    added: list[Element] = []
+    several, span = True, misfit
+    if problem.response is not None:
+        f = problem.response.frequency_hz
+        several = bool(f.max() > _RATES * f.min())
+        span += f"; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
+        if not several:
+            span = f"{misfit}; one frequency, so only the amplitude can tell"
     if several:  # at one frequency a mass is a spring
-        rated = (Mass(), Damper(), *rated)
-    if f is not None:
-        span = f"{misfit}; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
-    for element in rated:
-        if element.kind not in kinds:
-            added[f"{element.kind.replace('_', ' ')} added"] = element
-    if not several:
-        span = f"{misfit}; one frequency, so only the amplitude can tell"
-    for name, element in added.items():
-        yield name, (misfit if name == "spring added" else span, (model, element))
+        added += [Mass(), Damper()]
+    if several or optimum.loss == "linear":  # else outliers at large amplitudes look like a damper
+        added.append(PowerDamper())
+    for element in added:
+        if all(e.kind != element.kind for e in model.elements):
+            yield f"{element.kind.replace('_', ' ')} added", span, (model, element)
 
 
 def _even(optimum: Optimum) -> str:
@@ -632,12 +583,7 @@ def _falling_force(optimum: Optimum) -> str:
 
 def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
     """Return the misfit of parallel Jenkins elements where it is far smaller, else ""."""
-    if optimum.problem.is_exact:
-        return ""  # the bound is that of displacements that are sines
-    try:
-        least = least_misfit(optimum.problem.data, optimum.problem.model)
-    except DahlIdentError:
-        return ""
-    if not least < FAR_LESS * left.misfit:
+    least = least_misfit(optimum)
+    if least is None or not least < FAR_LESS * left.misfit:
         return ""
     return f"parallel Jenkins elements would leave {percent(least)} of the fundamental"

@@ -56,7 +56,6 @@ from dahl_ident.diagnostics.trends import (
     trends,
 )
 from dahl_ident.elements import Parameter
-from dahl_ident.errors import DahlIdentError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
@@ -387,7 +386,9 @@ def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
     differ = tested.runs_differ or any(one.p_value < tested.level for one in tested.groups)
     if differ or not tested.objections:
         return tested  # no law describes several devices at once
-    return replace(tested, bound=_bound(optimum, tested.rms_misfit))
+    least, misfit = least_misfit(optimum), tested.rms_misfit
+    helps = least is not None and (least < FAR_LESS * misfit or _CLOSE * misfit < least <= misfit)
+    return replace(tested, bound=least) if helps else tested
 
 
 def _tested_estimate(optimum: Optimum) -> Goodness:
@@ -398,22 +399,6 @@ def _tested_estimate(optimum: Optimum) -> Goodness:
 def _misfit_if_described(optimum: Optimum) -> float:
     tested = _tested_estimate(optimum)
     return np.inf if tested.objections else tested.rms_misfit
-
-
-def _bound(optimum: Optimum, misfit: float) -> float | None:
-    """Return the least misfit of parallel Jenkins elements; None where it says nothing."""
-    problem = optimum.problem
-    few = (problem.data.harmonic == 1).sum() < LEAST_DOF
-    if few or any(p.free for p in problem.sensors.parameters):
-        return None
-    if all(e.is_linear for e in problem.model.elements) or problem.is_exact:
-        return None  # the bound is that of displacements that are sines
-    try:
-        least = least_misfit(problem.data, problem.model)
-    except DahlIdentError:
-        return None
-    helps = least < FAR_LESS * misfit or _CLOSE * misfit < least <= misfit
-    return least if helps else None
 
 
 def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:

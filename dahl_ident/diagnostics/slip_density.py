@@ -23,13 +23,15 @@ from dahl_ident.diagnostics.text import sentence
 from dahl_ident.elements import Element, MaxwellSlip, Model
 from dahl_ident.elements.masing import jenkins
 from dahl_ident.elements.model import as_model
-from dahl_ident.errors import DataError, ModelError
+from dahl_ident.errors import DahlIdentError, DataError, ModelError
+from dahl_ident.fitting import Optimum
 from dahl_ident.problem import TableProblem
 
 _PER_DECADE = 48  # 5 % apart
 _BELOW = 100.0  # below the smallest amplitude, where all elements slip alike
 _SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)  # tried from the smoothest on
 _ALLOWED = 1.05  # of the least misfit that a smooth density may leave
+_FEWEST_ROWS = 6  # of which a misfit says something
 _EXACT = 1e-4  # misfit that counts as none
 FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming
 
@@ -125,9 +127,22 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
     )
 
 
-def least_misfit(data: FrequencyResponse, model: Element) -> float:
-    """Return the least misfit of parallel Jenkins elements in place of a model's friction."""
-    return _solved(_system(data, [e for e in as_model(model).elements if e.is_linear]), 0.0)[1]
+def least_misfit(optimum: Optimum) -> float | None:
+    """Return the least misfit of parallel Jenkins elements in place of a model's friction.
+
+    None where nothing can be said: with few rows, unknown calibrations, no friction, or where the
+    displacement is not a sine.
+    """
+    problem = optimum.problem
+    linear = [e for e in problem.model.elements if e.is_linear]
+    unknown = any(p.free for p in problem.sensors.parameters)
+    few = (problem.data.harmonic == 1).sum() < _FEWEST_ROWS
+    if few or unknown or problem.is_exact or len(linear) == len(problem.model.elements):
+        return None
+    try:
+        return _solved(_system(problem.data, linear), 0.0)[1]
+    except DahlIdentError:
+        return None
 
 
 class _SlipSystem(NamedTuple):

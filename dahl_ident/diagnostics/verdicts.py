@@ -59,6 +59,7 @@ _BY_PRIOR = 0.7  # of a prior's standard deviation: above it, the data say less 
 _NO_DIFFERENCE = 1.0  # of -2 ln L, between two values of which neither is the likelier
 _DIFFERENT = 9.0  # of -2 ln L, to first order: what an exchange would cost, 3 u
 _MOST_EXCHANGED = 6  # parameters, in pairs
+_EVEN = "measure the mean force or even harmonics too"
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
@@ -297,13 +298,11 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
     with parameters that pulling and pushing exchange. A move that should have cost something, by
     the derivatives, costs nothing.
     """
-    problem = optimum.problem
-    scale = optimum.scale or 1.0
-    reasons = dict[str, str]()
+    problem, theta = optimum.problem, optimum.theta
+    scale, error = optimum.scale or 1.0, np.sqrt(np.diagonal(optimum.covariance))
     driven = problem.data.controlled == "force"
     if not (problem.data.harmonic[driven] != 1).any():  # harmonics of motions need the motion
         problem = problem.with_steady("describing function")
-    theta, error = optimum.theta, np.sqrt(np.diagonal(optimum.covariance))
 
     def alike(changed: FloatArray) -> bool:
         y, moved = problem.residuals(np.array([theta, changed]), scale)
@@ -313,29 +312,27 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
         parameter = problem.parameters[i]
         return with_unit(value, optimum.stderr[parameter.name], parameter.unit)
 
+    reasons, names = dict[str, str](), problem.names
     for i in problem.friction_columns.tolist():
         turned = theta.copy()
         turned[i] = -turned[i]
         if not problem.parameters[i].positive and abs(theta[i]) > error[i] and alike(turned):
-            reasons[problem.names[i]] = (
+            reasons[names[i]] = (
                 f"its size is {shown(i, abs(float(optimum.values[i])))}, its sign is not "
-                "determined: the fundamental is the same for either; measure the mean force or "
-                "even harmonics too"
+                f"determined: the fundamental is the same for either; {_EVEN}"
             )
     for order in _exchanges(optimum):
         move = theta[order] - theta
         jacobian = problem.residuals_and_jacobian(theta, scale, tails=False)[1]
-        if not (float(np.sum((jacobian @ move) ** 2)) > _DIFFERENT and alike(theta[order])):
-            continue
-        for i in np.flatnonzero(np.abs(move) > error).tolist():
-            j = int(order[i])
-            values = [shown(k, float(optimum.values[k])) for k in (i, j)]
-            reasons[problem.names[i]] = (
-                f"either {' or '.join(values)}, as {problem.names[i]} and {problem.names[j]} are "
-                "exchangeable: these data are the same for either order; measure the mean force "
-                "or even harmonics too"
-            )
-        break
+        if float(np.sum((jacobian @ move) ** 2)) > _DIFFERENT and alike(theta[order]):
+            for i in np.flatnonzero(np.abs(move) > error).tolist():
+                j = int(order[i])
+                either = " or ".join(shown(k, float(optimum.values[k])) for k in (i, j))
+                reasons[names[i]] = (
+                    f"either {either}, as {names[i]} and {names[j]} are exchangeable: these data "
+                    f"are the same for either order; {_EVEN}"
+                )
+            break
     return reasons
 
 
