@@ -169,8 +169,8 @@ class TestBudget:
         assert found.status == "approximate", found.verdict
         assert found.goodness.objections == (str(found.goodness.runs_differ),)
         assert found.goodness.chi_square.p_value > 1e-3
-        f_max = found.errors.values["f_max"] * np.exp(found.errors.runs.theta[:, 0])
-        f_max *= np.exp(found.errors.runs.gain)
+        f_max = found.errors.values["f_max"] * np.exp(found.errors.runs.each[:, 0])
+        f_max *= np.exp(found.errors.runs.each[:, -2])
         np.testing.assert_allclose(f_max, limits, rtol=1e-3)
 
         wrong = fit(data, Dahl(alpha=0.9))

@@ -243,7 +243,7 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
         if name in errors.assumed or name in lost:
             continue
         direction = np.eye(len(names))[i]
-        if _noticed(errors, direction):
+        if errors.estimate.basis.holds(direction):
             yield name, units[name], errors.values[name], direction * abs(float(slopes[i]))
             positive = problem.parameters[i].positive
             if positive and errors.covariance[i, i] ** 0.5 > _DETERMINED:
@@ -260,7 +260,7 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
     vague = {n for n, std in zip(optimum.names, by_noise, strict=True) if std > _DETERMINED}
     for candidate in candidates(freed):
         direction, value = candidate.direction, candidate.value
-        if not (candidate.members & lost and _noticed(errors, direction)):
+        if not (candidate.members & lost and errors.estimate.basis.holds(direction)):
             continue
         # a combination that a limit depends on keeps the name that the fit gave it
         name = left.get(tuple(direction[of_optimum]), candidate.expression)
@@ -272,11 +272,6 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
         )
         if u < _DETERMINED or named:
             yield name, candidate.unit, float(value), direction * abs(value)
-
-
-def _noticed(errors: ErrorModel, direction: FloatArray) -> bool:
-    """Return whether the data determine a direction at all."""
-    return errors.estimate.basis is None or bool(errors.estimate.basis.holds(direction))
 
 
 def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:

@@ -64,9 +64,9 @@ from dahl_ident.diagnostics.held_out import HeldOut, held_out
 from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood, suspicious_points
 from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.residual_space import (
+    Linearization,
     ResidualSpace,
     RunDeviations,
-    linearization,
     run_deviations,
 )
 from dahl_ident.fitting import Optimum
@@ -155,12 +155,9 @@ class ErrorModel(ErrorContributions):
 
     def holds(self, name: str) -> bool:
         """Return whether a parameter is determined, where the data leave some directions open."""
-        basis = self.estimate.basis
-        if basis is None:
-            return True
         if not np.isfinite(self.optimum.stderr.get(name, 0.0)):
             return False  # at the limit at which the optimum lies
-        return bool(basis.holds(np.eye(len(self.names))[self.names.index(name)]))
+        return bool(self.estimate.basis.holds(np.eye(len(self.names))[self.names.index(name)]))
 
     def dof(self, direction: FloatArray, source: str | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
@@ -241,7 +238,7 @@ class ErrorModel(ErrorContributions):
             place = places.index(self.sources[k].per_test)
             effects[:, place] = predicted[self.state.model.columns(k)]
             spread[place] = self.variances[k] ** 0.5
-        mean = -self.estimate.directions @ predicted[: self.state.model.parameters]
+        mean = -self.estimate.basis.matrix @ predicted[: self.state.model.parameters]
         noise = float(self.noises[0] ** 0.5) * self.estimate.scale
         return run_deviations(self.estimate, mean, effects, spread, noise)
 
@@ -250,7 +247,7 @@ class ErrorModel(ErrorContributions):
         """Responses (n,), each run's by its own parameters, gain and phase."""
         if self.runs is None:
             return self.estimate.predicted
-        return linearization(self.problem, self.theta, self.runs).fitted
+        return Linearization(self.problem, self.theta, self.runs).fitted
 
     @cached_property
     def parallel_to_the_law(self) -> ComplexArray:
@@ -350,11 +347,11 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     shown = np.flatnonzero(state.variances[noises:] > 0.0)
     sources = tuple(sources[k] for k in shown)
     state = state.model.only(shown).at(state.variances[[*range(noises), *(noises + shown)]])
-    regular, exponents = estimate.basis is None, set[str]()
-    if regular:
+    exponents = set[str]()
+    if estimate.regular:
         exponents = {name for name, one in assumed.items() if one.source == EXPONENT}
     tests = rows_of_tests(problem.data)
-    by_tests = estimate.jackknife(tests) if regular else None
+    by_tests = estimate.jackknife(tests) if estimate.regular else None
     parts = [_propagated(estimate.lever(exact), state) for exact in (set[str](), exponents)]
     model = [k for k, one in enumerate(sources, noises) if one.name == MODEL_ERROR]
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
@@ -382,7 +379,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         if (wider > 1.0).any():
             every[TESTS] = positive_part(C * np.outer(wider, wider) - C)
     by_runs = None
-    if regular and len(problem.data.runs or ()) > 1:
+    if estimate.regular and len(problem.data.runs or ()) > 1:
         runs = rows_of(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
         by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     return ErrorModel(

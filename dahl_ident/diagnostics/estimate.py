@@ -18,7 +18,7 @@ Journal of Research of the National Bureau of Standards 87 (1982) 377.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -64,6 +64,12 @@ class Basis:
     chart: Chart  # gives theta at the coordinates
 
     @classmethod
+    def every(cls, count: int) -> Basis:
+        """Return all directions of theta."""
+        unit = np.eye(count)
+        return cls(np.ones(count), unit, unit, Chart(unit, np.zeros(count), unit))
+
+    @classmethod
     def of(cls, J: FloatArray, theta: FloatArray, chart: Chart) -> Basis:
         """Return the directions that residuals with the Jacobian J determine."""
         slopes = chart.derivative(theta)
@@ -80,13 +86,6 @@ class Basis:
     def at(self, theta: FloatArray) -> Basis:
         """Return the same changes of the coordinates at another theta."""
         return replace(self, slopes=self.chart.derivative(theta))
-
-    def moved(
-        self, theta: FloatArray, step: FloatArray, part: Callable[[FloatArray], float]
-    ) -> FloatArray:
-        """Return theta after the part of a step (r,) that a move of the coordinates allows."""
-        move = self.size * (self.directions @ step)
-        return self.chart.theta(self.chart.phi(theta) + move * part(move))
 
     def holds(self, slopes: FloatArray) -> NDArray[np.bool_]:
         """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
@@ -171,8 +170,8 @@ class WeightedEstimate:
     residuals: FloatArray  # (M,): those of data, then of priors, of unit variance
     jacobian: FloatArray  # (M, Q): their derivatives
     loss: Loss | None
-    # changes of theta that the data determine; None where they determine all
-    basis: Basis | None = None
+    regular: bool  # whether the data determine every parameter
+    basis: Basis  # what they determine
     # (Q,): how far a second minimum is, times the root of its probability; None where there is none
     second: FloatArray | None = None
 
@@ -191,14 +190,9 @@ class WeightedEstimate:
         return scores_of(self.residuals, self.problem.n_residuals, self.loss)
 
     @property
-    def directions(self) -> FloatArray:
-        """Changes of theta that the data determine, (Q, r)."""
-        return np.eye(len(self.theta)) if self.basis is None else self.basis.matrix
-
-    @property
     def columns(self) -> FloatArray:
         """Derivatives with respect to what the data determine, (M, r)."""
-        return self.jacobian @ self.directions
+        return self.jacobian @ self.basis.matrix
 
     def changed(self, changes: ComplexArray) -> FloatArray:
         """Return the changes of `y`, (M, k), by changes (k, n) of the measured responses."""
@@ -235,7 +229,7 @@ class WeightedEstimate:
 
     def lever(self, left_out: Collection[str] = ()) -> FloatArray:
         """Return G = (J'J)^-1 J', d theta/d y (Q, M), some parameters left out: exact."""
-        kept = self.directions
+        kept = self.basis.matrix
         if left_out:
             kept = kept[:, [name not in left_out for name in self.problem.names]]
         Q, R = np.linalg.qr(self.jacobian @ kept)
@@ -250,8 +244,7 @@ class WeightedEstimate:
         r, J = self.problem.residuals_and_jacobian(theta, self.scale, tails=self.loss is None)
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             return self
-        basis = None if self.basis is None else self.basis.at(theta)
-        return replace(self, theta=theta, residuals=r, jacobian=J, basis=basis)
+        return replace(self, theta=theta, residuals=r, jacobian=J, basis=self.basis.at(theta))
 
     def jackknife(self, tests: Sequence[NDArray[np.intp]]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
@@ -336,7 +329,7 @@ def _descended(
     optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
 ) -> WeightedEstimate:
     """Return the minimum where a search ends."""
-    stated, basis = problem.widened(np.zeros(problem.data.n)), None
+    stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
     loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
     if not determined:
         _, J = stated.residuals_and_jacobian(theta)
@@ -347,8 +340,8 @@ def _descended(
         weighted = stated.widened(variance)
         r, J = weighted.residuals_and_jacobian(theta, scale, tails=loss is None)
         y = scores_of(r, m, loss)
-        basis = None if basis is None else basis.at(theta)
-        columns = J if basis is None else J @ basis.matrix
+        basis = basis.at(theta)
+        columns = J @ basis.matrix
         if not (np.isfinite(y).all() and np.isfinite(columns).all()):
             raise np.linalg.LinAlgError("no finite step from the estimate")
         step = np.linalg.lstsq(columns, -y, rcond=1e-13)[0]
@@ -371,7 +364,7 @@ def _descended(
         theta = trial
     if not np.isfinite(y).all():
         raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
-    return WeightedEstimate(weighted, theta, misfit, variance, scale, r, J, loss, basis)
+    return WeightedEstimate(weighted, theta, misfit, variance, scale, r, J, loss, determined, basis)
 
 
 def scores_of(r: FloatArray, m: int, loss: Loss | None) -> FloatArray:
@@ -511,19 +504,11 @@ def _root(z: FloatArray, b: FloatArray, target: float) -> float:
     return x
 
 
-def _moved(
-    problem: TableProblem, theta: FloatArray, step: FloatArray, basis: Basis | None
-) -> FloatArray:
+def _moved(problem: TableProblem, theta: FloatArray, step: FloatArray, basis: Basis) -> FloatArray:
     """Return theta after a step, or the part of it that changes no logarithm by much."""
-    logarithmic = problem.space.positive
-    if basis is not None:  # coordinates that change one
-        logarithmic = (basis.slopes[logarithmic] != 0.0).any(axis=0)
-
-    def part(move: FloatArray) -> float:
-        return min(
-            1.0, _LONGEST_STEP / max(float(np.abs(move[logarithmic]).max(initial=0.0)), TINY)
-        )
-
-    if basis is not None:
-        return np.clip(basis.at(theta).moved(theta, step, part), *problem.bounds())
-    return np.clip(theta + step * part(step), *problem.bounds())
+    basis = basis.at(theta)
+    logarithmic = (basis.slopes[problem.space.positive] != 0.0).any(axis=0)
+    move = basis.size * (basis.directions @ step)
+    longest = max(float(np.abs(move[logarithmic]).max(initial=0.0)), TINY)
+    part = min(1.0, _LONGEST_STEP / longest)
+    return np.clip(basis.chart.theta(basis.chart.phi(theta) + part * move), *problem.bounds())

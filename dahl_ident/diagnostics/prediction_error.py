@@ -51,7 +51,7 @@ def prediction_error(
     where = places(amplitude, omega)
     by_theta = parts(slopes)
     X = np.zeros((len(slopes), 2, model.U.shape[1]))
-    X[..., : model.parameters] = -by_theta @ errors.estimate.directions
+    X[..., : model.parameters] = -by_theta @ basis.matrix
     for k, source in enumerate(errors.sources):
         made = source.changes(names, slopes, where, stiffness)
         if made is not None:
@@ -77,8 +77,7 @@ def prediction_error(
         mean = _diagonal(by_theta @ errors.by_runs.covariance @ by_theta.swapaxes(1, 2))
         runs = errors.by_runs.runs
         dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
-    if basis is not None:
-        covariance[~basis.holds(by_theta).all(axis=1)] = np.inf
+    covariance[~basis.holds(by_theta).all(axis=1)] = np.inf
     return PredictionError(X @ state.predicted, covariance, dof)
 
 

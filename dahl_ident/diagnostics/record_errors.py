@@ -45,29 +45,14 @@ _SHORTENS = 0.5  # of u: without a source of less, intervals are at most a tenth
 
 @dataclass(frozen=True)
 class RecordErrors(ErrorContributions):
-    """Covariance of the estimate, source by source.
+    """Covariance of the estimate, source by source."""
 
-    Attributes
-    ----------
-    contributions : mapping of str to ndarray, shape (P, P)
-        Noise first.
-    effective : float
-        Samples of white noise that would tell as much as the residuals.
-    exact : tuple of str
-        Inputs without a stated uncertainty.
-    runs : int
-        Records that were fitted together.
-    exponents : tuple of HeldValue
-        What the records say of exponents that the fit holds.
-    misfit : MotionMisfit or None
-        What the residuals follow, from which `ALONG_MOTION` was estimated.
-    """
-
-    contributions: Mapping[str, FloatArray]
-    effective: float
-    exact: tuple[str, ...]
-    runs: int
-    exponents: tuple[HeldValue, ...]
+    contributions: Mapping[str, FloatArray]  # (P, P) each, noise first
+    effective: float  # samples of white noise that would tell as much as the residuals
+    exact: tuple[str, ...]  # inputs without a stated uncertainty
+    runs: int  # records that were fitted together
+    exponents: tuple[HeldValue, ...]  # what the records say of exponents that the fit holds
+    # what the residuals follow, from which `ALONG_MOTION` was estimated
     misfit: MotionMisfit | None = None
 
     @property
@@ -82,13 +67,13 @@ class RecordErrors(ErrorContributions):
 
     def dof_of(self, source: str) -> float:
         """Degrees of freedom of one source."""
-        if source == NOISE:
-            return max(self.effective - len(self.covariance), 1.0)
-        return {
+        known = {
+            NOISE: max(self.effective - len(self.covariance), 1.0),
             MODEL_ERROR: BLOCKS - 1.0,
             ALONG_MOTION: float(self.misfit.functions) if self.misfit else np.inf,
             RUNS: self.runs - 1.0,
-        }.get(source, np.inf)
+        }
+        return known.get(source, np.inf)
 
     def dof(self, direction: FloatArray, source: str | None = None) -> float:
         """Return the degrees of freedom of direction . values, by Welch and Satterthwaite."""
@@ -117,18 +102,8 @@ def record_errors(
     What an assumed exponent changes counts with its range and with what the records say of it.
     Errors of the channels are those of :mod:`dahl_ident.diagnostics.record_channels`.
 
-    Parameters
-    ----------
-    problem : RecordProblem
-    values : ndarray, shape (P,)
-        The estimate.
-    jacobians, residuals : sequence of ndarray
-        Derivatives of the prediction and measured minus predicted, of each record; of a robust
-        fit the scores in place of the latter, which then say nothing of the prediction.
-
-    Returns
-    -------
-    RecordErrors
+    `jacobians` and `residuals` are the derivatives of each record's prediction, and measured minus
+    predicted; of a robust fit the scores, which then say nothing of the prediction.
     """
     fit = LinearFit.of(problem, values, jacobians, residuals)
     covariance, effective = fit.by_noise

@@ -34,25 +34,14 @@ _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A fit of records to first order; waves of each record are filtered as the fit weighs them.
-
-    Attributes
-    ----------
-    values : ndarray, shape (P,)
-        The estimate.
-    jacobians, residuals : sequence of ndarray, shapes (n, P) and (n,)
-        Derivatives of each record's prediction, and measured minus predicted.
-    noise : sequence of ndarray
-        Autocovariances of the residuals' noise.
-    judged : ndarray of bool, shape (P,)
-        The parameters in which a misfit shows: not the states and offsets of records.
-    """
+    """A fit of records to first order; waves of each record are filtered as the fit weighs them."""
 
     problem: RecordProblem
-    values: FloatArray
-    jacobians: Sequence[FloatArray]
-    residuals: Sequence[FloatArray]
-    noise: Sequence[FloatArray]
+    values: FloatArray  # (P,): the estimate
+    jacobians: Sequence[FloatArray]  # (n, P): derivatives of each record's prediction
+    residuals: Sequence[FloatArray]  # (n,): measured minus predicted
+    noise: Sequence[FloatArray]  # autocovariances of the residuals' noise
+    # (P,): the parameters in which a misfit shows: not the states and offsets of records
     judged: NDArray[np.bool_]
 
     @classmethod
@@ -141,36 +130,21 @@ class LinearFit:
 
 @dataclass(frozen=True)
 class HeldValue:
-    """An exponent that the fit holds.
-
-    Attributes
-    ----------
-    name, unit : str
-    value : float
-        What it is held at.
-    range : tuple of float
-        Where it may lie; nothing but `value` where the user stated it.
-    std : float
-        Of its logarithm, by the records and its range together.
-    asked, by_records : float
-        Logarithm of the ratio of the estimate by the records alone, which may be outside the
-        range, to `value`, and its standard deviation.
-    contribution : ndarray, shape (P, P)
-        Covariance of the estimate through it: as if it were estimated too, and at least as much
-        as the value estimated from the records moves it.
-    assumed : bool
-        Whether the user did not state it.
-    """
+    """An exponent that the fit holds."""
 
     name: str
     unit: str
-    value: float
-    range: tuple[float, float]
-    std: float
+    value: float  # what it is held at
+    range: tuple[float, float]  # where it may lie; nothing but `value` where the user stated it
+    std: float  # of its logarithm, by the records and its range together
+    # logarithm of the ratio of the estimate by the records alone, which may be outside the range,
+    # to `value`, and its standard deviation
     asked: float
     by_records: float
+    # (P, P): covariance of the estimate through it: as if it were estimated too, and at least as
+    # much as the value estimated from the records moves it
     contribution: FloatArray
-    assumed: bool
+    assumed: bool  # whether the user did not state it
 
     @property
     def contradicted(self) -> bool:
@@ -287,10 +261,8 @@ def between_blocks(fit: LinearFit) -> FloatArray | None:
     """Return the covariance between blocks beyond that of noise, or None where it shows none."""
     if sum(e.size for e in fit.residuals) < BLOCKS * BLOCKS:
         return None
-    blocks = [
-        (fit.jacobians[i][rows], fit.residuals[i][rows]) for i, rows in blocks_of(fit.residuals)
-    ]
-    return _beyond(blocks, fit.by_noise[0], fit.judged, _LEVEL)
+    blocks = [[block] for block in blocks_of(fit.residuals)]
+    return _between(fit, blocks, fit.by_noise[0], _LEVEL)
 
 
 def blocks_of(
@@ -314,48 +286,43 @@ def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
     parts it is: the problem's `runs` say which record each part is of.
     """
     runs = np.asarray(fit.problem.runs)
-    if np.ptp(runs) == 0:
-        return None
-    whole = []
-    for run in np.unique(runs):
-        members = np.flatnonzero(runs == run).tolist()
-        J, e = ([waves[i] for i in members] for waves in (fit.jacobians, fit.residuals))
-        whole.append((np.concatenate(J), np.concatenate(e)))
-    return _beyond(whole, known, fit.judged, _RUNS_LEVEL)
+    whole = [np.arange(e.size) for e in fit.residuals]
+    members = [np.flatnonzero(runs == run).tolist() for run in np.unique(runs)]
+    records = [[(i, whole[i]) for i in each] for each in members]
+    return _between(fit, records, known, _RUNS_LEVEL) if len(records) > 1 else None
 
 
-def _beyond(
-    blocks: Sequence[tuple[FloatArray, FloatArray]],
+def _between(
+    fit: LinearFit,
+    groups: Sequence[Sequence[tuple[int, NDArray[np.intp]]]],
     noise: FloatArray,
-    judged: NDArray[np.bool_],
     level: float,
 ) -> FloatArray | None:
-    """Return the covariance between blocks beyond `noise`, or None where chance explains it.
+    """Return the covariance between groups of samples beyond `noise`, or None by chance.
 
-    That between blocks is that of Liang and Zeger, Biometrika 73 (1986) 13-22.
+    A group is a list of records' numbers, each with samples. The covariance between groups is that
+    of Liang and Zeger, Biometrika 73 (1986) 13-22.
     """
     seen = np.flatnonzero(np.isfinite(noise.diagonal()))
-    if not noise[np.ix_(seen, seen)].any():
+    inside = np.ix_(seen, seen)
+    if not noise[inside].any():
         return None
-    if seen.size < len(noise):
-        visible, inside = [(J[:, seen], e) for J, e in blocks], noise[np.ix_(seen, seen)]
-        excess = _beyond(visible, inside, judged[seen], level)
-        if excess is None:
-            return None
-        whole = np.zeros(noise.shape)
-        whole[np.ix_(seen, seen)] = excess
-        return whole
-    size = np.sqrt(noise.diagonal())
-    scores = [size * (J.T @ e) for J, e in blocks]
-    parts = [np.outer(size, size) * (J.T @ J) for J, _ in blocks]
+    size = np.sqrt(noise.diagonal()[seen])
+    units, scores, parts = np.outer(size, size), [], []
+    for group in groups:
+        J = np.concatenate([fit.jacobians[i][rows] for i, rows in group])[:, seen]
+        scores.append(size * (J.T @ np.concatenate([fit.residuals[i][rows] for i, rows in group])))
+        parts.append(units * (J.T @ J))
     inverse = np.linalg.inv(sum(parts))
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
-    by_chance = noise / np.outer(size, size)
+    by_chance = noise[inside] / units
     # how much each block says of each parameter
     weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
     dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
     ratio = between.diagonal() / by_chance.diagonal()
-    if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[judged].any():
+    if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[fit.judged[seen]].any():
         return None
-    return np.asarray(positive_part(between - by_chance) * np.outer(size, size))
+    excess = np.zeros(noise.shape)
+    excess[inside] = positive_part(between - by_chance) * units
+    return excess

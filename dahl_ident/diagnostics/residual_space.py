@@ -16,7 +16,6 @@ A force limit that differs by 5 % from day to day bends the response by second-o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,6 +29,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.problem import TableProblem
 
+_STEPS = 2  # of Gauss-Newton, from the linear mixed model's deviations of runs
 _RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as none
 _GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
 _NOTHING = 1e-100  # length of a column that is none
@@ -41,52 +41,41 @@ class RunDeviations:
     """How each of R runs deviates from theta."""
 
     labels: NDArray[np.str_]  # (R,): the runs
-    theta: FloatArray  # (R, Q): added to the search coordinates
-    gain: FloatArray  # (R,): added to ln gain, and to the phase of the fundamental, rad
-    phase: FloatArray
+    # (R, Q + 2): added to the search coordinates, to ln gain, and to the phase of the fundamental
+    each: FloatArray
+    scatters: NDArray[np.bool_]  # (Q + 2,): which of them differ between runs
 
 
-@dataclass(frozen=True)
 class Linearization:
-    """Residuals (m,) of a problem's data, linearised at theta and the deviations of runs."""
+    """Residuals of a problem's data, linearised at theta and the deviations of runs; no priors."""
 
-    residuals: FloatArray  # (m,): residuals of each run at its own parameters
-    J: FloatArray  # (m, Q): their derivatives with respect to theta
-    predicted: ComplexArray  # (n,): responses, each run's at its own parameters
-    fitted: ComplexArray  # (n,): the same with each run's gain and phase
-    # problems, the rows (n,) that are theirs, and the theta of each
-    parts: Sequence[tuple[TableProblem, NDArray[np.bool_], FloatArray]]
+    def __init__(self, problem: TableProblem, theta: FloatArray, runs: RunDeviations) -> None:
+        self._harmonic = problem.data.harmonic
+        m = problem.n_residuals
+        self.residuals = np.zeros(m)  # of each run at its own parameters
+        self.J = np.zeros((m, len(theta)))  # their derivatives with respect to theta
+        # responses (n,), each run's at its own parameters; the same with its gain and phase
+        self.predicted, self.fitted = np.zeros((2, m // 2), dtype=np.complex128)
+        # problems, the rows (n,) that are theirs, and the theta of each
+        self.parts: list[tuple[TableProblem, NDArray[np.bool_], FloatArray]] = []
+        for label, b in zip(runs.labels, runs.each, strict=True):
+            rows = np.asarray(problem.data.run) == label
+            deviation = b[-2] + 1j * b[-1] * self._harmonic[rows]
+            part = problem.part(rows, problem.data.response[rows] * np.exp(-deviation))
+            there = np.clip(theta + b[:-2], *problem.bounds())
+            both = np.repeat(rows, 2)
+            at, by = part.residuals_and_jacobian(there, tails=False)
+            self.residuals[both], self.J[both] = at[: part.n_residuals], by[: part.n_residuals]
+            self.predicted[rows] = part.predict(there)
+            self.fitted[rows] = self.predicted[rows] * np.exp(deviation)
+            self.parts.append((part, rows, there))
 
-    def change(self, changes: ComplexArray) -> FloatArray:
-        """Return the changes of residuals, (k, m), by changes (k, n) of the measured responses."""
-        added = np.zeros((len(changes), 2 * changes.shape[1]))
-        for problem, rows, theta in self.parts:
-            added[:, np.repeat(rows, 2)] = -problem.residual_change(theta, changes[:, rows])
-        return added
-
-
-def linearization(problem: TableProblem, theta: FloatArray, runs: RunDeviations) -> Linearization:
-    """Return residuals and derivatives at theta and the runs' deviations, without priors."""
-    m = problem.n_residuals
-    residuals = np.zeros(m)
-    J = np.zeros((m, len(theta)))
-    predicted, fitted = np.zeros((2, m // 2), dtype=np.complex128)
-    labels, parts = np.asarray(problem.data.run), []
-    for label, shift, gain, phase in zip(
-        runs.labels, runs.theta, runs.gain.tolist(), runs.phase.tolist(), strict=True
-    ):
-        rows = labels == label
-        deviation = gain + 1j * phase * problem.data.harmonic[rows]
-        part = problem.part(rows, problem.data.response[rows] * np.exp(-deviation))
-        there = np.clip(theta + shift, *problem.bounds())
+    def of_run(self, number: int) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Return a run's residuals, and their derivatives with respect to its deviations."""
+        problem, rows, theta = self.parts[number]
+        turns = np.array([np.ones(rows.sum()), 1j * self._harmonic[rows]]) * self.predicted[rows]
         both = np.repeat(rows, 2)
-        at, by = part.residuals_and_jacobian(there, tails=False)
-        at, by = at[: part.n_residuals], by[: part.n_residuals]
-        predicted[rows] = part.predict(there)
-        fitted[rows] = predicted[rows] * np.exp(deviation)
-        residuals[both], J[both] = at, by
-        parts.append((part, rows, there))
-    return Linearization(residuals, J, predicted, fitted, parts)
+        return both, np.column_stack([self.J[both], problem.residual_change(theta, turns).T])
 
 
 def run_deviations(
@@ -100,22 +89,18 @@ def run_deviations(
     problem, scale = estimate.problem, estimate.scale
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
     unit, b = spread[scatters], effects.copy()
-    for last in (False, False, True):
-        runs = RunDeviations(labels, mean + b[:, :-2], b[:, -2], b[:, -1])
-        if last:
-            break
-        near = linearization(problem, estimate.theta, runs)
+    centre = np.append(mean, [0.0, 0.0])
+    for _ in range(_STEPS):
+        near = Linearization(problem, estimate.theta, RunDeviations(labels, centre + b, scatters))
         if not (np.isfinite(near.residuals).all() and np.isfinite(near.J).all()):
             return None
         r = scale * scores_of(near.residuals / scale, len(near.residuals), estimate.loss)
-        for i, (_, rows, _) in enumerate(near.parts):
-            both, share = np.repeat(rows, 2), near.predicted * rows
-            turns = near.change(np.array([-share, -1j * problem.data.harmonic * share]))
-            columns = np.hstack([near.J[both], turns[:, both].T])[:, scatters] * unit
+        for i in range(len(labels)):
+            both, columns = near.of_run(i)
             left = np.concatenate([r[both], noise * b[i, scatters] / unit])
-            every = np.vstack([columns, noise * np.eye(len(unit))])
+            every = np.vstack([columns[:, scatters] * unit, noise * np.eye(len(unit))])
             b[i, scatters] -= unit * np.linalg.lstsq(every, left, rcond=None)[0]
-    return runs
+    return RunDeviations(labels, centre + b, scatters)
 
 
 class Coefficient(NamedTuple):
@@ -226,9 +211,14 @@ class ResidualSpace(_Complement):
         y, J = self._problem.residuals_and_jacobian(optimum.theta, self._scale, tails=False)
         of_runs = np.zeros((m, 0))
         if runs is not None:
-            near = linearization(self._problem, optimum.theta, runs)
+            near = Linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
-            of_runs = _columns_of_runs(near, runs, self._problem.data.harmonic) / self._scale
+            parts = map(near.of_run, range(len(runs.labels)))
+            blocks = []
+            for both, columns in parts:
+                blocks.append(np.zeros((m, runs.scatters.sum())))
+                blocks[-1][both] = columns[:, runs.scatters] / self._scale
+            of_runs = np.hstack(blocks)
             self.dof -= orthonormal(np.hstack([J[:m], of_runs])).shape[1]
             self.dof += orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
@@ -283,23 +273,6 @@ class ResidualSpace(_Complement):
         if dof <= k or total <= explained:
             return np.nan
         return float(special.fdtrc(k, dof - k, explained / k / ((total - explained) / (dof - k))))
-
-
-def _columns_of_runs(
-    near: Linearization, runs: RunDeviations, harmonic: NDArray[np.integer]
-) -> FloatArray:
-    """Return what parameters, gain and phase of each run change, those that scatter, (m, k)."""
-    columns = []
-    for _, rows, _ in near.parts:
-        both = np.repeat(rows, 2)[:, None]
-        columns.append(near.J[:, np.ptp(runs.theta, axis=0) > 0.0] * both)
-        share = near.predicted * rows
-        turned = 1j * harmonic * share
-        if runs.gain.any():
-            columns.append(near.change(share[None]).T)
-        if runs.phase.any():
-            columns.append(near.change(turned[None]).T)
-    return np.hstack(columns)
 
 
 def orthonormal(columns: FloatArray, least: float = _RANK) -> FloatArray:

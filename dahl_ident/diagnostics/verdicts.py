@@ -396,7 +396,7 @@ def _determined(
 
     def stated(c: Candidate) -> Iterator[StatedCombination]:
         std = float(information.std(c.direction))
-        if std < IDENTIFIED_BELOW and errors is not None and errors.estimate.basis is None:
+        if std < IDENTIFIED_BELOW and errors is not None and errors.estimate.regular:
             direction = np.zeros(len(errors.names))
             direction[[errors.names.index(name) for name in optimum.names]] = c.direction
             std = float(errors.std(direction))
