@@ -60,9 +60,10 @@ class BoucWen(Friction):
     sigma (1 + sgn(p) abs(p F/sigma)^n) unloading, so that q and p keep their unit and the limit is
     sigma/q for every n: beta + gamma = sgn(q) abs(q)^n sigma^(1-n), beta - gamma the same of p.
     q = p = sigma/f_max with n = 1 is the linear Dahl model. In settled sines p counts as at most
-    1e8 over the displacement amplitude, where the loop differs from that of instant unloading by at
-    most 2e-4 of N: beyond, data cannot determine it. Y.-K. Wen, Method for random
-    vibration of hysteretic systems, J. Eng. Mech. Div. 102 (1976) 249-263.
+    1e8 over the displacement amplitude (in a driven plant, that of the plant with stuck friction),
+    where the loop differs from that of instant unloading by at most 2e-4 of N: beyond, data cannot
+    determine it. Y.-K. Wen, Method for random vibration of hysteretic systems, J. Eng. Mech. Div.
+    102 (1976) 249-263.
 
     Examples
     --------

@@ -16,6 +16,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.equations import plant_equations
+from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
 
@@ -137,23 +138,31 @@ class Shooting:
         if omega.size and self.drifts(values[0]):
             values = np.full(values.shape, np.nan)  # for which none are sought
         options["largest"] = 1.0 + NEUTRAL if stable else np.inf
-        result = self._motions(
-            values, omega, drive, chosen, starts=starts, cycles=cycles, **options
-        )
         with np.errstate(all="ignore"):
-            A = np.hypot(result.starts[:, 0], result.starts[:, 1] / omega)
-            resolved = np.stack(self._model.resolved(list(values.T), A), axis=-1)
-            beyond = (resolved < values) & result.found[:, None]
-        rows = np.flatnonzero(beyond.any(axis=1))
-        if rows.size:
-            repeated = self._motions(
-                resolved[rows], omega[rows], drive[rows], chosen, starts=result.starts[rows],
-                **options,
-            )  # fmt: skip
-            repeated.by_parameter.swapaxes(1, 2)[beyond[rows][:, list(chosen)]] = 0.0
-            for part, new in zip(result, repeated, strict=True):
-                part[rows] = new
+            least = self._least_amplitude(values, omega, drive)
+            resolved = np.stack(self._model.resolved(list(values.T), least), axis=-1)
+            rows, held = np.nonzero((resolved < values)[:, list(chosen)])
+        result = self._motions(
+            resolved, omega, drive, chosen, starts=starts, cycles=cycles, **options
+        )
+        result.by_parameter[rows, :, held] = 0.0
         return result
+
+    def _least_amplitude(
+        self, values: FloatArray, omega: FloatArray, drive: FloatArray
+    ) -> FloatArray:
+        """Return displacements that the motions exceed, whatever their phase and their branch.
+
+        Those of the plant whose friction is stuck, and whose linear part does not cancel it.
+        """
+        linear, stuck = np.zeros(omega.shape, dtype=np.complex128), np.zeros(omega.shape)
+        for element, numbers in self._model.of(list(values.T)):
+            if element.is_linear:
+                linear += element.stiffness(numbers, np.zeros(()), omega)
+            elif isinstance(element, Friction):
+                (law,) = element.inside or (element,)
+                stuck += law.rest_stiffness(numbers[: len(law.parameters)])
+        return np.asarray(drive / (np.abs(linear) + stuck))
 
     def _motions(
         self,
