@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
@@ -44,13 +45,14 @@ GAIN = "force_gain"
 _STEPS = 60  # Gauss-Newton steps; five are the rule
 _LITTLE_SAID = 0.25  # of the variance of a range: the data say little more of an exponent
 _APART = 0.1  # standard deviations between two minima
+_NEAR_ENOUGH = 0.03  # the same for the estimates of a jackknife
 _SETTLED = 1e-3  # of a standard deviation that a step still moves the estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
 _HALVINGS = 8  # of a step, until the sum of squares falls
 _ROOT_STEPS = 200  # Newton's, from below, for the misfit: it doubles where it is far off
 _LEAST_LEFT = 1e-3  # of a test, that the others do not determine
 _MOST_DISAGREEMENT = 1e6  # of harmonics with fundamentals, as a factor of their variance
-_HALVINGS_OF_FACTOR = 30  # of its logarithm's range: to 1e-8
+_SAME_FACTOR = 1e-8  # of its logarithm
 _SAME = 1e-9  # relative change of the misfit's square that no longer counts
 
 
@@ -319,16 +321,23 @@ def jackknife_by_refits(
         kept[rows] = False
         with suppress(np.linalg.LinAlgError):  # the others do not determine it
             others = problem.part(kept, problem.data.response[kept])
-            without = _descended(optimum, others, estimate.theta, determined=True)
+            without = _descended(
+                optimum, others, estimate.theta, determined=True, settled=_NEAR_ENOUGH
+            )
             moves.append(without.theta - estimate.theta)
     each = np.array(moves).reshape(-1, len(estimate.theta))
     return np.asarray((1.0 - 1.0 / len(tests)) * each.T @ each)
 
 
 def _descended(
-    optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
+    optimum: Optimum,
+    problem: TableProblem,
+    theta: FloatArray,
+    *,
+    determined: bool,
+    settled: float = _SETTLED,
 ) -> WeightedEstimate:
-    """Return the minimum where a search ends."""
+    """Return the minimum where a search ends: where steps are below `settled` deviations."""
     stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
     loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
     if not determined:
@@ -346,7 +355,7 @@ def _descended(
             raise np.linalg.LinAlgError("no finite step from the estimate")
         step = np.linalg.lstsq(columns, -y, rcond=1e-13)[0]
         size = np.linalg.norm(columns @ step)
-        if size < _SETTLED:
+        if size < settled:
             break
         moved = columns @ step
         further = _further(moved, last)
@@ -463,13 +472,15 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
         apart = explained(A, b) + explained(A_h, b_h) / factor
         return apart - explained(A + A_h / factor, b + b_h / factor)
 
-    low, high = 0.0, np.log(_MOST_DISAGREEMENT)
-    if distance(1.0) <= directions:
+    def excess(ln_factor: float) -> float:
+        return distance(np.exp(ln_factor)) - directions
+
+    most = np.log(_MOST_DISAGREEMENT)
+    if excess(0.0) <= 0.0:
         return 1.0
-    for _ in range(_HALVINGS_OF_FACTOR):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if distance(np.exp(middle)) > directions else (low, middle)
-    return float(np.exp(high))
+    if excess(most) >= 0.0:
+        return _MOST_DISAGREEMENT
+    return float(np.exp(brentq(excess, 0.0, most, xtol=_SAME_FACTOR)))
 
 
 def _square(z: FloatArray, b: FloatArray, target: float, loss: Loss | None) -> float:

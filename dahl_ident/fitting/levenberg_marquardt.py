@@ -47,6 +47,8 @@ _LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, within which a quadratic m
 _NOISE_TOLERANCE = 1e-8
 # longest step of a logarithm that may be the last: the Hessian returned is that before it
 _LAST_STEP = 1e-6
+_ALIKE = 0.9  # squared cosine between two steps of a geometric series
+_SLOWEST = 0.99  # their ratio at most: a hundred steps at once
 # change of the residuals, over their size, that a coordinate makes from bound to bound, below which
 # it is held: it has no effect
 _FLAT = 1e-3
@@ -200,7 +202,7 @@ def minimise(
     ends = at.take(active)
     converged, evaluations = np.full(S, P == 0), np.ones(S, dtype=np.intp)
     damping, growth = np.full(S, _FIRST_DAMPING), np.full(S, 2.0)
-    last = np.full(S, 1e-300)
+    last, before = np.full(S, 1e-300), np.zeros((S, P))
     # steps of each owner's converged search
     first, lowest = np.full((2, owner.max(initial=0) + 1), np.inf)
     for count in range(steps if P else 0):
@@ -234,7 +236,9 @@ def minimise(
             if not active.size:
                 break
             step, moves, predicted = step[keep], moves[keep], predicted[keep]
-            damping, growth, last = damping[keep], growth[keep], last[keep]
+            damping, growth, last, before = damping[keep], growth[keep], last[keep], before[keep]
+        further = _further(at.hessian, step, before)
+        step = further[:, None] * step
         trial = at.theta + step
         new = _State(trial, *evaluate(trial, active))
         evaluations[active] += 1
@@ -248,6 +252,7 @@ def minimise(
         damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
         last = np.where(better, moves, 1e-300)
+        before = np.where((better & (further == 1.0))[:, None], step, 0.0)
         at = new if better.all() else at.where(better, new)
     ends.assign(active, at)
     return Minima(ends.theta, ends.cost, ends.hessian, converged, evaluations)
@@ -302,6 +307,19 @@ def _step(
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     predicted = -(delta * g).sum(axis=1) - 0.5 * moves
     return delta / size, moves, np.maximum(predicted, 1e-300), longest
+
+
+def _further(hessian: FloatArray, step: FloatArray, before: FloatArray) -> FloatArray:
+    """Return the factor that lengthens a step to the sum of the geometric series it continues.
+
+    Where a model is curved and misses the data by much, each step of Gauss and Newton's is the same
+    share of the one `before`.
+    """
+    along, past = ((hessian @ each[:, :, None])[:, :, 0] for each in (step, before))
+    product, squares = (step * past).sum(axis=1), (before * past).sum(axis=1)
+    ratio = product / np.maximum(squares, 1e-300)
+    alike = product**2 > _ALIKE * squares * (step * along).sum(axis=1)
+    return np.where(alike & (ratio > 0.0), 1.0 / (1.0 - np.minimum(ratio, _SLOWEST)), 1.0)
 
 
 def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: float) -> FloatArray:

@@ -384,8 +384,8 @@ class TableProblem(Problem):
 
     @property
     def accuracy(self) -> float:
-        """Relative error of predictions: rounding, or what shooting leaves."""
-        return ACCURACY if self.is_exact else EXPLICIT
+        """Relative error of predictions: rounding, or what shooting and true amplitudes leave."""
+        return EXPLICIT if self._noise.amplitude is None and not self.is_exact else ACCURACY
 
     # Residuals
 
