@@ -238,6 +238,8 @@ def minimise(
             step, moves, predicted = step[keep], moves[keep], predicted[keep]
             damping, growth, last, before = damping[keep], growth[keep], last[keep], before[keep]
         further = _further(at.hessian, step, before)
+        longest = np.abs(step * logarithmic).max(axis=1)
+        further = np.clip(_LONGEST_STEP / np.maximum(longest, 1e-300), 1.0, further)
         step = further[:, None] * step
         trial = at.theta + step
         new = _State(trial, *evaluate(trial, active))
