@@ -58,28 +58,27 @@ class ResponseBand:
 
     def gain(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the gain at each point."""
-        factor = np.exp(self._threshold(level, self.dof[0]) * self.log_gain_std)
         size = np.abs(self.centre)
-        return size / factor, size * factor
+        less, more = self._around(0.0 * size, level, self.dof[0], self.log_gain_std)
+        return size * np.exp(less), size * np.exp(more)
 
     def phase(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the phase at each point, rad."""
-        width = self._threshold(level, self.dof[1]) * self.phase_std
-        centre = np.angle(self.centre)
-        return centre - width, centre + width
+        return self._around(np.angle(self.centre), level, self.dof[1], self.phase_std)
 
     def real(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the real part at each point."""
-        width = self._threshold(level, self.dof.min(axis=0)) * self.real_std
-        return self.centre.real - width, self.centre.real + width
+        return self._around(self.centre.real, level, self.dof.min(axis=0), self.real_std)
 
     def imag(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the imaginary part at each point."""
-        width = self._threshold(level, self.dof.min(axis=0)) * self.imag_std
-        return self.centre.imag - width, self.centre.imag + width
+        return self._around(self.centre.imag, level, self.dof.min(axis=0), self.imag_std)
 
-    def _threshold(self, level: float, dof: FloatArray) -> FloatArray:
-        return band_factor(self.scores, dof, float(checked_levels([level])[0]))
+    def _around(
+        self, centre: FloatArray, level: float, dof: FloatArray, std: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        width = band_factor(self.scores, dof, float(checked_levels([level])[0])) * std
+        return centre - width, centre + width
 
 
 @dataclass(frozen=True)
@@ -316,18 +315,17 @@ def _noise_band(
     optimum: Optimum, R: ComplexArray, by: ComplexArray, noise: FloatArray | None = None
 ) -> ResponseBand:
     """Return the band from noise alone, `noise` the covariance of a test's ln gain and phase."""
-    information = Information(optimum)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = by / R[..., None]
     dof = np.inf if optimum.scale_known else (optimum.dof if optimum.dof > 0 else np.nan)
-    parts = [information.std(d) for d in (by.real, by.imag, relative.real, relative.imag)]
+    parts = Information(optimum).std(np.array([by.real, by.imag, relative.real, relative.imag]))
     if noise is not None:
-        parts = [np.hypot(a, b) for a, b in zip(parts, _parts_std(R, noise), strict=True)]
+        parts = np.hypot(parts, _parts_std(R, noise))
     real, imag, gain, phase = parts
     return ResponseBand(R, R, real, imag, gain, phase, np.full((2, *R.shape), dof))
 
 
-def _parts_std(R: ComplexArray, covariance: FloatArray) -> list[FloatArray]:
+def _parts_std(R: ComplexArray, covariance: FloatArray) -> FloatArray:
     """Return standard deviations of real and imaginary part, ln gain and phase of (n,) responses.
 
     `covariance`, (n, 2, 2), is that of ln gain and phase.
@@ -335,7 +333,8 @@ def _parts_std(R: ComplexArray, covariance: FloatArray) -> list[FloatArray]:
     turned = np.stack([R, 1j * R], axis=-1)  # by ln gain and phase
     gain, phase = (np.tile(axis, (R.size, 1)) for axis in np.eye(2))
     levers = np.array([turned.real, turned.imag, gain, phase])
-    return list(np.sqrt(np.maximum(np.einsum("kni,nij,knj->kn", levers, covariance, levers), 0.0)))
+    squares = np.einsum("kni,nij,knj->kn", levers, covariance, levers)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 def _combined_band(

@@ -35,17 +35,7 @@ CHANNELS = {
 
 
 class ErrorContributions(ABC):
-    """An estimate's covariance by source of error, in the coordinates of the estimate.
-
-    Examples
-    --------
-    >>> class Two(ErrorContributions):
-    ...     contributions = {"noise": np.eye(2), "exponent": np.diag([3.0, np.inf])}
-    ...     def dof(self, direction, source=None):
-    ...         return np.inf
-    >>> Two().std(np.eye(2)).tolist()
-    [2.0, inf]
-    """
+    """An estimate's covariance by source of error, in the coordinates of the estimate."""
 
     contributions: Mapping[str, FloatArray]  # (Q, Q) each, noise first
 

@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
@@ -115,25 +116,17 @@ def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
     }
     reached = [one for one in limits(optimum.problem) if one.extremes == gone] if gone else []
     if not reached:
-        unit = np.eye(len(problem.names))
-        return Chart(unit, np.zeros(len(unit)), unit)
+        return Basis.every(len(problem.names)).chart
     chart = min(
         (one.chart.of(0) for one in reached),
         key=lambda c: float(np.abs(c.theta(c.phi(optimum.theta)) - optimum.theta).max()),
     )
     of_optimum = [problem.names.index(name) for name in optimum.names]
     others = [i for i in range(len(problem.names)) if i not in of_optimum]
-    C, size = chart.matrix.shape[1], len(problem.names)
-    matrix, offset = np.zeros((size, C + len(others))), np.zeros(size)
-    back = np.zeros((C + len(others), size))
-    matrix[of_optimum, :C], offset[of_optimum], back[:C, of_optimum] = (
-        chart.matrix,
-        chart.offset,
-        chart.back,
-    )
-    for k, i in enumerate(others, start=C):
-        matrix[i, k] = back[k, i] = 1.0
+    place, unit = np.argsort([*of_optimum, *others]), np.eye(len(others))
     tied = None if chart.tied is None else (of_optimum[chart.tied[0]], of_optimum[chart.tied[1]])
+    offset = np.append(chart.offset, np.zeros(len(others)))[place]
+    matrix, back = block_diag(chart.matrix, unit)[place], block_diag(chart.back, unit)[:, place]
     return Chart(matrix, offset, back, tied)
 
 

@@ -42,15 +42,9 @@ class MixedModel:
     """Residuals, and the columns of parameters and sources."""
 
     def __init__(
-        self,
-        y: FloatArray,
-        J: FloatArray,
-        Z: Sequence[FloatArray],
-        group: NDArray[np.intp],
-        known: FloatArray,
-        groups: int,
-        most: FloatArray,
-    ) -> None:
+        self, y: FloatArray, J: FloatArray, Z: Sequence[FloatArray], group: NDArray[np.intp],
+        known: FloatArray, groups: int, most: FloatArray,
+    ) -> None:  # fmt: skip
         self.most = np.concatenate([np.full(groups, np.inf), most])
         self.y, self.U, self.group, self.known = y, np.hstack([J, *Z]), group, known
         self.parameters, self.noises = J.shape[1], groups
@@ -77,27 +71,17 @@ class MixedModel:
         return self.elsewhere(self.y, self.U[:, : self.parameters], kept)
 
     def elsewhere(
-        self, y: FloatArray, J: FloatArray, kept: Iterable[int] | None = None
+        self, y: FloatArray, J: FloatArray, kept: Iterable[int] | None = None, *more: FloatArray
     ) -> MixedModel:
-        """Return the sources, or some, with residuals and derivatives at other parameters."""
+        """Return sources, or some of them and `more`, with other residuals and derivatives."""
         those = list(range(len(self.starts)) if kept is None else kept)
-        Z = [self.U[:, self.columns(k)] for k in those]
-        most = self.most[self.noises :][those]
+        Z = [*(self.U[:, self.columns(k)] for k in those), *more]
+        most = np.append(self.most[self.noises :][those], np.full(len(more), np.inf))
         return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
 
     def at(self, variances: FloatArray) -> MixedState:
         """Return the model at these variances."""
         return MixedState(self, variances)
-
-    def information_of_parameters(self, variances: FloatArray) -> FloatArray:
-        """Return J' V^-1 J, (P, P), where the parameters need not be determined."""
-        P, G, noise = self.parameters, self.noises, self.known.copy()
-        noise[:G] += variances[:G]
-        M = np.tensordot(1.0 / noise, self.grams, 1)[:-1, :-1]
-        root = np.sqrt(variances[G:])[self.source]
-        Z = M[:, P:] * root
-        inner = np.eye(len(root)) + root[:, None] * Z[P:]
-        return np.asarray(M[:P, :P] - Z[:P] @ np.linalg.solve(inner, Z[:P].T))
 
     def reml(self, chance: FloatArray) -> MixedState:
         """Return the state of the highest restricted likelihood."""

@@ -154,10 +154,8 @@ def departures(
     others = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
     state, noises = errors.state, errors.state.model.noises
     # residuals fall where a prediction rises
-    X = np.hstack([-estimate.jacobian, missed @ turned])
-    joint = state.model.elsewhere(estimate.y, X, others)
-    kept = state.variances[[*range(noises), *(noises + k for k in others)]]
-    prior = np.repeat([0.0, 1.0], [len(errors.names), turned.shape[1]])
-    return Departures(
-        there @ turned, joint.information_of_parameters(kept) + np.diag(prior), assumed
-    )
+    joint = state.model.elsewhere(estimate.y, -estimate.jacobian, others, missed @ turned)
+    sizes = [*state.variances[[*range(noises), *(noises + k for k in others)]], 1.0]
+    K, Q, W = joint.at(np.array(sizes)).K, len(errors.names), turned.shape[1]
+    kept = [*range(Q), *range(len(K) - W, len(K))]
+    return Departures(there @ turned, np.linalg.inv(K[np.ix_(kept, kept)]), assumed)
