@@ -338,19 +338,13 @@ def _parts_std(R: ComplexArray, covariance: FloatArray) -> FloatArray:
 
 
 def _combined_band(
-    errors: ErrorModel,
-    R: ComplexArray,
-    by: ComplexArray,
-    known: NDArray[np.bool_],
-    amplitude: FloatArray,
-    omega: FloatArray,
-    stiffness: ComplexArray | None = None,
+    errors: ErrorModel, R: ComplexArray, by: ComplexArray, known: NDArray[np.bool_],
+    amplitude: FloatArray, omega: FloatArray, stiffness: ComplexArray | None = None,
     of_a_test: bool = False,
-) -> ResponseBand:
+) -> ResponseBand:  # fmt: skip
     """Return the band of responses (n,); NaN where a response is not `known`."""
     R_known = R[known]
-    parts = np.full((4, R.size), np.nan)
-    dof = np.full((2, R.size), np.nan)
+    parts, dof = np.full((4, R.size), np.nan), np.full((2, R.size), np.nan)
     made = prediction_error(
         errors, by[known] / R_known[:, None], amplitude, omega, stiffness, of_a_test=of_a_test
     )

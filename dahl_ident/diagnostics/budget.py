@@ -238,17 +238,15 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
     problem, names = errors.problem, errors.names
     slopes = problem.value_slopes(errors.theta)
     units = {p.name: p.unit for p in problem.parameters}
+    positive = {p.name: p.positive for p in problem.parameters}
     lost = runaway(optimum)
-    for i, name in enumerate(names):
+    for name, direction, slope in zip(names, np.eye(len(names)), slopes, strict=True):
         if name in errors.assumed or name in lost:
             continue
-        direction = np.eye(len(names))[i]
-        if errors.estimate.basis.holds(direction):
-            yield name, units[name], errors.values[name], direction * abs(float(slopes[i]))
-            positive = problem.parameters[i].positive
-            if positive and errors.covariance[i, i] ** 0.5 > _DETERMINED:
-                lost |= {name}
-        else:
+        held, u = errors.estimate.basis.holds(direction), float(errors.std(direction))
+        if held:
+            yield name, units[name], errors.values[name], direction * abs(float(slope))
+        if not held or (positive[name] and u > _DETERMINED):
             lost |= {name}
     # an exponent that was assumed is a member as any other
     freed = replace(optimum, problem=problem, theta=errors.theta)

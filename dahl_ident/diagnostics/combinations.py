@@ -55,16 +55,15 @@ def candidates(optimum: Optimum) -> list[Candidate]:
     for element in friction:
         for combination in element.combinations():
             powers = {element.parameter(n): power for n, power in combination.powers.items()}
-            if all(p.free for p in powers):
-                by_name = {p.name: power for p, power in powers.items()}
-                with np.errstate(over="ignore", under="ignore"):
-                    logarithm = sum(power * np.log(theta[n]) for n, power in by_name.items())
-                    value = float(np.exp(logarithm))
-                direction = np.array([by_name.get(name, 0.0) for name in names])
-                text = element.named(combination.expression)
-                unit = _unit(powers)
-                unit = shown_unit(unit, problem.data.motion)
-                formed.append(Candidate(text, unit, value, direction, frozenset(by_name)))
+            if not all(p.free for p in powers):
+                continue
+            by_name = {p.name: power for p, power in powers.items()}
+            with np.errstate(over="ignore", under="ignore"):
+                value = float(np.exp(sum(c * np.log(theta[n]) for n, c in by_name.items())))
+            direction = np.array([by_name.get(name, 0.0) for name in names])
+            unit = shown_unit(_unit(powers), problem.data.motion)
+            text = element.named(combination.expression)
+            formed.append(Candidate(text, unit, value, direction, frozenset(by_name)))
     scale = [{n: e.parameter(n) for n in e.scale_parameters} for e in friction]
     stiff = (p for labels in scale for p in labels.values() if p.dimension == _STIFFNESS)
     pairs = [(p, spring) for p in stiff for spring in springs]
@@ -73,14 +72,11 @@ def candidates(optimum: Optimum) -> list[Candidate]:
     ):
         if first_element.kind == second_element.kind:
             pairs += [(first[label], second[label]) for label in first if label in second]
-    for pair in pairs:
-        if all(p.free for p in pair):
-            both = [p.name for p in pair]
-            value = sum(theta[name] for name in both)
-            direction = np.array([slopes[n] / value if n in both else 0.0 for n in names])
-            text = " + ".join(both)
-            members = frozenset(both)
-            formed.append(Candidate(text, units[both[0]], value, direction, members, is_sum=True))
+    for both in ([p.name for p in pair] for pair in pairs if all(p.free for p in pair)):
+        value = sum(theta[name] for name in both)
+        direction = np.array([slopes[n] / value if n in both else 0.0 for n in names])
+        text, unit = " + ".join(both), units[both[0]]
+        formed.append(Candidate(text, unit, value, direction, frozenset(both), is_sum=True))
     return formed
 
 

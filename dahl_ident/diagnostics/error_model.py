@@ -190,21 +190,18 @@ class ErrorModel(ErrorContributions):
         """The estimate as an optimum: its residuals have the stated weights."""
         problem, theta, optimum = self.problem, self.theta, self.optimum
         known = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+        held = np.array([self.holds(name) for name in self.names])
         values = [
-            value if self.holds(name) else known.get(name, value)
-            for name, value in self.values.items()
+            v if h else known.get(n, v) for h, (n, v) in zip(held, self.values.items(), strict=True)
         ]
-        C = blanked(self.covariance, np.array([not self.holds(name) for name in self.names]))
         y, m = problem.residuals(theta), problem.n_residuals
-        scale, loss = 1.0, self.estimate.loss
+        scale = 1.0
         if not problem.scale_known:
             free = max(optimum.dof - float(y[m:] @ y[m:]), 1.0)
+            loss = self.estimate.loss
             scale = agreed_scale(problem, loss, lambda _: (theta, free), self.estimate.scale)
-        cost = scale**2 * float(problem.quadratic(theta, scale, loss).cost)
-        return replace(
-            optimum, problem=problem, theta=theta, values=np.array(values), covariance=C,
-            scale=scale, cost=cost,
-        )  # fmt: skip
+        at = replace(optimum, theta=theta, covariance=blanked(self.covariance, ~held), scale=scale)
+        return self._of_problem(at, problem, np.array(values))
 
     @cached_property
     def by_noise(self) -> Optimum:
@@ -217,13 +214,15 @@ class ErrorModel(ErrorContributions):
         problem, stated = problem.widened(self.estimate.misfit_variance), self.at_estimate
         kept = [self.names.index(name) for name in problem.names]
         theta, lost = self.theta[kept], ~np.isfinite(np.diagonal(stated.covariance)[kept])
-        scale, loss = stated.scale, self.estimate.loss
-        covariance, _ = inverse(information_of(problem, theta, scale, loss, stated.dof))
-        cost = scale**2 * float(problem.quadratic(theta, scale, loss).cost)
-        return replace(
-            stated, problem=problem, theta=theta, values=stated.values[kept],
-            covariance=blanked(covariance, lost), cost=cost,
-        )  # fmt: skip
+        of_noise = information_of(problem, theta, stated.scale, self.estimate.loss, stated.dof)
+        at = replace(stated, theta=theta, covariance=blanked(inverse(of_noise)[0], lost))
+        return self._of_problem(at, problem, stated.values[kept])
+
+    def _of_problem(self, optimum: Optimum, problem: TableProblem, values: FloatArray) -> Optimum:
+        """Return an optimum of another problem with the cost there."""
+        scale = optimum.scale
+        cost = float(problem.quadratic(optimum.theta, scale, self.estimate.loss).cost)
+        return replace(optimum, problem=problem, values=values, cost=scale**2 * cost)
 
     @cached_property
     def runs(self) -> RunDeviations | None:

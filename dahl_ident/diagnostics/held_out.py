@@ -86,12 +86,10 @@ def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray
     least = special.stdtrit(nu, upper)
     falling = np.sort(scores[np.isfinite(scores)])[::-1]
     outside = (1.0 - level) * (_PRIOR_SCORES + falling.size)
-    best = np.full(np.shape(nu), np.inf)
-    for j in range(min(int(outside), falling.size) + 1):
-        by_prior = min((outside - j) / _PRIOR_SCORES, 1.0)
-        if by_prior > 0.0:
-            t = special.stdtrit(nu, 1.0 - 0.5 * by_prior)
-            best = np.minimum(best, np.maximum(t, falling[j] if j < falling.size else 0.0))
+    larger = np.arange(min(int(outside), falling.size) + 1)  # scores that stay outside
+    by_prior = np.minimum((outside - larger) / _PRIOR_SCORES, 1.0)
+    t = special.stdtrit(np.expand_dims(nu, -1), 1.0 - 0.5 * by_prior)
+    best = np.maximum(t, np.append(falling, 0.0)[larger])[..., by_prior > 0.0].min(axis=-1)
     return np.asarray(np.maximum(least, best))
 
 

@@ -37,14 +37,9 @@ class PredictionError(NamedTuple):
 
 
 def prediction_error(
-    errors: ErrorModel,
-    slopes: ComplexArray,
-    amplitude: FloatArray,
-    omega: FloatArray,
-    stiffness: ComplexArray | None,
-    *,
-    of_a_test: bool,
-) -> PredictionError:
+    errors: ErrorModel, slopes: ComplexArray, amplitude: FloatArray, omega: FloatArray,
+    stiffness: ComplexArray | None, *, of_a_test: bool,
+) -> PredictionError:  # fmt: skip
     """Return the error of a predicted fundamental."""
     state, names = errors.state, errors.names
     model, basis = state.model, errors.estimate.basis
@@ -120,12 +115,9 @@ class Departures(NamedTuple):
 
 
 def departures(
-    errors: ErrorModel,
-    slopes: ComplexArray,
-    amplitude: FloatArray,
-    omega: FloatArray,
+    errors: ErrorModel, slopes: ComplexArray, amplitude: FloatArray, omega: FloatArray,
     stiffness: ComplexArray,
-) -> Departures | None:
+) -> Departures | None:  # fmt: skip
     """Return the model error of a fit at other places; None where it has none.
 
     Where residuals are too few to distinguish it from noise, it is assumed as large as the noise.

@@ -77,9 +77,7 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
         return _of_records(optimum, (fitted or optimum).problem)
     problem, data = optimum.problem, optimum.problem.data
     test, owner = tests_of(data)
-    run = np.zeros(data.n, dtype=np.intp)
-    if data.run is not None:
-        run = np.unique(data.run, return_inverse=True)[1].astype(np.intp)
+    run = np.unique(np.zeros(data.n) if data.run is None else data.run, return_inverse=True)[1]
     size = np.abs(data.response)[owner]
     size = np.where(size > 0.0, size, size.max())  # a row of nothing counts as the largest
     predicted = problem.predict(optimum.theta)
@@ -90,22 +88,18 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     y = _parts(missed)
     J = problem.prediction_jacobian(optimum.theta) / size[:, None]
     known = np.isfinite(J).all(axis=0) & (np.abs(J) > 0.0).any(axis=0)
-    X = orthonormal(
-        np.array([_parts(column) for column in J[:, known].T]).reshape(-1, y.size).T, _RANK
-    )
+    X = orthonormal(_parts(J[:, known].T).T, _RANK)
     scatter: list[FloatArray] = []
     if run.max() > 0:
         relative = predicted / size
         members = run == np.arange(run.max() + 1)[:, None]
-        turns = (relative, 1j * data.harmonic * relative)
-        scatter = [np.array([_parts(turn) for turn in members * one]).T for one in turns]
+        scatter = [_parts(members * x).T for x in (relative, 1j * data.harmonic * relative)]
     stated, group = _stated(optimum, size), np.repeat(~fundamental, 2).astype(np.intp)
     real = np.repeat(data.harmonic == 0, 2) & (np.arange(y.size) % 2 == 1)
     keep = np.flatnonzero(~real)
     _, group = np.unique(group[keep], return_inverse=True)
     groups, y, stated = int(group.max()) + 1, y[keep], stated[keep]
-    of_group = [group == g for g in range(groups)]
-    beyond = np.array([max(float(np.mean(y[g] ** 2 - stated[g])), 0.0) for g in of_group])
+    beyond = np.maximum(np.bincount(group, y**2 - stated) / np.bincount(group), 0.0)
     unit = np.sqrt(stated + beyond[group] + _EXACT**2)
     Z = [one[keep] / unit[:, None] for one in scatter]
     model = MixedModel(
@@ -115,15 +109,13 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     state = model.reml(np.ones(len(Z)))
     tests = _densities(state, np.repeat(test, 2)[keep], unit, robust=optimum.loss != "linear")
     first = np.unique(test, return_index=True)[1]
-    square = np.abs(missed) ** 2
-    count = int(fundamental.sum())
-    misfit = of_harmonics = np.nan
-    if count:
-        misfit = float(np.sqrt(square[fundamental].mean()))
-    if not fundamental.all():
-        of_harmonics = float(np.sqrt(square[~fundamental].sum() / max(count, 1)))
+    square, count = np.abs(missed) ** 2, int(fundamental.sum()) or 1
+    misfit = float(np.sqrt(square[fundamental].sum() / count)) if fundamental.any() else np.nan
+    of_harmonics = float(np.sqrt(square[~fundamental].sum() / count))
     noise = misfit / float(np.sqrt(np.count_nonzero(data.harmonic == 1) or np.nan))
-    return PredictiveDensity(tests, run[first], misfit, of_harmonics, noise)
+    return PredictiveDensity(
+        tests, run[first], misfit, of_harmonics if not fundamental.all() else np.nan, noise
+    )
 
 
 def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:

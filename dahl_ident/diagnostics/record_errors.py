@@ -15,6 +15,7 @@ from dahl_ident.diagnostics.contributions import (
     NOISE,
     RUNS,
     ErrorContributions,
+    satterthwaite,
     variances,
 )
 from dahl_ident.diagnostics.correlated_residuals import sandwich
@@ -83,8 +84,8 @@ class RecordErrors(ErrorContributions):
         total = sum(parts.values())
         if np.isinf(total):  # which an infinite source alone decides
             return min(self.dof_of(name) for name, part in parts.items() if np.isinf(part))
-        loss = sum(part**2 / self.dof_of(name) for name, part in parts.items())
-        return total**2 / loss if loss > 0.0 else np.inf
+        spread = sum(2.0 * part**2 / self.dof_of(name) for name, part in parts.items())
+        return float(satterthwaite(np.asarray(total), np.asarray(spread)))
 
 
 def record_errors(

@@ -115,6 +115,7 @@ class _Complement(ABC):
 
     residuals: FloatArray
     basis: FloatArray
+    scale: float = 1.0  # standard deviation of one residual
 
     @abstractmethod
     def _raw(self, changes: ComplexArray) -> FloatArray:
@@ -147,11 +148,6 @@ class _Complement(ABC):
         gamma = np.linalg.lstsq(columns.T, self.residuals, rcond=_RANK)[0]
         return np.asarray(gamma @ changes)
 
-    @property
-    @abstractmethod
-    def scale(self) -> float:
-        """Standard deviation of one residual."""
-
 
 class RelativeSpace(_Complement):
     """ln(R/R_model) of fundamentals, neither 0, all rows alike: for the size of a departure.
@@ -172,29 +168,21 @@ class RelativeSpace(_Complement):
         self.basis = orthonormal(np.concatenate([J.real, J.imag]))
         r = np.concatenate([y.real, y.imag])
         self.residuals = r - self.basis @ (self.basis.T @ r)
+        dof = r.size - self.basis.shape[1]
+        self.scale = float(np.sqrt(self.residuals @ self.residuals / max(dof, 1)))
 
     def _raw(self, changes: ComplexArray) -> FloatArray:
         of_rows = changes[:, self._rows]
         return np.concatenate([of_rows.real, of_rows.imag], axis=-1)
 
-    @property
-    def scale(self) -> float:
-        """Standard deviation of ln gain and phase, as they scatter."""
-        dof = self.residuals.size - self.basis.shape[1]
-        return float(np.sqrt(self.residuals @ self.residuals / max(dof, 1)))
-
 
 class ResidualSpace(_Complement):
     """The residuals of an optimum in units of the noise: for whether a departure is one."""
 
-    scale = 1.0
-
     def __init__(
-        self,
-        optimum: Optimum,
-        runs: RunDeviations | None = None,
+        self, optimum: Optimum, runs: RunDeviations | None = None,
         weights: WeightedEstimate | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Take residuals with the stated weights, or with those of an estimate.
 
         The size of the latter's misfit is itself an estimate, as an unknown scale is.
@@ -213,12 +201,11 @@ class ResidualSpace(_Complement):
         if runs is not None:
             near = Linearization(self._problem, optimum.theta, runs)
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
-            parts = map(near.of_run, range(len(runs.labels)))
-            blocks = []
-            for both, columns in parts:
-                blocks.append(np.zeros((m, runs.scatters.sum())))
-                blocks[-1][both] = columns[:, runs.scatters] / self._scale
-            of_runs = np.hstack(blocks)
+            each = np.zeros((len(runs.labels), m, runs.scatters.sum()))
+            for number, block in enumerate(each):
+                both, columns = near.of_run(number)
+                block[both] = columns[:, runs.scatters] / self._scale
+            of_runs = np.hstack(list(each))
             self.dof -= orthonormal(np.hstack([J[:m], of_runs])).shape[1]
             self.dof += orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
