@@ -28,7 +28,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import p_text, with_unit
-from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
+from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
     SuspiciousPoint,
@@ -61,6 +61,7 @@ from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.units import percent
 
+_TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
 _HINT = 0.05  # the same of hints, which doubt nothing
 _FAR_MORE = 2.0  # scatter over what was measured
@@ -299,45 +300,40 @@ class Goodness:
         return self.noise_share is not None and self.noise_share > _NO_SENSOR
 
     def findings(
-        self, severity: VerdictStatus = VerdictStatus.NOT_DESCRIBED, *, counted: bool = False
+        self, severity: VerdictStatus = _NOT_DESCRIBED, *, counted: bool = False
     ) -> Iterator[Finding]:
         """Yield whether the model describes the data."""
-        described, note = Question.DESCRIBED, VerdictStatus.TRUSTED
         misfit: dict[str, Any] = {"rms": self.rms_misfit}
-        values: dict[str, Any]
         if self.sign:
-            worst = VerdictStatus.NOT_DESCRIBED
-            yield Finding(described, worst, "sign", {"convention": self.sign})
+            yield described("sign", _NOT_DESCRIBED, convention=self.sign)
         elif self.apart:
-            values = {"names": self.apart, "rows": self.rows, "remaining": self.without_them}
-            yield Finding(described, severity, "rows_apart", misfit | values)
+            apart = {"names": self.apart, "rows": self.rows, "remaining": self.without_them}
+            yield described("rows_apart", severity, **misfit, **apart)
         elif self.objections:
-            values = {"objections": self.objections, "counted": counted}
-            yield Finding(described, severity, "misfit", misfit | values)
+            yield described(
+                "misfit", severity, **misfit, objections=self.objections, counted=counted
+            )
         if not self._enough_points:
-            few = VerdictStatus.NOT_DETERMINED
-            yield Finding(described, few, "too_few_points", misfit | {"dof": self.dof})
+            yield described("too_few_points", _NOT_DETERMINED, **misfit, dof=self.dof)
         elif self.untested:
-            yield Finding(described, VerdictStatus.NOT_DETERMINED, "one_amplitude", misfit)
+            yield described("one_amplitude", _NOT_DETERMINED, **misfit)
         elif not self.objections:
             far = self.scatter is not None and self.scatter.ratio > _FAR_MORE
-            values = {"hints": self.hints, "scatter": str(self.scatter) if far else ""}
-            yield Finding(described, note, "noise", misfit | values)
+            scatter = str(self.scatter) if far else ""
+            yield described("noise", _TRUSTED, **misfit, hints=self.hints, scatter=scatter)
         if self.flagged:
             every = len(self.flagged) == self.fundamentals
-            worst = VerdictStatus.NOT_DETERMINED if every else VerdictStatus.APPROXIMATE
-            values = {"points": self.flagged, "every": every}
-            yield Finding(described, worst, "flagged", values)
+            worst = _NOT_DETERMINED if every else _APPROXIMATE
+            yield described("flagged", worst, points=self.flagged, every=every)
         if self.sign or self.apart:
             return
         if self.suspicious:
             names = tuple(point.name for point in self.suspicious)
-            values = {"names": names, "neighbours": self.neighbours}
-            worst = VerdictStatus.APPROXIMATE if self.neighbours else note
-            yield Finding(described, worst, "suspicious", values)
+            worst = _APPROXIMATE if self.neighbours else _TRUSTED
+            yield described("suspicious", worst, names=names, neighbours=self.neighbours)
         if self.bound is not None:
-            values = {"least": self.bound, "law": self.bound < FAR_LESS * self.rms_misfit}
-            yield Finding(described, note, "jenkins_bound", values)
+            law = self.bound < FAR_LESS * self.rms_misfit
+            yield described("jenkins_bound", _TRUSTED, least=self.bound, law=law)
 
     @property
     def cause(self) -> str:

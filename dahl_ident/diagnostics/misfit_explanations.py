@@ -237,8 +237,7 @@ def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimu
 def set_aside(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
     """Return the optimum of the other rows; None where they have none."""
     data = optimum.problem.data
-    kept = np.ones(data.n, dtype=np.bool_)
-    kept[list(rows)] = False
+    kept = ~np.isin(np.arange(data.n), rows)
     try:
         refit = solve(optimum.problem.like(data=data.select(rows=kept)), loss=optimum.loss)
     except DahlIdentError:

@@ -156,13 +156,9 @@ def _not_a_sine(optimum: Optimum) -> Iterator[str]:
 
 def negative_parameters(optimum: Optimum) -> Iterator[str]:
     """Yield every mass, damping or stiffness below zero, with its number."""
-    problem = optimum.problem
-    values = parameter_values(optimum)
+    problem, values = optimum.problem, parameter_values(optimum)
     values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-    for element in problem.model.elements:
-        if not (element.is_linear and element.linear_parameters):
-            continue
-        (parameter,) = element.parameters
+    for parameter in (e.parameters[0] for e in problem.model.elements if is_single(e)):
         value, error = values[parameter.name], optimum.stderr.get(parameter.name, 0.0)
         if value < 0.0 and np.isfinite(value):
             unit = shown_unit(parameter.unit, problem.motion)
@@ -302,30 +298,28 @@ def slight(
 
 
 def _sizes(optimum: Optimum) -> Iterator[str]:
-    if not optimum.success:
-        return
+    """Yield force limits, contact stiffnesses and x_c that no mechanism has."""
     motion, values = optimum.problem.data.motion, parameter_values(optimum)
     typical = _TYPICAL if motion == "translation" else _TYPICAL_ROTATION
-    for element in optimum.problem.model.elements:
-        if not element.has_memory:
-            continue
-        law_values = [float(values[p.name]) for p in element.parameters]
+    for element in optimum.problem.model.elements if optimum.success else ():
+        at_element = [float(values[p.name]) for p in element.parameters]
         sizes = [
             (p.name, p.unit, _DIMENSIONS[p.dimension], value)
-            for p, value in zip(element.parameters, law_values, strict=True)
-            if p.free and p.dimension in _DIMENSIONS
+            for p, value in zip(element.parameters, at_element, strict=True)
+            if element.has_memory and p.free and p.dimension in _DIMENSIONS
         ]
-        low, high = element.knee([np.asarray(v) for v in law_values])
-        if sizes and low == high:
-            sizes.append(("x_c", "m", "x_c", float(low)))
+        if sizes:
+            low, high = element.knee([np.asarray(v) for v in at_element])
+            sizes += [("x_c", "m", "x_c", float(low))] * bool(low == high)
         for name, unit, kind, value in sizes:
             least, most = typical[kind]
             if np.isfinite(value) and not least <= value <= most:
-                shown = shown_unit(unit, motion)
+                size, low, high = (
+                    engineering(v, shown_unit(unit, motion)) for v in (value, least, most)
+                )
                 yield (
-                    f"{name} is {engineering(value, shown)}, where mechanisms have "
-                    f"{engineering(least, shown)} to {engineering(most, shown)}: check the units "
-                    "of displacement and force"
+                    f"{name} is {size}, where mechanisms have {low} to {high}: check the units of "
+                    "displacement and force"
                 )
 
 

@@ -67,12 +67,12 @@ class Bracket:
     """
 
     def __init__(
-        self, target: FloatArray, first: FloatArray, step: FloatArray, furthest: FloatArray,
-        logarithmic: BoolArray, narrow_enough: FloatArray,
+        self, target: FloatArray, step: FloatArray, furthest: FloatArray, logarithmic: BoolArray,
+        narrow_enough: FloatArray,
     ) -> None:  # fmt: skip
         self._target, self._furthest, self._logarithmic = target, furthest, logarithmic
         self._narrow_enough = narrow_enough
-        self.position, self._step = np.minimum(first, furthest), step
+        self.position, self._step = np.minimum(step, furthest), step
         self._inner, self._outer = np.zeros(target.shape), np.full(target.shape, np.inf)
         self.end = np.full(target.shape, np.nan)
         self.active: IntArray = np.arange(target.size)
@@ -208,12 +208,9 @@ class Profiler:
     def _bracket(self, index: IntArray, sign: FloatArray, target: FloatArray) -> Bracket:
         origin = self._optimum.theta[index]
         furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
-        step, jump = self._first_step[index] * target, self._jump(index, sign)
-        jumps = np.isfinite(jump)
-        first = np.where(jumps, jump, step)
-        step = np.where(jumps, np.abs(origin + sign * jump), step)
+        step = self._first_step[index] * target
         narrow = _NARROW * self._conditional[index]
-        return Bracket(target, first, step, furthest, self._logarithmic[index], narrow)
+        return Bracket(target, step, furthest, self._logarithmic[index], narrow)
 
     def _from_best_start(
         self, index: IntArray, theta: FloatArray, change: FloatArray
@@ -373,18 +370,6 @@ class Profiler:
         flat |= status is Status.NOT_CONVERGED
         below = (values == -np.inf) | (self._logarithmic & (values == 0.0))
         return np.array([below | flat, (values == np.inf) | flat])
-
-    def _jump(self, index: IntArray, sign: FloatArray) -> FloatArray:
-        """Return the distance to where a spring at minus infinity begins to have an effect."""
-        jump, theta = np.full(len(index), np.nan), self._optimum.theta
-        for chart in self._microslip_charts:
-            assert chart.tied is not None
-            spring, _ = chart.tied
-            total = float(chart.phi(theta[None])[0, spring])
-            if self._optimum.values[spring] == -np.inf:
-                far = (index == spring) & (sign > 0.0)
-                jump[far] = total - 2.0 * abs(total) - theta[spring]
-        return jump
 
     def _reachable(self, theta: FloatArray, index: IntArray, position: FloatArray) -> BoolArray:
         """Return whether the model still changes farther out."""
