@@ -167,7 +167,7 @@ def _count(
         result.covered[method] += inside
     size = natural_sizes(_at_truth(scenario))
     result.squares += np.minimum(((optimum.theta - scenario.theta) / size) ** 2, 1e6)
-    verdicts = judged(optimum, lambda: profile).parameters
+    verdicts = judged(optimum, lambda: profile, None, profile, {}).parameters
     result.verdicts.append([verdicts[name].verdict for name in optimum.names])
     result.count += 1
 

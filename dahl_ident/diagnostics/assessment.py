@@ -277,18 +277,11 @@ class TableAssessment(Assessment):
     def identifiability(self) -> Identifiability:
         """Which parameters, or which combinations of them, the data determine."""
         profile = None if self.first_order else lambda: self.intervals("profile")
-        verdicts = judged(self.by_noise, profile, self.errors, self.intervals("combined"))
         try:
             sources: Mapping[str, ParameterBudget] = self.budget()
         except FitError:
-            return verdicts
-        combinations = tuple(
-            replace(c, value=sources[c.expression].value, stderr=sources[c.expression].u)
-            if c.expression in sources
-            else c
-            for c in verdicts.combinations
-        )
-        return replace(verdicts, combinations=combinations)
+            sources = {}
+        return judged(self.by_noise, profile, self.errors, self.intervals("combined"), sources)
 
     @property
     def assumed(self) -> tuple[str, ...]:

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.diagnostics.advice import advice
-from dahl_ident.diagnostics.combinations import Candidate, candidates, runaway, stiffness_seen
+from dahl_ident.diagnostics.budget import ParameterBudget
+from dahl_ident.diagnostics.combinations import candidates, stiffness_seen
 from dahl_ident.diagnostics.confidence_levels import LEVELS, coverage_factor, level_text, thresholds
 from dahl_ident.diagnostics.contributions import EXPONENT, MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -42,7 +43,7 @@ from dahl_ident.diagnostics.intervals import (
     wald_intervals,
 )
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
-from dahl_ident.fitting import Optimum, Status
+from dahl_ident.fitting import Optimum
 
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
@@ -207,14 +208,15 @@ def identifiability(fit: Any) -> Identifiability:
 def judged(
     optimum: Optimum,
     profile_of: Callable[[], ConfidenceIntervals] | None,
-    errors: ErrorModel | None = None,
-    stated: ConfidenceIntervals | None = None,
+    errors: ErrorModel | None,
+    stated: ConfidenceIntervals,
+    sources: Mapping[str, ParameterBudget],
 ) -> Identifiability:
     """Return the verdicts on an optimum, given how to find its profiles at the three LEVELS.
 
     With `errors`, parameters that noise leaves determined and other sources do not are not. The
-    limits in the texts are those of `stated`, by default those by which it is judged. Without
-    profiles, or where none is needed, that is to first order.
+    limits in the texts are those of `stated`, and combinations that are determined those of the
+    budget's `sources`. Without profiles, or where none is needed, that is to first order.
     """
     information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
@@ -243,11 +245,17 @@ def judged(
             verdicts[name] = Verdict.BY_PRIOR
     lost = frozenset(n for n, v in verdicts.items() if v is Verdict.NOT_IDENTIFIED)
     loose = lost | {n for n, v in verdicts.items() if v is Verdict.WEAK}
-    determined = _determined(optimum, information, lost, loose, errors)
+    determined = list(_combinations(optimum, sources, lost, loose))
+    seen = None if determined else stiffness_seen(optimum)
+    if seen is not None and seen.members <= loose and np.isfinite(seen.value):
+        std = float(information.std(seen.direction))
+        if std < IDENTIFIED_BELOW:
+            u = abs(seen.value) * std
+            determined.append(StatedCombination(seen.expression, seen.unit, seen.value, u))
     parameters = {}
     for name, parameter in zip(problem.names, problem.parameters, strict=True):
         unit = parameter.unit
-        _, limits, widest = (stated or intervals)[name]
+        _, limits, widest = stated[name]
         shown, why = _within(limits, unit), ""
         if name in blind:
             shown = blind[name]
@@ -264,7 +272,7 @@ def judged(
         parts = zip(problem.names, vector.tolist(), strict=True)
         direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
         direction = direction if len(direction) > 1 else {}
-    return Identifiability(parameters, determined, direction)
+    return Identifiability(parameters, tuple(determined), direction)
 
 
 def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
@@ -379,66 +387,30 @@ def _verdict(std: float, widest: Interval) -> Verdict:
     return Verdict.WEAK if closed else Verdict.NOT_IDENTIFIED
 
 
-def _determined(
+def _combinations(
     optimum: Optimum,
-    information: Information,
+    sources: Mapping[str, ParameterBudget],
     lost: frozenset[str],
     loose: frozenset[str],
-    errors: ErrorModel | None,
-) -> tuple[StatedCombination, ...]:
-    """Return the combinations of parameters that are not identified, but are together.
-
-    Noise says which; a combination that other sources of error leave vague is not determined.
+) -> Iterator[StatedCombination]:
+    """Yield the combinations in the budget of parameters that are not identified.
 
     A product needs two `loose` parameters, which are not identified: with one, and known ones, it
-    says no more than the verdict on that one.
+    says no more than the verdict on that one. Nor does a sum of which one part is known better.
     """
-
-    def stated(c: Candidate) -> Iterator[StatedCombination]:
-        std = float(information.std(c.direction))
-        if std < IDENTIFIED_BELOW and errors is not None and errors.estimate.regular:
-            direction = np.zeros(len(errors.names))
-            direction[[errors.names.index(name) for name in optimum.names]] = c.direction
-            std = float(errors.std(direction))
-        if std < IDENTIFIED_BELOW and np.isfinite(c.value):
-            yield StatedCombination(c.expression, c.unit, c.value, abs(c.value) * std)
-
-    every = candidates(optimum)
-    units = {p.name: p.unit for p in optimum.problem.parameters}
-    units |= {c.expression: c.unit for c in every}
-    determined = [
-        StatedCombination(
-            c.expression,
-            units.get(c.expression, units.get(c.expression.partition("/")[0], "")),  # f_max/alpha
-            c.value,
-            c.stderr,
-        )
-        for c in optimum.combinations
-        if c.expression not in optimum.names and c.stderr < IDENTIFIED_BELOW * abs(c.value)
-    ]
-    known = {c.expression for c in optimum.combinations}
-    gone = runaway(optimum)  # the optimum itself says which combinations of these are left
-    for candidate in every:
-        if candidate.expression in known or _runs_away(candidate, optimum, gone):
-            continue
-        members = candidate.members
+    stated = {c.expression for c in optimum.combinations}
+    information = Information(optimum)
+    for candidate in candidates(optimum):
+        members, direction = candidate.members, candidate.direction
         enough = bool(members & lost) and len(members & loose) > 1
-        if not (members <= lost if candidate.is_sum else enough):
-            continue
         if candidate.is_sum:
-            parts = np.diag(candidate.direction)[np.flatnonzero(candidate.direction)]
-            if information.std(candidate.direction) > information.std(parts).min():
-                continue  # one of its parts alone is known better
-        determined += stated(candidate)
-    seen = None if determined else stiffness_seen(optimum)
-    return tuple(determined if seen is None or not seen.members <= loose else stated(seen))
-
-
-def _runs_away(candidate: Candidate, optimum: Optimum, gone: frozenset[str]) -> bool:
-    """Return whether a combination has no finite value where the parameters in `gone` have none."""
-    going = candidate.direction[[name in gone for name in optimum.names]]
-    together = optimum.status is Status.NO_FULL_SLIP and not candidate.is_sum
-    return bool(going.any()) and not (together and going.sum() == 0.0)
+            parts = np.diag(direction)[np.flatnonzero(direction)]
+            known_better = information.std(direction) > information.std(parts).min()
+            enough = members <= lost and not known_better
+        if enough:
+            stated.add(candidate.expression)
+    for name in (name for name in sources if lost and name in stated - {*optimum.names}):
+        yield StatedCombination(name, sources[name].unit, sources[name].value, sources[name].u)
 
 
 def _within(limits: Interval, unit: str) -> str:
