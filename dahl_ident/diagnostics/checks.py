@@ -8,7 +8,7 @@ and of records both have, or says for which of the two it is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -55,22 +55,17 @@ Assessed = TableAssessment | RecordAssessment
 _Check = Callable[[Any], Iterable[Finding]]
 
 
-def of_tables(check: _Check) -> _Check:
-    """Return a check that applies to fits of tables only."""
-    return _of("table", check)
-
-
-def of_records(check: _Check) -> _Check:
-    """Return a check that applies to fits of records only."""
-    return _of("records", check)
-
-
 def _of(kind: str, check: _Check) -> _Check:
+    """Return a check that applies to fits of one kind of data only."""
+
     @wraps(check)
     def limited(fit: Assessed) -> Iterable[Finding]:
         return check(fit) if fit.problem.kind == kind else ()
 
     return limited
+
+
+_of_tables, _of_records = partial(_of, "table"), partial(_of, "records")
 
 
 def judgement(fit: Assessed) -> Judgement:
@@ -93,7 +88,7 @@ def judgement(fit: Assessed) -> Judgement:
 # Determined?
 
 
-@of_records
+@_of_records
 def _parameters_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield the parameters that are not determined, the reasons, and a motion that would do it."""
     for name, why in fit.undetermined.items():
@@ -101,7 +96,7 @@ def _parameters_of_records(fit: RecordAssessment) -> Iterator[Finding]:
         yield undetermined("record_parameter", name=name, stderr=stderr, unit=unit, why=why)
 
 
-@of_tables
+@_of_tables
 def _parameters(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
@@ -215,7 +210,7 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
     return min(rms_misfit_of(errors.problem, each) for each in fitted)
 
 
-@of_tables
+@_of_tables
 def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
     """Yield where a force exceeds what friction can carry; not rows that a loss sets aside."""
     errors, differ = fit.errors, fit.goodness.runs_differ
@@ -228,9 +223,10 @@ def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
 def _below_zero(fit: Assessed) -> Iterator[Finding]:
     """Yield every mass, damping or stiffness below zero, and what else no mechanism has."""
     yield from below_zero(fit.problem, fit.known)
-    for element in fit.model.elements if fit.problem.kind == "records" else ():
-        if not is_single(element):
-            for text in element.physics([p.value or 0.0 for p in element.parameters]):
+    for element in fit.model.elements:
+        values = [p.value or 0.0 for p in element.parameters]
+        if np.isfinite(values).all() and not is_single(element):
+            for text in element.physics(values):
                 yield described("unphysical", _APPROXIMATE, objection=text)
 
 
@@ -272,7 +268,7 @@ def _exponents(fit: Assessed) -> Iterator[Finding]:
             yield described("beyond_range", _APPROXIMATE, **asked, low=low, high=high)
 
 
-@of_tables
+@_of_tables
 def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters a robust fit moves by more than one uncertainty."""
     optimum, errors = fit.optimum, fit.errors
@@ -325,12 +321,12 @@ def robust_values(
     return robust, by_noise
 
 
-@of_tables
+@_of_tables
 def _steady(fit: TableAssessment) -> Iterator[Finding]:
     yield from steady_findings(fit.optimum, fit.model)
 
 
-@of_records
+@_of_records
 def _delay(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield the delay that was taken out: a doubt where it moves the output by more than noise."""
     problem = fit.problem
@@ -343,7 +339,7 @@ def _delay(fit: RecordAssessment) -> Iterator[Finding]:
     yield described("delay", _APPROXIMATE if doubtful else _TRUSTED, **lag)
 
 
-@of_records
+@_of_records
 def _notes(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield the size of the residuals, and what was done with the records."""
     problem, goodness = fit.problem, fit.goodness

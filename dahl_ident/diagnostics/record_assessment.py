@@ -12,6 +12,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, whole_number
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.record import cut
+from dahl_ident.diagnostics.advice import reasons
 from dahl_ident.diagnostics.assessment import Assessment, ContradictedExponent
 from dahl_ident.diagnostics.bands import DerivedQuantity, quantities_and_slopes
 from dahl_ident.diagnostics.budget import Budget, parameter_budget
@@ -26,7 +27,6 @@ from dahl_ident.diagnostics.contributions import ALONG_MOTION, MODEL_ERROR, NOIS
 from dahl_ident.diagnostics.formatting import table
 from dahl_ident.diagnostics.goodness import RecordGoodness, record_goodness
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals, around
-from dahl_ident.diagnostics.record_advice import reasons
 from dahl_ident.diagnostics.record_errors import (
     RecordErrors,
     errors_on_constraints,
