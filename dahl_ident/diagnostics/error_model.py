@@ -103,9 +103,9 @@ class ErrorModel(ErrorContributions):
     tests: int  # number of tests, of which each may have been left out
     # names of parameters that were assumed: exponents, the force gain for a drive factor
     assumed: tuple[str, ...]
-    # (count, Q, Q) each: covariance of theta by each variance at unit size, with the exponents
+    # (2, count, Q, Q): covariance of theta by each variance at unit size, with the exponents
     # estimated, and with exact ones
-    unit_parts: tuple[FloatArray, FloatArray]
+    units: FloatArray
     by_runs: RunJackknife | None
 
     @property
@@ -126,7 +126,7 @@ class ErrorModel(ErrorContributions):
     @property
     def noises(self) -> FloatArray:
         """Variance of the noise over that by which rows count: fundamentals, then harmonics."""
-        return 1.0 / self.state.weights[: self.state.model.noises]
+        return self.state.sizes[: self.state.model.noises]
 
     @property
     def distinguishes_noise(self) -> bool:
@@ -168,7 +168,7 @@ class ErrorModel(ErrorContributions):
         exponent adds depends on the variances as well.
         """
         direction = direction / (float(np.abs(direction).max()) or 1.0)  # any length will do
-        slopes, exact = (np.einsum("i,kij,j->k", direction, C, direction) for C in self.unit_parts)
+        slopes, exact = np.einsum("i,ekij,j->ek", direction, self.units, direction)
         counted = self.contributions if source is None else (source,)
         sizes = {name: float(direction @ self.contributions[name] @ direction) for name in counted}
         if source == EXPONENT:
@@ -351,18 +351,21 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         exponents = {name for name, one in assumed.items() if one.source == EXPONENT}
     tests = rows_of_tests(problem.data)
     by_tests = estimate.jackknife(tests) if estimate.regular else None
-    parts = [_propagated(estimate.lever(exact), state) for exact in (set[str](), exponents)]
-    model = [k for k, one in enumerate(sources, noises) if one.name == MODEL_ERROR]
+    labels = [NOISE] * noises + [source.name for source in sources]
+    labels += [CHANNELS.get(name, name) for name in problem.priors]
+    labels += [one.source for one in assumed.values()]
+    # with the exponents estimated, and with exact ones
+    units = np.array(
+        [_unit_covariances(estimate.lever(exact), state) for exact in (set[str](), exponents)]
+    )
+    sizes = np.append(state.sizes, np.ones(problem.n_priors))
     if by_tests is not None and len(tests) >= _TESTS_THAT_LIMIT:
-        size = np.einsum("kii,k->i", parts[0].units[model], state.variances[model])
+        model = np.array(labels) == MODEL_ERROR
+        size = np.einsum("kii,k->i", units[0, model], sizes[model])
         most = _SHARED_BY * np.diagonal(by_tests)
         limit = np.sqrt(np.divide(most, size, out=np.ones(len(size)), where=size > most))
-        for part in parts:
-            part.units[model] *= np.outer(limit, limit)
-    names = [source.name for source in sources]
-    priors = [CHANNELS.get(name, name) for name in problem.priors]
-    priors += [one.source for one in assumed.values()]
-    every, exact = (part.by_source(names, priors, state) for part in parts)
+        units[:, model] *= np.outer(limit, limit)
+    every, exact = (_by_source(labels, sizes[:, None, None] * each) for each in units)
     if exponents:
         added = np.asarray(sum(every.values())) - np.asarray(sum(exact.values()))
         every = {**exact, EXPONENT: positive_part(added)}
@@ -383,7 +386,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     return ErrorModel(
         optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed),
-        (parts[0].units, parts[1].units), by_runs,
+        units[:, : state.model.count], by_runs,
     )  # fmt: skip
 
 
@@ -414,39 +417,22 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
     return MixedModel(estimate.y, estimate.columns, Z, group, np.array(known), 1 + both, most)
 
 
-class _Propagated(NamedTuple):
-    """Covariances of theta that residuals make by a lever."""
-
-    units: FloatArray  # (count, Q, Q): by each variance at unit size
-    known: FloatArray  # (Q, Q): by known noise
-    priors: FloatArray  # (Q, n_priors): changes of theta by priors
-
-    def by_source(
-        self, sources: Sequence[str], priors: Sequence[str], state: MixedState
-    ) -> dict[str, FloatArray]:
-        """Return the covariance of theta by the name of a source."""
-        by_source, noises = {NOISE: self.known}, [NOISE] * state.model.noises
-        parts = [
-            *zip([*noises, *sources], state.variances[:, None, None] * self.units, strict=True),
-            *zip(priors, map(_square, self.priors.T[:, :, None]), strict=True),
-        ]
-        for name, part in parts:
-            by_source[name] = by_source.get(name, 0.0) + part
-        return by_source
-
-
-def _propagated(lever: FloatArray, state: MixedState) -> _Propagated:
-    """Return the covariances that the lever (Q, M) makes of noise, sources and priors."""
+def _unit_covariances(lever: FloatArray, state: MixedState) -> FloatArray:
+    """Return what the lever (Q, M) makes of noises, sources and priors of unit size, (k, Q, Q)."""
     model, G = state.model, state.model.noises
-    noise = [_square(lever[:, model.group == g]) for g in range(G)]
     moved = lever @ model.U
-    sources = [_square(moved[:, model.columns(k)]) for k in range(model.count - G)]
-    known = np.tensordot(model.known[:G], np.array(noise), 1)
-    return _Propagated(np.array([*noise, *sources]), known, lever[:, model.group >= G])
+    columns = [lever[:, model.group == g] for g in range(G)]
+    columns += [moved[:, model.columns(k)] for k in range(model.count - G)]
+    columns += list(lever.T[model.group >= G, :, None])
+    return np.array([each @ each.T for each in columns])
 
 
-def _square(columns: FloatArray) -> FloatArray:
-    return np.asarray(columns @ columns.T)
+def _by_source(labels: Sequence[str], parts: FloatArray) -> dict[str, FloatArray]:
+    """Return sums of the parts (k, Q, Q) that are of one source."""
+    by_source = dict[str, FloatArray]()
+    for name, part in zip(labels, parts, strict=True):
+        by_source[name] = by_source.get(name, 0.0) + part
+    return by_source
 
 
 def no_narrower(

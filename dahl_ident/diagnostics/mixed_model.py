@@ -167,6 +167,12 @@ class MixedState:
             model.counts @ np.log(self.weights) - self._Q[-1, -1]
         ) - float(np.log(np.diagonal(L)).sum() - np.log(units[:P]).sum())
 
+    @property
+    def sizes(self) -> FloatArray:
+        """Variances of noises, what is known of them included, and of sources."""
+        G = self.model.noises
+        return np.append(1.0 / self.weights[:G], self.variances[G:])
+
     @cached_property
     def _by_noise(self) -> list[tuple[FloatArray, FloatArray]]:
         """For each noise, K A and the diagonal of [U y]' P P [U y] over its rows."""

@@ -57,13 +57,12 @@ def prediction_error(
     if of_a_test:
         near = _nearest(errors.problem, amplitude, omega)
         units = errors.estimate.relative_units[near]
-        sizes = [*errors.noises, *errors.variances]
         drawn = [units, *[None] * (model.noises - 1)]
         drawn += [source.drawn(names, slopes, near, units) for source in errors.sources]
         for k, made in enumerate(drawn):
             if made is not None:
                 square = np.broadcast_to(made @ made.swapaxes(-1, -2), covariance.shape)
-                covariance = covariance + sizes[k] * square
+                covariance = covariance + state.sizes[k] * square
                 by_variance[k] += _diagonal(square)
     total = _diagonal(covariance)
     spread = np.einsum("kni,kl,lni->ni", by_variance, state.variances_covariance, by_variance)
