@@ -148,6 +148,22 @@ def test_instant_unloading_of_another_exponent_is_a_limit():
     np.testing.assert_allclose(steeper, steep, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("exponent", "p"), [(1.0, 1e15), (2.0, 1e13)])
+def test_motion_in_time_with_instant_unloading_is_a_limit(exponent, p):
+    """Friction once vanished after the first reversal, where its force crept to zero."""
+    rest = di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)
+    plant = di.BoucWen(30.0, 300.0, 2.0, exponent=exponent) + rest
+    t = np.arange(400) / 50.0
+    wave = band_limited(0.2 * np.cos(1.9 * t) + 0.15 * np.cos(4.4 * t + 1.0), 0.02)
+
+    def at(p):
+        values = np.array([float(v) for v in plant.with_values({"p": p}).known_values()])
+        return march(Shooting(plant).system, t, wave, t, np.zeros(3), values).output
+
+    exact = at(1e10)
+    assert np.ptp(at(p) - exact) < 1e-3 * np.ptp(exact)
+
+
 def at_unloading(p, **options):
     """Return amplitudes of a plant with Bouc-Wen friction that unloads at once."""
     rest = di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)

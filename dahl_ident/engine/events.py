@@ -26,6 +26,8 @@ LOCATED = 1e-13  # of the span: shorter steps, and times that differ by less, ar
 DECADE, LEFT = 0.1, 1e-11  # of the distance to a limit: left after a step; at the end
 FADED = 0.6  # of a slope after a step that comes so near
 _BISECTIONS = 60
+_AT_REST = 1e-14  # of the largest velocity: rounding
+_SMALL = 1e-6  # of a state, or of a step: nothing has changed
 _REPEATS = 12  # of a step that is shortened to an event; two are the rule
 PLACES = np.concatenate(
     [a + (b - a) * np.arange(1, 5) / 4 for a, b in zip([0.0, *NODES[:-1]], NODES, strict=True)]
@@ -97,6 +99,21 @@ def function_at(f, signal, t, h, y, place, e, w, at):
 
 
 @compiled
+def goes_on(f, signal, t, h, y, e, w, at):
+    """Return whether function e, near zero at the step's end, goes on to the other side.
+
+    On its own branch it may rest there, as a force does that unloads at once.
+    """
+    put_place(y, 1.0, w, at)
+    if e == 0 and (at.held or abs(w[2]) < _AT_REST * w[at.scale + 1]):
+        return False
+    w[at.sides + e] *= -1.0
+    evaluate(f, signal, t + h, 1.0, w, at)
+    w[at.sides + e] *= -1.0
+    return slope_of(e, w, at) * w[at.sides + e] < 0.0
+
+
+@compiled
 def first_event(f, signal, t, h, y, w, at):
     """Return which function passes through zero first in the step, or -1, and at which place.
 
@@ -123,6 +140,8 @@ def first_event(f, signal, t, h, y, w, at):
                 high = least if crossed else high
             else:
                 low = middle
+            if not crossed and high == 1.0 and value <= 0.0 < w[at.before + e] * side:
+                crossed, low = goes_on(f, signal, t, h, y, e, w, at), 0.0
             if not crossed:
                 older, old, low, middle = old, value, middle, high
                 continue
@@ -142,6 +161,17 @@ def first_event(f, signal, t, h, y, w, at):
                 which, where = e, high
             break
     return which, where
+
+
+@compiled
+def falls(place, y, w, at):
+    """Return whether a state has changed at a place of a step that takes no time."""
+    put_place(y, place, w, at)
+    for r in range(at.n):
+        size = max(abs(y[r]), w[at.scale + r])
+        if size > 0.0 and abs(w[1 + r] - y[r]) > _SMALL * size:
+            return True
+    return False
 
 
 @compiled
@@ -182,14 +212,14 @@ def step_to_event(
         if value == 0.0:
             return length, True
         change = -value / slope if slope != 0.0 else np.inf
-        if abs(change) <= max(1e-15 * span, 1e-12 * length):  # rounding of the time
+        if abs(change) <= max(min(1e-15 * span, _SMALL * length), 1e-12 * length):  # rounding
             return length, True
         if not 0.0 < length + change <= h:
             break
         change = max(change, -0.5 * length)
         shorten(1.0 + change / length, w, at)
         length += change
-    if abs(value) <= near or abs(change) <= LOCATED * span:
+    if abs(value) <= near or abs(change) <= min(LOCATED * span, _SMALL * length):
         return length, True
     return (length if value * w[at.sides + e] > 0.0 else 0.0), False
 

@@ -11,6 +11,7 @@ from dahl_ident.engine.events import (
     LOCATED,
     choose_branch,
     fades,
+    falls,
     first_event,
     pass_event,
     passed_another,
@@ -232,7 +233,7 @@ def advance(
         if at.held and h > LOCATED * span and fades(solved, y, w, at):
             step, last = 0.5 * h, 0.0
             continue
-        if which >= 0 and where * h <= LOCATED * span:
+        if which >= 0 and where * h <= LOCATED * span and not falls(where, y, w, at):
             stuck += 1
             if stuck > 2 * (at.k + 2):
                 return 0.0  # the motion is stuck between two branches
