@@ -253,6 +253,13 @@ def test_methods_that_return_nothing_are_named(method):
         law(dahl, **{method: lambda _, values: None})(0.2, 3.0)
 
 
+def test_states_without_rates_are_named():
+    two = law(dahl, n_states=2)(1.0, 1.0)
+    for use in (lambda: two.describing_function(1.0), lambda: di.response(two + di.Mass(1), 1, 1)):
+        with pytest.raises(ModelError, match="Mine has 2 states, but its slope gives one rate"):
+            use()
+
+
 def test_mechanics_that_return_nothing_are_named():
     mine = law(dahl, mechanics=lambda _, p, x, v, s, states: None)(0.2, 3.0)
     with pytest.raises(ModelError, match=r"Mine\.mechanics returned None; expected an inertia"):
