@@ -49,7 +49,8 @@ _APART = 0.1  # standard deviations between two minima
 _NEAR_ENOUGH = 0.03  # the same for the estimates of a jackknife
 _SETTLED = 1e-3  # of a standard deviation that a step still moves the estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
-_HALVINGS = 8  # of a step, until the sum of squares falls
+_FIRST_DAMPING, _DAMPED = 1e-3, 10.0  # of a step after which the sum of squares does not fall
+_TRIALS = 8  # of one step, each damped more
 _ROOT_STEPS = 200  # Newton's, from below, for the misfit: it doubles where it is far off
 _LEAST_LEFT = 1e-3  # of a test, that the others do not determine
 _MOST_DISAGREEMENT = 1e6  # of harmonics with fundamentals, as a factor of their variance
@@ -337,6 +338,7 @@ def _descended(
         _, J = stated.residuals_and_jacobian(theta)
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
     last: FloatArray | None = None
+    damping, bounds = 0.0, problem.bounds()
     for _ in range(_STEPS):
         misfit, variance, scale = _weights(stated, theta, loss)
         weighted = stated.widened(variance)
@@ -346,7 +348,7 @@ def _descended(
         columns = J @ basis.matrix
         if not (np.isfinite(y).all() and np.isfinite(columns).all()):
             raise np.linalg.LinAlgError("no finite step from the estimate")
-        step = np.linalg.lstsq(columns, -y, rcond=1e-13)[0]
+        step = _step(columns, y, theta, basis, bounds)
         size = np.linalg.norm(columns @ step)
         if size < settled:
             break
@@ -354,13 +356,18 @@ def _descended(
         further = _further(moved, last)
         step, last = further * step, moved if further == 1.0 else None
         mean = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
-        cost, length = _cost(r, m, loss, mean), 1.0
-        for _ in range(_HALVINGS):
-            trial = _moved(problem, theta, np.asarray(length * step), basis)
+        cost = _cost(r, m, loss, mean)
+        for _ in range(_TRIALS):
+            if damping:
+                rows = np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))
+                both, last = np.vstack([columns, rows]), None
+                step = _step(both, np.append(y, np.zeros(len(rows))), theta, basis, bounds)
+            trial = _moved(problem, theta, step, basis)
             value = weighted.residuals_and_jacobian(trial, scale, tails=loss is None)[0]
             if np.isfinite(value).all() and _cost(value, m, loss, mean) < cost:
+                damping = damping / _DAMPED if damping > _FIRST_DAMPING else 0.0
                 break
-            length *= 0.5
+            damping = max(_DAMPED * damping, _FIRST_DAMPING)
         else:
             break
         theta = trial
@@ -378,6 +385,32 @@ def _cost(r: FloatArray, m: int, loss: Loss | None, mean: float) -> float:
     """Return the sum of squares, or of losses over their mean slope, which has those scores."""
     z = squares_of(r[:m])
     return float(np.sum(z if loss is None else loss.rho(z) / mean) + r[m:] @ r[m:])
+
+
+def _step(
+    columns: FloatArray,
+    y: FloatArray,
+    theta: FloatArray,
+    basis: Basis,
+    bounds: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """Return Gauss and Newton's step; parameters that it would take out of bounds go to them."""
+    to_bounds, inside = np.zeros(columns.shape[1]), np.ones(columns.shape[1], dtype=bool)
+    matrix = basis.matrix
+    alone = (matrix != 0.0).sum(axis=1) == 1
+    step = to_bounds
+    for _ in range(len(theta)):
+        rest = np.linalg.lstsq(columns * inside, -y - columns @ to_bounds, rcond=1e-13)[0]
+        step = to_bounds + inside * rest
+        there = theta + matrix @ step
+        within = np.clip(there, *bounds)
+        beyond = np.flatnonzero(alone & (there != within))
+        places = np.abs(matrix[beyond]).argmax(axis=1)
+        if inside[places].sum() == 0:
+            break
+        inside[places] = False
+        to_bounds[places] = (within - theta)[beyond] / matrix[beyond, places]
+    return np.asarray(step)
 
 
 def _further(moved: FloatArray, last: FloatArray | None) -> float:
