@@ -38,3 +38,9 @@ def test_a_mass_that_rests_on_less_than_the_misfit_is_not_determined():
     assert "not determined, because of model error" in fit.verdict
     heavy = di.fit(table(law + di.Mass(3.0, name="b"), noise=0.02), di.Dahl() + di.Mass())
     assert "because of model error" not in heavy.verdict
+
+
+def test_friction_in_one_direction_only_is_doubted():
+    """By the law itself, of tables as of records."""
+    found = di.fit(di.load_dataset("noisy"), di.Dahl(asymmetry=0.9999), throw=False)
+    assert "asymmetry leaves almost no friction in one direction" in found.verdict

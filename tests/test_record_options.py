@@ -144,6 +144,7 @@ def test_constraints():
         assert again.params["sigma"].stderr == pytest.approx(sigma.stderr)
         assert str(again.status) == str(fit.status)
     assert right.trusted
+    assert "the constraint sigma" in right.verdict
     assert any(finding.code == "constraint" for finding in wrong.findings)
     assert not wrong.trusted
 

@@ -126,6 +126,7 @@ def test_an_exponent_beyond_its_range_is_named():
     assert not fit.trusted
     assert 1.9 < fit.params["alpha"].value <= 2.0
     assert "beyond the range that is assumed" in fit.verdict
+    assert {"beyond_range", "assumed"} <= {finding.code for finding in fit.findings}  # as of tables
 
 
 def test_an_assumed_exponent_of_a_driven_motion():

@@ -46,24 +46,12 @@ REMEDY = {
 
 @dataclass(frozen=True)
 class MotionMisfit:
-    """What the residuals follow beyond chance.
+    """What the residuals follow beyond chance."""
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (P, P)
-        Of the estimate, by the functions that the residuals follow.
-    follows : str
-        What explains most of the residuals.
-    share : float
-        Of their variance that it explains.
-    functions : int
-        From which the covariance was estimated.
-    """
-
-    covariance: FloatArray
-    follows: str
-    share: float
-    functions: int
+    covariance: FloatArray  # (P, P): of the estimate, by the functions that the residuals follow
+    follows: str  # what explains most of the residuals
+    share: float  # of their variance that it explains
+    functions: int  # from which the covariance was estimated
 
 
 def motion_misfit(
