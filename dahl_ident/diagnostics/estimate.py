@@ -197,14 +197,9 @@ class WeightedEstimate:
 
     def factors(self, problem: TableProblem) -> FloatArray:
         """Return the matrices from each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
-        sides = np.array([1.0, 1.0j])[:, None] * np.ones(self.problem.data.n, dtype=np.complex128)
-
-        def by_row(changes: FloatArray) -> FloatArray:
-            return changes.reshape(2, -1, 2).transpose(1, 2, 0)
-
-        ours = by_row(self.problem.residual_change(self.theta, sides) / self.scale)
-        theirs = by_row(problem.residual_change(self.theta, sides))
-        return np.asarray(ours @ np.linalg.pinv(theirs))
+        ones = np.ones(self.problem.data.n)
+        ours = by_row(self.problem, self.theta, ones) / self.scale
+        return np.asarray(ours @ np.linalg.pinv(by_row(problem, self.theta, ones)))
 
     @cached_property
     def predicted(self) -> ComplexArray:
@@ -219,9 +214,7 @@ class WeightedEstimate:
     @cached_property
     def relative_units(self) -> FloatArray:
         """The matrices from each row of `y` to ln gain and phase, shape (n, 2, 2)."""
-        both = self.changed(np.array([1.0, 1.0j])[:, None] * self.predicted)
-        units = np.linalg.pinv(both[: self.problem.n_residuals].reshape(-1, 2, 2))
-        return np.asarray(units, dtype=np.float64)
+        return relative_units(self.problem, self.theta, self.predicted) * self.scale
 
     def lever(self, left_out: Collection[str] = ()) -> FloatArray:
         """Return G = (J'J)^-1 J', d theta/d y (Q, M), some parameters left out: exact."""
@@ -258,6 +251,17 @@ class WeightedEstimate:
         each = np.linalg.solve(R, np.array(moves).T).T
         each = np.clip(each, *(bound - self.theta for bound in self.problem.bounds()))
         return np.asarray(each.T @ each)
+
+
+def by_row(problem: TableProblem, theta: FloatArray, size: FloatArray | ComplexArray) -> FloatArray:
+    """Return the changes of each row's residuals by `size` and by i times it, (n, 2, 2)."""
+    both = problem.residual_change(theta, np.array([[1.0], [1.0j]]) * size)
+    return both.reshape(2, -1, 2).transpose(1, 2, 0)
+
+
+def relative_units(problem: TableProblem, theta: FloatArray, predicted: ComplexArray) -> FloatArray:
+    """Return the matrices from each row's residuals to ln gain and phase, (n, 2, 2)."""
+    return np.asarray(np.linalg.pinv(-by_row(problem, theta, predicted)), dtype=np.float64)
 
 
 def weighted_estimate(
@@ -455,8 +459,7 @@ def _weights(
     if targets[0][1] <= 0.0:
         return 0.0, nothing, 1.0
     size = np.abs(stated.data.response)[tests_of(stated.data)[1]]
-    both = np.asarray(size[None] * np.array([[1.0], [1.0j]]), dtype=np.complex128)
-    D = stated.residual_change(theta, both).reshape(2, -1, 2).transpose(1, 2, 0)
+    D = by_row(stated, theta, size)
     b, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
     b, z = np.maximum(b, 0.0), np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)) ** 2
     square = np.zeros(len(first))

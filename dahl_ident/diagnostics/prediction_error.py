@@ -23,6 +23,7 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS, satterthwaite
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
 from dahl_ident.diagnostics.error_sources import error_sources, parts, places
+from dahl_ident.diagnostics.estimate import relative_units
 from dahl_ident.problem import TableProblem
 
 _NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
@@ -86,9 +87,8 @@ def stated_noise(
 
     That of the row which was measured nearest to each point.
     """
-    problem, predicted = problem.widened(np.zeros(problem.data.n)), problem.predict(theta)
-    sides = [-problem.residual_change(theta, f * predicted) for f in (1.0, 1j)]
-    units = np.linalg.pinv(np.stack([one.reshape(-1, 2) for one in sides], axis=-1))
+    problem = problem.widened(np.zeros(problem.data.n))
+    units = relative_units(problem, theta, problem.predict(theta))
     units = units[_nearest(problem, amplitude, omega)]
     return np.asarray(units @ units.swapaxes(1, 2))
 
