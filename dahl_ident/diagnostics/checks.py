@@ -139,7 +139,7 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     problem, converged = fit.problem, fit.optimum.converged
     far = fit.goodness.rms_in_band > (_FAIRLY if fit.misses else _TOO_LARGE)
     if far:
-        yield described("records_not_described", _NOT_DESCRIBED)
+        yield described("records_not_described", _NOT_DESCRIBED, rms=fit.goodness.rms_in_band)
     if not converged:
         yield described("no_optimum", _NOT_DESCRIBED, message=fit.optimum.message)
     displaced = all(record.displacement is not None for record in problem.records)

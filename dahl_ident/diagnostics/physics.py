@@ -78,9 +78,8 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
         return
     if problem.is_exact:
         row, apart = _steady_difference(optimum)
-        (name,) = row_names(problem.data, [row])
-        seen = apart >= _SEEN
-        yield described("steady", difference=apart if seen else 0.0, row=name if seen else "")
+        if apart >= _SEEN:
+            yield described("steady", difference=apart, row=row_names(problem.data, [row])[0])
         yield from _distorted(problem.data)
         yield from _jumps(problem.data, model)
         if unstable := problem.unstable_rows(optimum.theta):

@@ -195,13 +195,6 @@ def _slight(name: str, value: float, stderr: float, unit: str, share: float, mis
     )
 
 
-def _steady(difference: float, row: str) -> str:
-    begin = "The force was held, and the exact steady motion fitted"
-    if not row:
-        return f"{begin}; the describing function would be the same."
-    return f"{begin}; the describing function would be up to {percent(difference)} off, at {row}."
-
-
 def _jenkins_bound(least: float, law: bool) -> str:
     share = f"{percent(least)} (rms of the fundamental)"
     if law:
@@ -327,7 +320,8 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "moved": _moved,
     "negative": _negative,
     "slight": _slight,
-    "steady": _steady,
+    "steady": "The force was held, and the exact steady motion fitted; the describing function "
+    "would be up to {difference:percent} off, at {row}.",
     "jump": _jump,
     "unstable_rows": _unstable_rows,
     "distorted_force": _distorted_force,
@@ -335,7 +329,7 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "plant would drive itself, and no steady motion is there.",
     "describing_function": "The force was held, but the describing function predicts the motion: "
     "{why}.",
-    "records_not_described": "The model does not describe the records.",
+    "records_not_described": "The model does not describe the records ({rms:percent} rms misfit).",
     "no_optimum": "The search found no optimum. {message}",
     "motion_may_be_imposed": lambda: (
         "If the exciter imposed the motion, fit the force instead "
