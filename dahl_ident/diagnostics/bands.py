@@ -338,10 +338,15 @@ def _parts_std(R: ComplexArray, covariance: FloatArray) -> FloatArray:
 
 
 def _combined_band(
-    errors: ErrorModel, R: ComplexArray, by: ComplexArray, known: NDArray[np.bool_],
-    amplitude: FloatArray, omega: FloatArray, stiffness: ComplexArray | None = None,
+    errors: ErrorModel,
+    R: ComplexArray,
+    by: ComplexArray,
+    known: NDArray[np.bool_],
+    amplitude: FloatArray,
+    omega: FloatArray,
+    stiffness: ComplexArray | None = None,
     of_a_test: bool = False,
-) -> ResponseBand:  # fmt: skip
+) -> ResponseBand:
     """Return the band of responses (n,); NaN where a response is not `known`."""
     R_known = R[known]
     parts, dof = np.full((4, R.size), np.nan), np.full((2, R.size), np.nan)

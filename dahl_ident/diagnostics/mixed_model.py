@@ -42,9 +42,15 @@ class MixedModel:
     """Residuals, and the columns of parameters and sources."""
 
     def __init__(
-        self, y: FloatArray, J: FloatArray, Z: Sequence[FloatArray], group: NDArray[np.intp],
-        known: FloatArray, groups: int, most: FloatArray,
-    ) -> None:  # fmt: skip
+        self,
+        y: FloatArray,
+        J: FloatArray,
+        Z: Sequence[FloatArray],
+        group: NDArray[np.intp],
+        known: FloatArray,
+        groups: int,
+        most: FloatArray,
+    ) -> None:
         self.most = np.concatenate([np.full(groups, np.inf), most])
         self.y, self.U, self.group, self.known = y, np.hstack([J, *Z]), group, known
         self.parameters, self.noises = J.shape[1], groups

@@ -38,9 +38,14 @@ class PredictionError(NamedTuple):
 
 
 def prediction_error(
-    errors: ErrorModel, slopes: ComplexArray, amplitude: FloatArray, omega: FloatArray,
-    stiffness: ComplexArray | None, *, of_a_test: bool,
-) -> PredictionError:  # fmt: skip
+    errors: ErrorModel,
+    slopes: ComplexArray,
+    amplitude: FloatArray,
+    omega: FloatArray,
+    stiffness: ComplexArray | None,
+    *,
+    of_a_test: bool,
+) -> PredictionError:
     """Return the error of a predicted fundamental."""
     state, names = errors.state, errors.names
     model, basis = state.model, errors.estimate.basis
@@ -114,9 +119,12 @@ class Departures(NamedTuple):
 
 
 def departures(
-    errors: ErrorModel, slopes: ComplexArray, amplitude: FloatArray, omega: FloatArray,
+    errors: ErrorModel,
+    slopes: ComplexArray,
+    amplitude: FloatArray,
+    omega: FloatArray,
     stiffness: ComplexArray,
-) -> Departures | None:  # fmt: skip
+) -> Departures | None:
     """Return the model error of a fit at other places; None where it has none.
 
     Where residuals are too few to distinguish it from noise, it is assumed as large as the noise.

@@ -180,9 +180,11 @@ class ResidualSpace(_Complement):
     """The residuals of an optimum in units of the noise: for whether a departure is one."""
 
     def __init__(
-        self, optimum: Optimum, runs: RunDeviations | None = None,
+        self,
+        optimum: Optimum,
+        runs: RunDeviations | None = None,
         weights: WeightedEstimate | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take residuals with the stated weights, or with those of an estimate.
 
         The size of the latter's misfit is itself an estimate, as an unknown scale is.
