@@ -96,7 +96,8 @@ class RecordProblem(Problem):
             if not isinstance(record, Record):
                 raise ValidationError(
                     f"data holds a {type(record).__name__}; expected a FrequencyResponse, a Record "
-                    "or several records (read_frequency_response and read_record read files)"
+                    "or several records (read_frequency_response and read_record read files, "
+                    "FrequencyResponse.concatenate joins tables)"
                 )
         self.model = as_model(model)
         self.excitation = excitation
