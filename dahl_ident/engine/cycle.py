@@ -20,6 +20,7 @@ from dahl_ident.engine.radau import (
     Signal,
     eliminate,
     layout,
+    put_parameters,
     restart,
 )
 
@@ -72,7 +73,7 @@ def cycles(
     for k in harmonics:
         highest = max(highest, k)
     for row in range(rows):
-        w[3 + n + at.k : at.outputs] = parameters[row]
+        put_parameters(f, parameters[row], w, at)
         restart(w, at)
         signal = Signal(True, amplitudes[row], omegas[row], none, nothing)
         period = 2.0 * np.pi / omegas[row]

@@ -36,7 +36,8 @@ class Step(NamedTuple):
     """One operation: its name, what it works on, and where the result goes.
 
     Names: "CONST" with a number, "INPUT" and "OUTPUT" with a place in the array, "LEVEL" with the
-    level below which the function returns, or an operation of casadi with earlier results.
+    level below which the function returns, "BEGIN" where those end that are made at level -1 alone,
+    or an operation of casadi with earlier results.
     """
 
     name: str
@@ -73,6 +74,51 @@ def steps_of(graph: ca.Function, places: Sequence[Sequence[int]]) -> tuple[Step,
     return tuple(found)
 
 
+def prepared(steps: Sequence[Step], first: int, last: int) -> tuple[tuple[Step, ...], int]:
+    """Return the operations with those apart that depend on the inputs from first to last alone.
+
+    They are made once for many calls, at level -1; their results are kept in places from `last` on,
+    behind which the outputs move. Their number is returned too.
+    """
+    fixed = [False] * len(steps)
+    for i, (name, values) in enumerate(steps):
+        if name == "INPUT":
+            fixed[i] = first <= values[0] < last
+        elif name not in ("OUTPUT", "LEVEL"):
+            fixed[i] = name == "CONST" or all(fixed[int(j)] for j in values)
+    needed = {
+        int(j)
+        for i, (name, values) in enumerate(steps)
+        if not fixed[i] and name not in ("INPUT", "LEVEL")
+        for j in (values[1:] if name == "OUTPUT" else values)
+    }
+    kept = [i for i in sorted(needed) if fixed[i] and steps[i].name not in ("CONST", "INPUT")]
+    made: dict[int, int] = {}
+    result: list[Step] = []
+
+    def add(i: int) -> None:
+        name, values = steps[i]
+        if name == "OUTPUT":
+            values = (values[0] + len(kept), made[int(values[1])])
+        elif name not in ("CONST", "INPUT", "LEVEL"):
+            values = tuple(made[int(j)] for j in values)
+        made[i] = len(result)
+        result.append(Step(name, values))
+
+    for i in range(len(steps) if kept else 0):
+        if fixed[i]:
+            add(i)
+    result += [Step("OUTPUT", (last + slot, made[i])) for slot, i in enumerate(kept)]
+    result.append(Step("BEGIN", ()))
+    for slot, i in enumerate(kept):
+        made[i] = len(result)
+        result.append(Step("INPUT", (last + slot,)))
+    for i in range(len(steps)):
+        if not fixed[i] or steps[i].name in ("CONST", "INPUT"):
+            add(i)
+    return tuple(result), len(kept)
+
+
 def compiled(steps: Sequence[Step]) -> Any:
     """Return the C function ``f(numbers)`` of some steps."""
     from llvmlite import ir
@@ -100,7 +146,8 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
     number, whole = ir.DoubleType(), ir.IntType(32)
     zero, one, two = (ir.Constant(number, v) for v in (0.0, 1.0, 2.0))
     results: list[Any] = []
-    end = builder.append_basic_block("end")
+    end, begin = (builder.append_basic_block(name) for name in ("end", "begin"))
+    prepare = builder.append_basic_block("prepare")
 
     def place(i: float) -> Any:
         return builder.gep(array, [ir.Constant(whole, int(i))])
@@ -155,9 +202,15 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
         "POW": power,
         "CONSTPOW": power,
     }
+    once = builder.fcmp_ordered("<", builder.load(place(0)), zero)
+    builder.cbranch(once, prepare, begin)
+    builder.position_at_end(prepare)
     for name, values in steps:
         result = None
-        if name == "CONST":
+        if name == "BEGIN":
+            builder.branch(end)
+            builder.position_at_end(begin)
+        elif name == "CONST":
             result = ir.Constant(number, values[0])
         elif name == "INPUT":
             result = builder.load(place(values[0]))

@@ -567,7 +567,7 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
     at the upper turning point; and the factor by which a deviation shrinks in a cycle.
     """
     k, P, rows = sizes[1], sizes[2], amplitudes.size
-    o, m, columns = 6 + k + P, 4 + k, 2 + chosen.size
+    o, m, columns = 6 + k + P + sizes[5], 4 + k, 2 + chosen.size
     at = Work(
         np.zeros(o + m * (5 + P)), k, P, o, m, sizes[4] == 1, np.zeros(STAGES), np.zeros(STAGES),
         np.zeros(STAGES), np.zeros(STAGES), np.zeros(STAGES), np.zeros((STAGES, k)),
@@ -590,7 +590,9 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
         if 2.0 * amplitude <= gap:
             found[row] = 1
             continue
-        at.w[6 + k : o] = parameters[row, :P]
+        at.w[6 + k : 6 + k + P] = parameters[row, :P]
+        at.w[0] = -1.0
+        f(at.w.ctypes)
         at.numbers[0], at.numbers[1] = amplitude, omegas[row]
         y, settles, sure, change, rest = 0.0, False, False, 0.0, 1.0
         if last >= 0 and _continues(row, last, omegas, parameters):

@@ -106,7 +106,7 @@ def layout(sizes, columns, degree):
     """Return where each quantity begins, for that many columns of sensitivities."""
     n, k, P = sizes[0], sizes[1], sizes[2]
     m, s = n + 1 + k, STAGES
-    outputs = 3 + n + k + P  # the function's inputs come first
+    outputs = 3 + n + k + P + sizes[5]  # the function's inputs come first
     values = outputs + m * (2 + n + P)  # rates, output and switching functions at stages, (s, m)
     rates = values + s * m  # at the beginning of a step, (n)
     state_slopes = rates + n  # derivatives of the values by the states, (s, m, n)
@@ -143,6 +143,15 @@ def restart(w, at):
     w[at.outputs :] = 0.0
     w[at.sides : at.sides + 1 + at.k] = 1.0
     w[at.interval] = -1.0
+
+
+@compiled
+def put_parameters(f, p, w, at):
+    """Put parameters into the inputs, with all that follows from them alone."""
+    for i in range(at.P):
+        w[3 + at.n + at.k + i] = p[i]
+    w[0] = -1.0
+    f(w.ctypes)
 
 
 @compiled

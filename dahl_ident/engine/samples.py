@@ -14,6 +14,7 @@ from dahl_ident.engine.radau import (
     VECTOR,
     Signal,
     layout,
+    put_parameters,
     restart,
 )
 
@@ -42,7 +43,7 @@ def march(
     w = np.zeros(at.length)
     matrix, columns = np.zeros((STAGES * n, STAGES * n)), np.zeros((STAGES * n, max(1, q)))
     restart(w, at)
-    w[3 + n + at.k : at.outputs] = p
+    put_parameters(f, p, w, at)
     signal = Signal(False, 0.0, 1.0, knots, coefficients)
     y, S = first.copy(), np.zeros((n, q))
     for i in range(n if q else 0):

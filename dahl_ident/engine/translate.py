@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.engine.emit import Step, compiled, steps_of
+from dahl_ident.engine.emit import Step, compiled, prepared, steps_of
 from dahl_ident.engine.switches import on_one_branch
 
 
@@ -64,13 +64,14 @@ class System:
     function : callable
         ``f(numbers)``, a numba C function of one array: inputs, then outputs. Inputs: how much is
         wanted (0 values, 1 also the derivatives with respect to the states, 2 also with respect to
-        drive and parameters), states, drive, direction, sides of the switches, parameters.
-        Outputs: rates, output and switching functions; their derivatives with respect to the
-        states, row by row; those with respect to drive and parameters, row by row. Zeros are not
-        written.
-    sizes : ndarray of int, shape (5,)
+        drive and parameters), states, drive, direction, sides of the switches, parameters. At
+        level -1, to be called once for the parameters, only what follows from them: it is kept
+        behind them. Outputs: rates, output and switching functions; their derivatives with respect
+        to the states, row by row; those with respect to drive and parameters, row by row. Zeros are
+        not written.
+    sizes : ndarray of int, shape (6,)
         States, switches, parameters; 1 where the displacement is held, and 1 where the output for a
-        held displacement depends on its speed, else 0.
+        held displacement depends on its speed, else 0; numbers kept that follow from parameters.
     solved : ndarray of int
         States for which the stages of a step are solved.
     followers : ndarray of int
@@ -118,7 +119,10 @@ def translate(equations: Equations) -> System:
     by_parameter = ca.jacobian(rows, ca.vertcat(drive, *parameters))
     numbers = ca.vertcat(*states, drive, equations.direction, *sides, *parameters)
     graph = ca.Function("f", [numbers], [ca.densify(rows), by_state, by_parameter])
-    steps = steps_of(graph, _places(numbers.numel(), rows.numel(), graph))
+    last = 1 + numbers.numel()
+    steps, kept = prepared(
+        steps_of(graph, _places(numbers.numel(), rows.numel(), graph)), last - len(parameters), last
+    )
     order = len(states)
     followers = _followers(by_state, rows, states, drive, order)
     if steps not in _COMPILED:
@@ -127,7 +131,9 @@ def translate(equations: Equations) -> System:
     rated = equations.held and not _goes_with_speed(equations)
     return System(
         _COMPILED[steps],
-        np.array([order, len(switches), len(parameters), equations.held, rated], dtype=np.int64),
+        np.array(
+            [order, len(switches), len(parameters), equations.held, rated, kept], dtype=np.int64
+        ),
         np.array(solved, dtype=np.int64),
         np.array(followers, dtype=np.int64),
         is_odd(equations),
