@@ -20,10 +20,16 @@ from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DahlIdentError, DataError, UnitError
 from dahl_ident.units import parse_unit
 
-_NUMBER = re.compile(
-    r"\s*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?\s*|[-+]?inf|nan",
-    re.ASCII | re.IGNORECASE,
-)
+CELL = {
+    mark: re.compile(
+        r"\s*[-+]?(?:"
+        + (rf"\d{{1,3}}(?:\{mark[1]}\d{{3}})+(?:\{mark[0]}\d*)?|" if mark[1:] else "")
+        + rf"(?:\d+(?:\{mark[0]}\d*)?|\{mark[0]}\d+)(?:[eE][-+]?\d+)?|nan|inf(?:inity)?)\s*",
+        re.IGNORECASE | re.ASCII,
+    )
+    for mark in (".", ",", ".,", ",.")
+}
+"""A number in a cell of text, by its decimal mark and, behind it, that of thousands if any."""
 _COUNTED = re.compile(r"column ([0-9]{1,4})")
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 _SYMBOL = "(?:[numkM]?(?:Nm|N|m|rad|V|A|Hz|s)|s2|kg|lbf|(?i:hz|deg|rad|s))"
@@ -273,16 +279,12 @@ class RawFile:
         """Return the numbers in cells of text, NaN for empty ones, or name the cell without one."""
         numbers = np.empty(channel.values.size)
         mark, thousands = self.decimal[0], self.decimal[1:]
-        swapped = str.maketrans(",.", ".,") if mark == "," else {}
-        group = rf"\s*[-+]?\d{{1,3}}(?:\{thousands}\d{{3}})+" if thousands else ""
-        grouped = re.compile(rf"{group}(?:\{mark}\d*)?\s*")
+        swapped = str.maketrans(mark, ".", thousands)
         for i, cell in enumerate(map(str, channel.values.flat)):
-            text = cell.replace(thousands, "") if thousands and grouped.fullmatch(cell) else cell
-            text = text.translate(swapped)
-            if text.strip() and not _NUMBER.fullmatch(text):
+            if cell.strip() and not CELL[self.decimal].fullmatch(cell):
                 comma = " with a decimal comma" if mark == "," else ""
                 raise DataError(f"{self.where(channel, i)}: {cell[:40]!r} is not a number{comma}")
-            numbers[i] = float(text) if text.strip() else np.nan
+            numbers[i] = float(cell.translate(swapped)) if cell.strip() else np.nan
         return numbers
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import (
+    CELL,
     RawChannel,
     RawFile,
     Stored,
@@ -48,16 +49,6 @@ _UNNAMED = "column {}"
 _UNIT_OF = re.compile(r"(.+?)[ _]units?")  # "displacement units": "mm"
 _VALUES, _UNITS = ("values", "data"), ("unit", "unit_str", "units")
 _TABLES = ("channels", "signals", "columns", "data", "rows")
-# Decimal mark, and behind it that of thousands where there is one.
-CELL = {
-    mark: re.compile(
-        r"\s*[-+]?(?:"
-        + (rf"\d{{1,3}}(?:\{mark[1]}\d{{3}})+(?:\{mark[0]}\d*)?|" if mark[1:] else "")
-        + rf"(?:\d+(?:\{mark[0]}\d*)?|\{mark[0]}\d+)(?:[eE][-+]?\d+)?|nan|inf(?:inity)?)\s*",
-        re.IGNORECASE | re.ASCII,
-    )
-    for mark in (".", ",", ".,", ",.")
-}
 _NUMBERED = "x-axis"  # before the numbers by which Keysight oscilloscopes call their channels
 
 
@@ -199,21 +190,19 @@ def _parquet_values(table: Any, name: str, rows: slice) -> NDArray[Any]:
     return _plain(column.slice(start - int(edges[first]), stop - start).to_pandas())
 
 
-def frame_source(
-    frame: pd.DataFrame, name: str = "the table", kind: str = "table", sha256: str | None = None
-) -> RawFile:
+def frame_source(frame: pd.DataFrame) -> RawFile:
     """Return the columns of a pandas table, a named index among them, units out of their names."""
     metadata = frame.attrs.get("dahl_ident", {})
     if any(level is not None for level in frame.index.names):
         frame = frame.reset_index()
     if not len(frame) or not len(frame.columns):
-        raise DataError(f"{name}: the table is empty")
+        raise DataError("the table is empty")
     headers = [split_header(str(label)) for label in frame.columns]
     channels = tuple(
         RawChannel(header, _plain(frame.iloc[:, i]), unit)
         for i, (header, unit) in enumerate(headers)
     )
-    return RawFile(name, kind, channels, sha256, metadata=metadata)
+    return RawFile("the table", "table", channels, metadata=metadata)
 
 
 def _plain(series: pd.Series[Any]) -> NDArray[Any]:

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.data.raw_columns import TRACE, RawChannel, RawFile, plain, split_header, words
+from dahl_ident.data.raw_columns import CELL, TRACE, RawChannel, RawFile, plain, split_header, words
 from dahl_ident.data.readers.file import File, refuse_many, utf8
 from dahl_ident.data.readers.tables import (
-    CELL,
     Header,
     are_units,
     best_run,
