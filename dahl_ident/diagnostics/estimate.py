@@ -27,7 +27,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.optimize import brentq
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
@@ -509,6 +508,8 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
         return 1.0
     if excess(most) >= 0.0:
         return _MOST_DISAGREEMENT
+    from scipy.optimize import brentq  # slow to import, and for harmonics that disagree alone
+
     return float(np.exp(brentq(excess, 0.0, most, xtol=_SAME_FACTOR)))
 
 
