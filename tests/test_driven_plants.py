@@ -148,6 +148,28 @@ def test_instant_unloading_of_another_exponent_is_a_limit():
     np.testing.assert_allclose(steeper, steep, rtol=1e-4)
 
 
+@pytest.mark.parametrize("exponent", [3.0, 4.0])
+def test_steeper_unloading_is_a_limit(exponent):
+    """It once took minutes, and friction that hardly slips had other amplitudes."""
+    steep, steeper = (at_unloading(p, exponent=exponent) for p in (1e7, 1e13))
+    np.testing.assert_allclose(steeper, steep, rtol=2e-4)
+
+
+def test_unloading_that_time_does_not_resolve_has_no_steady_motion():
+    with pytest.warns(di.errors.NoSteadyMotionWarning):
+        assert np.isnan(at_unloading(1e6, exponent=10.0)).all()
+
+
+def test_an_element_that_does_not_slip_keeps_its_offset_beside_a_law_that_drifts():
+    """The mean force of the first is what the mean of the motion began with, from rest."""
+    law = di.Dahl(0.06, 0.21, asymmetry=0.14, name="d") + di.MaxwellSlip([0.0039], [52.0], name="m")
+    plant = law + di.Mass(0.134) + di.Damper(0.36) + di.Spring(2.8)
+    drive = [0.002, 0.01, 0.03, 0.06, 0.12]
+    exact = di.response(plant, 0.93, drive)
+    near = di.response(plant, 0.93, drive, steady="describing function")
+    np.testing.assert_allclose(exact.amplitude, near.amplitude, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("exponent", "p"), [(1.0, 1e15), (2.0, 1e13)])
 def test_motion_in_time_with_instant_unloading_is_a_limit(exponent, p):
     """Friction once vanished after the first reversal, where its force crept to zero."""

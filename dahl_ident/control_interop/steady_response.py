@@ -215,7 +215,8 @@ def response(
     exists = np.isfinite(roots)
     force = points.at(np.nonzero(exists)[0]).force(roots[exists])
     X: ComplexArray = np.full(roots.shape, np.nan, dtype=np.complex128)
-    X[exists] = amplitude[exists] * (force.conj() / np.abs(force))
+    with np.errstate(invalid="ignore"):  # a law without a settled loop there
+        X[exists] = amplitude[exists] * (force.conj() / np.abs(force))
     harmonics = np.where(np.array(HARMONICS) == 1, X[..., None], 0.0)
     multiplier = np.full(X.shape, np.nan)
     chosen = np.zeros(X.shape[0], dtype=np.intp)

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
 _P = 4  # column of p in rows of amplitude, frequency and values
-_AT_ONCE = 1e8  # p times amplitude, beyond which N changes by less than 1e-4
+_AT_ONCE = 1e4, 1e8  # p times amplitude, from which on N changes by less than 2e-4
+_STEEPEST = 1e16  # of sigma: the slope up to which friction that hardly slips is resolved in time
 _WITH_EXPONENT = (
     "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
     "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
@@ -60,9 +61,10 @@ class BoucWen(Friction):
     sigma (1 + sgn(p) abs(p F/sigma)^n) unloading, so that q and p keep their unit and the limit is
     sigma/q for every n: beta + gamma = sgn(q) abs(q)^n sigma^(1-n), beta - gamma the same of p.
     q = p = sigma/f_max with n = 1 is the linear Dahl model. In settled sines p counts as at most
-    1e8 over the displacement amplitude (in a driven plant, that of the plant with stuck friction),
-    where the loop differs from that of instant unloading by at most 2e-4 of N: beyond, data cannot
-    determine it. Y.-K. Wen, Method for random vibration of hysteretic systems, J. Eng. Mech. Div.
+    1e8 over the displacement amplitude, where the loop differs from that of instant unloading by at
+    most 2e-4 of N: beyond, data cannot determine it. In a driven plant the amplitude is that of the
+    plant with stuck friction, and for n > 2 the limit is lower, to 1e4 at n = 4; steeper slopes
+    than 1e16 sigma then have no steady motion. Y.-K. Wen, Method for random vibration of hysteretic systems, J. Eng. Mech. Div.
     102 (1976) 249-263.
 
     Examples
@@ -119,18 +121,26 @@ class BoucWen(Friction):
         return sigma * (1.0 - sign * (rate * np.fabs(force / sigma)) ** n)
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return the values with p times amplitude at most `_AT_ONCE`.
+        """Return the values with p up to where friction unloads at once; NaN beyond what time is.
 
-        Data of gross slip leave p open, and searches let it grow without end.
+        Friction that hardly slips shakes the mass at each turn, in times that the steepest slope
+        shortens.
         """
         sigma, q, p, *exponent = values
-        return sigma, q, np.minimum(p, _AT_ONCE / amplitude), *exponent
+        steepest = np.asarray(_STEEPEST ** (1.0 / exponent[0]) if exponent else _STEEPEST)
+        p = np.minimum(p, np.clip(steepest, *_AT_ONCE) / amplitude)
+        slipping = np.minimum(amplitude, 1.0 / np.maximum(q, 1e-300))
+        return sigma, q, np.where(p * slipping > steepest * (1.0 + 1e-9), np.nan, p), *exponent
 
     def _loops(
         self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
     ) -> Loops:
-        """Return settled loops; p times amplitude counts as at most `_AT_ONCE`."""
-        resolved = np.stack([*at[:, :2].T, *self.resolved(list(at[:, 2:].T), at[:, 0])], axis=-1)
+        """Return settled loops; p counts up to where friction unloads at once.
+
+        Data of gross slip leave p open, and searches let it grow without end.
+        """
+        resolved = at.copy()
+        resolved[:, _P] = np.minimum(at[:, _P], _AT_ONCE[1] / at[:, 0])
         loops = super()._loops(resolved, orders, chosen)
         if _P - 2 in chosen:
             loops.by_parameter[resolved[:, _P] < at[:, _P], :, chosen.index(_P - 2)] = 0.0

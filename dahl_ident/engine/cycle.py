@@ -18,6 +18,7 @@ from dahl_ident.engine.radau import (
     TABLE,
     VECTOR,
     Signal,
+    compiled,
     eliminate,
     layout,
     put_parameters,
@@ -28,10 +29,33 @@ _ITERATIONS = 40  # of shooting; five are the rule
 _CONVERGED = 1e-4  # change of the first state over the largest one; its square is corrected
 _FAR = 1.0  # the same; a longer Newton step is replaced by a cycle
 _AGREED = 1e-3  # change by the last cycle; where it is more, rounding decides: nothing settles
+_FOLLOWS = 1e-9  # of their sizes: two changes by a cycle that are in proportion
 _UNDECIDED = 1e-9  # change of all states by a cycle that is an error of its steps
+_FADING = 0.1  # share of the sizes of earlier cycles, which may have gone far astray
 _DARING = 4  # but not every fourth: in a sharp resonance cycles alone take too long
 _COARSE = 300.0  # errors of steps while shooting, over those of the last cycle
 _SHORTEST = 12.0  # steps of a cycle, and of one of the highest harmonic, at least
+
+
+@compiled
+def keep_offsets(followers, y, chosen, w, at, matrix, columns):
+    """Let what follows the displacement through a whole cycle keep its offset from it.
+
+    It returns to where it was, whatever that is: an equation that says nothing, and is replaced.
+    """
+    for i in followers:
+        g = w[at.follow + i]
+        follows = g != 0.0
+        for j in range(at.n):
+            apart = abs(matrix[i, j] - g * matrix[0, j]) * w[at.scale + j]
+            follows = follows and apart <= _FOLLOWS * (w[at.scale + i] + abs(g) * w[at.scale])
+        if follows:
+            matrix[i] = 0.0
+            matrix[i, i], matrix[i, 0] = 1.0, -g
+            columns[i] = 0.0
+            for z in range(chosen.size):
+                slope = w[at.follow_slopes + i * (1 + at.P) + 1 + chosen[z]]
+                columns[i, 2 + z] = slope * y[0]
 
 
 @njit(
@@ -86,6 +110,7 @@ def cycles(
         for coarse in (_COARSE, 1.0):  # what coarse steps miss, fine ones find
             found[row] = 0
             for iteration in range(_ITERATIONS):
+                w[at.scale : at.scale + n] *= _FADING
                 x, S = y.copy(), np.zeros((n, free + 1))
                 for i in range(free):
                     S[begin + i, i] = 1.0
@@ -99,6 +124,8 @@ def cycles(
                     for j in range(free):
                         matrix[i, j] = (1.0 if i == j else 0.0) - sign * S[begin + i, j]
                     columns[i, 0] = sign * x[begin + i] - y[begin + i]
+                if not held:
+                    keep_offsets(followers, y, nobody, w, at, matrix, columns)
                 largest = 0.0
                 if iteration < plain or not eliminate(matrix, columns, free, 1):
                     largest = np.inf
@@ -137,6 +164,8 @@ def cycles(
                 for z in range(1 + chosen.size):
                     columns[i, 1 + z] = sign * S[begin + i, free + z]
                 columns[i, 0] = sign * x[begin + i] - y[begin + i]
+            if not held:
+                keep_offsets(followers, y, chosen, w, at, matrix, columns)
             if not eliminate(matrix, columns, free, 2 + chosen.size):
                 columns[:] = np.inf
             if free and largest < _UNDECIDED:
