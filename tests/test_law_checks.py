@@ -336,6 +336,12 @@ def test_what_cannot_be_compiled_is_named():
         (lambda _, F, d, v, p: p[1] * ((d * F < p[0]) | (d * F < -9.0 * p[0])), joined),
         (lambda _, F, d, v, p: p[1] * ~(d * F >= p[0]), joined),
     )
+    for rounded in (np.ceil, np.rint, lambda m: m // 1.0 + 0.1 * m):
+
+        def stepped(self, force, direction, velocity, values, rounded=rounded):
+            return values[1] * rounded(5.0 * np.maximum(1.0 - direction * force / values[0], 0.0))
+
+        cases += ((stepped, r"rounds, or takes a remainder .* expected steps as comparisons"),)
     for slope, message in cases:
         with pytest.raises(DahlIdentError, match=message):
             drive(plant(slope))

@@ -42,6 +42,8 @@ from dahl_ident.units import si_unit
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FAIRLY = 0.2  # rms that a model of records misses: beyond it, intervals do not hold
+_SLOW = 0.3  # effective share of the samples, below which noise looks like another law,
+_VISIBLE = 0.05  # where it is more than this share of the output, rms
 _FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
 _ENOUGH_HELD_OUT = 16  # held-out values; of so many, 80 % lie in bands of 95 % once in 100 times
@@ -149,6 +151,9 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
         follows = fit.errors.misfit.follows if fit.errors.misfit else ""
         remedy = REMEDY.get(follows, "")
         yield described("records_misfit", _APPROXIMATE, follows=follows, remedy=remedy)
+    effective = fit.errors.effective / problem.n_samples
+    if not fit.misses and effective < _SLOW and fit.goodness.rms_in_band > _VISIBLE:
+        yield described("slow_misfit", _APPROXIMATE, rms=fit.goodness.rms_in_band)
     if fit.errors.dof_of(NOISE) < _FEW:
         few = {"effective": fit.errors.effective, "unknowns": len(problem.names)}
         yield described("few_effective_samples", _APPROXIMATE, **few)

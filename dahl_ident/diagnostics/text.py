@@ -340,6 +340,8 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
         "The misfit exceeds the noise"
         + (f": the residuals follow {follows}; {remedy}." if follows else ".")
     ),
+    "slow_misfit": "The residuals, {rms:percent} rms, vary slowly. So does some noise, and so does "
+    "the error of a law that is not right: the records cannot tell which it is.",
     "record_parameter": _record_parameter,
     "unphysical": "Physically doubtful: {objection}.",
     "stated_exponent": "The records contradict {name} = {held:g}, which was stated: they ask for "

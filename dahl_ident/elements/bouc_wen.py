@@ -64,8 +64,8 @@ class BoucWen(Friction):
     1e8 over the displacement amplitude, where the loop differs from that of instant unloading by at
     most 2e-4 of N: beyond, data cannot determine it. In a driven plant the amplitude is that of the
     plant with stuck friction, and for n > 2 the limit is lower, to 1e4 at n = 4; steeper slopes
-    than 1e16 sigma then have no steady motion. Y.-K. Wen, Method for random vibration of hysteretic systems, J. Eng. Mech. Div.
-    102 (1976) 249-263.
+    than 1e16 sigma then have no steady motion. Y.-K. Wen, Method for random vibration of hysteretic
+    systems, J. Eng. Mech. Div. 102 (1976) 249-263.
 
     Examples
     --------

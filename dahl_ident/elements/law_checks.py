@@ -539,7 +539,7 @@ def _check_part(name: str, part: Any, n_states: int) -> None:
 
 
 def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
-    """Refuse a slope or an output that differs between symbols and numbers."""
+    """Refuse what differs between symbols and numbers, and steps that are not comparisons."""
     import casadi as ca
 
     rng = np.random.default_rng(1)
@@ -548,6 +548,13 @@ def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> Non
     slope = law.slope(force, s, v, values)
     output = law.output(force, slope, v, values)
     function = ca.Function("law", [force, s, v, *(v for v, _ in free)], [slope, output])
+    codes = {function.instruction_id(i) for i in range(function.n_instructions())}
+    if codes & {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER}:
+        raise ModelError(
+            f"{type(law).__name__} rounds, or takes a remainder (floor, ceil, round, trunc, mod, "
+            "//, %), and where that steps is not located; expected steps as comparisons, such as "
+            "(y < 0.2) + (y < 0.4)"
+        )
     forces, direction = rng.uniform(-0.5, 0.5, _TRIALS), np.resize([1.0, -1.0], _TRIALS)
     speed = direction * 10.0 ** rng.uniform(-_SPREAD, _SPREAD, _TRIALS)
     with np.errstate(all="ignore"):
