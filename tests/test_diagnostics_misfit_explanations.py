@@ -73,7 +73,7 @@ class TestRows:
         found = fit(data, Dahl(alpha=1.0))
         assert {point.row for point in found.goodness.suspicious} >= {7, 19}
         assert found.goodness.cause == ""
-        assert "The stated uncertainties include a misfit of" in found.statements[0]
+        assert "rms misfit" in found.statements[0]
 
     def test_do_not_lead_where_they_lie_side_by_side(self):
         """As where a stop is hit: the model may fail there, and a robust loss would hide it."""
