@@ -159,8 +159,8 @@ def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
     step = _STEP * float(problem.unit_sizes((1, 0, 0))[number])
 
     def moved(force: FloatArray) -> FloatArray:
-        more = [step * force if r is record else np.zeros(len(r)) for r in problem.records]
-        return problem.driven_more(more).predict(values, number, derivatives=False).output - plain
+        driven = problem.driven_more({number: step * force})
+        return driven.predict(values, number, derivatives=False).output - plain
 
     forces = _forces(problem, values, *in_band(record, plain)[:2])
     return {

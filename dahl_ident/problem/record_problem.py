@@ -414,18 +414,22 @@ class RecordProblem(Problem):
     def with_noisier_drive(self, stds: Sequence[float], draw: int) -> RecordProblem:
         """Return the same problem, white noise added to the drive of each record."""
         rng = np.random.default_rng(draw)
-        sizes = zip(self.records, stds, strict=True)
-        return self.driven_more([std * rng.standard_normal(len(record)) for record, std in sizes])
+        waves = [
+            std * rng.standard_normal(len(record))
+            for record, std in zip(self.records, stds, strict=True)
+        ]
+        return self.driven_more(dict(enumerate(waves)))
 
-    def driven_more(self, waves: Sequence[FloatArray]) -> RecordProblem:
-        """Return the same problem, waves added to the drive of each record."""
+    def driven_more(self, waves: Mapping[int, FloatArray]) -> RecordProblem:
+        """Return the same problem, waves added to the drives of the records with these numbers."""
         from dahl_ident.engine import band_limited
 
-        drives = tuple(
-            (time, drive + band_limited(wave, 1.0 / record.sample_rate))
-            for (time, drive), record, wave in zip(self.drives, self.records, waves, strict=True)
-        )
-        return self.altered("latest", drives=drives)
+        drives = list(self.drives)
+        for number, wave in waves.items():
+            time, drive = drives[number]
+            more = band_limited(wave, 1.0 / self.records[number].sample_rate)
+            drives[number] = time, drive + more
+        return self.altered("latest", drives=tuple(drives))
 
     @cached_property
     def system(self) -> System:
