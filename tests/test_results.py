@@ -15,7 +15,6 @@ import dahl_ident as di
 from dahl_ident import compare_models, fit, fit_many, load_dataset, posterior
 from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status
-from dahl_ident.problem import TableProblem
 from tests.friction_tables import FRICTION, amplitudes, plant_table, table
 
 
@@ -294,7 +293,10 @@ class TestStorage:
         np.testing.assert_array_equal(one.optimum.covariance, other.optimum.covariance)
         assert one.status is other.status
         assert one.combinations == other.combinations
-        assert one.to_json() == other.to_json()
+        here, there = json.loads(one.to_json()), json.loads(other.to_json())
+        assert here.keys() == there.keys()
+        for name in here.keys() - {"estimates", "digest"}:
+            assert here[name] == there[name]
         assert one.fit_report() == other.fit_report()
 
     def test_round_trip(self, result, plant, microslip):
@@ -336,6 +338,9 @@ class TestStorage:
             "sigma": "free",
             "alpha": {"assumed": 1.0},
         }
+        stated = {name: (p.value, p.stderr) for name, p in microslip.params.items()}
+        saved = content["estimates"]
+        assert {n: (float(p["value"]), float(p["stderr"])) for n, p in saved.items()} == stated
 
     def test_what_is_no_fit(self, result, tmp_path):
         content = json.loads(result.to_json())
@@ -378,13 +383,6 @@ class TestStorage:
         (tmp_path / "edited.json").write_text(json.dumps(content))
         with pytest.raises(DataError, match=r"edited.json was changed after the fit was saved"):
             di.FitResult.load(tmp_path / "edited.json")
-
-    def test_priors_that_no_file_can_hold(self):
-        result = fit(table(), di.Dahl())
-        sensors = di.Sensors(force_gain=stats.uniform(0.9, 0.2))
-        odd = replace(result.optimum, problem=TableProblem(table(), di.Dahl(), sensors=sensors))
-        with pytest.raises(DataError, match="prior of kind uniform"):
-            di.FitResult(odd).to_json()
 
 
 def xy(line):

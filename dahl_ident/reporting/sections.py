@@ -403,8 +403,9 @@ def _fit_facts(fit: FitResult) -> dict[str, Any]:
                 "value": e.value,
                 "stderr": e.stderr,
                 "unit": e.unit,
-                "fixed": not e.vary,
-                "interval_95.45": list(intervals[name][1:]) if e.vary else None,
+                "fixed": not e.vary and name not in fit.assumed,
+                "assumed": name in fit.assumed,
+                "interval_95.45": list(intervals[name][1:]) if name in intervals else None,
                 "verdict": fit.verdict_on(name)[0].value if e.vary else None,
             }
             for name, e in fit.params.items()

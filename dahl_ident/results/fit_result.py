@@ -81,7 +81,8 @@ class FitResult(Result):
         self.first_order = first_order
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).from_json, (self.to_json(),)  # a plant's functions cannot be copied
+        text = fit_storage.to_json(self.optimum, self.first_order)
+        return type(self).from_json, (text,)  # a plant's functions cannot be copied
 
     @cached_property
     def assessment(self) -> TableAssessment | RecordAssessment:
@@ -570,8 +571,15 @@ class FitResult(Result):
     # Storage
 
     def to_json(self) -> str:
-        """Return the fit as JSON: table or records, model, noise, sensors and optimum."""
-        return fit_storage.to_json(self.optimum, self.first_order)
+        """Return the fit as JSON: table or records, model, noise, sensors, optimum, estimates.
+
+        The optimum is where the search ended, assumed exponents held; the estimates are `params`.
+        """
+        estimates = {
+            name: {"value": p.value, "stderr": p.stderr, "unit": p.unit}
+            for name, p in self.params.items()
+        }
+        return fit_storage.to_json(self.optimum, self.first_order, estimates)
 
     @classmethod
     def from_json(cls, text: str) -> Self:

@@ -38,8 +38,11 @@ _OF_RECORD = ("drive_unit", "drive_factor", "drive_factor_uncertainty", "motion"
 _OF_PROBLEM = ("output", "excitation", "calibration")  # as they are given
 
 
-def to_json(optimum: Optimum, first_order: bool) -> str:
-    """Return a fit as JSON text, numbers that JSON does not know as text, such as "inf"."""
+def to_json(optimum: Optimum, first_order: bool, estimates: Mapping[str, Any] | None = None) -> str:
+    """Return a fit as JSON text, numbers that JSON does not know as text, such as "inf".
+
+    `estimates` are for readers of the file: a fit that is loaded has the same again.
+    """
     problem = optimum.problem
     facts = {
         "schema": _SCHEMAS[problem.kind],
@@ -48,6 +51,7 @@ def to_json(optimum: Optimum, first_order: bool) -> str:
         "model": describe_model(problem.model),
         "laws": describe_laws(problem.model.elements),
         **_DESCRIBED[problem.kind](problem),
+        **({} if estimates is None else {"estimates": estimates}),
         "optimum": _describe_optimum(optimum) | {"first_order": first_order},
     }
     content = plain_data(facts, not_finite=str)
@@ -227,10 +231,7 @@ def _data(content: Mapping[str, Any]) -> FrequencyResponse:
 def _describe_channel(channel: Any) -> Any:
     if channel is None or isinstance(channel, float):
         return channel
-    kind = getattr(getattr(channel, "dist", None), "name", type(channel).__name__)
-    if kind != "norm":
-        raise DataError(f"a prior of kind {kind} cannot be written to a file; only norm can")
-    return {"norm": [float(channel.mean()), float(channel.std())]}
+    return {"norm": [float(channel.mean()), float(channel.std())]}  # a fit takes no other prior
 
 
 def _channel(content: Any) -> Any:
