@@ -307,7 +307,9 @@ def goodness(fit: FitResult) -> TextTable:
         rows["sum of squares"] = number(fit.chisqr)
         rows["sum of squares over degrees of freedom"] = number(fit.redchi)
     rows["noise scale"] = "known" if fit.scale_known else f"{fit.scale:.4g}, estimated"
-    rows |= {"AIC": number(fit.aic, 6), "BIC": number(fit.bic, 6)}
+    assumed = [p for p in fit.problem.model.parameters if p.assumed]
+    held = "".join(f" at {p.name} = {p.value:g}" for p in assumed)
+    rows |= {f"AIC{held}": number(fit.aic, 6), f"BIC{held}": number(fit.bic, 6)}
     listed = [{"measure": name, "value": cell} for name, cell in rows.items()]
     return TextTable.of("Goodness of fit", listed)
 

@@ -124,9 +124,11 @@ def _correlations(fit: FitResult) -> list[str]:
 
 
 def _solver(fit: FitResult) -> list[str]:
+    assumed = [p for p in fit.problem.model.parameters if p.assumed]
+    held = "".join(f", at {p.name} = {p.value:g}" for p in assumed)
     lines = [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
-        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}",
+        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}{held}",
     ]
     if fit.scale_known:  # chi-square stands among the tests
         return lines
