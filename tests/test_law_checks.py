@@ -90,8 +90,18 @@ WRONG: dict[str, tuple[Slope, str]] = {
         lambda _, F, d, v, p: p[1] * np.cos(4.0 * d * F / p[0]),
         r"negative before full slip, .*, and positive again at larger forces",
     ),
+    "negative in a part": (
+        lambda _, F, d, v, p: (
+            p[1] * (1.0 - d * F / p[0]) * (0.5 - d * F / p[0]) * (0.3 - d * F / p[0])
+        ),
+        r"negative before full slip, at force = 0\.07\d* N, .*, and positive again",
+    ),
     "constant number": (lambda _, F, d, v, p: 3.0, r"is 3 N/m for every force .*use di\.Spring"),
     "constant array": (lambda _, F, d, v, p: p[1] * np.ones_like(F), r"a constant number"),
+    "largest of all": (
+        lambda _, F, d, v, p: p[1] * np.max(1.0 - d * F / p[0]),
+        r"a constant number.*\(np\.max takes the largest of a whole array, np\.maximum of each\)",
+    ),
     "shape": (
         lambda _, F, d, v, p: np.ones(7),
         r"returned the shape \(7,\) for an array of \(1, \d+\) forces, and 2 values; expected",

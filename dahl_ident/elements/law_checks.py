@@ -388,7 +388,8 @@ class _Trial:
             smallest = _ROUNDING * self._at_rest
             negative = np.flatnonzero(near & (slopes < -smallest))
             later = np.flatnonzero(near & (slopes > smallest))
-        if not (negative.size and later.size and later[-1] > negative[0]):
+        negative = negative[negative < later.max(initial=-1)]
+        if not negative.size:
             return ""
         worst = negative[np.argmin(slopes[negative])]
         return (
@@ -407,7 +408,8 @@ class _Trial:
         return (
             f"is {slopes[0]:.4g} N/m for every force and direction: a constant number, which "
             "is a spring without friction; expected a slope that depends on force and "
-            "direction, or use di.Spring"
+            "direction (np.max takes the largest of a whole array, np.maximum of each), or use "
+            "di.Spring"
         )
 
     def loops(self) -> str:
