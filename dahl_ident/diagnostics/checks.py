@@ -149,7 +149,9 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
         yield described("motion_may_be_imposed", _NOT_DESCRIBED)
     if fit.misses and not far:
         follows = fit.errors.misfit.follows if fit.errors.misfit else ""
-        remedy = REMEDY.get(follows, "")
+        kind, remedy = REMEDY.get(follows, ("", ""))
+        if kind and all(element.kind != kind for element in problem.model.elements):
+            remedy = f"add a {kind}, or {remedy}"
         yield described("records_misfit", _APPROXIMATE, follows=follows, remedy=remedy)
     effective = fit.errors.effective / problem.n_samples
     if not fit.misses and effective < _SLOW and fit.goodness.rms_in_band > _VISIBLE:

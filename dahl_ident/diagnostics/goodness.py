@@ -646,8 +646,10 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
         segments.append((float(mean[place]), number, record.time[place], record.time[stop]))
     square, number, start, stop = max(segments, key=lambda segment: segment[0])
     which = f" of record {number}" if len(records) > 1 else ""
+    ends = dict.fromkeys((f"{start:.4g}", f"{stop:.4g}"))
+    when = f"between {' and '.join(ends)}" if len(ends) > 1 else f"at {start:.4g}"
     worst = (
-        f"most between {start:.4g} and {stop:.4g} s{which}, where the residuals are "
+        f"most {when} s{which}, where the residuals are "
         f"{square**0.5 / rms if rms else 0.0:.2g} times larger"
     )
     products = sum(float(e[1:] @ e[:-1]) for e in residuals)

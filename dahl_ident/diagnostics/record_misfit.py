@@ -37,11 +37,11 @@ _BLOCKS = 60  # of all records, in which the noise may differ: many more than fu
 _STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
 FRICTION, VELOCITY, DISPLACEMENT = "the friction force", "the velocity", "the displacement"
 REMEDY = {
-    FRICTION: "fit another friction law",
-    VELOCITY: "add a damper, or fit a law that changes with the speed",
-    DISPLACEMENT: "add a spring, or look for a stiffness that is not linear",
+    FRICTION: ("", "fit another friction law"),
+    VELOCITY: ("damper", "fit a law that changes with the speed"),
+    DISPLACEMENT: ("spring", "look for a stiffness that is not linear"),
 }
-"""What may help where the residuals follow it."""
+"""An element to add, if the model has none, and what else may help where residuals follow it."""
 
 
 @dataclass(frozen=True)
