@@ -155,3 +155,21 @@ def test_damper_that_vanishes_does_not_stop_the_search():
         expected = without.params[name]
         assert expected.stderr is not None
         assert abs(fit.params[name].value - expected.value) < 0.3 * expected.stderr
+
+
+@pytest.mark.parametrize(
+    "law",
+    [di.MaxwellSlip([1e-3, 8e-3], [20.0, 10.0]), di.Backlash(di.Dahl(0.1, 30.0), gap=1e-3)],
+    ids=["two elements", "gap"],
+)
+def test_slow_residuals_of_another_law_are_not_trusted(law):
+    """Noise that varies as slowly would hide as much: the records cannot tell."""
+    rng = np.random.default_rng(4)
+    t = np.arange(2000) / 200.0
+    for _ in range(12):
+        tones = rng.uniform(0.2, 2.5, 12)
+        phases = rng.uniform(0.0, 2.0 * np.pi, 12)
+        x = 2.4e-3 * np.sin(2.0 * np.pi * tones * t[:, None] + phases).sum(axis=1)
+        force = law.force(x) + 1e-3 * rng.standard_normal(t.size)
+        fit = di.fit(di.Record(t, displacement=x, force=force), di.Dahl(), throw=False)
+        assert not fit.trusted
