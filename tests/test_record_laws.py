@@ -173,3 +173,22 @@ def test_slow_residuals_of_another_law_are_not_trusted(law):
         force = law.force(x) + 1e-3 * rng.standard_normal(t.size)
         fit = di.fit(di.Record(t, displacement=x, force=force), di.Dahl(), throw=False)
         assert not fit.trusted
+
+
+def test_a_search_ends_at_a_kink_of_the_cost():
+    """Samples change their branch next to the minimum, across which the cost does not fall."""
+
+    class Bilinear(di.Friction):
+        parameters = di.Dahl.parameters[:2]
+
+        def slope(self, force, direction, velocity, values):
+            f_max, sigma = values
+            y = direction * force / f_max
+            return sigma * ((y < 0.5) + 0.2 * (y >= 0.5)) * (y < 1.0)
+
+    t = np.arange(2000) / 500.0
+    x = 3e-2 * (np.sin(2.0 * t) + np.sin(7.3 * t))
+    force = Bilinear(1.0, 100.0).force(x) + 5e-3 * np.random.default_rng(5).standard_normal(t.size)
+    fit = di.fit(di.Record(t, displacement=x, force=force), Bilinear())
+    assert fit.trusted
+    assert abs(fit.params["sigma"].value - 100.0) < 3.0 * fit.params["sigma"].stderr

@@ -51,6 +51,7 @@ ROUGH = 15  # steps after which the noise is known well enough to judge a step b
 _STAGNANT = 0.01  # relative fall of the cost in as many steps, below which more lead nowhere
 WORTHLESS = 1e-5  # fall of the cost, over the residuals' variance
 SETTLED = 0.03  # step in standard errors that no longer matters
+_HINDERED = 0.2  # the same where the cost does not fall along it, as across the kinks of a law
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is not chance
 STEPS = 75  # at most; a search without convergence is not an estimate
 
@@ -171,7 +172,7 @@ class RecordSearch:
             )
             slope = np.where(out, 0.0, at.gradient / size)
             left = slope @ np.linalg.pinv(at.hessian / np.outer(size, size), hermitian=True) @ slope
-        return replace(end, converged=np.array([bool(left < SETTLED**2 * noise)]))
+        return replace(end, converged=np.array([bool(left < _HINDERED**2 * noise)]))
 
     def minimise(
         self, problem: RecordProblem, begin: FloatArray, most: int, *, bounded: bool = False
