@@ -49,6 +49,7 @@ from dahl_ident.problem import Problem
 from dahl_ident.units import percent, si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
+_ASTRAY = 0.5  # misfit at which a search has ended far from any description
 _RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
 _SMOOTH = 8  # degree in ln A of the change of gain that is allowed at every frequency
 _FALSE_ALARM = 1e-4  # of a force that falls with the frequency: it only adds a candidate
@@ -468,6 +469,12 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
             errors = error_model(candidate) if problem.kind == "table" else None
             candidate = candidate if errors is None else errors.at_estimate
             density = predictive_density(candidate, optimum)
+            if models is None and density.misfit > _ASTRAY > 2.0 * fitted[0].density.misfit:
+                failed[name] = (
+                    f"its search ended where {percent(density.misfit)} of "
+                    f"{problem.output_in_words} is left"
+                )
+                continue
             fitted.append(ComparedModel(name, candidate, density, reason))
         except DahlIdentError as exc:
             failed[name] = str(exc)
