@@ -469,16 +469,18 @@ class RecordSearch:
     def best(self, problem: RecordProblem, starts: FloatArray, steps: int = STEPS) -> Minima:
         """Return the end of a search from the start that is lowest after a few steps.
 
-        No further start is tried where one leaves nothing but noise.
+        No further start is tried where one leaves nothing but noise. Where a value has lost its
+        effect at the end, searches from the other starts go on, and the lowest end is returned.
         """
-        best: Minima | None = None
+        near = list[Minima]()
         for one in starts:
             end = self.minimise(problem, problem.to_search(one)[None], _COMPARED)
-            if np.isfinite(end.cost[0]) and (best is None or end.cost[0] < best.cost[0]):
-                best = end
-                if len(starts) == 1 or _leaves_noise(problem, best):
+            if np.isfinite(end.cost[0]):
+                near.append(end)
+                if len(starts) == 1 or _leaves_noise(problem, end):
+                    near = [end]
                     break
-        if best is None:
+        if not near:
             predict = argument("output", "force", option="predicted")
             imposed = f", or, if the exciter imposes the motion, fit the force: {predict}"
             raise FitError(
@@ -486,7 +488,13 @@ class RecordSearch:
                 f"{argument('start')}, or check the units"
                 + (imposed if problem.output == "motion" else "")
             )
-        return self.descend(problem, best.theta[0], steps)
+        near.sort(key=lambda end: float(end.cost[0]))
+        ends = list[Minima]()
+        for begin in near:
+            ends.append(self.descend(problem, begin.theta[0], steps))
+            if not _has_idle(problem, ends[-1]):
+                break
+        return min(ends, key=lambda end: float(end.cost[0]))
 
 
 def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
