@@ -31,7 +31,9 @@ units = {"time": "time [s]", "displacement": "displacement [m]", "force": "force
 points = extract(sys.argv[1], columns=units)
 assert np.allclose(points.amplitude, 1e-3, rtol=1e-3), points.amplitude
 used = resource.getrusage(resource.RUSAGE_SELF)
-print(used.ru_utime + used.ru_stime, 1024 * used.ru_maxrss)
+with open("/proc/self/status") as status:  # ru_maxrss is also that of the process that started this
+    peak = next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
+print(used.ru_utime + used.ru_stime, 1024 * peak)
 """
 
 

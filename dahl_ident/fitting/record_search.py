@@ -470,7 +470,7 @@ class RecordSearch:
         """Return the end of a search from the start that is lowest after a few steps.
 
         No further start is tried where one leaves nothing but noise. Where a value has lost its
-        effect at the end, searches from the other starts go on, and the lowest end is returned.
+        effect at the end, searches from other starts go on as long as they end lower.
         """
         near = list[Minima]()
         for one in starts:
@@ -489,12 +489,15 @@ class RecordSearch:
                 + (imposed if problem.output == "motion" else "")
             )
         near.sort(key=lambda end: float(end.cost[0]))
-        ends = list[Minima]()
-        for begin in near:
-            ends.append(self.descend(problem, begin.theta[0], steps))
-            if not _has_idle(problem, ends[-1]):
+        best = self.descend(problem, near[0].theta[0], steps)
+        for begin in near[1:]:
+            if not _has_idle(problem, best):
                 break
-        return min(ends, key=lambda end: float(end.cost[0]))
+            end = self.descend(problem, begin.theta[0], steps)
+            if not end.cost[0] < best.cost[0] * (1.0 - _STAGNANT):
+                break
+            best = end
+        return best
 
 
 def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
