@@ -160,9 +160,25 @@ def test_unloading_that_time_does_not_resolve_has_no_steady_motion():
         assert np.isnan(at_unloading(1e6, exponent=10.0)).all()
 
 
-def test_an_element_that_does_not_slip_keeps_its_offset_beside_a_law_that_drifts():
+class LinearAtFirst(di.Friction):
+    """Stuck up to two thirds of its limit, from where its slope falls to zero."""
+
+    parameters = (
+        di.Parameter("k", "N/m", "stiffness", lower=0.0, transform="log"),
+        di.Parameter("f_max", "N", "limit", lower=0.0, transform="log"),
+    )
+
+    def slope(self, force, direction, velocity, values):
+        k, f_max = values
+        return k * np.minimum(1.0, 3.0 * np.maximum(1.0 - direction * force / f_max, 0.0))
+
+
+@pytest.mark.parametrize(
+    "stuck", [di.MaxwellSlip([0.0039], [52.0], name="m"), LinearAtFirst(52.0, 0.2, name="m")]
+)
+def test_an_element_that_does_not_slip_keeps_its_offset_beside_a_law_that_drifts(stuck):
     """The mean force of the first is what the mean of the motion began with, from rest."""
-    law = di.Dahl(0.06, 0.21, asymmetry=0.14, name="d") + di.MaxwellSlip([0.0039], [52.0], name="m")
+    law = di.Dahl(0.06, 0.21, asymmetry=0.14, name="d") + stuck
     plant = law + di.Mass(0.134) + di.Damper(0.36) + di.Spring(2.8)
     drive = [0.002, 0.01, 0.03, 0.06, 0.12]
     exact = di.response(plant, 0.93, drive)

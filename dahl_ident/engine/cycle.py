@@ -20,7 +20,9 @@ from dahl_ident.engine.radau import (
     Signal,
     compiled,
     eliminate,
+    evaluate,
     layout,
+    put,
     put_parameters,
     restart,
 )
@@ -38,15 +40,21 @@ _SHORTEST = 12.0  # steps of a cycle, and of one of the highest harmonic, at lea
 
 
 @compiled
-def keep_offsets(followers, y, chosen, w, at, matrix, columns):
+def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
     """Let what follows the displacement through a whole cycle keep its offset from it.
 
     It returns to where it was, whatever that is: an equation that says nothing, and is replaced.
     """
-    for i in followers:
-        g = w[at.follow + i]
+    n, o = at.n, at.outputs
+    m = n + 1 + at.k
+    put(y, w)
+    evaluate(f, signal, 0.0, 0.0, w, at)
+    w[0], w[2] = 2.0, 1.0  # at unit velocity the rate is the change by displacement
+    f(w.ctypes)
+    for i in range(2, n):
+        g = w[o + i]
         follows = g != 0.0
-        for j in range(at.n):
+        for j in range(n):
             apart = abs(matrix[i, j] - g * matrix[0, j]) * w[at.scale + j]
             follows = follows and apart <= _FOLLOWS * (w[at.scale + i] + abs(g) * w[at.scale])
         if follows:
@@ -54,8 +62,7 @@ def keep_offsets(followers, y, chosen, w, at, matrix, columns):
             matrix[i, i], matrix[i, 0] = 1.0, -g
             columns[i] = 0.0
             for z in range(chosen.size):
-                slope = w[at.follow_slopes + i * (1 + at.P) + 1 + chosen[z]]
-                columns[i, 2 + z] = slope * y[0]
+                columns[i, 2 + z] = w[o + m * (1 + n) + i * (1 + at.P) + 1 + chosen[z]] * y[0]
 
 
 @njit(
@@ -125,7 +132,7 @@ def cycles(
                         matrix[i, j] = (1.0 if i == j else 0.0) - sign * S[begin + i, j]
                     columns[i, 0] = sign * x[begin + i] - y[begin + i]
                 if not held:
-                    keep_offsets(followers, y, nobody, w, at, matrix, columns)
+                    keep_offsets(f, signal, y, nobody, w, at, matrix, columns)
                 largest = 0.0
                 if iteration < plain or not eliminate(matrix, columns, free, 1):
                     largest = np.inf
@@ -165,7 +172,7 @@ def cycles(
                     columns[i, 1 + z] = sign * S[begin + i, free + z]
                 columns[i, 0] = sign * x[begin + i] - y[begin + i]
             if not held:
-                keep_offsets(followers, y, chosen, w, at, matrix, columns)
+                keep_offsets(f, signal, y, chosen, w, at, matrix, columns)
             if not eliminate(matrix, columns, free, 2 + chosen.size):
                 columns[:] = np.inf
             if free and largest < _UNDECIDED:
