@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.facts import Values
+from dahl_ident.elements.facts import Asymptote, Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
@@ -145,6 +145,11 @@ class BoucWen(Friction):
         if _P - 2 in chosen:
             loops.by_parameter[resolved[:, _P] < at[:, _P], :, chosen.index(_P - 2)] = 0.0
         return loops
+
+    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
+        """Return the limit of gross slip, in which friction unloads at once."""
+        pinned = {"p": _AT_ONCE[1] / low}
+        return (Asymptote("runs_away", "one that unloads at once", pinned, None, {"p": np.inf}),)
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return sigma/q for both directions where the force saturates, inf where it does not."""
