@@ -46,6 +46,7 @@ _STEPS = 60  # Gauss-Newton steps; five are the rule
 _LITTLE_SAID = 0.25  # of the variance of a range: the data say little more of an exponent
 _APART = 0.1  # standard deviations between two minima
 _NEAR_ENOUGH = 0.03  # the same for the estimates of a jackknife
+_LINEAR = 0.3  # change of a logarithm, with which the model changes in proportion
 _SETTLED = 1e-3  # of a standard deviation that a step still moves the estimate
 _LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
 _FIRST_DAMPING, _DAMPED = 1e-3, 10.0  # of a step after which the sum of squares does not fall
@@ -159,8 +160,7 @@ class WeightedEstimate:
 
     problem: TableProblem  # the assumed exponents free, its covariances with the misfit
     theta: FloatArray  # (Q,): the estimate, search coordinates
-    misfit: float  # share s of the fundamental force of a row's test
-    misfit_variance: FloatArray  # (n,): what it adds to the stated covariances
+    misfit_variance: FloatArray  # (n,): what the misfit adds to the stated covariances
     scale: float  # of the residuals; 1 where the data state it
     residuals: FloatArray  # (M,): those of data, then of priors, of unit variance
     jacobian: FloatArray  # (M, Q): their derivatives
@@ -169,6 +169,11 @@ class WeightedEstimate:
     basis: Basis  # what they determine
     # (Q,): how far a second minimum is, times the root of its probability; None where there is none
     second: FloatArray | None = None
+
+    @property
+    def has_misfit(self) -> bool:
+        """Whether the model leaves more than the stated noise."""
+        return bool(self.misfit_variance.any())
 
     @cached_property
     def deviance(self) -> float:
@@ -302,39 +307,109 @@ def weighted_estimate(
     return replace(best, second=np.sqrt(chance) * (second.theta - best.theta))
 
 
-def jackknife_by_refits(
-    estimate: WeightedEstimate,
-    optimum: Optimum,
-    problem: TableProblem,
-    tests: Sequence[NDArray[np.intp]],
+def jackknife_with_weights(
+    estimate: WeightedEstimate, optimum: Optimum, tests: Sequence[NDArray[np.intp]]
 ) -> FloatArray:
     """Return the covariance of theta (Q, Q) by estimating again without each test, weights too.
 
-    `problem` has the stated covariances, to which each estimate adds its own misfit.
+    The model is linearised at the estimate, and refitted where a test moves it far.
     """
+    theta, loss = estimate.theta, estimate.loss
+    problem = estimate.problem.widened(np.zeros(estimate.problem.data.n))
+    every, basis, bounds = LinearRows.at(problem, theta), Basis.every(len(theta)), problem.bounds()
     moves = []
     for rows in tests:
         kept = np.ones(problem.data.n, dtype=bool)
         kept[rows] = False
+        others, there = every.take(kept), theta.copy()
         with suppress(np.linalg.LinAlgError):  # the others do not determine it
-            others = problem.part(kept, problem.data.response[kept])
-            without = _descended(
-                optimum, others, estimate.theta, determined=True, settled=_NEAR_ENOUGH
-            )
-            moves.append(without.theta - estimate.theta)
-    each = np.array(moves).reshape(-1, len(estimate.theta))
+            for _ in range(_STEPS):
+                at = others.moved(there - theta)
+                r, columns = at.weighted(at.squares(loss))
+                y = scores_of(r, 2 * len(at.z), loss)
+                step = _step(columns, y, there, basis, bounds)
+                there = there + step
+                if np.linalg.norm(columns @ step) < _NEAR_ENOUGH:
+                    break
+            if np.abs(there - theta)[problem.space.positive].max(initial=0.0) > _LINEAR:
+                part = problem.part(kept, problem.data.response[kept])
+                there = _descended(optimum, part, theta, determined=True).theta
+            moves.append(there - theta)
+    each = np.array(moves).reshape(-1, len(theta))
     return np.asarray((1.0 - 1.0 / len(tests)) * each.T @ each)
 
 
+@dataclass(frozen=True)
+class LinearRows:
+    """Residuals by the stated covariances, each row's turned so that a misfit weighs both parts.
+
+    A misfit of the square x makes the variances of the two parts 1 + growth x.
+    """
+
+    z: FloatArray  # (n, 2)
+    slopes: FloatArray  # (n, 2, Q): derivatives with respect to theta
+    growth: FloatArray  # (n, 2)
+    of_priors: tuple[FloatArray, FloatArray]  # (p,) and (p, Q): residuals and derivatives
+    first: NDArray[np.bool_]  # (n,): fundamentals
+    numbers: FloatArray  # (n,): of each row
+
+    @classmethod
+    def at(cls, stated: TableProblem, theta: FloatArray) -> LinearRows:
+        """Return the rows of a problem whose misfit is zero."""
+        m = stated.n_residuals
+        y, J = stated.residuals_and_jacobian(theta)
+        D = by_row(stated, theta, np.abs(stated.data.response)[tests_of(stated.data)[1]])
+        growth, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
+        return cls(
+            np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)),
+            np.einsum("nji,njq->niq", turn, J[:m].reshape(-1, 2, len(theta))),
+            np.maximum(growth, 0.0),
+            (y[m:], J[m:]),
+            stated.data.harmonic == 1,
+            np.where(stated.data.harmonic == 0, 1.0, 2.0),
+        )
+
+    def take(self, rows: NDArray[np.bool_]) -> LinearRows:
+        """Return some of the rows, and all priors."""
+        named = ("z", "slopes", "growth", "first", "numbers")
+        return replace(self, **{name: getattr(self, name)[rows] for name in named})
+
+    def moved(self, step: FloatArray) -> LinearRows:
+        """Return the rows after a step of theta."""
+        y, J = self.of_priors
+        return replace(self, z=self.z + self.slopes @ step, of_priors=(y + J @ step, J))
+
+    def weighted(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals of unit variance, and derivatives, for misfits of the squares (n,)."""
+        weight = 1.0 / np.sqrt(1.0 + self.growth * square[:, None])
+        y, J = self.of_priors
+        slopes = (weight[:, :, None] * self.slopes).reshape(-1, J.shape[1])
+        return np.concatenate([(weight * self.z).ravel(), y]), np.concatenate([slopes, J])
+
+    def squares(self, loss: Loss | None) -> FloatArray:
+        """Return the square of each row's misfit, (n,), with which chi-square is as expected."""
+        y, J = self.of_priors
+        first, square = self.first, np.zeros(len(self.z))
+        apart = bool(first.any() and not first.all() and 2 * first.sum() > J.shape[1])
+        first = first | (not apart)
+        free = J.shape[1] - len(y) + float(y @ y)
+        targets = [(first, self.numbers[first].sum() - free), (~first, self.numbers[~first].sum())]
+        if targets[0][1] <= 0.0:
+            return square
+        for rows, target in targets:
+            square[rows] = _square(self.z[rows] ** 2, self.growth[rows], float(target), loss)
+        if apart and square.any():
+            square[~first] = np.maximum(square[~first], square[first].max())
+            r, slopes = self.weighted(square)
+            factor = _disagreement(scores_of(r, 2 * len(first), loss), slopes, ~first)
+            square = np.where(first, 1.0, factor) * square
+        return square
+
+
 def _descended(
-    optimum: Optimum,
-    problem: TableProblem,
-    theta: FloatArray,
-    *,
-    determined: bool,
-    settled: float = _SETTLED,
+    optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
 ) -> WeightedEstimate:
-    """Return the minimum where a search ends: where steps are below `settled` deviations."""
+    """Return the minimum at which a search from theta ends."""
     stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
     loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
     if not determined:
@@ -343,7 +418,7 @@ def _descended(
     last: FloatArray | None = None
     damping, bounds = 0.0, problem.bounds()
     for _ in range(_STEPS):
-        misfit, variance, scale = _weights(stated, theta, loss)
+        variance, scale = _weights(stated, theta, loss)
         weighted = stated.widened(variance)
         r, J = weighted.residuals_and_jacobian(theta, scale, tails=loss is None)
         y = scores_of(r, m, loss)
@@ -353,7 +428,7 @@ def _descended(
             raise np.linalg.LinAlgError("no finite step from the estimate")
         step = _step(columns, y, theta, basis, bounds)
         size = np.linalg.norm(columns @ step)
-        if size < settled:
+        if size < _SETTLED:
             break
         moved = columns @ step
         further = _further(moved, last)
@@ -376,7 +451,7 @@ def _descended(
         theta = trial
     if not np.isfinite(y).all():
         raise np.linalg.LinAlgError("a drive beyond the force limit has no steady response")
-    return WeightedEstimate(weighted, theta, misfit, variance, scale, r, J, loss, determined, basis)
+    return WeightedEstimate(weighted, theta, variance, scale, r, J, loss, determined, basis)
 
 
 def scores_of(r: FloatArray, m: int, loss: Loss | None) -> FloatArray:
@@ -440,39 +515,17 @@ def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 def _weights(
     stated: TableProblem, theta: FloatArray, loss: Loss | None
-) -> tuple[float, FloatArray, float]:
-    """Return the misfit, what it adds to each row's variance, and the scale of the residuals."""
-    nothing = np.zeros(stated.data.n)
+) -> tuple[FloatArray, float]:
+    """Return what the misfit adds to each row's variance, and the scale of the residuals."""
+    if stated.scale_known:
+        square = LinearRows.at(stated, theta).squares(loss)
+        return square * np.abs(stated.data.response)[tests_of(stated.data)[1]] ** 2, 1.0
     m, dof = stated.n_residuals, stated.n_numbers - len(stated.names)
-    # with what the weighted ones will need
+    # with the derivatives, which the weighted ones will need
     y = stated.residuals_and_jacobian(theta, tails=loss is None)[0]
-    if not stated.scale_known:
-        scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)
-        return 0.0, nothing, agreed_scale(stated, loss, lambda _: (theta, dof), scale)
-    first = stated.data.harmonic == 1
-    apart = bool(first.any() and not first.all() and 2 * first.sum() > len(stated.names))
-    first = first | (not apart)
-    numbers = np.where(stated.data.harmonic == 0, 1, 2)
-    free = len(stated.names) - stated.n_priors + float(y[m:] @ y[m:])
-    targets = [(first, numbers[first].sum() - free), (~first, numbers[~first].sum())]
-    if targets[0][1] <= 0.0:
-        return 0.0, nothing, 1.0
-    size = np.abs(stated.data.response)[tests_of(stated.data)[1]]
-    D = by_row(stated, theta, size)
-    b, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
-    b, z = np.maximum(b, 0.0), np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)) ** 2
-    square = np.zeros(len(first))
-    for rows, target in targets:
-        square[rows] = _square(z[rows], b[rows], float(target), loss)
-    if not square.any():
-        return 0.0, nothing, 1.0
-    square[~first] = np.maximum(square[~first], square[first].max())
-    variance = square * size**2
-    if apart:
-        r, J = stated.widened(variance).residuals_and_jacobian(theta, tails=loss is None)
-        at_misfit = scores_of(r, m, loss)
-        variance = np.where(first, 1.0, _disagreement(at_misfit, J, ~first)) * variance
-    return float(np.sqrt(square.max())), variance, 1.0
+    scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)
+    scale = agreed_scale(stated, loss, lambda _: (theta, dof), scale)
+    return np.zeros(stated.data.n), scale
 
 
 def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) -> float:
