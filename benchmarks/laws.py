@@ -137,7 +137,8 @@ def deviations(
     begin, parts = time.process_time(), []
     for first in range(0, count, _BATCH):
         batch = di.fit_many(data[first : first + _BATCH], law.asked)
-        error = (batch.values - truth[first : first + _BATCH]) / batch.stderr_noise
+        optima = batch.optima
+        error = (optima.values - truth[first : first + _BATCH]) / optima.stderr
         parts.append(np.where(np.asarray(batch.success)[:, None], error, np.nan))
     return np.concatenate(parts), time.process_time() - begin
 

@@ -208,9 +208,8 @@ def fit_many(
     Returns
     -------
     FitBatch
-        Estimates of all tables, with standard errors from noise alone and, on request, combined
-        uncertainties; ``batch[i]`` is the :class:`FitResult` of one of them, with everything that
-        a single fit offers.
+        Estimates of all tables, with combined uncertainties; ``batch[i]`` is the
+        :class:`FitResult` of one of them, with everything that a single fit offers.
 
     Raises
     ------

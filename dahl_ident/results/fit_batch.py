@@ -56,47 +56,45 @@ class FitBatch(Sequence[FitResult]):
         """Names of the P free parameters."""
         return list(self.optima.names)
 
-    values = part(
-        "optima.values", "Estimates, shape (S, P); infinite or zero where an optimum lies there."
-    )
-    stderr_noise = part(
-        "optima.stderr", "Standard errors of `values` from noise alone, first order, shape (S, P)."
-    )
     scale = part("optima.scale", "Standard deviation of the residuals, shape (S,).")
     status = part("optima.status", "How each search ended.")
     success = part("optima.success", "Whether each table has a finite optimum, shape (S,).")
 
     @cached_property
-    def _combined(self) -> FloatArray:
-        every = (fit.params for fit in self)
-        pairs = [[(p[name].value, p[name].stderr) for name in self.var_names] for p in every]
-        return np.array(pairs, dtype=np.float64)
+    def _params(self) -> FloatArray:
+        """Value, combined uncertainty, and that from noise alone, shape (S, P, 3)."""
+        return np.array(
+            [
+                [(f.params[n].value, f.params[n].stderr, f.stderr_noise[n]) for n in self.var_names]
+                for f in self
+            ],
+            dtype=np.float64,
+        )
 
     @property
-    def estimates(self) -> FloatArray:
-        """Estimates that take every source of error into account, shape (S, P).
+    def values(self) -> FloatArray:
+        """Estimates, shape (S, P): those of ``batch[i].params``.
 
-        Those of ``batch[i].params``. Each table has its error model, which takes some 10 ms, here
-        and in `stderr`; it is computed once.
+        Each table has its error model, which takes some 10 ms and is computed once.
+        ``batch.optima.values`` are the optima of the search alone.
         """
-        return np.asarray(self._combined[..., 0])
+        return np.asarray(self._params[..., 0])
 
     @property
     def stderr(self) -> FloatArray:
-        """Combined standard uncertainties of `estimates`, shape (S, P).
+        """Combined standard uncertainties of `values`, shape (S, P).
 
         Those from noise alone where a table leaves nothing to estimate other errors from.
         """
-        return np.asarray(self._combined[..., 1])
+        return np.asarray(self._params[..., 1])
 
-    def to_frame(self, *, combined: bool = False) -> Any:
-        """Return a pandas table: one row a table, value and error of each parameter.
+    @property
+    def stderr_noise(self) -> FloatArray:
+        """Standard errors of `values` from noise alone, first order, shape (S, P)."""
+        return np.asarray(self._params[..., 2])
 
-        Parameters
-        ----------
-        combined : bool, default False
-            Also the estimates that take every source of error into account, with their combined
-            uncertainties.
+    def to_frame(self) -> Any:
+        """Return a pandas table: one row a table, value and uncertainties of each parameter.
 
         Returns
         -------
@@ -107,10 +105,8 @@ class FitBatch(Sequence[FitResult]):
         columns: dict[str, Any] = {}
         for i, name in enumerate(self.var_names):
             columns[name] = self.values[:, i]
+            columns[f"{name}_stderr"] = self.stderr[:, i]
             columns[f"{name}_stderr_noise"] = self.stderr_noise[:, i]
-            if combined:
-                columns[f"{name}_estimate"] = self.estimates[:, i]
-                columns[f"{name}_stderr"] = self.stderr[:, i]
         columns["scale"] = self.scale
         columns["status"] = [status.name for status in self.status]
         return pd.DataFrame(columns)
