@@ -374,7 +374,7 @@ class TestEstimate:
         data = load_dataset("noisy")
         assert fit(data, Dahl()).goodness.chi_square is not None
         found = modelled(data, Dahl(alpha=1.0))
-        assert not found.estimate.has_misfit
+        assert not found.estimate.problem.has_misfit
         plain = fit(data, Dahl(alpha=1.0)).optimum
         np.testing.assert_allclose(found.theta, plain.theta, atol=1e-7)
 

@@ -340,7 +340,9 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     if not few:
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
     state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
-    if few and problem.scale_known and not estimate.has_misfit:  # too few to doubt the noise
+    if (
+        few and problem.scale_known and not estimate.problem.has_misfit
+    ):  # too few to doubt the noise
         state = state.model.at(np.zeros(state.model.count))
     noises = state.model.noises
     shown = np.flatnonzero(state.variances[noises:] > 0.0)
@@ -373,7 +375,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
-        if estimate.has_misfit and len(tests) <= _MOST_REFITS:
+        if estimate.problem.has_misfit and len(tests) <= _MOST_REFITS:
             by_tests = jackknife_with_weights(estimate, optimum, tests)
         C, least = np.asarray(sum(every.values())), by_chance**2 * np.diagonal(by_tests)
         u2 = np.diagonal(C)

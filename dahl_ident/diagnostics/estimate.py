@@ -170,11 +170,6 @@ class WeightedEstimate:
     # (Q,): how far a second minimum is, times the root of its probability; None where there is none
     second: FloatArray | None = None
 
-    @property
-    def has_misfit(self) -> bool:
-        """Whether the model leaves more than the stated noise."""
-        return bool(self.misfit_variance.any())
-
     @cached_property
     def deviance(self) -> float:
         """Minus twice the log likelihood, apart from a constant."""

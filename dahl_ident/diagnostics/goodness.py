@@ -461,7 +461,7 @@ def _tested(
         optimum = errors.at_estimate
     space, problem = within or ResidualSpace(optimum), optimum.problem
     weighted = space
-    if errors is not None and errors.estimate.has_misfit:
+    if errors is not None and errors.estimate.problem.has_misfit:
         weighted = ResidualSpace(optimum, None if within is None else errors.runs, errors.estimate)
     chi_square = _chi_square(optimum, space)
     return Goodness(

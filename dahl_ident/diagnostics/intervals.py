@@ -4,7 +4,8 @@
     Every source of the uncertainty budget (:mod:`dahl_ident.diagnostics.budget`), with Student's
     t for its effective degrees of freedom; the default.
 
-Three ways count noise alone, from quick to thorough:
+Three ways count noise alone, and a misfit beyond a stated noise as if it were noise. From quick to
+thorough:
 
 ``wald``
     Estimate plus and minus standard errors, in search coordinates (for positive parameters a
@@ -249,7 +250,8 @@ def intervals_from_search(
         ends.append(problem.to_values(theta)[:, :count])
     if optimum.scale_known:
         law = "normal and chi-square" if problem.gaussian else "Student's t row by row"
-        note = f"noise as given by the data: {law}"
+        added = ", and the misfit as further noise" if problem.has_misfit else ""
+        note = f"noise as given by the data{added}: {law}"
     else:
         note = f"noise scale estimated: t and F with {optimum.dof} degrees of freedom"
     names, units = problem.names[:count], tuple(p.unit for p in problem.parameters[:count])

@@ -189,7 +189,7 @@ class ResidualSpace(_Complement):
 
         The size of the latter's misfit is itself an estimate, as an unknown scale is.
         """
-        self._widened = weights is not None and weights.has_misfit
+        self._widened = weights is not None and weights.problem.has_misfit
         self._optimum, self._problem = optimum, optimum.problem
         if weights is not None and self._widened:
             self._problem = weights.problem

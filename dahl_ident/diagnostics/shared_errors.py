@@ -14,7 +14,7 @@ _SAME = 1e-6  # of the noise's variance: as stated
 def row_errors(errors: ErrorModel) -> RowErrors | None:
     """Return the covariance of the residuals by all sources; None where they are independent."""
     problem, estimate, m = errors.problem, errors.estimate, errors.problem.n_residuals
-    as_stated = not estimate.has_misfit and (errors.noises < 1.0 + _SAME).all()
+    as_stated = not estimate.problem.has_misfit and (errors.noises < 1.0 + _SAME).all()
     if not errors.sources and (as_stated or not problem.scale_known):
         return None
     counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))

@@ -66,6 +66,8 @@ class Problem(ABC):
     """Mean and standard deviation of the logarithms of assumed parameters."""
     scale_known: bool = False
     """Whether the residuals have unit variance as they are."""
+    has_misfit: bool = False
+    """Whether covariances hold a misfit in addition to the stated noise."""
     tail: Rho | None = None
     """The loss of rows whose covariance has few degrees of freedom; else they are Gaussian."""
     repetitions: int = 4999

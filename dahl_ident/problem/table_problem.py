@@ -158,7 +158,8 @@ class TableProblem(Problem):
 
         Rows are Gaussian then; see ``Measured.widened`` in noise.py.
         """
-        widened = self.altered("stiffness_data", _misfit=misfit)
+        there = bool(misfit.any())
+        widened = self.altered("stiffness_data", _misfit=misfit, has_misfit=there)
         widened._set_noise(noise_for(self._rows, self.noise))
         return widened
 
