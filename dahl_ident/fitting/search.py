@@ -459,12 +459,13 @@ class TableSearch:
         return best
 
     def _friction_error(self, end: Minima, scale: float) -> FloatArray:
-        """Return the largest standard deviation of the logarithm of a friction parameter."""
+        """Return the largest standard deviation of a friction parameter, relative to its value."""
+        size = np.where(self.logarithmic, 1.0, np.abs(end.theta))[:, self.friction]
         variance: FloatArray | float = 1.0
         if not self.problem.scale_known and not self.rescales:
             variance = 2.0 * end.cost / max(self.m - end.theta.shape[1], 1)
         covariance, _ = inverse(end.hessian)
         spread = np.diagonal(covariance, axis1=1, axis2=2)[:, self.friction]
-        with np.errstate(invalid="ignore"):
-            largest = np.asarray(np.sqrt(variance * spread.max(axis=1, initial=0.0)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            largest = np.sqrt(variance * (spread / size**2).max(axis=1, initial=0.0))
         return np.where(np.isnan(largest), np.inf, largest)
