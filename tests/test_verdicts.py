@@ -101,8 +101,19 @@ class TestTrust:
         both = np.where(np.arange(12) < 6, 1e-3, 2e-3)
         tested = fit(FrequencyResponse(f, damped.response, both), Dahl())
         assert tested.goodness.judged
-        assert tested.status.value == "not determined"  # there is no friction
+        assert tested.status.value == "not described"  # there is no friction
         assert "does not describe these data" in tested.verdict
+
+    def test_a_law_that_another_one_replaces_is_not_described(self):
+        """Of two Jenkins elements one slips at every level: sigma would be half the truth."""
+        A = np.geomspace(1.0, 20.0, 8) * X_C
+        law = MaxwellSlip([0.3 * X_C, 2.4 * X_C], [20.0, 10.0])
+        N = law.describing_function(A) * relative_noise(8, 0.01, 11)
+        C = (0.01 * np.abs(N))[:, None, None] ** 2 * np.eye(2)
+        result = fit(FrequencyResponse(np.ones(8), N, A, covariance=C), Dahl())
+        assert 0.05 < result.goodness.rms_misfit < 0.2
+        assert result.status.value == "not described"
+        assert "law of parallel Jenkins elements (MaxwellSlip, Iwan) leaves 0." in result.verdict
 
     @pytest.mark.parametrize("noise", ["relative", "absolute"])
     def test_a_scatter_that_no_sensor_has(self, noise):

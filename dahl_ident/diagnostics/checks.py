@@ -42,6 +42,7 @@ from dahl_ident.units import si_unit
 
 _TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
 _FAIRLY = 0.2  # rms that a model misses beyond the noise: beyond it, intervals do not hold
+_OF_WRONG_LAW = 0.05  # the same where another law misses far less
 _SLOW = 0.3  # effective share of the samples, below which noise looks like another law,
 _VISIBLE = 0.05  # where it is more than this share of the output, rms
 _FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
@@ -174,7 +175,8 @@ def _misfit_of_table(fit: TableAssessment, reservations: Sequence[Finding]) -> I
         or goodness.of_several
         or any(finding.severity is _NOT_DESCRIBED for finding in bands)
     )
-    large = goodness.rms_misfit > (_FAIRLY if goodness.objections else _TOO_LARGE)
+    fairly = _OF_WRONG_LAW if goodness.law_is_wrong else _FAIRLY
+    large = goodness.rms_misfit > (fairly if goodness.objections else _TOO_LARGE)
     severity = _NOT_DESCRIBED if lost or large else _APPROXIMATE
     yield from goodness.findings(severity, counted=severity is _APPROXIMATE and fit.is_determined)
     if large and not goodness.objections:

@@ -295,6 +295,11 @@ class Goodness:
         return max([*runs, *labelled], default=0.0) > _OF_ONE_DEVICE
 
     @property
+    def law_is_wrong(self) -> bool:
+        """Whether another law of friction describes the data far better."""
+        return self.bound is not None and self.bound < FAR_LESS * self.rms_misfit
+
+    @property
     def beyond_any_sensor(self) -> bool:
         """Whether the scatter exceeds that of any sensor."""
         return self.noise_share is not None and self.noise_share > _NO_SENSOR
@@ -332,8 +337,9 @@ class Goodness:
             worst = _APPROXIMATE if self.neighbours else _TRUSTED
             yield described("suspicious", worst, names=names, neighbours=self.neighbours)
         if self.bound is not None:
-            law = self.bound < FAR_LESS * self.rms_misfit
-            yield described("jenkins_bound", _TRUSTED, least=self.bound, law=law)
+            law = self.law_is_wrong
+            worst = severity if law else _TRUSTED
+            yield described("jenkins_bound", worst, least=self.bound, law=law)
 
     @property
     def cause(self) -> str:
