@@ -1,4 +1,4 @@
-"""The server: pages from the files of a folder, on this machine alone."""
+"""The web server: pages for the files of a folder, reachable from this machine only."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LIMIT = 2_000_000_000
-"""Bytes that one upload may have."""
-_READ_SECONDS = 600  # s for reading files for the preview
+"""Largest size of one upload, bytes."""
+_READ_SECONDS = 600  # time limit of reading files for the preview
 _DOWNLOADS = {
     "report.html": "Report", "report.pdf": "Report, PDF", "fit.json": "Fit, JSON",
     "points.csv": "Points, CSV", "plan.csv": "Plan, CSV", "waveform.csv": "Waveform, CSV",
@@ -57,7 +57,7 @@ _EXPORTS = {
     "latex": "LaTeX", "c": "C", "matlab": "MATLAB", "modelica": "Modelica", "urdf": "URDF",
     "mujoco": "MuJoCo",
 }  # fmt: skip
-_OF_REPORT = (
+_REPORT_POLICY = (
     "sandbox allow-scripts allow-modals allow-downloads; default-src 'none'; img-src data:; "
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
@@ -73,10 +73,10 @@ _HEADERS = {
 
 
 class Guard:
-    """Refuses requests without the token, by another name of this machine, or from other pages.
+    """Refuses requests that lack the token, name another host, or come from other pages.
 
-    The token is in the address at first, then in a cookie that no other site's requests carry;
-    `limit` is the size of one request's body in bytes.
+    The token is first in the address, then in a cookie that requests from other sites do not
+    carry; `limit` is the largest body of a request, in bytes.
     """
 
     def __init__(self, app: ASGIApp, token: str, port: int, limit: int) -> None:
@@ -87,9 +87,9 @@ class Guard:
         self._cookie = f"dahl_ident_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or pass it on."""
+        """Refuse a request, or pass it on."""
 
-        async def answer(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
@@ -97,18 +97,18 @@ class Guard:
             await send(message)
 
         if scope["type"] == "http":
-            refused = self._answer(Request(scope))
-            await (refused or self._app)(scope, receive, answer)
+            early = self._early_response(Request(scope))
+            await (early or self._app)(scope, receive, send_with_headers)
         else:
             await self._app(scope, receive, send)
 
-    def _answer(self, request: Request) -> Response | None:
-        """Return the answer to a request that is not passed on."""
+    def _early_response(self, request: Request) -> Response | None:
+        """Return the response to a request that is not passed on, None for others."""
         if request.headers.get("host") not in self._hosts:
             return PlainTextResponse("This server answers to 127.0.0.1 alone.", 421)
         origin = request.headers.get("origin")
-        reads = request.method in ("GET", "HEAD")
-        if (origin or not reads) and origin not in {f"http://{host}" for host in self._hosts}:
+        is_read = request.method in ("GET", "HEAD")
+        if (origin or not is_read) and origin not in {f"http://{host}" for host in self._hosts}:
             return PlainTextResponse("The request comes from another page.", 403)
         if self._is_token(request.query_params.get("token", "")):
             response = RedirectResponse(request.url.path, 303)
@@ -118,7 +118,7 @@ class Guard:
         if not self._is_token(request.cookies.get(self._cookie, "")):
             text = "Open the address with its token, as the terminal printed it."
             return PlainTextResponse(text, 403)
-        size = request.headers.get("content-length", "" if not reads else "0")
+        size = request.headers.get("content-length", "0" if is_read else "")
         if not size.isdecimal():
             return PlainTextResponse("The request does not say how long it is.", 411)
         if int(size) > self._limit:
@@ -131,7 +131,7 @@ class Guard:
 
 
 class App:
-    """The pages; `root` holds a folder for each piece of work, every command gets the `laws`."""
+    """The pages; `root` holds a folder for each piece of work, `laws` go to every command."""
 
     def __init__(self, root: Path, laws: tuple[Path, ...] = ()) -> None:
         self.root, self.jobs = root, Jobs()
@@ -143,20 +143,20 @@ class App:
         )  # fmt: skip
 
     def routes(self) -> list[Route | Mount]:
-        """Return what every address shows or does."""
+        """Return the handler of every address."""
         get, post = partial(Route, methods=["GET"]), partial(Route, methods=["POST"])
         return [
             get("/", self.start),
             post("/", self.upload),
             get("/laws/{kind}.svg", self.law),
-            get("/static/page.{ending}", self.of_reports),
+            get("/static/page.{ending}", self.report_asset),
             Mount("/static", StaticFiles(directory=_HERE / "static")),
             get("/{work}", self.data),
             post("/{work}", self.save_data),
             post("/{work}/files", self.upload),
             get("/{work}/model", self.model),
             post("/{work}/model", self.save_model),
-            post("/{work}/commands", self.equivalent),
+            post("/{work}/commands", self.equivalent_commands),
             get("/{work}/run-{run:int}", self.run),
             get("/{work}/run-{run:int}/state", self.state),
             post("/{work}/run-{run:int}/{what:str}", self.act),
@@ -187,19 +187,19 @@ class App:
         return self._page("start", works=works, root=self.root)
 
     async def upload(self, request: Request) -> Response:
-        """Store files, in a new piece of work or in one that is there."""
+        """Store files, in a new piece of work or in an existing one."""
         async with request.form(max_files=500) as form:
             files = [f for f in form.getlist("files") if not isinstance(f, str) and f.filename]
             if not files:
                 raise HTTPException(400, "No file was chosen; go back and choose one or more.")
-            there = "work" in request.path_params
-            work = self._work(request) if there else Work.create(self.root)
+            exists = "work" in request.path_params
+            work = self._work(request) if exists else Work.create(self.root)
             for file in files:
                 await run_in_threadpool(work.add, file.filename or "file", file.file)
-        return _to(f"/{work.name}")
+        return _redirect(f"/{work.name}")
 
     async def data(self, request: Request) -> Response:
-        """Show what the files hold, and the form that says what it means."""
+        """Show the channels of the files, and the form that says what each one is."""
         work = self._work(request)
         preview = await run_in_threadpool(self._preview, work)
         return self._page("data", work=work, state=work.state, found=preview, roles=commands.ROLES)
@@ -220,24 +220,24 @@ class App:
         return preview
 
     async def save_data(self, request: Request) -> Response:
-        """Store what the channels are; go on, or show again what can be read."""
+        """Store what the channels are; then continue, or show the preview again."""
         work, form = self._work(request), await _form(request)
         work.write("columns.toml", commands.columns_toml(form))
         names = ("kind", *commands.OF_TABLES, *commands.OF_RECORDS, *commands.OF_BOTH)
         reading = {name: form.get(name, "") for name in names}
-        if form.get("next"):  # what was found has been confirmed
+        if form.get("next"):  # the user has confirmed the detected kind
             reading["kind"] = reading["kind"] or form.get("found", "")
         work.save(reading=reading, confirmed="next" in form)
-        return _to(f"/{work.name}/model" if form.get("next") else f"/{work.name}")
+        return _redirect(f"/{work.name}/model" if form.get("next") else f"/{work.name}")
 
     async def model(self, request: Request) -> Response:
-        """Show the form of model and knowledge."""
+        """Show the form for the model and what is known of the device."""
         work = self._work(request)
         known_laws = await run_in_threadpool(laws, self.laws)
         return self._page("model", work=work, state=work.state, laws=known_laws)
 
     async def save_model(self, request: Request) -> Response:
-        """Store model and knowledge, and start a run."""
+        """Store that form, and start a run."""
         work, form = self._work(request), await _form(request)
         work.save(**_knowledge(form))
         work.write("report.toml", commands.report_toml(form))
@@ -245,7 +245,7 @@ class App:
         steps, program = self._commands(work, work.state, folder.name)
         (folder / "program.py").write_text(program, "utf-8")
         self.jobs.start(folder, steps, work.folder)
-        return _to(f"/{work.name}/{folder.name}")
+        return _redirect(f"/{work.name}/{folder.name}")
 
     def _commands(self, work: Work, state: dict[str, Any], run: str) -> tuple[list[JobStep], str]:
         state["laws"] = self.laws
@@ -253,15 +253,15 @@ class App:
         steps = commands.fit_steps(state, work.folder, run, metadata=metadata)
         return steps, commands.as_python(state, work.folder, metadata=metadata)
 
-    async def equivalent(self, request: Request) -> Response:
-        """Return what the form comes to as commands, and in Python, without starting it."""
+    async def equivalent_commands(self, request: Request) -> Response:
+        """Return the form as the equivalent commands and Python program, without running them."""
         work, form = self._work(request), await _form(request)
         run = f"run-{1 + len(work.runs())}"
         steps, program = self._commands(work, {**work.state, **_knowledge(form)}, run)
         return JSONResponse({"commands": _typed(steps), "program": program})
 
     async def run(self, request: Request) -> Response:
-        """Show how a run goes, and its result."""
+        """Show the progress of a run, and its result."""
         work, folder = self._run(request)
         job = self.jobs.state(folder)
         page = folder / "report.html"
@@ -287,7 +287,7 @@ class App:
         ]  # fmt: skip
 
     async def state(self, request: Request) -> Response:
-        """Return how a run goes, for the page's script."""
+        """Return the progress of a run, for the page's script."""
         _, folder = self._run(request)
         job, left = self.jobs.state(folder), ""
         if job["left"] is not None:
@@ -298,7 +298,7 @@ class App:
         return JSONResponse({"busy": self.jobs.is_running(folder), "text": text})
 
     async def act(self, request: Request) -> Response:
-        """Cancel a run, or start what goes on from its fit."""
+        """Cancel a run, or start a comparison or a plan from its fit."""
         work, folder = self._run(request)
         what, form = request.path_params["what"], await _form(request)
         if what == "cancel":
@@ -313,24 +313,24 @@ class App:
                 else commands.compare_step(self.jobs.state(folder)["steps"])
             )
             self.jobs.start(part, [step], work.folder)
-        return _to(f"/{work.name}/{folder.name}")
+        return _redirect(f"/{work.name}/{folder.name}")
 
     async def download(self, request: Request) -> Response:
-        """Return a file of a run: one of those that its jobs write, by a name from the folder."""
+        """Return a file that the jobs of a run have written."""
         work, folder = self._run(request)
         wanted = request.path_params["path"]
         points = folder / "points.csv"
         if wanted == points.name and _is_table(folder) and not points.exists():
             fit = await run_in_threadpool(FitResult.load, folder / "fit.json")
             save_frame(fit.data.to_frame(), points)
-        there = {str(path.relative_to(folder)): path for path in folder.rglob("*")}
-        path = there.get(wanted)
+        files = {str(path.relative_to(folder)): path for path in folder.rglob("*")}
+        path = files.get(wanted)  # never a path outside the folder
         if path is None or not path.is_file() or path.suffix not in (
             ".html", ".pdf", ".json", ".csv", ".png"
         ):  # fmt: skip
             raise HTTPException(404, "There is no such file in this run.")
-        if path.suffix == ".html":  # has its styles in itself
-            return FileResponse(path, headers={"Content-Security-Policy": _OF_REPORT})
+        if path.suffix == ".html":  # its styles and scripts are inline
+            return FileResponse(path, headers={"Content-Security-Policy": _REPORT_POLICY})
         name = None if path.suffix == ".png" else f"{Path(work.state['title']).stem}_{path.name}"
         return FileResponse(path, filename=name)
 
@@ -341,11 +341,11 @@ class App:
         if to not in _EXPORTS:
             raise HTTPException(404, "There is no such format.")
         text = await run_in_threadpool(lambda: FitResult.load(folder / "fit.json").export(to))
-        where = {"Content-Disposition": f'attachment; filename="friction_{to}.txt"'}
-        return Response(str(text), headers=where, media_type="text/plain")
+        headers = {"Content-Disposition": f'attachment; filename="friction_{to}.txt"'}
+        return Response(str(text), headers=headers, media_type="text/plain")
 
-    async def of_reports(self, request: Request) -> Response:
-        """Return the styles or the script of reports, which the pages share."""
+    async def report_asset(self, request: Request) -> Response:
+        """Return the style sheet or the script of reports, which the pages use as well."""
         name = f"page.{'js' if request.path_params['ending'] == 'js' else 'css'}"
         return FileResponse(Path(reporting.__file__).with_name(name))
 
@@ -365,20 +365,20 @@ class App:
 
 
 def _knowledge(form: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """Return what the model form says, as the state keeps it."""
+    """Return the entries of the model form as the state stores them."""
     model = {name: form.get(name, "") for name in ("law", "known", "play")}
     for name in commands.LINEAR:
         model |= {name: form.get(name, "none"), f"{name}_value": form.get(f"{name}_value", "")}
-    kept = ("meta_", "force_", "displacement_", "delay_")
-    return {"model": model, "report": {n: t for n, t in form.items() if n.startswith(kept)}}
+    prefixes = ("meta_", "force_", "displacement_", "delay_")
+    return {"model": model, "report": {n: t for n, t in form.items() if n.startswith(prefixes)}}
 
 
 def _typed(steps: Sequence[JobStep]) -> str:
-    """Return commands as they are typed."""
+    """Return commands as typed in a terminal."""
     return "".join(f"{shlex.join(('dahl-ident', *step.words))}\n" for step in steps)
 
 
-def _to(place: str) -> Response:
+def _redirect(place: str) -> Response:
     return RedirectResponse(place, status_code=303)
 
 
@@ -405,7 +405,7 @@ def application(
 
 
 def serve(root: Path, *, port: int, laws: tuple[Path, ...] = (), browser: bool = True) -> None:
-    """Serve the page until it is interrupted; port 0 takes a free one."""
+    """Serve the pages until interrupted; port 0 takes a free one."""
     import socket
 
     listening = socket.create_server(("127.0.0.1", port))
