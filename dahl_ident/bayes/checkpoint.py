@@ -29,9 +29,9 @@ from dahl_ident.data.storage import library, locked, plain_data, put_in_place
 from dahl_ident.elements.model import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
-_FORMAT = "dahl_ident chain", 1  # name and version of the layout; files of others are refused
+_FORMAT = "dahl_ident chain", 1  # name and version of the layout; any other is refused
 _ARRAYS = ("points", "log_density", "start", "random_key", "random_rest")
-_SHARE = 20.0  # time spent sampling over time spent writing
+_SAMPLING_PER_WRITING = 20.0  # ratio of their times
 
 Identity = Mapping[str, str]
 """Everything a chain depends on, part by part, as text or digest."""
@@ -71,7 +71,7 @@ class ChainFile:
         self._due = 0.0
 
     def load(self) -> Chain | None:
-        """Return the chain in the file, None where there is no file yet."""
+        """Return the chain in the file; None if there is no file yet."""
         if not self.path.exists():
             return None
         chain, stored = _read(self.path)
@@ -99,7 +99,7 @@ class ChainFile:
         _write(self.path, self._latest, self._identity)
         self._written = self._latest
         ended = time.monotonic()
-        self._due = ended + _SHARE * (ended - began)
+        self._due = ended + _SAMPLING_PER_WRITING * (ended - began)
 
 
 @contextmanager
@@ -146,20 +146,20 @@ def _write(path: Path, chain: Chain, identity: Identity) -> None:
 
 
 def _read(path: Path) -> tuple[Chain, dict[str, str]]:
-    """Return the chain in a file, and what it belongs to."""
+    """Return the chain in a file, and its identity."""
     h5py = library("h5py")
     try:
         with h5py.File(path, "r") as file:
             attributes = plain_data(dict(file.attrs))
             stated = (attributes.get("format"), attributes.get("version"))
-            known = stated == _FORMAT and {"identity", "seed", "digest"} <= set(attributes)
-            values = [file[name][()] for name in _ARRAYS] if known else []
+            readable = stated == _FORMAT and {"identity", "seed", "digest"} <= set(attributes)
+            values = [file[name][()] for name in _ARRAYS] if readable else []
     except (OSError, KeyError, RuntimeError) as exc:
         raise SamplingError(
             f"{path} cannot be read as a chain ({exc}); it is damaged or something else. Give "
             "another file; this one is left as it is"
         ) from exc
-    if not known:
+    if not readable:
         raise SamplingError(
             f"{path} is an HDF5 file, but not a chain that this version can resume: format and "
             f"version are {stated}, expected {_FORMAT}. Give another file; this one is left as it "

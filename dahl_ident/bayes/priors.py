@@ -32,14 +32,12 @@ from dahl_ident.elements import Parameter
 from dahl_ident.errors import HIGH, LOW, ModelError, ValidationError, argument, choices
 from dahl_ident.problem import Problem
 
-# a positive parameter's default bounds over the sizes of its unit in the data: a knee may lie so
-# far from the data
-_DECADES = 1e5
-# bounds of a gain over 1, beyond which it is a mistake; those of an estimate of either sign over it
-_WIDER = 10.0
-_BEYOND = 5.0  # default bounds over the range that a parameter declares
+# Factors of the default bounds:
+_BEYOND_DATA = 1e5  # over the sizes in the data, of positive parameters: a knee may lie so far away
+_WIDER = 10.0  # over 1, of gains (more is a mistake); over the estimate, of either sign
+_BEYOND_RANGE = 5.0  # over the range that a parameter declares
 _RESONANCE = 1e3  # a plant's parts over their sum: at a resonance they nearly cancel
-_TAIL = 1e-10  # probability that counts as none, where a distribution has no ends
+_TAIL = 1e-10  # tail probability that is neglected, where a distribution is unbounded
 
 
 PriorLike = Any
@@ -51,7 +49,7 @@ class ParameterPrior:
     """The prior of one parameter."""
 
     parameter: Parameter
-    given: PriorLike  # a distribution of the value, or the ends of a log-uniform or uniform one
+    prior: PriorLike  # a distribution of the value, or the ends of a log-uniform or uniform one
     source: str = "given"  # {"given", "sensors", "assumed", "default"}
     # the least-squares value, not finite where unknown: `limits` reach beyond it, because data can
     # outweigh a prior even in its far tail
@@ -65,17 +63,16 @@ class ParameterPrior:
     @property
     def bounded(self) -> bool:
         """Whether the prior is the ends of a range."""
-        return isinstance(self.given, tuple)
+        return isinstance(self.prior, tuple)
 
     @cached_property
     def limits(self) -> tuple[float, float]:
         """Ends of theta beyond which the posterior probability is zero or negligible."""
         low, high = self.bulk
         at = self._theta(self.estimate)
-        if not self.bounded and np.isfinite(
-            at
-        ):  # as far beyond the estimate as that is from the prior
-            first, last = (self._theta(float(self.given.ppf(q))) for q in (0.0, 1.0))
+        # as far beyond the estimate as the estimate is from the prior
+        if not self.bounded and np.isfinite(at):
+            first, last = (self._theta(float(self.prior.ppf(q))) for q in (0.0, 1.0))
             low = max(first, min(low, 2.0 * at - low))
             high = min(last, max(high, 2.0 * at - high))
         return low, high
@@ -83,12 +80,12 @@ class ParameterPrior:
     @cached_property
     def bulk(self) -> tuple[float, float]:
         """Ends of theta beyond which the prior probability is zero or negligible."""
-        ends = self.given if self.bounded else self.given.ppf([_TAIL, 1.0 - _TAIL])
+        ends = self.prior if self.bounded else self.prior.ppf([_TAIL, 1.0 - _TAIL])
         low, high = (self._theta(float(end)) for end in ends)
         return low, high
 
     def _theta(self, value: float) -> float:
-        """Return the coordinate of a value, which is moved inside the parameter's bounds."""
+        """Return theta of a value, which is clipped to the parameter's bounds."""
         value = min(max(value, self.parameter.lower), self.parameter.upper)
         return float(np.log(max(value, 1e-300))) if self.logarithmic else value
 
@@ -106,7 +103,7 @@ class ParameterPrior:
         with np.errstate(over="ignore"):
             value = np.exp(theta) if self.logarithmic else theta
         allowed = (value >= self.parameter.lower) & (value <= self.parameter.upper)
-        density = np.where(allowed, _log_density(self.given, value), -np.inf)
+        density = np.where(allowed, _log_density(self.prior, value), -np.inf)
         return density + theta if self.logarithmic else density
 
     def probability(self, theta: FloatArray) -> FloatArray:
@@ -114,23 +111,23 @@ class ParameterPrior:
         if self.bounded:
             low, high = self.limits
             return np.clip((theta - low) / (high - low), 0.0, 1.0)
-        return np.asarray(self.given.cdf(np.exp(theta) if self.logarithmic else theta))
+        return np.asarray(self.prior.cdf(np.exp(theta) if self.logarithmic else theta))
 
     def quantile(self, q: FloatArray) -> FloatArray:
         """Return quantiles of theta."""
         low, high = self.limits
         if self.bounded:
             return np.asarray(low + (high - low) * q)
-        value = np.asarray(self.given.ppf(q))
+        value = np.asarray(self.prior.ppf(q))
         return np.log(np.maximum(value, np.exp(low))) if self.logarithmic else value
 
     def __str__(self) -> str:
         unit = f" {self.parameter.unit}" if self.parameter.unit else ""
         if self.bounded:
             kind = "log-uniform" if self.logarithmic else "uniform"
-            text = f"{kind} from {self.given[0]:.4g} to {self.given[1]:.4g}{unit}"
+            text = f"{kind} from {self.prior[0]:.4g} to {self.prior[1]:.4g}{unit}"
         else:
-            text = _described(self.given) + unit
+            text = _description(self.prior) + unit
         why = {"default": " (from the size of the data)", "assumed": " (its range)"}
         return text + why.get(self.source, "")
 
@@ -177,7 +174,7 @@ def joint_prior(
 ) -> JointPrior:
     """Return the prior of every free parameter of the device and of the sensors.
 
-    The first source that has one counts: given, assumed, sensors; else wide bounds.
+    Sources in order of precedence: given, assumed, sensors; otherwise wide bounds.
     """
     parameters = problem.parameters[: problem.n_reported]
     names = [p.name for p in parameters]
@@ -192,7 +189,7 @@ def joint_prior(
     parts = []
     for i, parameter in enumerate(parameters):
         at = float("nan") if estimate is None else float(estimate[i])
-        source = next((s for s, known in sources.items() if parameter.name in known), None)
+        source = next((s for s, stated in sources.items() if parameter.name in stated), None)
         if source is None:
             parts.append(ParameterPrior(parameter, _default(problem, parameter, at), "default"))
         else:
@@ -202,8 +199,8 @@ def joint_prior(
 
 
 def _checked_prior(parameter: Parameter, stated: Any) -> PriorLike:
-    """Return a prior as it was given, or raise where it is none for the parameter."""
-    frozen = not hasattr(stated, "freeze")  # as those of scipy.stats without parameters have
+    """Return a prior as stated; raise if it cannot be one of the parameter."""
+    frozen = not hasattr(stated, "freeze")  # a method of distributions that are not frozen
     if frozen and all(hasattr(stated, name) for name in ("logpdf", "cdf", "ppf")):
         _check_support(parameter, stated)
         return stated
@@ -229,7 +226,7 @@ def _checked_prior(parameter: Parameter, stated: Any) -> PriorLike:
 
 
 def _check_support(parameter: Parameter, dist: Any) -> None:
-    """Refuse a distribution with noticeable probability where the parameter cannot be."""
+    """Refuse a distribution with noticeable probability outside the parameter's bounds."""
     with np.errstate(divide="ignore", invalid="ignore"):
         outside = float(dist.cdf(parameter.lower)) + 1.0 - float(dist.cdf(parameter.upper))
         median = float(dist.ppf(0.5))
@@ -240,14 +237,14 @@ def _check_support(parameter: Parameter, dist: Any) -> None:
         )
     if outside > 1e-3:
         raise ValidationError(
-            f"the prior of {parameter.name}, {_described(dist)}, has {outside:.2g} of its "
+            f"the prior of {parameter.name}, {_description(dist)}, has {outside:.2g} of its "
             f"probability outside {parameter.lower:g} to {parameter.upper:g}; use one that lies "
             "inside, such as scipy.stats.lognorm for a positive parameter"
         )
 
 
 def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[float, float]:
-    """Return wide bounds of the value; `estimate` is one, not finite where unknown."""
+    """Return wide bounds of the value; `estimate` is not finite where unknown."""
     if parameter.name == "delay":
         half = np.pi * float(problem.unit_sizes((0, 0, 1)).min())
         return -half, half
@@ -256,19 +253,20 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
     # the problem shows units of rotation where the data do; dimensions follow those declared
     parameter = next((p for p in problem.model.parameters if p.name == parameter.name), parameter)
     if parameter.prior is not None:
-        low, high = parameter.prior  # of 95 % probability: bounds well beyond it
-        beyond = _BEYOND * (high - low)
-        low, high = (
-            (low / _BEYOND, high * _BEYOND) if parameter.positive else (low - beyond, high + beyond)
-        )
+        low, high = parameter.prior  # the range of 95 % probability
+        if parameter.positive:
+            low, high = low / _BEYOND_RANGE, high * _BEYOND_RANGE
+        else:
+            beyond = _BEYOND_RANGE * (high - low)
+            low, high = low - beyond, high + beyond
     elif not any(parameter.dimension):
-        raise _without_default(parameter)
+        raise _no_default_error(parameter)
     elif parameter.positive:
         sizes = problem.unit_sizes(parameter.dimension)
         seen = sizes[sizes > 0.0]
         if not seen.size:
-            raise _without_default(parameter)
-        low, high = float(seen.min()) / _DECADES, float(seen.max()) * _DECADES
+            raise _no_default_error(parameter)
+        low, high = float(seen.min()) / _BEYOND_DATA, float(seen.max()) * _BEYOND_DATA
     else:
         high = _RESONANCE * float(problem.unit_sizes(parameter.dimension).max())
         if np.isfinite(estimate):
@@ -276,11 +274,11 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
         low = -high
     low, high = max(low, parameter.lower), min(high, parameter.upper)
     if not (np.isfinite([low, high]).all() and low < high):
-        raise _without_default(parameter)
+        raise _no_default_error(parameter)
     return low, high
 
 
-def _without_default(parameter: Parameter) -> ValidationError:
+def _no_default_error(parameter: Parameter) -> ValidationError:
     name = parameter.name
     return ValidationError(
         f"{name} has no default prior, because the data do not show its size; give "
@@ -290,7 +288,7 @@ def _without_default(parameter: Parameter) -> ValidationError:
 
 
 def _log_density(distribution: Any, value: FloatArray) -> FloatArray:
-    """Return logpdf; of normal distributions directly, because scipy takes fifty times as long."""
+    """Return logpdf; that of a normal distribution written out, fifty times as fast as scipy."""
     if _name(distribution) == "norm":
         mean, std = _moments(distribution)
         with np.errstate(over="ignore"):
@@ -307,7 +305,7 @@ def _moments(distribution: Any) -> tuple[float, float]:
     return float(distribution.mean()), float(distribution.std())
 
 
-def _described(distribution: Any) -> str:
+def _description(distribution: Any) -> str:
     mean, std = _moments(distribution)
     if np.isfinite(std):
         return f"{_name(distribution)}, mean {mean:.6g}, std {std:.4g}"

@@ -140,7 +140,7 @@ class Posterior(Result):
     def given_priors(self) -> Mapping[str, PriorLike]:
         """The priors that were given, as they were given; the others follow the data's size."""
         parts = self._density.prior.priors
-        return {part.parameter.name: part.given for part in parts if part.source == "given"}
+        return {part.parameter.name: part.prior for part in parts if part.source == "given"}
 
     # Numbers
 
