@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 FORMATS = (".html", ".pdf")
 _LISTED = 200
-"""Devices whose rows are printed; all of them are in the table."""
+"""Fits whose rows are printed; all of them are in the table of results."""
 
 
 def campaign_document(
     table: pd.DataFrame, evaluated: Population | None, title: str, reports: str
 ) -> Document:
-    """Return the report's content; `reports` is the folder of the fits' reports, for links."""
+    """Return the report's content; links to the fits' reports point into the folder `reports`."""
     statuses = table["status"].value_counts()
     counted = ", ".join(f"{count} {status}" for status, count in statuses.items())
     verdict = [f"{len(table)} fits of {table['device'].nunique()} devices: {counted}."]
@@ -41,16 +41,16 @@ def campaign_document(
         status = "trusted" if (table["status"] == "trusted").all() else "approximate"
         for p in evaluated.parameters.values():
             verdict.append(f"{'; '.join(str(p).splitlines())}.")
-            sections.append(Section(f"Population: {p.name}", tuple(_blocks(p))))
+            sections.append(Section(f"Population: {p.name}", tuple(_population_blocks(p))))
     else:
         verdict.append("Fewer than three devices have usable results: there is no population.")
     sections.append(Section("Fits that cannot be used", (_unusable(table),)))
-    sections.append(Section("All fits", tuple(_all(table, reports))))
+    sections.append(Section("All fits", tuple(_all_fits(table, reports))))
     facts = {"statuses": {str(k): int(v) for k, v in statuses.items()}}
     return Document(title, status, tuple(verdict), tuple(sections), facts=facts)
 
 
-def _blocks(p: PopulationParameter) -> Iterator[Block]:
+def _population_blocks(p: PopulationParameter) -> Iterator[Block]:
     label = f"{p.name} [{p.unit}]" if p.unit else p.name
     measured = f"ln {p.name}" if p.logarithmic else label
     scatters = {"devices": p.between_devices, "runs": p.between_runs}
@@ -58,9 +58,9 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
         f"Scatter of {measured}",
         ("source", "median", "2.3 %", "97.7 %"),
         tuple(
-            (Cell(f"scatter between {where}"), *(number(x, 3) for x in scatter))
-            for where, scatter in scatters.items()
-            if scatter[0] or where == "devices"
+            (Cell(f"scatter between {groups}"), *(number(x, 3) for x in scatter))
+            for groups, scatter in scatters.items()
+            if scatter[0] or groups == "devices"
         ),
     )
 
@@ -75,23 +75,24 @@ def _blocks(p: PopulationParameter) -> Iterator[Block]:
         order = "in order of time" if p.ordered else "in the order of the table"
         return plot_control_charts(p.fits, label=measured, x_label=f"fit, {order}")
 
-    beyond = ", ".join(p.outlying) or "none"
+    outlying = ", ".join(p.outlying) or "none"
     drift = " and EWMA chart" if p.ordered else "; no order in time is stated, so no EWMA chart"
-    compared = ""
+    comparison = ""
     if len(p.devices) < len(p.fits):
-        alone = int(p.fits["value"].isna().sum())
-        compared = "; each fit is compared with the others of its device"
-        compared += f", so that {alone} devices with a single fit are not shown" if alone else ""
+        single = int(p.fits["value"].isna().sum())
+        comparison = "; each fit is compared with the others of its device"
+        if single:
+            comparison += f", so that {single} devices with a single fit are not shown"
     yield Picture(
         f"devices_{p.name}",
         f"{p.name} of each device: own estimate, and estimate shrunk towards the population",
-        f"{len(p.devices)} devices around {p.mean[0]:.4g}; outside the population: {beyond}",
+        f"{len(p.devices)} devices around {p.mean[0]:.4g}; outside the population: {outlying}",
         devices,
     )
     yield Picture(
         f"charts_{p.name}",
         f"Individuals (limits: three standard deviations from moving ranges){drift}, corrected for "
-        f"covariates{compared}",
+        f"covariates{comparison}",
         f"{len(p.out_of_control)} of {len(p.fits)} fits lie outside the limits",
         charts,
     )
@@ -108,7 +109,7 @@ def _unusable(table: pd.DataFrame) -> Block:
     return Bullets(tuple(f"{device}: {status}. {reason}" for device, status, reason in rows))
 
 
-def _all(table: pd.DataFrame, folder: str) -> Iterator[Block]:
+def _all_fits(table: pd.DataFrame, folder: str) -> Iterator[Block]:
     names = [str(c) for c in table if f"u_{c}" in table]
     labels = [c for c in ("device", "run") if c in table]
     rows = []

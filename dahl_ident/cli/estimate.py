@@ -79,14 +79,14 @@ def check_reports(*places: str | None) -> None:
             place_of(str(place), "a report", FORMATS)
 
 
-def write_report(results: Sequence[Reported], place: str, writing: Writing, **how: Any) -> str:
-    """Write a report, as HTML where that is standard output, and return where it is.
+def write_report(results: Sequence[Reported], place: str, writing: Writing, **options: Any) -> str:
+    """Write a report (HTML to standard output) and return its place.
 
-    `how` are further arguments of ``report``.
+    `options` are further arguments of ``report``.
     """
     from dahl_ident.reporting import report
 
-    options = {**how, "command": console.typed_command(), "overwrite": writing.overwrite}
+    options |= {"command": console.typed_command(), "overwrite": writing.overwrite}
     with console.busy("writing the report") as progress:
         return written(partial(report, results, progress=progress, **options), place, ".html")
 
@@ -94,7 +94,7 @@ def write_report(results: Sequence[Reported], place: str, writing: Writing, **ho
 def report_also(
     results: Sequence[Reported], place: str | None, writing: Writing, metadata: Path | None
 ) -> None:
-    """Write a report in addition to other output, where there is a place for it."""
+    """Write a report in addition to other output, if a place is given."""
     if place is None:
         return
     written_to = write_report(results, place, writing, metadata=metadata)
@@ -134,8 +134,8 @@ def finish(result: Result) -> None:
 Predicted = Annotated[
     str | None,
     option(
-        "Of records: force or motion is predicted from the other; by default motion where the "
-        "model has a mass.",
+        "For records: whether force or motion is predicted from the other; by default motion if "
+        "the model has a mass.",
         one_of="force|motion",
     ),
 ]
@@ -175,17 +175,17 @@ def fitted(
     """Return the fit of the model to a table or to records, with its verdict."""
     from dahl_ident.results import fit as estimate
 
-    how = {**model.keywords(), **estimating.keywords()}
+    keywords = {**model.keywords(), **estimating.keywords()}
     if isinstance(data, list):
-        how |= {"output": predicted, "progress": sys.stderr.isatty()}
+        keywords |= {"output": predicted, "progress": sys.stderr.isatty()}
         try:
-            return estimate(data, throw=False, **how)
+            return estimate(data, throw=False, **keywords)
         except FitInterrupted as stop:
             console.write(stop.result.fit_report())
             raise
     with console.busy("fitting"):
-        result = estimate(data, throw=False, **how)
-        _ = result.statements  # computed when first asked for
+        result = estimate(data, throw=False, **keywords)
+        _ = result.statements  # computed now, while the progress is shown
     return result
 
 
@@ -214,7 +214,7 @@ def fit(
 ) -> None:
     """Estimate a model's parameters, and state whether the data determine them.
 
-    Of several saved fits, such as monday.json friday.json, it says what changed.
+    With several saved fits, such as monday.json friday.json, print what changed between them.
 
     Example: dahl-ident datasets noisy -o - | dahl-ident fit -
     """
@@ -223,8 +223,8 @@ def fit(
 
     laws.run()
     saved = len(files) > 1 and all(map(is_saved, files))
-    unsaid = {*changed(reading, channels, model, estimating)} - {"metadata"}
-    if saved and (unsaid or save is not None):
+    chosen = {*changed(reading, channels, model, estimating)} - {"metadata"}
+    if saved and (chosen or save is not None):
         raise ValidationError("saved fits are compared as they are; give no other options")
     writing.check([report, save], files, json=general.json)
     check_reports(report)
@@ -253,13 +253,13 @@ def _print(result: Any, *, verbose: bool, compare: bool, of_records: bool) -> No
     from dahl_ident.diagnostics.comparison import compare_models
 
     console.write_wrapped(result.fit_report(details=verbose))
-    if compare and (result.goodness.acceptable or not verbose):  # else it is there already
+    if compare and (result.goodness.acceptable or not verbose):  # otherwise already printed
         console.write(str(compare_models(result)))
     if not verbose:
-        more = "further findings, tests of the residuals, other models and the solver's numbers"
+        details = "further findings, tests of the residuals, other models and the solver's numbers"
         if of_records:
-            more = "the budget, the records' own values and the residuals"
-        console.write(f"-v prints {more}")
+            details = "the budget, the values of each record and the residuals"
+        console.write(f"-v prints {details}")
 
 
 def _compare_saved(
@@ -346,8 +346,8 @@ def report(
         from dahl_ident.results import posterior as estimate_posterior
 
         results.append(estimate_posterior(fits[0], seed=seed, progress=sys.stderr.isatty()))
-    how = {"title": title, "record": record, "metadata": model.metadata}
-    places = [write_report(results, place, writing, **how) for place in output]
+    options = {"title": title, "record": record, "metadata": model.metadata}
+    places = [write_report(results, place, writing, **options) for place in output]
     if general.json:
         console.write_json(places)
     elif STANDARD not in places:
@@ -391,7 +391,7 @@ class Sampling:
     )
     steps: int | None = setting("Total steps; by default until converged.")
     max_steps: int = setting("Maximum steps, converged or not.", 20000)
-    ess: float = setting("Effective draws wanted.", 2000.0)
+    ess: float = setting("Target effective sample size.", 2000.0)
     walkers: int | None = setting("Walkers in all ensembles together.")
     ensembles: int = setting("Independent groups of walkers.", 4)
     resume: Path | None = setting(
@@ -400,12 +400,12 @@ class Sampling:
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``posterior``."""
-        how = dict(vars(self))
-        how["priors"] = dict(prior(text) for text in how.pop("prior") or [])
+        keywords = dict(vars(self))
+        keywords["priors"] = dict(prior(text) for text in keywords.pop("prior") or [])
         if self.seed is None and (self.resume is None or not self.resume.exists()):
-            how["seed"] = 1
+            keywords["seed"] = 1
         steady = None if self.steady == "exact" else self.steady
-        return {**how, "steady": steady, "progress": sys.stderr.isatty()}
+        return {**keywords, "steady": steady, "progress": sys.stderr.isatty()}
 
     def check(self) -> None:
         """Refuse options of a chain with --method grid."""
@@ -437,12 +437,12 @@ def sample(
     writing.check([report], files, json=general.json)
     check_reports(report)
     sampling.check()
-    how = {**model.keywords(), **sampling.keywords()}
+    keywords = {**model.keywords(), **sampling.keywords()}
     data = reading.read_any(files, channels, record=record)
     try:
-        posterior = estimate_posterior(data, **how)
+        posterior = estimate_posterior(data, **keywords)
     except KeyboardInterrupt:
-        console.write_error(_kept(sampling.resume))
+        console.write_error(_how_to_resume(sampling.resume))
         raise
     if general.json:
         console.write_json(posterior.to_dict())
@@ -452,8 +452,8 @@ def sample(
     finish(posterior)
 
 
-def _kept(chain: Path | None) -> str:
-    """Return a message on where a stopped chain is kept."""
+def _how_to_resume(chain: Path | None) -> str:
+    """Return a message on whether and how a stopped chain can be continued."""
     if chain is None:
         return "the chain is not kept; with --resume chain.h5 a stopped chain can be continued"
     if not chain.exists():

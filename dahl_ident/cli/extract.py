@@ -107,11 +107,11 @@ def extract(
         console.write_json(data.to_frame().to_dict("records"))
     elif output != STANDARD:
         show(data)
-    _tell_of_sweeps(data, files, reading, extracting.controlled)
+    _note_fast_sweeps(data, files, reading, extracting.controlled)
     judge(data)
 
 
-def _tell_of_sweeps(
+def _note_fast_sweeps(
     data: FrequencyResponse, files: list[str], reading: RecordReading, controlled: str
 ) -> None:
     """Say how to fit waveforms that were swept too fast for a table."""
@@ -119,20 +119,20 @@ def _tell_of_sweeps(
 
     from dahl_ident.units import percent
 
-    points = _one_row_a_point(data)
+    points = _one_row_per_point(data)
     fast = ~points.quality["settled"] & (points.quality["more_periods"] == 0)
     if fast.any():
         bias = np.hypot(points.quality["bias_real"], points.quality["bias_imag"]) / points.gain
-        named = changed(reading)
-        words = [word for n in named for word in (option_name(n), str(getattr(reading, n)))]
-        if controlled == "force":  # which moves a mass
+        names = changed(reading)
+        words = [word for n in names for word in (option_name(n), str(getattr(reading, n)))]
+        if controlled == "force":  # the plant has a mass
             words += ["--mass", "free", "--damping", "free", "--stiffness", "free"]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
         console.note(
-            f"{fast.sum()} of {points.n} points are of a sweep that friction could not follow, and "
-            f"biased by about {percent(np.median(bias[fast]))} (median), at most "
-            f"{percent(bias[fast].max())}. Its waveforms can be fitted at once, without that "
-            f"error: {command}"
+            f"{fast.sum()} of {points.n} points were swept too fast to settle, which biases them "
+            f"by about {percent(np.median(bias[fast]))} (median), at most "
+            f"{percent(bias[fast].max())}. A fit of the waveforms does not have that error: "
+            f"{command}"
         )
 
 
@@ -150,19 +150,19 @@ def good_points(data: FrequencyResponse) -> FrequencyResponse:
     return data.select(rows=good)
 
 
-def _one_row_a_point(data: FrequencyResponse) -> FrequencyResponse:
-    """Return the fundamental of every point, or the lowest harmonic that was asked for."""
+def _one_row_per_point(data: FrequencyResponse) -> FrequencyResponse:
+    """Return the fundamental of every point, or the lowest harmonic that was extracted."""
     harmonic = 1 if (data.harmonic == 1).any() else int(data.harmonic.min())
     return data.select(harmonic=harmonic)
 
 
 def show(data: FrequencyResponse) -> None:
-    """Print one row for each point, with its run and level where it has them, and its verdict."""
+    """Print one row for each point: its level and run if it has them, values and verdict."""
     import numpy as np
 
     from dahl_ident.units import si_unit
 
-    points = _one_row_a_point(data)
+    points = _one_row_per_point(data)
     assert points.amplitude is not None  # extraction measures it
     used = points.quality["num_periods"] - points.quality["settling_periods"]
     columns = {
@@ -185,7 +185,7 @@ def show(data: FrequencyResponse) -> None:
 
 def judge(data: FrequencyResponse) -> None:
     """End with status 3 if a point is not good, and print which and why."""
-    verdicts = _one_row_a_point(data).quality["verdict"]
+    verdicts = _one_row_per_point(data).quality["verdict"]
     bad = [(i, str(v)) for i, v in enumerate(verdicts) if v != "good"]
     named = "; ".join(f"point {i}: {verdict}" for i, verdict in bad[:3])
     more = "" if len(bad) <= 3 else "; ..."
@@ -217,7 +217,7 @@ def demo(
     writing.check([table, page])
     origin = load_dataset(_DATASET).provenance or {}
     with redirect_stdout(sys.stderr) if general.json else nullcontext():
-        result, posterior = _chain(origin, table, page, overwrite=writing.overwrite)
+        result, posterior = _run_steps(origin, table, page, overwrite=writing.overwrite)
     if general.json:
         console.write_json(
             {
@@ -228,11 +228,11 @@ def demo(
                 "report": str(page.resolve()),
             }
         )
-    for judged in (result, posterior):
-        finish(judged)
+    finish(result)
+    finish(posterior)
 
 
-def _chain(
+def _run_steps(
     origin: Mapping[str, Any], table: Path, page: Path, *, overwrite: bool
 ) -> tuple[FitResult, Posterior]:
     """Run every step from the recording to the report, and print a heading for each."""
@@ -258,9 +258,9 @@ def _chain(
     rows = []
     for name, p in result.params.items():
         truth = origin["truth"][name]
-        off = (p.value - truth) / p.stderr if p.stderr else 0.0
-        error = f"{p.stderr:.2g}" if p.stderr else "fixed"
-        rows.append((name, f"{p.value:.5g}", error, f"{truth:g}", f"{off:+.1f}"))
+        ratio = (p.value - truth) / p.stderr if p.stderr else 0.0
+        stderr = f"{p.stderr:.2g}" if p.stderr else "fixed"
+        rows.append((name, f"{p.value:.5g}", stderr, f"{truth:g}", f"{ratio:+.1f}"))
     header = ("parameter", "estimate", "standard error", "truth", "error / standard error")
     console.table("Compared with the truth", header, rows)
     console.heading("4. identifiability: what the data determine")
