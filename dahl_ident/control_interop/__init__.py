@@ -1,18 +1,18 @@
 """Responses of plants with friction to a sinusoidal force, and friction in control engineering.
 
 Systems of python-control can be used in models as :class:`~dahl_ident.elements.LinearSystem`
-elements; most of this subpackage goes in the other direction. Names are loaded when first used,
-because python-control loads for long.
+elements; most of this subpackage goes in the other direction. Names are imported when first used,
+because python-control is slow to import.
 
 - :func:`response` gives the steady response of a plant with known parameters; for estimation,
-  :func:`~dahl_ident.control_interop.force_balance.solve` balances fundamentals alone.
+  :func:`~dahl_ident.control_interop.force_balance.solve` balances fundamentals only.
 - :func:`level_responses` gives responses over frequency at several levels, as FRD or plots, and
   :func:`response_branches` every steady response of an active plant, with its stability.
 - :class:`FrictionNonlinearity` puts friction into python-control's describing-function tools.
-- :func:`limit_cycles` finds the free oscillations of a loop, and which of them are stable.
+- :func:`limit_cycles` finds the limit cycles of a loop, and which of them are stable.
 - :func:`equivalent_plant` and :func:`loop_margins` help to design a controller: the linear plant
   at one amplitude, and the loop's margins against amplitude.
-- :func:`closed_loop_response` prepares data of a plant that was measured under feedback.
+- :func:`closed_loop_response` prepares data of a plant that was measured in closed loop.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Every steady motion of known plants, exactly: from the describing function's to the true one.
+"""All exact steady motions of plants with known parameters, from those of the describing function.
 
-Motions that the describing function does not see are found from those of the neighbouring points:
-each motion is followed in the order of the points, up and down, as far as it goes.
+Motions that the describing function misses are found by continuation: each motion is followed from
+point to point, forwards and backwards, as far as it exists.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 HARMONICS = tuple(range(10))
 """The harmonics of a motion that are returned."""
-_SAME = 1e-6  # relative difference of two motions that are one
-_CYCLES = 3  # that an estimate goes through, so that memory of its own start fades
-_STEP = 0.005  # of ln of drive and frequency together, in which motions are followed
-_MOST_STEPS = 40  # between two points: what lies far apart is not one sweep
+_SAME = 1e-6  # relative difference below which two motions are the same
+_CYCLES = 3  # cycles simulated from an estimate, so that the memory of its start fades
+_STEP = 0.005  # of a continuation: change of ln of drive and of frequency together
+_MOST_STEPS = 40  # between two points; points farther apart do not belong to one sweep
 
 
 class ExactMotions(NamedTuple):
-    """Every motion of every point, (points, most), NaN beyond the last, by rising size.
+    """All motions of each point, (points, most), in order of amplitude; NaN after the last.
 
     `harmonics` are X_k, k from 0 to 9, (points, most, 10); `multiplier` is the largest modulus of
-    the multipliers of a cycle. `followed` is the place of the stable motion of each point that a
-    sweep follows, -1 where there is none.
+    the Floquet multipliers of a cycle. `followed` is the index of the stable motion of each point
+    that a sweep follows, -1 where there is none.
     """
 
     harmonics: ComplexArray
@@ -58,22 +58,22 @@ def exact_motions(
 ) -> ExactMotions:
     """Return the exact motions of points, (n,), near estimates of their fundamentals, (n, most).
 
-    Where the estimate is `unique`, so is the motion, and it is sought from rest. Elsewhere each
-    estimate is a start, and so is each motion of the point before and after, followed in small
+    Where the estimate is `unique`, so is the motion, and it is computed from rest. Elsewhere the
+    starts are each estimate, and each motion of the points before and after, followed in small
     steps.
     """
     shooting = Shooting(model)
-    place = np.log([omega, drive])
-    steps = np.ceil(np.abs(np.diff(place)).sum(axis=0) / _STEP)
-    apart = np.append(True, steps > _MOST_STEPS)
+    log_points = np.log([omega, drive])
+    steps = np.ceil(np.abs(np.diff(log_points)).sum(axis=0) / _STEP)
+    begins_sweep = np.append(True, steps > _MOST_STEPS)
     steps = steps.clip(1, _MOST_STEPS)
     steps[unique[1:] & unique[:-1]] = 1.0
-    points = np.append(0, np.cumsum(steps)).astype(np.intp)  # the others lie between
+    points = np.append(0, np.cumsum(steps)).astype(np.intp)  # rows of the points; steps between
     along = np.interp(np.arange(points[-1] + 1), points, np.arange(points.size))
-    omega, drive = (np.exp(np.interp(along, np.arange(points.size), one)) for one in place)
-    estimates, near = near, np.full((along.size, near.shape[1]), np.nan, dtype=np.complex128)
-    alike, unique = unique, np.zeros(along.size, dtype=np.bool_)
-    near[points], unique[points] = estimates, alike
+    omega, drive = (np.exp(np.interp(along, np.arange(points.size), logs)) for logs in log_points)
+    estimates = np.full((along.size, near.shape[1]), np.nan, dtype=np.complex128)
+    is_unique, is_start = np.zeros((2, along.size), dtype=np.bool_)
+    estimates[points], is_unique[points], is_start[points] = near, unique, begins_sweep
     values = np.array([float(v) for v in model.known_values()])
     motions: list[list[_Orbit]] = [[] for _ in omega]
 
@@ -83,48 +83,46 @@ def exact_motions(
             starts=starts, **({"stable": False} | how),
         )  # fmt: skip
 
-    def kept(rows: NDArray[np.intp], solution: SteadyMotion) -> NDArray[np.intp]:
-        """Keep the motions that are new; return their places."""
+    def add_new(rows: NDArray[np.intp], solution: SteadyMotion) -> NDArray[np.intp]:
+        """Add the motions that are new; return their indices."""
         new = []
-        for place in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():
-            known = motions[rows[place]]
-            motion = _Orbit(solution.harmonics[place], float(solution.multiplier[place]))
+        for i in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():
+            at_point = motions[rows[i]]
+            motion = _Orbit(solution.harmonics[i], float(solution.multiplier[i]))
             X = motion.fundamental
-            if all(abs(X - other.fundamental) >= _SAME * abs(X) for other in known):
-                known.append(motion)
-                new.append(place)
+            if all(abs(X - other.fundamental) >= _SAME * abs(X) for other in at_point):
+                at_point.append(motion)
+                new.append(i)
         return np.array(new, dtype=np.intp)
 
-    alone = np.flatnonzero(unique)
-    if alone.size:
-        kept(alone, solved(alone, None))
-    rows, column = np.nonzero(np.isfinite(near) & ~unique[:, None])
+    single = np.flatnonzero(is_unique)
+    if single.size:
+        add_new(single, solved(single, None))
+    rows, column = np.nonzero(np.isfinite(estimates) & ~is_unique[:, None])
     starts = np.zeros((rows.size, shooting.system.order))
-    starts[:, 0] = near[rows, column].real
-    starts[:, 1] = -omega[rows] * near[rows, column].imag
+    starts[:, 0] = estimates[rows, column].real
+    starts[:, 1] = -omega[rows] * estimates[rows, column].imag
 
     def follow(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> None:
-        """Keep the motions to which starts lead, and those of the neighbouring points."""
+        """Add the motions to which the starts lead, and continue each one to its neighbours."""
         while rows.size:
             solution = solved(rows, starts, **how)
-            new = kept(rows, solution)
-            nearby = np.concatenate([rows[new] - 1, rows[new] + 1])
-            inside = (nearby >= 0) & (nearby < omega.size)
-            inside[inside] &= open_to[nearby[inside]]
-            rows, starts = nearby[inside], np.tile(solution.starts[new], (2, 1))[inside]
+            new = add_new(rows, solution)
+            neighbours = np.concatenate([rows[new] - 1, rows[new] + 1])
+            inside = (neighbours >= 0) & (neighbours < omega.size)
+            inside[inside] &= continues[neighbours[inside]]
+            rows, starts = neighbours[inside], np.tile(solution.starts[new], (2, 1))[inside]
             how |= {"again": False, "cycles": None, "stable": False}
 
-    open_to = ~unique
-    follow(rows, starts, cycles=_CYCLES)  # leads to what is stable
+    continues = ~is_unique
+    follow(rows, starts, cycles=_CYCLES)  # leads to stable motions
     follow(rows, starts, again=False)
-    open_to = np.array([bool(m) and not any(one.stable for one in m) for m in motions])
+    continues = np.array([bool(m) and not any(one.stable for one in m) for m in motions])
     if shooting.system.odd:
-        follow(np.flatnonzero(open_to), None, one_sided=True, stable=True)
-    for one in motions:
-        one.sort(key=lambda motion: abs(motion.fundamental))
-    begins = np.zeros(along.size, dtype=np.bool_)
-    begins[points] = apart
-    followed = _followed(motions, begins)[points]
+        follow(np.flatnonzero(continues), None, one_sided=True, stable=True)
+    for at_point in motions:
+        at_point.sort(key=lambda motion: abs(motion.fundamental))
+    followed = _followed(motions, is_start)[points]
     most = max(near.shape[1], *(len(motions[point]) for point in points))
     harmonics = np.full((points.size, most, len(HARMONICS)), np.nan, dtype=np.complex128)
     multiplier = np.full((points.size, most), np.nan)
@@ -134,18 +132,18 @@ def exact_motions(
     return ExactMotions(harmonics, multiplier, followed)
 
 
-def _followed(motions: list[list[_Orbit]], begins: BoolArray) -> IntArray:
-    """Return the stable motion of every point that a sweep follows: the nearest to the last.
+def _followed(motions: list[list[_Orbit]], is_start: BoolArray) -> IntArray:
+    """Return the index of the stable motion that a sweep follows at each point.
 
-    The smallest where a sweep begins.
+    It is the nearest to that of the previous point, or the smallest where a sweep begins.
     """
     result = np.full(len(motions), -1, dtype=np.intp)
     last: complex | None = None
-    for point, (every, first) in enumerate(zip(motions, begins.tolist(), strict=True)):
-        stable = [place for place, motion in enumerate(every) if motion.stable]
-        last = None if first else last
+    for point, (at_point, starts) in enumerate(zip(motions, is_start.tolist(), strict=True)):
+        stable = [i for i, motion in enumerate(at_point) if motion.stable]
+        last = None if starts else last
         if stable:
-            fundamentals = [every[place].fundamental for place in stable]
+            fundamentals = [at_point[i].fundamental for i in stable]
             nearest = 0 if last is None else int(np.argmin(np.abs(np.array(fundamentals) - last)))
             result[point], last = stable[nearest], fundamentals[nearest]
     return result

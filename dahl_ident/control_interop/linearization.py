@@ -53,7 +53,7 @@ def equivalent_plant(plant: Element, amplitude: float, frequency_hz: float) -> A
     Raises
     ------
     ModelError
-        If a parameter has no value, the plant has no friction or nothing else, or a linear
+        If a parameter has no value, the plant lacks friction or linear elements, or a linear
         system is discrete or an FRD.
     ValidationError
         If `amplitude` or `frequency_hz` is not one number above zero.
@@ -81,11 +81,11 @@ class LoopMargins:
     Attributes
     ----------
     amplitude : ndarray, shape (m,)
-        m.
+        Zero-to-peak displacement, m.
     gain_margin : ndarray, shape (..., m)
-        Factor on the loop gain that reaches -1, the one nearest to 1; infinite without any.
+        Factor nearest to 1 that takes the loop gain through -1; infinite if there is none.
     phase_margin_deg : ndarray, shape (..., m)
-        Phase, degrees, that reaches -1, the one nearest to 0; infinite without any.
+        Rotation nearest to 0 that takes it through -1, degrees; infinite if there is none.
     modulus_margin : ndarray, shape (..., m)
         Smallest distance of the loop gain from -1, the inverse of the peak sensitivity.
     """
@@ -98,8 +98,8 @@ class LoopMargins:
     def band(self, name: str, probability: float = 0.95) -> tuple[FloatArray, FloatArray]:
         """Return the central interval of a margin over the draws, at every amplitude.
 
-        `name` is that of an attribute. Two arrays of quantiles, (m,); ValidationError if the
-        margins hold no draws.
+        `name` is that of an attribute. Returns the lower and the upper quantile, each (m,);
+        raises ValidationError if the margins hold no draws.
 
         Examples
         --------
@@ -120,7 +120,7 @@ class LoopMargins:
     def plot(self, ax: Any = None) -> tuple[Any, Any]:
         """Draw gain and phase margin against amplitude, with bands where there are draws.
 
-        `ax` are two Axes, for gain and phase, new ones where left out; they are returned.
+        `ax` is a pair of Axes, for gain and phase, new ones by default; it is returned.
         """
         from dahl_ident.plots import plot_margins
 
@@ -206,7 +206,7 @@ def loop_margins(
 def _with_draws(
     plant: Element, draws: Mapping[str, ArrayLike] | None
 ) -> tuple[Element, list[FloatArray]]:
-    """Return the plant and its values, those in `draws` with shape (S, 1, 1)."""
+    """Return the model and its parameter values, those in `draws` with shape (S, 1, 1)."""
     model = as_model(plant)
     if draws is None:
         return model, list(model.known_values())
@@ -216,12 +216,12 @@ def _with_draws(
     if len({c.shape for c in columns.values()}) != 1 or next(iter(columns.values())).ndim != 1:
         shapes = ", ".join(f"{name} {c.shape}" for name, c in columns.items())
         raise ValidationError(f"draws have the shapes {shapes}; expected one length for all")
-    known = model.with_values({name: float(c[0]) for name, c in columns.items()})
+    model = model.with_values({name: float(c[0]) for name, c in columns.items()})
     values = [
         columns[p.name][:, None, None] if p.name in columns else value
-        for p, value in zip(known.parameters, known.known_values(), strict=True)
+        for p, value in zip(model.parameters, model.known_values(), strict=True)
     ]
-    return known, values
+    return model, values
 
 
 def _margins(loop: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -229,11 +229,11 @@ def _margins(loop: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     size, angle = np.log(np.abs(loop)), np.angle(-loop)
     turn = np.angle(loop[..., 1:] / loop[..., :-1])
     no_wrap = np.abs(np.diff(angle)) < np.pi
-    room_at_180 = _at_zeros(angle, -size, -np.diff(size), no_wrap)
+    log_gain_at_180 = _at_zeros(angle, -size, -np.diff(size), no_wrap)
     angle_at_one = _at_zeros(size, angle, turn, np.ones_like(no_wrap))
     crosses = np.isfinite(angle_at_one)
     angle_at_one[crosses] = np.angle(np.exp(1j * angle_at_one[crosses]))
-    gain = np.exp(_nearest_to_zero(room_at_180))
+    gain = np.exp(_nearest_to_zero(log_gain_at_180))
     phase = np.degrees(_nearest_to_zero(angle_at_one))
     return gain, phase, np.min(np.abs(1.0 + loop), axis=-1)
 
@@ -241,11 +241,11 @@ def _margins(loop: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _at_zeros(
     curve: FloatArray, value: FloatArray, step: FloatArray, valid: NDArray[np.bool_]
 ) -> FloatArray:
-    """Return `value` where `curve` passes zero within each interval, infinity elsewhere."""
+    """Return `value` where `curve` crosses zero within an interval, infinity elsewhere."""
     before, after = curve[..., :-1], curve[..., 1:]
-    passes = valid & ((before < 0.0) != (after < 0.0))
-    share = before / np.where(passes, before - after, 1.0)
-    return np.where(passes, value[..., :-1] + share * step, np.inf)
+    crosses = valid & ((before < 0.0) != (after < 0.0))
+    fraction = before / np.where(crosses, before - after, 1.0)
+    return np.where(crosses, value[..., :-1] + fraction * step, np.inf)
 
 
 def _nearest_to_zero(values: FloatArray) -> FloatArray:
