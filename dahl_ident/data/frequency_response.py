@@ -188,9 +188,9 @@ class FrequencyResponse(Tabular):
         for name, value in values.items():
             object.__setattr__(self, name, value)
         check_table(self)
-        if self.covariance is not None:
-            even = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0  # but for rounding
-            object.__setattr__(self, "covariance", frozen_copy(even))
+        if self.covariance is not None:  # made symmetric to the last digit
+            symmetric = (self.covariance + self.covariance.swapaxes(1, 2)) / 2.0
+            object.__setattr__(self, "covariance", frozen_copy(symmetric))
 
     @classmethod
     def backbone(
@@ -205,10 +205,10 @@ class FrequencyResponse(Tabular):
     ) -> FrequencyResponse:
         r"""Return natural frequency and damping ratio against amplitude, as a table.
 
-        As tests with a phase-locked loop and modal analysis of ring-downs give them. The response
+        Tests with a phase-locked loop and modal analysis of ring-downs give such data. The response
         is ``Z/(2 m omega^2)``, Z the dynamic stiffness of mode and friction and m the modal mass:
-        at resonance its real part is zero, and its imaginary part the damping ratio. Its real part
-        is uncertain by that of the frequency, over the frequency.
+        at resonance its real part is zero, and its imaginary part the damping ratio. The standard
+        deviation of its real part is that of the frequency over the frequency.
 
         Parameters
         ----------
@@ -217,11 +217,11 @@ class FrequencyResponse(Tabular):
         natural_frequency_hz : (n,) array_like
             Hz, where the force is in quadrature with the displacement.
         damping_ratio : (n,) array_like
-            Of critical damping.
+            Fraction of critical damping.
         frequency_std, damping_ratio_std : (n,) array_like or float
             Standard deviations.
         **columns
-            Others of :class:`FrequencyResponse`, such as `run` and `motion`.
+            Further columns of :class:`FrequencyResponse`, such as `run` and `motion`.
 
         Returns
         -------
@@ -340,7 +340,7 @@ class FrequencyResponse(Tabular):
         """Return the same points, with their covariance, as another standard quantity.
 
         The covariance transforms by the Jacobian of the conversion, first order in the error.
-        The reference of amplitude and drive stays: displacement and force.
+        Amplitude and drive remain those of displacement and force.
 
         Parameters
         ----------
@@ -354,8 +354,8 @@ class FrequencyResponse(Tabular):
         Raises
         ------
         ValidationError
-            If a response of zero would have to be inverted, or rows hold harmonics, which belong
-            to their quantity.
+            If a response of zero would have to be inverted, or rows hold harmonics, which cannot
+            be converted.
 
         Examples
         --------
@@ -394,7 +394,7 @@ class FrequencyResponse(Tabular):
         harmonic: int | None = None,
         rows: ArrayLike | None = None,
     ) -> FrequencyResponse:
-        """Return the points that meet every condition given.
+        """Return the points that meet all conditions.
 
         Parameters
         ----------
@@ -442,8 +442,8 @@ class FrequencyResponse(Tabular):
             mask = np.asarray(rows)
             if mask.dtype != np.bool_ or mask.shape != keep.shape:
                 raise ValidationError(
-                    f"rows: expected {self.n} of True or False, got dtype {mask.dtype} of shape "
-                    f"{mask.shape}"
+                    f"rows: expected {self.n} values, True or False; got dtype {mask.dtype} of "
+                    f"shape {mask.shape}"
                 )
             keep &= mask
         if not keep.any():
@@ -497,8 +497,8 @@ class FrequencyResponse(Tabular):
         ----------
         polar : bool
             Whether the response is given as ``gain`` and ``phase_deg`` with their standard
-            deviations, instead of ``real`` and ``imag`` with their covariance. Only the latter
-            keeps everything.
+            deviations, instead of ``real`` and ``imag`` with their covariance. The polar form loses
+            the correlation of gain and phase.
 
         Returns
         -------
@@ -566,7 +566,8 @@ class FrequencyResponse(Tabular):
             if twice.size:
                 raise ValidationError(
                     f"level {label!r} has {part.frequency_hz[order][twice[0]]:g} Hz more "
-                    "than once; a transfer function has one value a frequency. Give the rows levels"
+                    "than once; a transfer function has one value at each frequency. Give the rows "
+                    "levels"
                 )
             systems[label] = control.FrequencyResponseData(part.response[order], part.omega[order])
         return systems
@@ -574,13 +575,13 @@ class FrequencyResponse(Tabular):
     def plot(self, ax: Any = None) -> tuple[Any, Any]:
         """Draw gain and phase of the fundamental, over frequency or over amplitude.
 
-        Over frequency, one curve a level, where a level has more than one frequency; over
-        amplitude, with error bars where the covariance is known, otherwise.
+        Over frequency, with one curve for each level, if a level has more than one frequency;
+        otherwise over amplitude, with error bars where the covariance is known.
 
         Parameters
         ----------
         ax : sequence of two matplotlib Axes, optional
-            For gain and for phase; new ones where left out.
+            For gain and for phase; new ones by default.
 
         Returns
         -------

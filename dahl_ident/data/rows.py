@@ -1,4 +1,4 @@
-"""Rows of tables for computation, their names for people, and the levels that they belong to."""
+"""Columns of tables for computation, names of rows for messages, and levels of tables and files."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from dahl_ident.units import (
     shown_unit,
 )
 
-_SAME = 1.1  # ratio of drives or amplitudes up to which they are one level
+_SAME_LEVEL = 1.1  # ratio of drives or amplitudes up to which they are one level
 _SAME_FREQUENCY = 1.001  # ratio; points next to each other at a sharp resonance differ by more
 _NEARLY_ALL = 0.99  # share of a wave's samples; noise and spikes lie beyond
 _NUMBER = r"(?P<value>[0-9]+(?:[.,][0-9]+)?(?:e[-+]?[0-9]+)?)"
 _UNIT = r"[^\W\d_][^;,\t\])\"']{0,20}"
 _LINE = re.compile(
-    rf"[\W_]*(?P<key>[a-z][a-z _.-]{{2,40}}?)\s*(?:[\[(](?P<own>{_UNIT})[\])]\s*)?[\"']?\s*"
+    rf"[\W_]*(?P<key>[a-z][a-z _.-]{{2,40}}?)\s*(?:[\[(](?P<bracketed>{_UNIT})[\])]\s*)?[\"']?\s*"
     rf"(?:[:=;,\t]\s*|\s)[\"']?{_NUMBER}(?:[\"']?\s*[;,\t]?\s*[\[(\"']?(?P<unit>{_UNIT}))?",
     re.IGNORECASE,
 )
@@ -46,7 +46,7 @@ _SIZES = {"level", "amplitude"}
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns of shape (n,), or (tables, n) where tables are stacked; None where not given."""
+    """Columns of shape (n,), or (tables, n) where stacked tables differ; None for absent ones."""
 
     quantity: Quantity
     harmonic: NDArray[np.int64]
@@ -74,13 +74,13 @@ class Rows:
 
     @cached_property
     def fundamental(self) -> NDArray[np.intp]:
-        """The row of each row's fundamental in its table, of several the first; -1 for none."""
+        """For each row, that of its fundamental in the same table (the first of several), or -1."""
         shape = self.response.shape
-        none = np.zeros(())
-        drive, amplitude = (none if c is None else c for c in (self.drive, self.amplitude))
+        absent = np.zeros(())
+        drive, amplitude = (absent if c is None else c for c in (self.drive, self.amplitude))
         table = np.arange(self.response[..., 0].size).reshape(*shape[:-1], 1)
-        held = np.where(self.forced, drive, amplitude)
-        keys = [np.broadcast_to(k, shape).ravel() for k in (held, self.forced, self.omega, table)]
+        size = np.where(self.forced, drive, amplitude)
+        keys = [np.broadcast_to(k, shape).ravel() for k in (size, self.forced, self.omega, table)]
         order = np.lexsort(keys)
         changes = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
         point = np.empty(self.response.size, dtype=np.intp)
@@ -99,7 +99,7 @@ class Rows:
 
     @property
     def of_displacement(self) -> NDArray[np.bool_]:
-        """Which rows are harmonics of the displacement, under a force that is a sine, (n,)."""
+        """Which rows are harmonics of the displacement, under a sinusoidal force, (n,)."""
         return np.asarray(self.forced & (self.harmonic != 1))
 
     @classmethod
@@ -118,7 +118,7 @@ class Rows:
 
     @classmethod
     def stack(cls, tables: Sequence[FrequencyResponse]) -> Rows:
-        """Return the columns of many tables of one kind of rows; shared ones are (n,)."""
+        """Return the columns of many tables with the same rows; columns that are equal are (n,)."""
         first = tables[0]
         for index, table in enumerate(tables):
             if table.n != first.n or table.quantity != first.quantity:
@@ -139,7 +139,7 @@ class Rows:
         return cls._with(columns, first.quantity)
 
     def take(self, tables: NDArray[np.intp] | slice | int) -> Rows:
-        """Return one or some of the stacked tables; columns that all share stay as they are."""
+        """Return one or some of the stacked tables; shared columns stay as they are."""
         taken: dict[str, Any] = {}
         for one in fields(self):
             column = getattr(self, one.name)
@@ -150,7 +150,7 @@ class Rows:
 
 
 def _stacked(tables: Sequence[FrequencyResponse], name: str) -> NDArray[Any] | None:
-    """Return the column of all tables, or the one that they share; None where none has it."""
+    """Return the column of all tables, once if all are equal; None if no table has it."""
     columns = [getattr(table, name) for table in tables]
     present = [column is not None for column in columns]
     if not any(present):
@@ -217,10 +217,10 @@ def _one_level_each(parts: Sequence[FrequencyResponse]) -> bool:
         return False
     bands = np.array([(p.frequency_hz.min(), p.frequency_hz.max()) for p in parts])
     for column in zip(*map(sizes, parts), strict=True):
-        known = [size for size in column if size is not None]
-        one_each = all(size.max() < _SAME * size.min() for size in known)
-        medians = np.array([np.median(size) for size in known])
-        if one_each and len(known) == len(parts) and _all_differ(medians, bands):
+        stated = [size for size in column if size is not None]
+        one_each = all(size.max() < _SAME_LEVEL * size.min() for size in stated)
+        medians = np.array([np.median(size) for size in stated])
+        if one_each and len(stated) == len(parts) and _all_differ(medians, bands):
             return True
     return False
 
@@ -231,10 +231,11 @@ def one_run(records: Sequence[Record]) -> bool:
         waves = [getattr(record, channel) - getattr(record, channel).mean() for record in records]
         largest = np.array([np.quantile(np.abs(wave), _NEARLY_ALL) for wave in waves])
         sizes = np.array([np.sqrt(2.0 * np.mean(wave**2)) for wave in waves])
-        keep = (sizes < _SAME * largest) & (largest < _SAME * sizes)
-        halves = np.array([np.count_nonzero(np.diff(np.signbit(wave))) for wave in waves])
-        rates = 0.5 * halves / [record.time[-1] - record.time[0] for record in records]
-        if keep.all() and _all_differ(sizes, rates[:, None] * [_SAME**-0.5, _SAME**0.5]):
+        steady = (sizes < _SAME_LEVEL * largest) & (largest < _SAME_LEVEL * sizes)
+        crossings = np.array([np.count_nonzero(np.diff(np.signbit(wave))) for wave in waves])
+        rates = 0.5 * crossings / [record.time[-1] - record.time[0] for record in records]
+        bands = rates[:, None] * [_SAME_LEVEL**-0.5, _SAME_LEVEL**0.5]
+        if steady.all() and _all_differ(sizes, bands):
             return True
     return False
 
@@ -243,7 +244,7 @@ def _all_differ(sizes: FloatArray, bands: FloatArray) -> bool:
     """Return whether no two of `sizes`, (n,), agree where `bands` of frequency, (n, 2), overlap."""
     low, high = bands.T
     overlap = (low[:, None] < _SAME_FREQUENCY * high) & (low < _SAME_FREQUENCY * high[:, None])
-    alike = (sizes[:, None] < _SAME * sizes) & (sizes < _SAME * sizes[:, None])
+    alike = (sizes[:, None] < _SAME_LEVEL * sizes) & (sizes < _SAME_LEVEL * sizes[:, None])
     return bool(np.count_nonzero(overlap & alike) == len(sizes))  # each with itself
 
 
@@ -269,7 +270,7 @@ def stated_levels(lines: Iterable[str]) -> dict[str, str]:
         words = set(re.split(r"[\s_.-]+", match["key"].casefold())) - {""}
         if not words <= _SUBJECTS | _SIZES or not (words & _SIZES or words == {"drive"}):
             continue
-        unit = match["own"] or match["unit"] or ""
+        unit = match["bracketed"] or match["unit"] or ""
         text = f"{match['value'].replace(',', '.')} {unit.strip()}"
         try:
             _, kind, _ = parse_quantity(text, (*DRIVE_KINDS, *MOTION_KINDS), "level")

@@ -1,4 +1,4 @@
-"""Readers, which turn the usual laboratory files into frequency responses or records.
+"""Readers that turn the usual laboratory files into frequency responses or records.
 
 Formats are recognised by their content. What a file does not contain, such as a unit, comes from a
 column map or from keywords, or is an error; every assumption is noted in the result.
@@ -72,8 +72,8 @@ def read_frequency_response(
     quantity : str, optional
         Which of the six standard quantities the response is; by default it follows from the unit.
     frequency : float, optional
-        Hz, for a table that does not say it. Without it such a table of amplitudes is good for
-        laws that do not depend on the rate.
+        Hz, for a table that does not say it. Without it such a table can be used with
+        rate-independent laws only.
     sweep : str, optional
         Frequencies of all rows, for a table without a column of them, as some analysers write it:
         ``"1:100Hz log"`` or ``"0:800Hz linear"``.
@@ -153,7 +153,7 @@ def read_frequency_response(
             frequency_hz=frequency_hz,
             passive=passive,
         )
-        stated = _given(columns=columns, **entries, sheet=sheet, **vars(options))
+        stated = _options_given(columns=columns, **entries, sheet=sheet, **vars(options))
         part = response_from(open_source(one, sheet, stated), mapped, options)
         for name, label, labels in (("level", level, part.level), ("run", options.run, part.run)):
             if label is not None and labels is not None and any(v != label for v in labels):
@@ -244,29 +244,29 @@ def record_pieces(
     missing: Literal["error", "drop"] = "error",
     **roles: Any,
 ) -> Iterator[Record]:
-    """Yield a record in pieces of at most so many samples, each read when its turn comes."""
+    """Yield a record in pieces of at most so many `samples`, each read only when asked for."""
     one_of(missing, "missing", ("error", "drop"))
     if roles.get("time") is not None and roles.get("sample_rate") is not None:
         raise ValidationError("time and sample_rate are both given; leave out one of them")
-    source = open_source(path, sheet, _given(columns=columns, sheet=sheet, **roles))
-    bound = column_map(columns, **roles)
-    n = 0 if samples is None else record_size(source, bound)
+    source = open_source(path, sheet, _options_given(columns=columns, sheet=sheet, **roles))
+    mapped = column_map(columns, **roles)
+    n = 0 if samples is None else record_size(source, mapped)
     pieces = 1 if samples is None else max(1, -(-n // samples))
     if pieces == 1:
-        yield record_from(source, bound, missing)
+        yield record_from(source, mapped, missing)
         return
     for start, stop in pairwise(i * n // pieces for i in range(pieces + 1)):
         channels = (c.part(slice(start, stop)) if c.size == n else c for c in source.channels)
-        named = partial(lambda first, row: source.row_name(first + row), start)
-        part = replace(source, channels=tuple(channels), row_name=named)
-        record = record_from(part, bound, missing)
-        if bound.sample_rate is not None:
-            record = replace(record, time=record.time + start / bound.sample_rate)
+        row_name = partial(lambda first, row: source.row_name(first + row), start)
+        part = replace(source, channels=tuple(channels), row_name=row_name)
+        record = record_from(part, mapped, missing)
+        if mapped.sample_rate is not None:
+            record = replace(record, time=record.time + start / mapped.sample_rate)
         yield record
 
 
 def _is_frame(path: Any) -> TypeIs[pd.DataFrame]:
-    """Return whether this is a table in memory, without the import of pandas."""
+    """Return whether this is a table in memory, without importing pandas."""
     return hasattr(path, "iloc")
 
 
@@ -348,13 +348,12 @@ def _parsed(file: File, sheet: str | None) -> RawFile:
     return source
 
 
-def _given(**options: Any) -> dict[str, Any]:
-    """Return the options that were given, as JSON data."""
-    options_given = {
-        name: plain_data(value) for name, value in options.items() if value is not None
-    }
+def _options_given(**options: Any) -> dict[str, Any]:
+    """Return the options that are not at their defaults, as JSON data."""
     return {
-        name: value for name, value in options_given.items() if (name, value) != ("passive", True)
+        name: plain_data(value)
+        for name, value in options.items()
+        if value is not None and (name, value) != ("passive", True)
     }
 
 
@@ -371,7 +370,7 @@ def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:
 
 
 def refuse_repeated(sources: Sequence[Any]) -> None:
-    """Refuse a file that is named twice, whose rows would count twice."""
+    """Refuse a file that is named twice, because its rows would count twice."""
     seen: set[Path] = set()
     for source in sources:
         if isinstance(source, (str, Path)):
@@ -381,7 +380,7 @@ def refuse_repeated(sources: Sequence[Any]) -> None:
 
 
 def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dict[str, Any]:
-    """Return what the regular expression finds in a file's name, the level among it."""
+    """Return the groups that a regular expression finds in a file's name, including the level."""
     if expression is None:
         return {}
     name = Path(str(path)).name if not _is_frame(path) else "the table"
@@ -405,7 +404,7 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
 
 
 def _filled(text: str | None, groups: Mapping[str, Any], path: PathLike | pd.DataFrame) -> Any:
-    """Return a text with its braces filled; names only, as a format string reaches attributes."""
+    """Return a text with its braces filled; not by str.format, which would reach attributes."""
     parts = re.split(r"\{(\w+)\}", text or "")
     absent = [name for name in parts[1::2] if name not in groups]
     if absent or any(mark in part for part in parts[0::2] for mark in "{}"):

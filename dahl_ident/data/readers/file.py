@@ -1,8 +1,8 @@
-"""A file with its hash, its format found from the content, and limits of size and time.
+"""A file with its hash, its format as recognised from the content, and limits of size and time.
 
-A damaged file of some kilobytes may declare exabytes, so sizes are limited before memory is taken.
-Compiled libraries trust what a file says of itself; they work in a separate process (where there is
-``fork``), so that a crash is an error like others.
+A damaged file of some kilobytes may declare exabytes, so sizes are checked before memory is
+allocated. Compiled libraries trust what a file declares, so they run in a separate process (where
+``fork`` exists): a crash there is reported like any other error.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from dahl_ident.data.storage import regular
 from dahl_ident.errors import DataError
 
 MOST_CHANNELS = 5000
-"""Columns, arrays or data sets of one file; a laboratory's file has some tens."""
+"""Largest number of columns, arrays or data sets in one file; measured files have some tens."""
 DEEPEST = 32
-"""Levels of groups, structs or lists in one another."""
+"""Deepest nesting of groups, structs or lists."""
 ZIP_ERRORS = (
     zipfile.BadZipFile, OSError, EOFError, ValueError, KeyError, zlib.error, NotImplementedError,
     RuntimeError,
 )  # fmt: skip
-"""What Python's reader of archives raises on damaged ones."""
-_UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; when read, they take ten times as much
+"""What Python's zipfile raises on damaged archives."""
+_UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; parsed, they take ten times as much
 _OBJECT_BYTES = 40  # least memory of each line or list into which a text is split
-_UNPACKED_RATIO = 8  # text and samples of a converter rarely compress better
+_UNPACKED_RATIO = 8  # text and sampled waveforms rarely compress better
 
 
 class Format(NamedTuple):
-    """A format: its name, the extensions it may have, module.function to read it.
+    """A format: its name, its extensions, and its reader as module.function.
 
-    Where a library reads it, any of its errors says that what is called `damaged` is so.
+    `damaged` is what messages call damaged, if the library that reads the format raises any error.
     """
 
     name: str
@@ -104,9 +104,9 @@ _PACKED: tuple[tuple[bytes, Callable[[Any], Any], str], ...] = (
 
 @dataclass(frozen=True)
 class File:
-    """A file that is open to be read; `content` where it is not on the disk as it is.
+    """A file to read; `content` holds its bytes if they are not on disk in this form.
 
-    Its reader leaves what it assumed in `notes`, and what it warns of in `doubts`.
+    Its reader adds its assumptions to `notes`, and its warnings to `doubts`.
     """
 
     path: Path | None
@@ -151,7 +151,7 @@ class File:
         return max(_UNPACKED_BYTES, _UNPACKED_RATIO * self.size)
 
     def lines(self, marks: bytes = b"\n") -> bytes:
-        """Return all bytes; refuse more lines, or other marks, than may be kept one by one."""
+        """Return all bytes; refuse text of more lines (or other marks) than memory may hold."""
         count = sum(self.data.count(mark) for mark in marks)
         self.refuse_above_limit(_OBJECT_BYTES * count, f"text of {count} parts")
         return self.data
@@ -166,7 +166,7 @@ class File:
             )
 
     def source(self, kind: str, channels: Iterable[RawChannel], **facts: Any) -> RawFile:
-        """Return the channels of this file with other facts of a :class:`Source`."""
+        """Return the channels of this file; `facts` are further fields of :class:`RawFile`."""
         channels = tuple(channels)
         if not channels:
             raise DataError(f"{self.name}: the file holds no channels")
@@ -175,16 +175,16 @@ class File:
 
 
 def refuse_many(name: str, count: int, what: str, most: int = MOST_CHANNELS) -> None:
-    """Refuse a file of more columns, arrays or the like than a laboratory's has."""
+    """Refuse a file of more columns, arrays or the like than a measured one has."""
     if count > most:
         raise DataError(
             f"{name}: the file has {count} {what}; at most {most} are read. Save what is needed in "
-            "a file of its own"
+            "a separate file"
         )
 
 
 def open_file(path: str | Path) -> File:
-    """Look at a file, ``-`` being standard input."""
+    """Return a file with its hash and format; ``-`` is standard input."""
     if str(path) == "-":
         if sys.stdin is None:
             raise DataError("standard input is closed; pipe the file into it, or name the file")
@@ -192,7 +192,7 @@ def open_file(path: str | Path) -> File:
         digest = hashlib.sha256(data).hexdigest()
         return _recognised(File(None, "standard input", len(data), digest, "", data))
     place = regular(path)
-    # names of files are bytes, and what is not UTF-8 in them could not be written into a report
+    # a file's name may hold bytes that are not UTF-8, which could not be written into a report
     name = str(place).encode(errors="backslashreplace").decode()
     try:
         with place.open("rb") as stream:
@@ -221,15 +221,15 @@ def _recognised(file: File) -> File:
     if not head or (head.isspace() and file.data.isspace()):
         raise DataError(f"{file.name}: the file is empty")
     name = _format(file, head, suffix)
-    is_format = FORMATS[name]
+    actual = FORMATS[name]
     allowed = [one for one in FORMATS.values() if suffix and suffix in one.extensions.split()]
-    if allowed and is_format not in allowed:
+    if allowed and actual not in allowed:
         raise DataError(
             f"{file.name}: the extension {suffix} says {allowed[0].name}, the content is "
-            f"{is_format.name}; rename the file to what it is"
+            f"{actual.name}; rename the file to what it is"
         )
-    if not is_format.reader:
-        raise DataError(f"{file.name}: {is_format.name} is not read; save it as .xlsx or .csv")
+    if not actual.reader:
+        raise DataError(f"{file.name}: {actual.name} is not read; save it as .xlsx or .csv")
     return replace(file, format=name)
 
 
@@ -237,7 +237,7 @@ def _format(file: File, head: bytes, suffix: str) -> str:
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return _archive(file, suffix) if kind == "zip" else kind
-    # HDF5 may begin behind a block of the user's own: of 512 bytes, 1024, 2048, ...
+    # HDF5 may begin after a user block of 512 bytes, 1024, 2048, ...
     if suffix in (".h5", ".hdf5") and any(file.data.startswith(_HDF5, 512 << k) for k in range(12)):
         return "hdf5"
     if suffix == ".mat" and b"\0" in head[:4]:
@@ -252,7 +252,7 @@ def _format(file: File, head: bytes, suffix: str) -> str:
 
 
 def _archive(file: File, suffix: str) -> str:
-    """Say what a ZIP archive is, once it holds no more than it may."""
+    """Return the format of a ZIP archive, after a check of its unpacked size."""
     try:
         with zipfile.ZipFile(file.stream()) as archive:
             members = archive.infolist()
@@ -262,7 +262,7 @@ def _archive(file: File, suffix: str) -> str:
                 return "excel"
             if "mimetype" in names and b"opendocument.spreadsheet" in archive.read("mimetype"):
                 return "ods"
-    except DataError:  # a ValueError too
+    except DataError:  # which ZIP_ERRORS would catch as a ValueError
         raise
     except ZIP_ERRORS:  # its reader will report the damage
         return {".ods": "ods", ".npz": "npz"}.get(suffix, "excel" if "xls" in suffix else "zip")
@@ -301,12 +301,15 @@ class Answer(NamedTuple):
 
 
 def apart(work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = None) -> Answer:
-    """Return a function's result, within limits of time and of memory beyond that in use."""
+    """Return a function's result, computed in a child process with limits of time and memory.
+
+    `bytes_at_most` are in addition to the memory that is already in use.
+    """
     if not hasattr(os, "fork"):
         return Answer(work())
     reading, writing = os.pipe()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # other threads are not touched
+        warnings.simplefilter("ignore", DeprecationWarning)  # the child does not use other threads
         process = os.fork()
     if process == 0:  # pragma: no cover
         try:
@@ -318,7 +321,7 @@ def apart(work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = 
             pickle.dump(answer, pipe)
         os._exit(0)
     os.close(writing)
-    timer = threading.Timer(2.0 * seconds, os.kill, (process, signal.SIGKILL))  # on the clock
+    timer = threading.Timer(2.0 * seconds, os.kill, (process, signal.SIGKILL))  # wall clock
     timer.start()
     with os.fdopen(reading, "rb") as pipe:
         content = pipe.read()
@@ -333,7 +336,7 @@ def apart(work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = 
 
 
 def _limit(seconds: int, bytes_at_most: int | None) -> None:  # pragma: no cover
-    """Limit the processor time and the memory of this process, which prints nothing."""
+    """Limit the processor time and the memory of this process, and silence it."""
     import resource
 
     faulthandler.disable()
@@ -341,7 +344,7 @@ def _limit(seconds: int, bytes_at_most: int | None) -> None:  # pragma: no cover
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     if bytes_at_most is not None:
-        with contextlib.suppress(OSError):  # where there is no such file, the limit is the whole
+        with contextlib.suppress(OSError):  # without /proc, memory in use counts as well
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             bytes_at_most += pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (bytes_at_most, bytes_at_most))
