@@ -168,15 +168,15 @@ def test_a_lock_left_by_a_killed_run_or_removed_by_another_does_not_matter(tmp_p
     lock = tmp_path / "chain.h5.lock"
     lock.touch()
     seen: list[bool] = []
-    is_still = storage._is_still
+    is_same_file = storage._is_same_file
 
     def removed_once(path, file):
         if not seen:
             lock.unlink()
-        seen.append(is_still(path, file))
+        seen.append(is_same_file(path, file))
         return seen[-1]
 
-    monkeypatch.setattr(storage, "_is_still", removed_once)
+    monkeypatch.setattr(storage, "_is_same_file", removed_once)
     assert sampled(path, seed=9, steps=60).steps == 60
     assert seen == [False, True]
     assert not lock.exists()

@@ -292,7 +292,7 @@ class TestMatlab:
 
     def test_no_matlab_file(self, tmp_path):
         (tmp_path / "a.mat").write_bytes(b"\x07\x08\x00" * 99)
-        with pytest.raises(DataError, match="the file is damaged or no MATLAB file"):
+        with pytest.raises(DataError, match="the file is damaged or not a MATLAB file"):
             read_record(tmp_path / "a.mat")
 
     def test_nothing_but_a_cube(self, tmp_path):

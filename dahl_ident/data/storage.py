@@ -1,4 +1,4 @@
-"""Tables to files without loss: CSV, TSV, Parquet and HDF5; incomplete files are never left."""
+"""Tables written without loss to CSV, TSV, Parquet and HDF5; no incomplete file is ever left."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False
     """Write a table in the format of the path's extension."""
     place = Path(path)
     packed = place.suffix.lower() == ".gz" and Path(place.stem).suffix.lower() in (".csv", ".tsv")
-    named = Path(place.stem) if packed else place_of(place, "a table", (*_WRITERS, ".csv.gz"))
-    content = _WRITERS[named.suffix.lower()](frame)
+    table = Path(place.stem) if packed else place_of(place, "a table", (*_WRITERS, ".csv.gz"))
+    content = _WRITERS[table.suffix.lower()](frame)
     write_whole(place, gzip.compress(content, mtime=0) if packed else content, overwrite=overwrite)
     return place
 
 
 def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
-    """Return the path, which has to have one of the endings."""
+    """Return the path; raise if it has none of the endings."""
     place = Path(path)
     if place.suffix.lower() not in endings:
         raise ValidationError(
@@ -58,7 +58,7 @@ def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
 
 
 def regular(path: str | Path, what: str = "the file") -> Path:
-    """Return the path of a file, which has to be a regular one: others may never end."""
+    """Return the path of a regular file; raise for others, because reading them may never end."""
     place = Path(path)
     try:
         kind = stat.S_IFMT(place.stat().st_mode)
@@ -115,7 +115,7 @@ def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
         refuse_existing(path)
     try:
         put_in_place(path, lambda part: part.write_bytes(content), overwrite=overwrite)
-    except FileExistsError:  # somebody else has written it meanwhile
+    except FileExistsError:  # another process has written it meanwhile
         refuse_existing(path)
         raise
     except OSError as exc:
@@ -128,7 +128,7 @@ def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool
     `write` gets the path to write to; whatever it raises leaves `path` alone. Of several writers
     without `overwrite`, all but the first get a FileExistsError.
     """
-    # not a file of tempfile, which nobody else may read
+    # not by tempfile, whose files other users cannot read
     part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.part")
     try:
         write(part)
@@ -172,7 +172,7 @@ def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
                 raise error(
                     f"another run is writing {file}; wait for its end, or give another file"
                 ) from None
-            if not _is_still(path, lock):  # its last owner has removed it meanwhile
+            if not _is_same_file(path, lock):  # the previous owner has removed it meanwhile
                 continue
             try:
                 yield
@@ -181,7 +181,7 @@ def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
             return
 
 
-def _is_still(path: Path, file: IO[str]) -> bool:
+def _is_same_file(path: Path, file: IO[str]) -> bool:
     """Return whether an open file is the one that the path names."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
@@ -190,17 +190,21 @@ def _is_still(path: Path, file: IO[str]) -> bool:
 
 
 def inert(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose texts no spreadsheet takes for formulas: those get an apostrophe."""
-    return _texts(frame, lambda text: f"'{text}" if _runs(text) else text)
+    """Return a table in which texts that a spreadsheet would run begin with an apostrophe."""
+    return _with_texts(frame, lambda text: f"'{text}" if _is_formula(text) else text)
 
 
 def as_before_inert(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the table that :func:`inert` was given."""
-    return _texts(frame, lambda text: text[1:] if text[:1] == "'" and _runs(text) else text)
+
+    def without_apostrophe(text: str) -> str:
+        return text[1:] if text[:1] == "'" and _is_formula(text) else text
+
+    return _with_texts(frame, without_apostrophe)
 
 
-def _runs(text: str) -> bool:
-    """Return whether a spreadsheet would run a text, but for apostrophes in front of it."""
+def _is_formula(text: str) -> bool:
+    """Return whether a spreadsheet would run a text without the apostrophes before it."""
     bare = text.lstrip("'")
     try:
         float(bare)
@@ -209,8 +213,8 @@ def _runs(text: str) -> bool:
     return False
 
 
-def _texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
-    """Return a table with another text in each cell that holds text, column names included."""
+def _with_texts(frame: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFrame:
+    """Return a table with each text changed, in cells and in column names."""
 
     def cell(value: Any) -> Any:
         return change(value) if isinstance(value, str) else value
@@ -235,7 +239,7 @@ def library(module: str, extra: str | None = None) -> Any:
 
 
 def digest(value: Any) -> str:
-    """Return the SHA-256 of plain data, the same whatever the order of mappings."""
+    """Return the SHA-256 of plain data; it does not depend on the order of mappings."""
     text = json.dumps(plain_data(value), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
@@ -244,12 +248,12 @@ def read_metadata(text: Any) -> dict[str, Any]:
     """Return what an earlier save of this package wrote together with a table."""
     try:
         content = json.loads(text)
-        known = isinstance(content, dict) and all(
+        valid = isinstance(content, dict) and all(
             key in _SAVED and _SAVED[key](value) for key, value in content.items()
         )
     except (RecursionError, TypeError) as exc:
         raise ValueError("the comment of this package is not JSON") from exc
-    if not known:
+    if not valid:
         raise ValueError("the comment of this package holds something else than it wrote")
     return dict(content)
 
@@ -263,7 +267,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_provenance(value: Any) -> bool:
-    """Return whether a value is the provenance of data, or of made from; or None."""
+    """Return whether a value is provenance of the form that this package writes, or None."""
     if not isinstance(value, dict):
         return value is None
     parts = value.get("parts", [])
@@ -285,9 +289,9 @@ _SAVED: dict[str, Callable[[Any], bool]] = {
 
 
 def plain_data(value: Any, *, not_finite: Callable[[float], Any] = float) -> Any:
-    """Return mappings as dicts, sequences as lists and complex numbers as pairs, as JSON has them.
+    """Return mappings as dicts, sequences as lists and complex numbers as pairs, for JSON.
 
-    `not_finite` says what becomes of NaN and infinity, which strict JSON does not know.
+    `not_finite` replaces NaN and infinity, which strict JSON does not have.
     """
     if isinstance(value, Mapping):
         return {str(k): plain_data(v, not_finite=not_finite) for k, v in value.items()}

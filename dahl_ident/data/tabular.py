@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Lines = Sequence[tuple[str, str]]
 ASSUMED = "assumed"
-"""The note in the provenance where a table has no frequency."""
+"""The note in the provenance of a table that does not state its frequency."""
 _SHOWN = 8  # items that fit into a line of a message
 
 
@@ -63,7 +63,7 @@ def distinct(values: NDArray[Any]) -> list[Any]:
 
 
 def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Return the file, or the number of files, and what had to be assumed on reading."""
+    """Return lines with the files, the warnings, and what was assumed on reading."""
     if provenance is None:
         return []
     parts = provenance.get("parts", [provenance])
@@ -75,7 +75,7 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def doubts(provenance: Mapping[str, Any] | None) -> list[str]:
-    """Return the warnings that were shown on reading data, and what they were made from."""
+    """Return the warnings that were shown on reading the data, or their sources."""
     warnings: list[str] = []
     for part in _origins(provenance):
         file = f"{part['file']}: " if "file" in part else ""
@@ -84,18 +84,18 @@ def doubts(provenance: Mapping[str, Any] | None) -> list[str]:
 
 
 def assumes_frequency(provenance: Mapping[str, Any] | None) -> bool:
-    """Return whether a table, or one that it was made from, did not say its frequency."""
+    """Return whether a table, or one of its sources, does not state its frequency."""
     return any(part.get("frequency") == ASSUMED for part in _origins(provenance))
 
 
 def _origins(provenance: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
-    """Yield the provenance of data, and of all that they were made from, breadth first."""
+    """Yield the provenance of data, and of all their sources, breadth first."""
     waiting = [provenance or {}]
     while waiting:
         part = waiting.pop(0)
         yield part
-        makers = (*part.get("parts", ()), part.get("origin"))
-        waiting += [maker for maker in makers if isinstance(maker, Mapping)]
+        sources = (*part.get("parts", ()), part.get("origin"))
+        waiting += [source for source in sources if isinstance(source, Mapping)]
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -149,7 +149,7 @@ class Tabular(ABC):
         Raises
         ------
         ValidationError
-            If the ending is another one.
+            If the path has another ending.
         DataError
             If a file is there already, or the place cannot be written to.
 

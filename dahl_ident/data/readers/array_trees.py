@@ -1,7 +1,8 @@
-"""Named arrays in a tree, as MATLAB, HDF5 and NumPy keep them, to channels.
+"""Channels from the trees of named arrays in MATLAB, HDF5 and NumPy files.
 
 A path names an array: ``FRdata.ForceControl[2].frequency`` in MATLAB files (indices count from 0),
-``group/dataset`` in HDF5. A matrix is its columns or rows, whichever are fewer: ``data[:,0]``.
+``group/dataset`` in HDF5. A matrix gives a channel for each of its columns, or of its rows if these
+are fewer: ``data[:,0]``.
 """
 
 from __future__ import annotations
@@ -20,17 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.data.raw_columns import RawChannel, RawFile, Stored, split_header, words
-from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File, apart, refuse_many
+from dahl_ident.data.readers.file import DEEPEST, MOST_CHANNELS, File, in_child_process, refuse_many
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-_WIDEST = 64  # columns and rows: a matrix with more of both is a map or a picture
-_SECONDS, _BYTES_A_SECOND = 5, 10_000_000  # in which MATLAB's files are read
-_LOOK_SECONDS = 1  # a look at a good file takes some milliseconds,
-_LOOK_BYTES_A_SECOND = 1_000_000  # and at one of many small objects 0.2 ms for each 300 bytes
+_WIDEST = 64  # a matrix with more columns and more rows is a map or a picture
+_SECONDS, _BYTES_PER_SECOND = 5, 10_000_000  # time limit for a MATLAB file: constant, and by size
+# The same for a check of an HDF5 file. Most take some milliseconds; one of many small objects takes
+# 0.2 ms for each 300 bytes.
+_CHECK_SECONDS, _CHECK_BYTES_PER_SECOND = 1, 1_000_000
+_CHECKED_BYTES = 1 << 24  # of data that the check reads
 _PACKING = {"scale_factor", "add_offset", "_FillValue", "missing_value"}
-_LOOKED_AT = 1 << 24  # bytes that are searched in all
 Leaf = tuple[str, Any, str | None]  # path, array or Stored, unit
 
 
@@ -42,7 +44,7 @@ def tree_source(
     for path, value, unit in leaves:
         if unit is None:
             path, unit = split_header(path)
-        file.refuse_above_limit(8 * math.prod(np.shape(value)), path)  # as numbers, once read
+        file.refuse_above_limit(8 * math.prod(np.shape(value)), path)  # 8 bytes for each number
         columns = list(_channels(path, value, unit))
         channels += columns
         if not columns:
@@ -63,12 +65,12 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
     too_wide = len(shape) > 2 or (len(shape) == 2 and min(shape) > _WIDEST)
     if array.dtype.kind not in "fiubcU" or 0 in array.shape or too_wide:
         return
-    upright = len(shape) < 2 or shape[1] <= shape[0]
+    by_columns = len(shape) < 2 or shape[1] <= shape[0]
     parts = [""]
     if len(shape) == 2:
-        parts = [f"[:,{i}]" if upright else f"[{i},:]" for i in range(min(shape))]
+        parts = [f"[:,{i}]" if by_columns else f"[{i},:]" for i in range(min(shape))]
     for i, index in enumerate(parts):
-        read = partial(_column, array, shape, i, upright)
+        read = partial(_column, array, shape, i, by_columns)
         if not isinstance(array, Stored):
             content: Any = read(slice(None))
         elif array.shape == shape and len(shape) == 1:
@@ -78,22 +80,24 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
         yield RawChannel(path + index, content, unit, short=short + index)
 
 
-def _column(array: Any, shape: tuple[int, ...], i: int, upright: bool, rows: slice) -> NDArray[Any]:
-    """Return a part of one column or row of a matrix, or of a vector in one."""
+def _column(
+    array: Any, shape: tuple[int, ...], i: int, by_columns: bool, rows: slice
+) -> NDArray[Any]:
+    """Return `rows` of the column (or row) `i` of a matrix, or of a vector stored as a matrix."""
     if not isinstance(array, Stored):
         matrix = array.reshape(shape)
-    elif rows != slice(None) and upright and array.shape == shape:
+    elif rows != slice(None) and by_columns and array.shape == shape:
         matrix = array[rows]
         rows = slice(None)
     else:
         matrix = array.array.reshape(shape)
     if len(shape) < 2:
         return np.asarray(matrix[rows] if shape else matrix)
-    return np.asarray(matrix[rows, i] if upright else matrix[i, rows])
+    return np.asarray(matrix[rows, i] if by_columns else matrix[i, rows])
 
 
 def read_npz(file: File) -> RawFile:
-    """Return the arrays of a ``.npz`` file; objects, which would have to be run, are refused."""
+    """Return the arrays of a ``.npz`` file; refuse pickled objects, which could run code."""
     with np.load(io.BytesIO(file.data), allow_pickle=False) as content:
         names = content.files
         refuse_many(file.name, len(names), "arrays")
@@ -106,7 +110,7 @@ def read_npz(file: File) -> RawFile:
 
 
 def read_npy(file: File) -> RawFile:
-    """Return the columns of the matrix, or the fields of the table, in a ``.npy`` file."""
+    """Return the columns of a ``.npy`` file's matrix, or the fields of its structured array."""
     mapped = file.content is None
     stream = file.stream()
     array = np.load(stream, mmap_mode="r" if mapped else None, allow_pickle=False)
@@ -117,12 +121,12 @@ def read_npy(file: File) -> RawFile:
 
 
 def _fields(path: str, array: NDArray[Any], mapped: File | None = None) -> Iterator[Leaf]:
-    """Yield an array, or each field of a table; of a mapped file each part is a mapping again."""
+    """Yield an array, or each field of a structured one; those of a mapped file are read later."""
 
     def read(field: str | None, rows: slice) -> NDArray[Any]:
-        assert mapped is not None  # others are in memory
-        again = np.load(mapped.stream(), mmap_mode="r", allow_pickle=False)
-        return np.array((again if field is None else again[field])[rows])
+        assert mapped is not None  # other arrays are in memory
+        content = np.load(mapped.stream(), mmap_mode="r", allow_pickle=False)
+        return np.array((content if field is None else content[field])[rows])
 
     for field in array.dtype.names or (None,):
         values: Any = array if field is None else array[field]
@@ -139,13 +143,13 @@ def read_matlab(file: File) -> RawFile:
 
     def load() -> Any:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a variable twice, or one that cannot be read
+            warnings.simplefilter("error")  # a duplicate variable, or one that cannot be read
             return loadmat(file.stream(), appendmat=False)
 
-    seconds = _SECONDS + file.length // _BYTES_A_SECOND
-    content, error = apart(load, seconds=seconds, bytes_at_most=2 * file.limit)
+    seconds = _SECONDS + file.length // _BYTES_PER_SECOND
+    content, error = in_child_process(load, seconds=seconds, bytes_at_most=2 * file.limit)
     if error:
-        raise DataError(f"{file.name}: the file is damaged or no MATLAB file: {error}")
+        raise DataError(f"{file.name}: the file is damaged or not a MATLAB file: {error}")
     names = [name for name in content if not name.startswith("__")]
     leaves = (leaf for name in names for leaf in _matlab_leaves(file, content[name], name, 0))
     return tree_source(file, "MATLAB", leaves)
@@ -175,8 +179,8 @@ def read_hdf5(file: File) -> RawFile:
     """Return the data sets of an HDF5 or MATLAB v7.3 file."""
     h5py = library("h5py")
     _refuse_fatal(file, h5py)
-    root = h5py.File(file.stream(), "r")  # open as long as an array of it waits to be read
-    # Bytes that were added move others; the library itself refuses a file that is too short.
+    root = h5py.File(file.stream(), "r")  # stays open until its arrays have been read
+    # Bytes that were added have shifted others; h5py itself refuses a file that is too short.
     # (HDF5 File Format Specification, II.A: the superblock)
     with file.opened() as content:
         content.seek(root.userblock_size)
@@ -195,12 +199,15 @@ def read_hdf5(file: File) -> RawFile:
 
 
 def _refuse_fatal(file: File, h5py: Any) -> None:
-    """Visit every object, and read the data sets whose places the file has to look up."""
+    """Refuse a file on which the library hangs or crashes.
 
-    def look() -> None:  # pragma: no cover
+    A child process visits every object, and reads chunked data sets, which have an index.
+    """
+
+    def visit() -> None:  # pragma: no cover
         with contextlib.suppress(Exception), h5py.File(file.stream(), "r") as root:
-            dict(root.attrs)  # an error will be met again, and named, by the reader
-            left = _LOOKED_AT
+            dict(root.attrs)  # the reader will meet an error again, and report it
+            left = _CHECKED_BYTES
             for _, item in _Tree(file, root, h5py).all_items(root, 0):
                 with contextlib.suppress(Exception):
                     dict(item.attrs)
@@ -209,7 +216,9 @@ def _refuse_fatal(file: File, h5py: Any) -> None:
                         _ = item[()] if item.nbytes < left else (item[:1], item[-1:])
                     left -= min(item.nbytes, left)
 
-    error = apart(look, seconds=_LOOK_SECONDS + file.length // _LOOK_BYTES_A_SECOND).error
+    error = in_child_process(
+        visit, seconds=_CHECK_SECONDS + file.length // _CHECK_BYTES_PER_SECOND
+    ).error
     if error:
         raise ValueError(f"{error} on its structure")
 
@@ -223,7 +232,7 @@ class _Tree:
         self.count = 0
 
     def members(self, group: Any, depth: int) -> Iterator[tuple[str, Any]]:
-        """Yield what a group holds itself; links to elsewhere are not followed."""
+        """Yield the members of a group; soft and external links are not followed."""
         if depth > DEEPEST:
             raise DataError(f"{self.file.name}: groups are nested deeper than {DEEPEST} levels")
         for name in group:
@@ -263,24 +272,24 @@ class _Tree:
             yield path, words(np.ravel(item.asstr()[()])).reshape(item.shape), unit
         elif item.dtype.names:
             for name in item.dtype.names:
-                form = operator.itemgetter(name)
-                yield f"{path}.{name}", self.stored(item, path, item.dtype[name], form), unit
+                convert = operator.itemgetter(name)
+                yield f"{path}.{name}", self.stored(item, path, item.dtype[name], convert), unit
         elif _PACKING & item.attrs.keys():
             yield path, self.stored(item, path, np.float64, partial(_unpacked, item.attrs)), unit
         else:
             yield path, self.stored(item, path, item.dtype, np.asarray), unit
 
     def stored(
-        self, item: Any, path: str, dtype: Any, form: Any, *, turned: bool = False
+        self, item: Any, path: str, dtype: Any, convert: Any, *, transposed: bool = False
     ) -> Stored:
         """Return an array that is read when it is used."""
 
         def read(rows: slice) -> NDArray[Any]:
             self.refuse(item, path)
-            array = form(item[()] if rows == slice(None) or turned else item[rows])
-            return np.asarray(array[rows] if turned else array)
+            array = convert(item[()] if rows == slice(None) or transposed else item[rows])
+            return np.asarray(array[rows] if transposed else array)
 
-        shape = tuple(int(n) for n in (item.shape[::-1] if turned else item.shape))
+        shape = tuple(int(n) for n in (item.shape[::-1] if transposed else item.shape))
         return Stored(shape, np.dtype(dtype), read, f"{self.file.name}: {path}")
 
     def refuse(self, item: Any, path: str) -> None:
@@ -325,12 +334,12 @@ class _Tree:
         elif "MATLAB_empty" not in item.attrs:
             parts = item.dtype.names == ("real", "imag")
             kind = np.dtype(np.complex128) if parts else item.dtype
-            form = _joined if parts else np.transpose
-            yield where, self.stored(item, where, kind, form, turned=True), None
+            convert = _as_complex if parts else np.transpose
+            yield where, self.stored(item, where, kind, convert, transposed=True), None
 
 
 def _unpacked(attributes: Any, array: NDArray[Any]) -> NDArray[np.float64]:
-    """Return what numbers stand for, as NetCDF packs them; a missing one is NaN."""
+    """Return the values that NetCDF packed as these numbers; missing ones are NaN."""
     values = array * float(np.squeeze(attributes.get("scale_factor", 1.0)))
     values = np.asarray(values + float(np.squeeze(attributes.get("add_offset", 0.0))))
     for name in ("_FillValue", "missing_value"):
@@ -338,5 +347,5 @@ def _unpacked(attributes: Any, array: NDArray[Any]) -> NDArray[np.float64]:
     return values
 
 
-def _joined(parts: NDArray[Any]) -> NDArray[Any]:
+def _as_complex(parts: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(parts["real"].T + 1j * parts["imag"].T)

@@ -300,7 +300,9 @@ class Answer(NamedTuple):
     error: str = ""
 
 
-def apart(work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = None) -> Answer:
+def in_child_process(
+    work: Callable[[], Any], *, seconds: int, bytes_at_most: int | None = None
+) -> Answer:
     """Return a function's result, computed in a child process with limits of time and memory.
 
     `bytes_at_most` are in addition to the memory that is already in use.

@@ -33,7 +33,7 @@ from dahl_ident.data.raw_columns import (
     split_header,
     words,
 )
-from dahl_ident.data.readers.file import ZIP_ERRORS, File, apart, refuse_many, utf8
+from dahl_ident.data.readers.file import ZIP_ERRORS, File, in_child_process, refuse_many, utf8
 from dahl_ident.data.rows import stated_levels
 from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
@@ -88,7 +88,7 @@ def _cells(file: File) -> dict[str, list[list[Any]]]:
             book = calamine.CalamineWorkbook.from_filelike(content)
             return {name: _rows(book, name) for name in book.sheet_names}
 
-    cells, error = apart(read, seconds=_SECONDS, bytes_at_most=_BYTES)
+    cells, error = in_child_process(read, seconds=_SECONDS, bytes_at_most=_BYTES)
     if error:
         raise DataError(f"{file.name}: the workbook is damaged, or too large: {error[:200]}")
     sheets: dict[str, list[list[Any]]] = cells
