@@ -1,9 +1,9 @@
-"""Confidence levels, and how many standard errors each of them takes.
+"""Confidence levels, and the number of standard errors for each of them.
 
 Where the noise's scale is known, an estimate's error is normal and the rise of -2 ln L follows
 chi-square; where the scale was estimated with nu degrees of freedom, they follow Student's t and
-F(1, nu). Both are expressed here by one number for each level: the threshold q, with ``theta_hat ±
-q stderr`` on one side and a rise of the deviance by q^2 on the other.
+F(1, nu). Both follow from one number for each level, the threshold q: the limits are ``theta_hat ±
+q stderr``, or lie where the deviance has risen by q^2.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dahl_ident.arrays import FloatArray, array_between
 from dahl_ident.errors import ValidationError
 from dahl_ident.fitting import Optimum
 
-CONFIDENCE = 0.9545  # of intervals that are stated alone: k = 2, as JCGM 100 has U
+CONFIDENCE = 0.9545  # of intervals for which no level is stated: k = 2, as for U in JCGM 100
 LEVELS = (0.6827, CONFIDENCE, 0.9973)  # one, two and three standard deviations
 # Student's t with more degrees of freedom is normal to all digits that a budget shows.
 MANY = 1e6
 
 
 def checked_levels(levels: Sequence[float] | float) -> FloatArray:
-    """Return confidence levels as an array, rising, or say what is wrong with them."""
+    """Return confidence levels as a rising array; raise if they are not valid."""
     array = np.sort(np.atleast_1d(array_between(levels, "levels", 0.0, 1.0)))
     if array.ndim != 1 or array.size == 0 or array[0] <= 0.0 or array[-1] >= 1.0:
         raise ValidationError(
@@ -40,7 +40,7 @@ def coverage_factor(dof: float) -> float:
 
 
 def coverage_factors(dof: ArrayLike, levels: ArrayLike) -> FloatArray:
-    """Return k of Student's t, of the normal distribution for infinite degrees of freedom.
+    """Return k of Student's t, or of the normal distribution for infinite degrees of freedom.
 
     Examples
     --------

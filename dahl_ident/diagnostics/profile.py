@@ -1,18 +1,18 @@
-r"""Profile likelihood: the deviance as a function of one parameter, the others being optimal.
+r"""Profile likelihood: the deviance as a function of one parameter, with all others optimal.
 
-The deviance of a parameter at a value is the rise of -2 ln L, with that parameter held there and
+The deviance of a parameter at a value is the rise of -2 ln L with that parameter held there and
 all others optimal,
 
     D(theta_i) = (min S(theta | theta_i) - min S(theta)) / s^2,
 
-s the noise's scale. Its square root with the sign of the side is nearly a straight line where the
-problem is nearly linear, and its slope is known without another search (the envelope theorem), so
-Newton's method on that root finds a limit in few steps. All parameters, both sides and all levels
-are searched together; each step solves all their constrained problems at once, from the tangent
-of the last solution.
+with s the noise's scale. Its square root, negative on the lower side, is nearly a straight line
+where the problem is nearly linear, and its slope follows without another search (the envelope
+theorem), so Newton's method on that root finds a limit in few steps. The limits of all parameters,
+sides and levels are searched together; each step solves all their constrained problems at once,
+starting along the tangent of the last solution.
 
-If a profile stays below its threshold up to the point where the model no longer changes, the
-interval is open on that side.
+If a profile stays below its threshold until the model no longer changes, the interval is open on
+that side.
 """
 
 from __future__ import annotations
@@ -38,50 +38,54 @@ from dahl_ident.problem import Quadratic
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-_NEAR = 1e-3  # of the target's distance; one more Newton step needs no evaluation
-_CLOSED = 1e-4  # width of a bracket over its distance
-_MARGIN = 0.02  # of a bracket's width that a step keeps from its ends
-_GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last, until the target is bracketed
-_STEPS = 60  # of the searches for limits, all together
-_SEARCH_STEPS = 40  # of a constrained search
-_TOLERANCE_FACTOR = 1e5  # still gives the deviance, flat at its minimum, to 1e-6
-_SAME_DEVIANCE = 0.1  # relative difference: 5 % of the distance to a limit
-_ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
+# Searches for limits
+_NEAR = 1e-3  # distance of the root from its target at which one last Newton step is exact enough
+_CLOSED = 1e-4  # width of a bracket over its distance, and
+_NARROW = 0.01  # in conditional standard errors, at which a limit is known well enough
+_MARGIN = 0.02  # distance that a step keeps from the ends of a bracket, over its width
+_GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last one, until the target is bracketed
 _LONGEST = 3.0  # step of a logarithm
-_TOGETHER = 8  # places of a curve that are searched at once, from the last one on their side
-_FARTHEST = 1e6  # conditional standard errors of a parameter that is not a logarithm
+_STEPS = 60  # most steps of the searches, which are made together
+_TOGETHER = 8  # points of a curve computed at once, from the last one on their side
+# Constrained searches
+_SEARCH_STEPS = 40
+_TOLERANCE_FACTOR = 1e5  # the deviance, flat at its minimum, still errs by 1e-6 only
+_ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
+_SAME_DEVIANCE = 0.1  # relative difference: 5 % of the distance to a limit
+# Where a search gives up
+_FARTHEST = 1e6  # conditional standard errors, if the parameter is not a logarithm
+_FARTHEST_LOG = 80.0  # distance of a logarithm from the optimum
+_FARTHEST_RATIO = 4.0  # the same of a pure number: an exponent or a gain
 _LEAST_X_C = 1e-14  # over the smallest amplitude
 _MOST_X_C, _MOST_X_C_WITH_SPRING = 1e8, 1e5  # over the largest, alone and in parallel with a spring
 _SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
-_FARTHEST_LOG = 80.0  # of a logarithm, from the optimum
 _FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
-_NARROW = 0.01  # conditional standard errors: a limit is known as well as that
-_FARTHEST_RATIO = 4.0  # of the logarithm of a pure number: an exponent or a gain
 
 
 class Bracket:
     """S searches outwards from 0, each for the point where its function reaches its target.
 
-    Of the `active` ones, the functions are wanted at `position`, (S,); `end`, (S,), is where the
-    targets are met, infinite where they are not.
+    The searches that are `active` need their functions at `position`, (S,). `end`, (S,), is where
+    the targets are met, infinite where they are not.
     """
 
     def __init__(
         self, target: FloatArray, step: FloatArray, furthest: FloatArray, logarithmic: BoolArray,
-        narrow_enough: FloatArray,
+        least_width: FloatArray,
     ) -> None:  # fmt: skip
         self._target, self._furthest, self._logarithmic = target, furthest, logarithmic
-        self._narrow_enough = narrow_enough
+        self._least_width = least_width
         self.position, self._step = np.minimum(step, furthest), step
         self._inner, self._outer = np.zeros(target.shape), np.full(target.shape, np.inf)
         self.end = np.full(target.shape, np.nan)
         self.active: IntArray = np.arange(target.size)
 
     def narrow(self, value: FloatArray, slope: FloatArray, hopeless: BoolArray) -> BoolArray:
-        """Take the functions' values and slopes at the active positions, and move on.
+        """Take the functions' values and slopes at the active positions, and choose the next ones.
 
-        Searches below their target that are `hopeless`, or as far out as they may go, end there.
-        Returns which of the active ones were below their targets.
+        A search ends where it meets its target. One below its target ends open if it is `hopeless`,
+        and at the furthest position if it has come so far. Returns which active searches were below
+        their targets.
         """
         a = self.active
         position, target = self.position[a], self._target[a]
@@ -92,27 +96,27 @@ class Bracket:
             newton = (target - value) / slope
             width = self._outer[a] - self._inner[a]
             met = (np.abs(value - target) < _NEAR) & np.isfinite(newton)
-            narrow = np.minimum(_CLOSED * self._outer[a], self._narrow_enough[a])
-            met |= np.isfinite(self._outer[a]) & (width <= narrow)
+            least_width = np.minimum(_CLOSED * self._outer[a], self._least_width[a])
+            met |= np.isfinite(self._outer[a]) & (width <= least_width)
         newton = np.where(np.isfinite(newton), newton, np.inf)
-        stuck = below & (position >= self._furthest[a]) & ~met
-        lost = below & hopeless & ~met & ~stuck
+        at_bound = below & (position >= self._furthest[a]) & ~met
+        is_open = below & hopeless & ~met & ~at_bound
         polished = position + np.where(np.abs(newton) < self._step[a], newton, 0.0)
         self.end[a[met]] = polished[met]
-        self.end[a[stuck]] = position[stuck]
-        self.end[a[lost]] = np.inf
-        going = ~(met | stuck | lost)
-        self.active = a[going]
-        self._move(newton[going], below[going])
+        self.end[a[at_bound]] = position[at_bound]
+        self.end[a[is_open]] = np.inf
+        continues = ~(met | at_bound | is_open)
+        self.active = a[continues]
+        self._move(newton[continues], below[continues])
         return below
 
     def give_up(self) -> FloatArray:
-        """Return the ends; searches that have none end at the outer side of their brackets."""
+        """Return the ends; searches without an end take the outer side of their brackets."""
         self.end[self.active] = self._outer[self.active]
         return self.end
 
     def _move(self, newton: FloatArray, below: BoolArray) -> None:
-        """Choose the next positions: Newton's, kept within the bracket and the longest step."""
+        """Set the next positions: Newton's, kept within the bracket and the longest step."""
         a = self.active
         position, inner, outer = self.position[a], self._inner[a], self._outer[a]
         bracketed = np.isfinite(outer)
@@ -169,10 +173,10 @@ class Profiler:
 
         Limits are searched with a prediction near the optimum that is far cheaper.
         """
-        far = ends[:, np.argmax(ends[1].max(axis=1))]
-        place, index = far.ravel(), np.tile(np.arange(far.shape[1]), 2)
-        known = np.isfinite(place)
-        index, moved = index[known], (place - self._optimum.theta[index])[known]
+        widest = ends[:, np.argmax(ends[1].max(axis=1))]
+        limit, index = widest.ravel(), np.tile(np.arange(widest.shape[1]), 2)
+        closed = np.isfinite(limit)
+        index, moved = index[closed], (limit - self._optimum.theta[index])[closed]
         if not index.size:
             return True
         theta = self._optimum.theta + moved[:, None] * self._tangents[index]
@@ -181,25 +185,25 @@ class Profiler:
             for p in (self._searched, self._problem)
         )
         with np.errstate(invalid="ignore"):
-            apart = np.abs(exact - near) > _SAME_DEVIANCE * np.abs(near - self._least)
-        return not (apart | ~np.isfinite(exact)).any()
+            differs = np.abs(exact - near) > _SAME_DEVIANCE * np.abs(near - self._least_cost)
+        return not (differs | ~np.isfinite(exact)).any()
 
     def _ends(self, index: IntArray, sign: FloatArray, target: FloatArray) -> FloatArray:
         """Return where the profile of parameter `index` meets `target` on the side of `sign`."""
         theta = np.tile(self._optimum.theta, (len(index), 1))
         tangent, origin = self._tangents[index], self._optimum.theta[index]
-        entered = np.zeros(len(index), dtype=np.bool_)
+        was_reachable = np.zeros(len(index), dtype=np.bool_)
         bracket = self._bracket(index, sign, target)
         for _ in range(_STEPS):
             a = bracket.active
             moved = sign[a] * bracket.position[a] + origin[a] - theta[a, index[a]]
             at = self._from_best_start(index[a], theta[a], self._along(tangent[a], moved))
             root = np.sqrt(np.maximum(at.deviance, 0.0))
-            reached = self._reachable(at.theta, index[a], bracket.position[a])
-            entered[a] |= reached
+            reachable = self._reachable(at.theta, index[a], bracket.position[a])
+            was_reachable[a] |= reachable
             with np.errstate(divide="ignore", invalid="ignore"):
                 slope = sign[a] * at.slope / root
-            below = bracket.narrow(root, slope, entered[a] & ~reached)
+            below = bracket.narrow(root, slope, was_reachable[a] & ~reachable)
             theta[a[below]], tangent[a[below]] = at.theta[below], at.tangent[below]
             if not bracket.active.size:
                 break
@@ -209,60 +213,60 @@ class Profiler:
         origin = self._optimum.theta[index]
         furthest = np.where(sign > 0.0, self._high[index] - origin, origin - self._low[index])
         step = self._first_step[index] * target
-        narrow = _NARROW * self._conditional[index]
-        return Bracket(target, step, furthest, self._logarithmic[index], narrow)
+        least_width = _NARROW * self._conditional[index]
+        return Bracket(target, step, furthest, self._logarithmic[index], least_width)
 
     def _from_best_start(
         self, index: IntArray, theta: FloatArray, change: FloatArray
     ) -> _ConstrainedOptima:
-        """Return constrained optima near theta + change, or far from it where friction is vague."""
+        """Return the best constrained optima from starts at theta + change, an edge or a valley."""
         moved, held = theta + change, np.arange(theta.shape[1]) == index[:, None]
-        inside = np.clip(moved, self._low, self._high)  # a change beyond all bounds says nothing
-        begins, rows = [np.where((inside == moved) | held, inside, theta)], [np.arange(len(index))]
+        inside = np.clip(moved, self._low, self._high)  # coordinates that would leave it stay
+        starts, rows = [np.where((inside == moved) | held, inside, theta)], [np.arange(len(index))]
         for edge in self._edges:
-            begins.append(np.where(held, begins[0], edge))
+            starts.append(np.where(held, starts[0], edge))
             rows.append(rows[0])
         for chart in self._microslip_charts:
-            bent, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
-            begins.append(bent[applies])
+            valley, applies = _along_valley(chart, index, theta, change, self._reach.smallest)
+            starts.append(valley[applies])
             rows.append(np.flatnonzero(applies))
         row = np.concatenate(rows)
-        return self._constrained(index[row], np.concatenate(begins)).lowest(row)
+        return self._constrained(index[row], np.concatenate(starts)).lowest(row)
 
     @cached_property
     def _edges(self) -> list[FloatArray]:
         """Starts in gross slip, where data with a free spring do not rule out microslip."""
-        sd, begins = np.sqrt(np.diagonal(self._optimum.covariance)), []
+        sd, starts = np.sqrt(np.diagonal(self._optimum.covariance)), []
         for chart in self._microslip_charts:
             f_max, sigma = _friction_of(chart)
             if max(sd[f_max], sd[sigma]) > DOUBTFUL:
-                ends = edge_starts(self._problem)
-                begins += [e for e in ends if e[f_max] - e[sigma] < self._reach.smallest]
-        return begins
+                edges = edge_starts(self._problem)
+                starts += [e for e in edges if e[f_max] - e[sigma] < self._reach.smallest]
+        return starts
 
     @cached_property
     def _microslip_charts(self) -> list[Chart]:
         return [] if self._problem.response is None else microslip_charts(self._problem)
 
     def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
-        """Return the change of theta along its tangent, limited in its logarithms."""
+        """Return the change of theta along its tangent; steps of other logarithms are limited."""
         change = moved[:, None] * tangent
-        short = np.clip(change, -_LONGEST, _LONGEST)
-        return np.where(self._logarithmic & (change != moved[:, None]), short, change)
+        limited = np.clip(change, -_LONGEST, _LONGEST)
+        return np.where(self._logarithmic & (change != moved[:, None]), limited, change)
 
     # Constrained problems
 
     def curve(self, index: int, coordinate: FloatArray) -> FloatArray:
         """Return the deviance of parameter `index` at each of `coordinate`."""
-        away = coordinate - self._optimum.theta[index]
-        order = np.argsort(np.abs(away))
+        distance = coordinate - self._optimum.theta[index]
+        order = np.argsort(np.abs(distance))
         deviance, last = np.empty(len(coordinate)), np.tile(self._optimum.theta, (2, 1))
-        for some in np.array_split(order, max(1, order.size // _TOGETHER)):
-            side = (away[some] > 0.0).astype(np.intp)
+        for block in np.array_split(order, max(1, order.size // _TOGETHER)):
+            side = (distance[block] > 0.0).astype(np.intp)
             start = last[side]
-            start[:, index] = coordinate[some]
-            at = self._constrained(np.full(some.size, index), start)
-            deviance[some], last[side] = at.deviance, at.theta  # the farthest stays
+            start[:, index] = coordinate[block]
+            at = self._constrained(np.full(block.size, index), start)
+            deviance[block], last[side] = at.deviance, at.theta  # the farthest on each side
         return np.maximum(deviance, 0.0)
 
     def _constrained(self, index: IntArray, start: FloatArray) -> _ConstrainedOptima:
@@ -272,12 +276,12 @@ class Profiler:
         held[rows, index] = True
         theta, at = self._minimised(held, np.clip(start, self._low, self._high))
         stretch = self._stretch[index]
-        deviance = 2.0 * (at.cost - self._least) * stretch
+        deviance = 2.0 * (at.cost - self._least_cost) * stretch
         slope = at.gradient[rows, index] * stretch
         return _ConstrainedOptima(theta, deviance, slope, _tangent(at.hessian, index))
 
     def _minimised(self, held: BoolArray, start: FloatArray) -> tuple[FloatArray, Quadratic]:
-        """Return the constrained optima, and the cost there: beyond the last step, as predicted."""
+        """Return the constrained optima, and the cost there as the last step predicts it."""
         S, P = start.shape
         theta, lowest = start.copy(), Quadratic(*(np.empty((S, *(P,) * k)) for k in range(3)))
         lowest.cost[:] = np.inf
@@ -287,8 +291,8 @@ class Profiler:
             rows = np.arange(S) if which is None else which
             lower = ~(cost > lowest.cost[rows])
             theta[rows[lower]] = at[lower]
-            for known, new in zip(lowest, (cost, gradient, hessian), strict=True):
-                known[rows[lower]] = new[lower]
+            for best, new in zip(lowest, (cost, gradient, hessian), strict=True):
+                best[rows[lower]] = new[lower]
             fixed = held if which is None else held[which]
             gradient = np.where(fixed, 0.0, gradient)
             either = fixed[:, :, None] | fixed[:, None, :]
@@ -300,17 +304,17 @@ class Profiler:
             accuracy=self._problem.accuracy, bounds=(self._low, self._high),
         ).theta  # fmt: skip
         step = ends - theta
-        moved = step.any(axis=1, keepdims=True)  # else a cost may be infinite
-        turn = np.where(moved, np.einsum("sij,sj->si", lowest.hessian, step), 0.0)
-        change = np.where(moved, (lowest.gradient + 0.5 * turn) * step, 0.0).sum(axis=1)
-        return ends, Quadratic(lowest.cost + change, lowest.gradient + turn, lowest.hessian)
+        moved = step.any(axis=1, keepdims=True)  # elsewhere derivatives may be infinite
+        bend = np.where(moved, np.einsum("sij,sj->si", lowest.hessian, step), 0.0)
+        change = np.where(moved, (lowest.gradient + 0.5 * bend) * step, 0.0).sum(axis=1)
+        return ends, Quadratic(lowest.cost + change, lowest.gradient + bend, lowest.hessian)
 
     def _quadratic(self, theta: FloatArray) -> Quadratic:
         at: Quadratic = self._searched.quadratic(theta, self._scale, self._loss)
         return at
 
     @cached_property
-    def _least(self) -> float:
+    def _least_cost(self) -> float:
         return self._optimum.cost / self._scale**2
 
     @cached_property
@@ -326,9 +330,9 @@ class Profiler:
 
     @cached_property
     def _stretch(self) -> FloatArray:
-        """Return the factors that give each deviance the spread of a chi-square.
+        """Return the factors that scale each deviance to follow chi-square.
 
-        That of a robust loss has one; that of residuals correlated in time one a parameter.
+        A robust loss has one factor; residuals correlated in time have one for each parameter.
         """
         in_time = self._problem.response is None
         if self._loss is None and not in_time:
@@ -351,7 +355,7 @@ class Profiler:
 
     @cached_property
     def _first_step(self) -> FloatArray:
-        """Return the first step of a threshold of 1: a standard error, in logarithms at most 1."""
+        """Return the first step for a threshold of 1: a standard error, of logarithms at most 1."""
         error = np.sqrt(np.diagonal(self._optimum.covariance))
         unknown = np.where(self._logarithmic, 1.0, self._conditional)
         step = np.where(np.isfinite(error) & (error > 0.0), error, unknown)
@@ -362,8 +366,8 @@ class Profiler:
     def _open(self) -> BoolArray:
         """Return which sides need no search, below and above, shape (2, P).
 
-        Those where the optimum lies at infinity or zero, and those of parameters that can change
-        without any change of the prediction.
+        These are the sides on which the optimum lies at infinity or zero, and those of parameters
+        that can change without any change of the prediction.
         """
         values, status = self._optimum.values, self._optimum.status
         flat = np.isinf(np.diagonal(self._optimum.covariance)) & (status is Status.SINGULAR)
@@ -380,14 +384,14 @@ class Profiler:
             ln_f_max, ln_sigma = (np.asarray(columns.get(p.name, _ln(p))) for p in (f_max, sigma))
             ln_x_c = ln_f_max - ln_sigma
             reach = self._reach
-            seen = (ln_x_c > reach.least) & (ln_x_c < reach.most) & (ln_sigma > reach.softest)
+            matters = (ln_x_c > reach.least) & (ln_x_c < reach.most) & (ln_sigma > reach.softest)
             cancels = (ln_sigma > reach.stiffest) & (ln_x_c > reach.smallest)
-            near &= ~of_friction | (seen & ~cancels)
+            near &= ~of_friction | (matters & ~cancels)
         return near
 
     @cached_property
     def _friction(self) -> list[tuple[Parameter, Parameter]]:
-        """Force limit and stiffness of every law that they scale together."""
+        """Force limit and stiffness of every law whose scale parameters these two are."""
         pairs: list[tuple[Parameter, Parameter]] = []
         for element in self._problem.model.elements if self._problem.response is not None else ():
             scale = {element.parameter(s).dimension: s for s in element.scale_parameters}
@@ -418,8 +422,8 @@ class Profiler:
 class _Distances(NamedTuple):
     """Range of ln x_c and ln sigma outside of which friction is at a limit.
 
-    Stiffer than `stiffest` with an x_c beyond the `smallest` amplitude, it is all but cancelled
-    by a spring.
+    Friction stiffer than `stiffest`, with an x_c above the `smallest` amplitude, is almost
+    cancelled by a negative spring.
     """
 
     least: float
@@ -431,7 +435,7 @@ class _Distances(NamedTuple):
 
 @dataclass(frozen=True)
 class _ConstrainedOptima:
-    """Constrained optima: theta, deviance, half its slope along the held coordinate, tangent."""
+    """Constrained optima: theta, deviance, half its slope in the held coordinate, and tangent."""
 
     theta: FloatArray
     deviance: FloatArray
@@ -439,7 +443,7 @@ class _ConstrainedOptima:
     tangent: FloatArray
 
     def lowest(self, row: IntArray) -> _ConstrainedOptima:
-        """Return the solution of the least deviance for each row, of several that belong to it."""
+        """Return the solution of least deviance among those of each row."""
         order = np.lexsort((self.deviance, row))
         best = order[np.unique(row[order], return_index=True)[1]]
         return _ConstrainedOptima(*(array[best] for array in vars(self).values()))
@@ -450,31 +454,31 @@ def _along_valley(
 ) -> tuple[FloatArray, BoolArray]:
     """Return theta with one coordinate moved at constant sigma^2/f_max and sigma + stiffness.
 
-    Also which rows this is for: those whose coordinate is part of the valley, and which stay
-    above the `least` ln x_c of microslip.
+    Also return to which rows this applies: their coordinate takes part in the valley, and ln x_c
+    stays above the `least` of microslip.
     """
     assert chart.tied is not None
     spring, _ = chart.tied
     f_max, sigma = _friction_of(chart)
-    wanted = (theta + change)[np.arange(len(index)), index]
+    target = (theta + change)[np.arange(len(index)), index]
     phi = chart.phi(theta)
     ln_kappa, total = phi[:, sigma], phi[:, spring]
     with np.errstate(invalid="ignore", divide="ignore"):
         ln_x_c: dict[int, FloatArray] = {
-            f_max: 0.5 * (wanted - ln_kappa),
-            sigma: wanted - ln_kappa,
-            spring: np.log(total - wanted) - ln_kappa,
+            f_max: 0.5 * (target - ln_kappa),
+            sigma: target - ln_kappa,
+            spring: np.log(total - target) - ln_kappa,
         }
     for column, value in ln_x_c.items():
         phi[:, f_max] = np.where(index == column, value, phi[:, f_max])
-    bent = chart.theta(phi)
-    bent[np.arange(len(index)), index] = wanted
+    moved = chart.theta(phi)
+    moved[np.arange(len(index)), index] = target
     applies = np.isin(index, np.array([*ln_x_c])) & (phi[:, f_max] > least)
-    return bent, applies & np.isfinite(bent).all(axis=1)
+    return moved, applies & np.isfinite(moved).all(axis=1)
 
 
 def _friction_of(chart: Chart) -> tuple[int, int]:
-    """Return the indices of f_max and sigma of the element whose valley it is."""
+    """Return the indices of f_max and sigma of the element to which a chart belongs."""
     assert chart.tied is not None
     sigma = chart.tied[1]
     (f_max,) = (int(i) for i in np.flatnonzero(chart.matrix[sigma]) if i != sigma)

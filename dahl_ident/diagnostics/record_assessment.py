@@ -42,7 +42,7 @@ from dahl_ident.fitting.record_search import hold_model
 from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.units import percent, shown_unit
 
-_LEAST = 1e-100  # of a positive value, or of a share of the response
+_LEAST = 1e-100  # smallest positive value, or misfit over the response
 _UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
 
 
@@ -69,11 +69,10 @@ class RecordBand:
 
 
 class RecordAssessment(Assessment):
-    """A fit of records, with its errors source by source."""
+    """A fit of records, with its errors by source."""
 
     problem: RecordProblem
     instead = "it has errors, residuals and hold_out() of the samples"
-
     with_less = None
 
     @property
@@ -90,17 +89,17 @@ class RecordAssessment(Assessment):
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """Names of parameters that were not given; the uncertainty counts their ranges."""
+        """Names of parameters whose values are assumed; the uncertainty counts their ranges."""
         return tuple(one.name for one in self.errors.assumed)
 
     @property
     def success(self) -> bool:
-        """Whether the search converged, also where the records leave a parameter undetermined."""
+        """Whether the search converged, even if the records leave a parameter undetermined."""
         return self.optimum.converged
 
     @cached_property
     def model(self) -> Model:
-        """The model with the estimates put in, fixed."""
+        """The model with every parameter fixed at its estimate."""
         values = dict(zip(self.optimum.names, self.optimum.values.tolist(), strict=True))
         return self.problem.model.with_fixed(
             {p.name: p.nearest(values[p.name]) for p in self.problem.free}
@@ -108,8 +107,8 @@ class RecordAssessment(Assessment):
 
     @cached_property
     def _evaluated(self) -> tuple[list[FloatArray], list[FloatArray]]:
-        places = range(len(self.problem.records))
-        predictions = [self.problem.predict(self.optimum.values, i) for i in places]
+        numbers = range(len(self.problem.records))
+        predictions = [self.problem.predict(self.optimum.values, i) for i in numbers]
         residuals = [y - p.output for y, p in zip(self.problem.measured, predictions, strict=True)]
         return [p.by for p in predictions], residuals
 
@@ -120,14 +119,14 @@ class RecordAssessment(Assessment):
 
     @cached_property
     def errors(self) -> RecordErrors:
-        """The estimate's uncertainty, source by source."""
+        """The estimate's uncertainty by source."""
         jacobians, residuals = self._evaluated
         loss = loss_named(self.optimum.loss, self.problem.parts)
-        if loss is not None:  # to first order, least squares of these residuals
+        if loss is not None:  # to first order it is least squares of the scores
             units = [size * self.optimum.scale for size in self.problem.sizes]
-            whole = np.concatenate([e / unit for e, unit in zip(residuals, units, strict=True)])
+            scaled = np.concatenate([e / unit for e, unit in zip(residuals, units, strict=True)])
             ends = np.cumsum([e.size for e in residuals])[:-1]
-            scores = np.split(loss.scores(whole), ends)
+            scores = np.split(loss.scores(scaled), ends)
             residuals = [unit * part for unit, part in zip(units, scores, strict=True)]
         if self.first_order:
             return errors_on_constraints(self.optimum, jacobians, residuals)
@@ -135,7 +134,7 @@ class RecordAssessment(Assessment):
 
     @property
     def covar(self) -> FloatArray:
-        """Covariance of the free values, every source together."""
+        """Covariance of the free values, from all sources together."""
         return self.errors.covariance
 
     @property
@@ -170,17 +169,15 @@ class RecordAssessment(Assessment):
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
-        # of what was assumed, in the logarithm
-        more = coverage_factors(self.errors.least_dof, array[:, None]) * [
-            one.std for one in assumed
-        ]
-        held = np.array([one.value for one in assumed])
+        ln_u = np.array([one.std for one in assumed])
+        ln_U = coverage_factors(self.errors.least_dof, array[:, None]) * ln_u
+        assumed_values = np.array([one.value for one in assumed])
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
         return ConfidenceIntervals(
             "combined", array, (*self.problem.names, *(one.name for one in assumed)),
             (*(p.unit for p in self.problem.parameters), *(one.unit for one in assumed)),
-            np.append(values, held), np.hstack([lower, held * np.exp(-more)]),
-            np.hstack([upper, held * np.exp(more)]), note,
+            np.append(values, assumed_values), np.hstack([lower, assumed_values * np.exp(-ln_U)]),
+            np.hstack([upper, assumed_values * np.exp(ln_U)]), note,
         )  # fmt: skip
 
     @cached_property
@@ -195,13 +192,13 @@ class RecordAssessment(Assessment):
         verdicts: dict[str, ParameterVerdict] = {}
         for name, unit in zip(self.problem.names, limits.units, strict=False):
             verdict = Verdict.NOT_IDENTIFIED if name in why else Verdict.IDENTIFIED
-            known = f"not determined{why[name]}" if name in why else verdict.value
-            verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], known)
+            text = f"not determined{why[name]}" if name in why else verdict.value
+            verdicts[name] = ParameterVerdict(name, unit, verdict, limits[name][1], text)
         return Identifiability(verdicts, (), {})
 
     @property
     def constraint_cost(self) -> ConstraintCost | None:
-        """The cost of constraints; correlated samples count as fewer."""
+        """The cost of constraints, for the effective number of independent samples."""
         cost = self.optimum.constraint_cost
         share = self.errors.effective / self.problem.n_samples
         return cost and replace(cost, rise=cost.rise * share, dof=cost.dof * share)
@@ -213,26 +210,27 @@ class RecordAssessment(Assessment):
 
     @property
     def misses(self) -> bool:
-        """Whether the model misses more than noise."""
+        """Whether the model has a misfit in excess of noise."""
         return not {MODEL_ERROR, ALONG_MOTION}.isdisjoint(self.errors.contributions)
 
     @property
     def contradicted_exponents(self) -> Iterator[ContradictedExponent]:
         """The exponents that the records contradict, or put outside their range."""
-        for one in (one for one in self.errors.exponents if one.contradicted):
-            asked = one.value * float(np.exp(one.asked))
-            limits = one.range if one.assumed else None
-            yield ContradictedExponent(one.name, one.value, asked, asked * one.by_records, limits)
+        for one in self.errors.exponents:
+            if one.contradicted:
+                asked = one.value * float(np.exp(one.asked))
+                u, limits = asked * one.by_records, one.range if one.assumed else None
+                yield ContradictedExponent(one.name, one.value, asked, u, limits)
 
     @property
     def missed(self) -> tuple[float, float] | None:
-        """The misfit, twice; None where there is none, or the output is a motion."""
+        """The misfit, within runs and in all; None if there is none, or the output is a motion."""
         if self.problem.output == "motion" or not self.misses:
             return None
         return (self.goodness.rms_in_band,) * 2
 
     def force_share(self, element: Element, value: float) -> float:
-        """Return the rms force of an element of one parameter over that of the whole."""
+        """Return the rms force of an element of one parameter, over that of the records."""
         size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
         force = [
             element.force_history([value], x, v, 0.0, acceleration=a)
@@ -243,8 +241,8 @@ class RecordAssessment(Assessment):
     def design(self, *, counted: bool) -> dict[str, Any]:
         """Return what the number of records assumes."""
         exponents = self.problem.exponents
-        unfound = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
-        return {"single_run": self.errors.runs < 2, "unfound": tuple(unfound * counted)}
+        unseen = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
+        return {"single_run": self.errors.runs < 2, "unfound": tuple(unseen * counted)}
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -294,7 +292,7 @@ class RecordAssessment(Assessment):
 
     @cached_property
     def device(self) -> tuple[Optimum, None, None]:
-        """The estimate as that of a table of one row; its noise is what the model misses."""
+        """The estimate as that of a table of one row, whose noise is the model's misfit."""
         one = FrequencyResponse([1.0], [1.0], [1.0], motion=self.problem.motion)
         problem: TableProblem = self.problem.at(one).like(noise="relative")
         count = self.problem.n_reported
@@ -332,7 +330,7 @@ class RecordAssessment(Assessment):
     def started(
         self, record: Record, values: FloatArray, initial: str
     ) -> tuple[RecordProblem, FloatArray]:
-        """Return the problem of another record, with the model's `values` completed."""
+        """Return the problem of another record, and the model's `values` with those it adds."""
         problem = self.problem.of([record])
         if initial == "fitted":
             return problem, hold_model(problem, values)
@@ -343,16 +341,16 @@ class RecordAssessment(Assessment):
         return problem, full
 
     def band(self, problem: RecordProblem, output: FloatArray, variance: FloatArray) -> RecordBand:
-        """Return a predicted record with its bands, from the variance of what is predicted.
+        """Return a predicted record with its bands; `variance` is that from the parameters.
 
-        What a model misses is a share of the output: its scatter grows with the record's level.
+        A misfit is proportional to the output, so its scatter grows with the record's level.
         """
         scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
         if self.misses:
             scatter *= max(1.0, problem.level / self.problem.level) ** 2
-        half = coverage_factor(self.errors.least_dof) * np.sqrt(variance + scatter)
+        U = coverage_factor(self.errors.least_dof) * np.sqrt(variance + scatter)
         return RecordBand(
-            problem.records[0].time, output, np.sqrt(variance), output - half, output + half,
+            problem.records[0].time, output, np.sqrt(variance), output - U, output + U,
             problem.measured[0],
         )  # fmt: skip
 
@@ -372,10 +370,9 @@ class RecordAssessment(Assessment):
         start = dict(zip(problem.names[: problem.n_reported], self.optimum.values, strict=False))
         left_out = []
         for k, (number, piece) in enumerate(pieces):
-            others = problem.like(records=[each for i, (_, each) in enumerate(pieces) if i != k])
+            others = problem.like(records=[other for i, (_, other) in enumerate(pieces) if i != k])
             optimum = solve(others, loss=self.optimum.loss, start=start)
-            fit = RecordAssessment(optimum)
-            band = fit.predict_record(piece, "fitted")
+            band = RecordAssessment(optimum).predict_record(piece, "fitted")
             inside = np.mean((band.measured >= band.lower) & (band.measured <= band.upper))
             first, last = float(piece.time[0]), float(piece.time[-1])
             left_out.append(
@@ -388,11 +385,11 @@ class RecordAssessment(Assessment):
 class HeldOutPart:
     """A part of the records, predicted by a fit to the others."""
 
-    record: int  # which one, from 1
+    record: int  # number of the record, from 1
     start: float  # s
     stop: float
     samples: int
-    rms_share: float  # of the prediction errors, over the standard deviation of the part's output
+    rms_share: float  # rms prediction error over the standard deviation of the part's output
     inside: float  # share of its samples within the 95.45 % band
 
 

@@ -1,13 +1,14 @@
 r"""Residuals in units of the noise, and their component orthogonal to the fit.
 
 A question such as "do the data fall with frequency against the model?" is one more column next to
-those of the Jacobian: a small change u of the predicted responses, R -> R exp(gamma u). After
-projection on what the parameters cannot explain, its coefficient and error follow from one inner
-product; several columns together make a chi-square or F test. Nothing is fitted again.
+those of the Jacobian: a small change u of the predicted responses, R -> R exp(gamma u). After its
+projection onto the complement of the Jacobian's columns, which the parameters cannot explain, its
+coefficient and error follow from one inner product; several columns together make a chi-square or F
+test. Nothing is fitted again.
 
-Rows whose covariance has nu degrees of freedom follow Student's t; their residuals y are taken to
-the normal ones of the same probability, |y|^2 -> (nu - 1) ln(1 + |y|^2/nu). Rows under a robust
-loss enter by their scores. Residuals that are rounding errors count as none.
+Rows whose covariance has nu degrees of freedom follow Student's t; their residuals y are mapped to
+normal ones of the same probability, |y|^2 -> (nu - 1) ln(1 + |y|^2/nu). Rows under a robust
+loss enter by their scores. Residuals that are rounding errors count as zero.
 
 A force limit that differs by 5 % from day to day bends the response by second-order terms of
 0.1 %, more than a quiet sensor's noise: residuals within runs are those at the run's parameters.
@@ -30,10 +31,10 @@ from dahl_ident.fitting.losses import loss_named
 from dahl_ident.problem import TableProblem
 
 _STEPS = 2  # of Gauss-Newton, from the linear mixed model's deviations of runs
-_RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as none
+_RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as zero
 _GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
-_NOTHING = 1e-100  # length of a column that is none
-_LEFT = 1e-4  # length of a column after projection, over that before, that counts as none
+_NOTHING = 1e-100  # length of a column that counts as zero
+_LEFT = 1e-4  # length of a column after projection, over that before, that counts as zero
 
 
 @dataclass(frozen=True)
@@ -52,39 +53,42 @@ class Linearization:
     def __init__(self, problem: TableProblem, theta: FloatArray, runs: RunDeviations) -> None:
         self._harmonic = problem.data.harmonic
         m = problem.n_residuals
-        self.residuals = np.zeros(m)  # of each run at its own parameters
+        self.residuals = np.zeros(m)  # of each run, at the parameters of that run
         self.J = np.zeros((m, len(theta)))  # their derivatives with respect to theta
-        # responses (n,), each run's at its own parameters; the same with its gain and phase
+        # predicted responses (n,) of each run at its parameters; the same with its gain and phase
         self.predicted, self.fitted = np.zeros((2, m // 2), dtype=np.complex128)
-        # problems, the rows (n,) that are theirs, and the theta of each
+        # of each run: its problem, its rows (n,), and its theta
         self.parts: list[tuple[TableProblem, NDArray[np.bool_], FloatArray]] = []
         for label, b in zip(runs.labels, runs.each, strict=True):
             rows = np.asarray(problem.data.run) == label
             deviation = b[-2] + 1j * b[-1] * self._harmonic[rows]
             part = problem.part(rows, problem.data.response[rows] * np.exp(-deviation))
-            there = np.clip(theta + b[:-2], *problem.bounds())
-            both = np.repeat(rows, 2)
-            at, by = part.residuals_and_jacobian(there, tails=False)
-            self.residuals[both], self.J[both] = at[: part.n_residuals], by[: part.n_residuals]
-            self.predicted[rows] = part.predict(there)
+            run_theta = np.clip(theta + b[:-2], *problem.bounds())
+            both, count = np.repeat(rows, 2), part.n_residuals
+            residuals, J = part.residuals_and_jacobian(run_theta, tails=False)
+            self.residuals[both], self.J[both] = residuals[:count], J[:count]
+            self.predicted[rows] = part.predict(run_theta)
             self.fitted[rows] = self.predicted[rows] * np.exp(deviation)
-            self.parts.append((part, rows, there))
+            self.parts.append((part, rows, run_theta))
 
     def of_run(self, number: int) -> tuple[NDArray[np.bool_], FloatArray]:
-        """Return a run's residuals, and their derivatives with respect to its deviations."""
+        """Return which residuals belong to a run, and their derivatives.
+
+        The derivatives are with respect to the deviations of that run.
+        """
         problem, rows, theta = self.parts[number]
-        turns = np.array([np.ones(rows.sum()), 1j * self._harmonic[rows]]) * self.predicted[rows]
+        changes = np.array([np.ones(rows.sum()), 1j * self._harmonic[rows]]) * self.predicted[rows]
         both = np.repeat(rows, 2)
-        return both, np.column_stack([self.J[both], problem.residual_change(theta, turns).T])
+        return both, np.column_stack([self.J[both], problem.residual_change(theta, changes).T])
 
 
 def run_deviations(
     estimate: WeightedEstimate, mean: FloatArray, effects: FloatArray, spread: FloatArray,
     noise: float,
 ) -> RunDeviations | None:  # fmt: skip
-    """Return how runs deviate, where each run's residuals and deviations together are least.
+    """Return the deviations of runs that minimise each run's residuals and deviations together.
 
-    None where the model has no response at the `mean`, as beyond a parameter that is hardly known.
+    None where the model has no response at the `mean`, as may be if a parameter is hardly known.
     """
     problem, scale = estimate.problem, estimate.scale
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
@@ -97,9 +101,9 @@ def run_deviations(
         r = scale * scores_of(near.residuals / scale, len(near.residuals), estimate.loss)
         for i in range(len(labels)):
             both, columns = near.of_run(i)
-            left = np.concatenate([r[both], noise * b[i, scatters] / unit])
-            every = np.vstack([columns[:, scatters] * unit, noise * np.eye(len(unit))])
-            b[i, scatters] -= unit * np.linalg.lstsq(every, left, rcond=None)[0]
+            stacked = np.concatenate([r[both], noise * b[i, scatters] / unit])
+            design = np.vstack([columns[:, scatters] * unit, noise * np.eye(len(unit))])
+            b[i, scatters] -= unit * np.linalg.lstsq(design, stacked, rcond=None)[0]
     return RunDeviations(labels, centre + b, scatters)
 
 
@@ -111,7 +115,7 @@ class Coefficient(NamedTuple):
 
 
 class _Complement(ABC):
-    """Residuals orthogonal to the Jacobian's columns, and columns to compare them with."""
+    """Residuals orthogonal to the Jacobian's columns, and changes to compare them with."""
 
     residuals: FloatArray
     basis: FloatArray
@@ -124,8 +128,8 @@ class _Complement(ABC):
     def columns(self, changes: ComplexArray) -> FloatArray:
         """Return the columns (k, m) of relative changes (k, n) of the predicted responses.
 
-        What the parameters explain is taken out; a column of which nothing is left is zero. The
-        sign is that of the data: positive where data exceed the model.
+        The part that the parameters explain is removed; a column that they explain whole is zero.
+        The sign is that of the data: positive where data exceed the model.
         """
         columns = self._raw(changes)
         before = np.linalg.norm(columns, axis=-1, keepdims=True)
@@ -150,21 +154,21 @@ class _Complement(ABC):
 
 
 class RelativeSpace(_Complement):
-    """ln(R/R_model) of fundamentals, neither 0, all rows alike: for the size of a departure.
+    """ln(R/R_model) of fundamentals with equal weights, which shows the size of a departure.
 
-    Whatever the noise model, the weights here do not depend on it, so that a departure of 30 %
-    reads as one also where the data claim errors of 1 %.
+    The weights do not depend on the noise model, so that a departure of 30 % reads as 30 % even
+    where the data claim errors of 1 %. Rows in which R or R_model is 0 are left out.
     """
 
     def __init__(self, optimum: Optimum) -> None:
         problem, theta = optimum.problem, optimum.theta
         predicted = problem.predict(theta)
-        some = (problem.data.response != 0.0) & (predicted != 0.0)
-        self._rows = (problem.data.harmonic == 1) & some
+        nonzero = (problem.data.response != 0.0) & (predicted != 0.0)
+        self._rows = (problem.data.harmonic == 1) & nonzero
         with np.errstate(divide="ignore", invalid="ignore"):
             y = np.log(problem.data.response / predicted)[self._rows]
             J = (problem.prediction_jacobian(theta) / predicted[:, None])[self._rows]
-        J = J[:, [name not in problem.ranges for name in problem.names]]  # assumed ones stay
+        J = J[:, [name not in problem.ranges for name in problem.names]]  # assumed ones are fixed
         self.basis = orthonormal(np.concatenate([J.real, J.imag]))
         r = np.concatenate([y.real, y.imag])
         self.residuals = r - self.basis @ (self.basis.T @ r)
@@ -177,7 +181,7 @@ class RelativeSpace(_Complement):
 
 
 class ResidualSpace(_Complement):
-    """The residuals of an optimum in units of the noise: for whether a departure is one."""
+    """Residuals of an optimum in units of the noise, which show if a departure is significant."""
 
     def __init__(
         self,
@@ -185,9 +189,9 @@ class ResidualSpace(_Complement):
         runs: RunDeviations | None = None,
         weights: WeightedEstimate | None = None,
     ) -> None:
-        """Take residuals with the stated weights, or with those of an estimate.
+        """Weigh residuals by the stated noise, or as an estimate does that allows for a misfit.
 
-        The size of the latter's misfit is itself an estimate, as an unknown scale is.
+        The size of a misfit is itself estimated, as an unknown scale is.
         """
         self._widened = weights is not None and weights.problem.has_misfit
         self._optimum, self._problem = optimum, optimum.problem
@@ -205,22 +209,22 @@ class ResidualSpace(_Complement):
             y[:m], J[:m] = near.residuals / self._scale, near.J / self._scale
             each = np.zeros((len(runs.labels), m, runs.scatters.sum()))
             for number, block in enumerate(each):
-                both, columns = near.of_run(number)
-                block[both] = columns[:, runs.scatters] / self._scale
+                both, by_deviations = near.of_run(number)
+                block[both] = by_deviations[:, runs.scatters] / self._scale
             of_runs = np.hstack(list(each))
             self.dof -= orthonormal(np.hstack([J[:m], of_runs])).shape[1]
             self.dof += orthonormal(J[:m]).shape[1]
         self._column_weight, residual_weight = self._weights(y[:m])
-        every = np.vstack(
+        columns = np.vstack(
             [np.hstack([J[:m], of_runs]), np.pad(J[m:], ((0, 0), (0, of_runs.shape[1])))]
         )
-        every[:m] *= self._column_weight[:, None]
-        self.basis = orthonormal(every)[:m]
+        columns[:m] *= self._column_weight[:, None]
+        self.basis = orthonormal(columns)[:m]
         r = residual_weight * y[:m] * (not optimum.is_exact)
         self.residuals = r - self.basis @ (self.basis.T @ r)
 
     def _weights(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the weight of each row's columns, and that of its residuals."""
+        """Return the weights of each row in the columns, and in the residuals."""
         z = np.repeat(y[0::2] ** 2 + y[1::2] ** 2, 2)
         loss, dof = loss_named(self._optimum.loss), self._problem.data.dof
         if loss is not None:
@@ -242,23 +246,24 @@ class ResidualSpace(_Complement):
         return np.asarray(columns * self._column_weight)
 
     def p_value(self, changes: ComplexArray) -> float:
-        """Return the probability of such a departure along `changes`, (k, n), by noise alone."""
+        """Return the probability that noise alone departs so far along `changes`, (k, n)."""
         basis = orthonormal(self.columns(changes).T)
         explained = float(np.sum((basis.T @ self.residuals) ** 2))
         return self.tail(explained, basis.shape[1])
 
     def tail(self, explained: float, k: int) -> float:
-        """Return the probability of more than this sum of squares in `k` directions of noise."""
+        """Return the probability that noise has more than this sum of squares in `k` directions."""
         return self.tail_of(explained, k, float(self.residuals @ self.residuals), self.dof)
 
     def tail_of(self, explained: float, k: int, total: float, dof: int) -> float:
-        """Return the same where only `total`, with `dof` degrees of freedom, is left of them."""
+        """Return the same for residuals of the sum of squares `total`, of `dof` dof."""
         if k == 0:
             return np.nan
         if self._scale_known:
             return float(special.chdtrc(k, explained))
         if self._widened and (self._problem.data.harmonic != 1).any():
-            total = max(total, float(dof))  # what fundamentals weigh down does not show small noise
+            # harmonics that the fundamentals' misfit weighs down do not show small noise
+            total = max(total, float(dof))
         if dof <= k or total <= explained:
             return np.nan
         return float(special.fdtrc(k, dof - k, explained / k / ((total - explained) / (dof - k))))
@@ -267,9 +272,9 @@ class ResidualSpace(_Complement):
 def orthonormal(columns: FloatArray, least: float = _RANK) -> FloatArray:
     """Return an orthonormal basis of the column space, shape (m, rank)."""
     size = np.abs(columns).max(axis=0, initial=0.0)
-    some = (size > _NOTHING) & np.isfinite(size)
-    if not some.any():
+    nonzero = (size > _NOTHING) & np.isfinite(size)
+    if not nonzero.any():
         return np.zeros((len(columns), 0))
-    used = columns[:, some] / size[some]  # squares of the smallest numbers would vanish
+    used = columns[:, nonzero] / size[nonzero]  # squares of very small numbers underflow
     U, singular, _ = np.linalg.svd(used / np.linalg.norm(used, axis=0), full_matrices=False)
     return np.asarray(U[:, singular > least * singular[0]])

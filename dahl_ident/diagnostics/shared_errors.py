@@ -1,4 +1,4 @@
-"""Errors that rows share, from the error model of a fit, for a posterior's likelihood."""
+"""Errors that rows share, from the error model of a fit, for the likelihood of a posterior."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
 
-_SAME = 1e-6  # of the noise's variance: as stated
+_SAME = 1e-6  # relative rise of the noise's variance up to which it is as stated
 
 
 def row_errors(errors: ErrorModel) -> RowErrors | None:
-    """Return the covariance of the residuals by all sources; None where they are independent."""
+    """Return the residuals' covariance from all sources; None if rows are independent."""
     problem, estimate, m = errors.problem, errors.estimate, errors.problem.n_residuals
     as_stated = not estimate.problem.has_misfit and (errors.noises < 1.0 + _SAME).all()
     if not errors.sources and (as_stated or not problem.scale_known):
@@ -27,42 +27,42 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
         v**0.5 * root[:, None] * s.columns[:m]
         for v, s in zip(errors.variances.tolist(), errors.sources, strict=True)
     ]
-    inside = None
-    every = np.hstack([jacobian, *columns])
-    if m > 2 * every.shape[1]:
-        inside, _ = np.linalg.qr(every)
-        columns = [inside.T @ one for one in columns]
-    r = m if inside is None else inside.shape[1]
+    basis = None  # of the directions in which rows share errors, where these are few
+    stacked = np.hstack([jacobian, *columns])
+    if m > 2 * stacked.shape[1]:
+        basis, _ = np.linalg.qr(stacked)
+        columns = [basis.T @ one for one in columns]
+    r = m if basis is None else basis.shape[1]
     noise, shared = np.eye(r), np.zeros((r, r))
     for source, part in zip(errors.sources, columns, strict=True):
         target = noise if source.name == NOISE else shared
         target += part @ part.T / unit
     L = np.linalg.cholesky(noise)
-    half = np.linalg.solve(L, shared)
-    ratios, vectors = np.linalg.eigh(np.linalg.solve(L, half.T))
-    turn = np.linalg.solve(L, np.eye(r)).T @ vectors
-    turn = turn.T if inside is None else turn.T @ inside.T
+    # shared over noise is diagonal in the coordinates W y; see RowErrors
+    ratios, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, shared).T))
+    W = (np.linalg.solve(L, np.eye(r)).T @ vectors).T
+    W = W if basis is None else W @ basis.T
     volume = -float(np.log(np.diagonal(L)).sum())
-    differing = {s.per_test for s in errors.sources if s.name == RUNS}
-    scatters = np.array([name in differing for name in errors.names])
+    of_runs = {s.per_test for s in errors.sources if s.name == RUNS}
+    scatters = np.array([name in of_runs for name in errors.names])
     factors = size * root.reshape(-1, 2, 1) * estimate.factors(problem)
     volume += float(np.log(np.abs(np.linalg.det(factors))).sum())
     _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
     return RowErrors(
-        counted, turn, np.maximum(ratios, 0.0), volume, factors, *_dof_and_share(errors), jacobian,
+        counted, W, np.maximum(ratios, 0.0), volume, factors, *_dof_and_share(errors), jacobian,
         size * root * estimate.y[:m], known, np.where(scatters, errors.theta, np.nan),
-        np.where(scatters, slopes[:m], 0.0), inside,
+        np.where(scatters, slopes[:m], 0.0), basis,
     )  # fmt: skip
 
 
 def _dof_and_share(errors: ErrorModel) -> tuple[float, float]:
-    """Return effective degrees of freedom, and the share of what rows share in the variance.
+    """Return effective degrees of freedom, and the fraction of variance due to shared errors.
 
-    Both are those of the parameter in which that share is the largest.
+    Both are those of the parameter for which that fraction is largest.
     """
     names = {s.name for s in errors.sources if s.name != NOISE}
-    part = sum((np.diagonal(errors.contributions[n]) for n in names), np.zeros(len(errors.names)))
-    shares = part / np.maximum(np.diagonal(errors.covariance), np.finfo(float).tiny)
+    shared = sum((np.diagonal(errors.contributions[n]) for n in names), np.zeros(len(errors.names)))
+    shares = shared / np.maximum(np.diagonal(errors.covariance), np.finfo(float).tiny)
     shares[[errors.names.index(name) for name in errors.assumed]] = 0.0
-    most = int(np.argmax(shares))
-    return errors.dof(np.eye(len(shares))[most]), float(shares[most])
+    largest = int(np.argmax(shares))
+    return errors.dof(np.eye(len(shares))[largest]), float(shares[largest])
