@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
 _P = 4  # column of p in rows of amplitude, frequency and values
-_AT_ONCE = 1e4, 1e8  # p times amplitude, from which on N changes by less than 2e-4
-_STEEPEST = 1e16  # of sigma: the slope up to which friction that hardly slips is resolved in time
+_AT_ONCE = 1e4, 1e8  # p times amplitude above which N changes by less than 2e-4
+_STEEPEST = 1e16  # slope over sigma up to which friction that hardly slips is resolved in time
 _WITH_EXPONENT = (
     "dF/dx = sigma (1 - sgn(q) |q F/sigma|^n) (F and motion of one sign), "
     "sigma (1 + sgn(p) |p F/sigma|^n) (opposite signs), n = exponent"
@@ -34,8 +34,8 @@ class BoucWen(Friction):
     Parameters
     ----------
     sigma : float, optional
-        Contact stiffness at zero force, a in the usual letters, N/m, > 0. Given: fixed; left
-        out: free.
+        Contact stiffness at zero force, a in the usual letters, N/m, > 0. A number fixes a
+        parameter; one left out is free.
     q : float, optional
         Rate of softening while loading, 1/m. Above 0 the force saturates at sigma/q. At 0 or
         below there is no such limit, and for n > 1 a force with q < 0 becomes infinite within a
@@ -59,13 +59,16 @@ class BoucWen(Friction):
     -----
     With an exponent, dF/dx = sigma (1 - sgn(q) abs(q F/sigma)^n) loading and
     sigma (1 + sgn(p) abs(p F/sigma)^n) unloading, so that q and p keep their unit and the limit is
-    sigma/q for every n: beta + gamma = sgn(q) abs(q)^n sigma^(1-n), beta - gamma the same of p.
-    q = p = sigma/f_max with n = 1 is the linear Dahl model. In settled sines p counts as at most
-    1e8 over the displacement amplitude, where the loop differs from that of instant unloading by at
-    most 2e-4 of N: beyond, data cannot determine it. In a driven plant the amplitude is that of the
-    plant with stuck friction, and for n > 2 the limit is lower, to 1e4 at n = 4; steeper slopes
-    than 1e16 sigma then have no steady motion. Y.-K. Wen, Method for random vibration of hysteretic
-    systems, J. Eng. Mech. Div. 102 (1976) 249-263.
+    sigma/q for every n: beta + gamma = sgn(q) abs(q)^n sigma^(1-n), and beta - gamma likewise with
+    p. q = p = sigma/f_max with n = 1 is the linear Dahl model.
+
+    In settled sines p is limited to 1e8 over the displacement amplitude: there the loop differs
+    from that of instant unloading by at most 2e-4 of N, so data cannot determine a larger p. In a
+    driven plant the amplitude is that of the plant with stuck friction, and for n > 2 the limit is
+    lower, down to 1e4 at n = 4; slopes steeper than 1e16 sigma then have no steady motion.
+
+    Source: Y.-K. Wen, Method for random vibration of hysteretic systems, J. Eng. Mech. Div. 102
+    (1976) 249-263.
 
     Examples
     --------
@@ -112,7 +115,7 @@ class BoucWen(Friction):
         sigma, q, p, *exponent = values
         ahead = direction * force
         if not exponent:
-            size = np.fabs(ahead)  # each side's sum or difference is exact: p does not hide q
+            size = np.fabs(ahead)  # ahead + size and ahead - size are exact: p does not hide q
             return sigma - 0.5 * (q * (ahead + size) + p * (ahead - size))
         (n,) = exponent
         side = np.sign(ahead)
@@ -121,10 +124,10 @@ class BoucWen(Friction):
         return sigma * (1.0 - sign * (rate * np.fabs(force / sigma)) ** n)
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return the values with p up to where friction unloads at once; NaN beyond what time is.
+        """Return the values with p limited to that of instant unloading; NaN if it is too steep.
 
-        Friction that hardly slips shakes the mass at each turn, in times that the steepest slope
-        shortens.
+        Friction that hardly slips shakes the mass at each turning point, the faster the steeper its
+        slope; an integration in time does not resolve slopes beyond a limit.
         """
         sigma, q, p, *exponent = values
         steepest = np.asarray(_STEEPEST ** (1.0 / exponent[0]) if exponent else _STEEPEST)
@@ -135,9 +138,9 @@ class BoucWen(Friction):
     def _loops(
         self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
     ) -> Loops:
-        """Return settled loops; p counts up to where friction unloads at once.
+        """Return settled loops, with p limited to that of instant unloading.
 
-        Data of gross slip leave p open, and searches let it grow without end.
+        Data in gross slip do not bound p, so searches may let it grow without end.
         """
         resolved = at.copy()
         resolved[:, _P] = np.minimum(at[:, _P], _AT_ONCE[1] / at[:, 0])
@@ -147,7 +150,7 @@ class BoucWen(Friction):
         return loops
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return the limit of gross slip, in which friction unloads at once."""
+        """Return the limit of gross slip, in which friction unloads instantly."""
         pinned = {"p": _AT_ONCE[1] / low}
         return (Asymptote("runs_away", "one that unloads at once", pinned, None, {"p": np.inf}),)
 
@@ -161,7 +164,7 @@ class BoucWen(Friction):
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return 8 sigma/pi and 4/pi sigma/q where the force saturates, inf where it does not.
 
-        A tip's force is loaded over at most 2 A; a fundamental is at most 4/pi of it.
+        The peak force is loaded over at most 2 A, and a fundamental is at most 4/pi of the peak.
         """
         sigma, q, *_ = values
         steepest = np.where(np.asarray(q) >= 0.0, 8.0 / np.pi * np.asarray(sigma), np.inf)

@@ -1,4 +1,4 @@
-"""Models whose linear systems have free parameters, in the coefficients of their equations."""
+"""Coefficients of the equation of motion of models whose linear systems have free parameters."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Coefficients:
     Attributes
     ----------
     model : Model
-        The same with coefficients for parameters; the one that was given where none is needed.
+        The model with these coefficients as parameters; the original one if they are its values.
     """
 
     def __init__(self, model: Model) -> None:
@@ -47,8 +47,8 @@ class Coefficients:
             if isinstance(counterpart, _LinearEquation):
                 part, block[:, :, first:last] = counterpart.coefficients(part)
             else:
-                place = np.arange(len(element.parameters))
-                block[:, place, first + place] = 1.0
+                diagonal = np.arange(len(element.parameters))
+                block[:, diagonal, first + diagonal] = 1.0
             numbers.append(part)
             blocks.append(block)
             first = last
@@ -56,9 +56,9 @@ class Coefficients:
 
 
 class _LinearEquation(LinearSystem):
-    """A linear system with free parameters; its parameters are those of its equation of motion.
+    """A linear system whose parameters are the coefficients of its equation of motion.
 
-    The equation's degree is that at values near the starts of the system's parameters.
+    The degree of the equation is that near the starts of the original system's parameters.
     """
 
     def __init__(self, system: LinearSystem) -> None:
@@ -87,13 +87,13 @@ class _LinearEquation(LinearSystem):
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return mass, the rest of the force, and the changes of the states, in metres."""
+        """Return mass, the remaining force, and the rates of the states, in metres."""
         return Equation(self._rate, self._below, values).mechanics(x, velocity, states)
 
     def coefficients(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the coefficients, (rows, Q), at values of the system's parameters, and slopes.
 
-        NaN where the values are not finite, or the system has another degree there.
+        They are NaN where the values are not finite, or the system has another degree.
         """
         vectors, which = np.unique(values, axis=0, return_inverse=True)
         names = [p.name for p in self._origin.parameters]
@@ -109,17 +109,15 @@ class _LinearEquation(LinearSystem):
         """Return the coefficients at one vector of the system's parameters."""
         if np.isfinite(vector).all():
             Z = Rational(*self._origin.rational_stiffness(vector)).without_common_zeros_at_0()
-            above, below = (
-                _of_degree(Z.numerator, self._above),
-                _of_degree(Z.denominator, self._below),
-            )
+            above = _of_degree(Z.numerator, self._above)
+            below = _of_degree(Z.denominator, self._below)
             if above is not None and below is not None and below[0] != 0.0:
                 return coefficients_of(Rational(above, below), self._rate)
         return np.full(3 + 2 * self._below, np.nan)
 
 
 def _of_degree(polynomial: FloatArray, degree: int) -> FloatArray | None:
-    """Return a polynomial of a degree; None where it has a higher one."""
+    """Return a polynomial padded to a degree; None if its degree is higher."""
     size = degree + 1
     if np.any(polynomial[: max(0, polynomial.size - size)]):
         return None

@@ -1,4 +1,4 @@
-"""Results of elements: a stiffness or force with derivatives, limits, products of powers."""
+"""What elements take and return: motions, stiffnesses and forces with derivatives, limits."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ Orders = int | NDArray[np.int64]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 Settled = Callable[[Any, Values, "Sine", int], "StiffnessGradient"]
-"""A law's method that gives the stiffness of settled loops."""
+"""A law's method that returns the stiffness of settled loops."""
 
-STEP = 1e-3  # relative: truncation, its fourth power, and rounding are then both below 1e-12
+STEP = 1e-3  # relative; truncation (fourth order) and rounding are then both below 1e-12
 STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0))
-"""Central difference of fourth order: places and weights."""
+"""Central difference of fourth order: offsets in steps, and weights."""
 
-SOFTENED = 0.01  # share of the stiffness that is gone at the lower knee: seen in data of 1 % noise
+SOFTENED = 0.01  # relative loss of stiffness at the lower knee: visible in data of 1 % noise
 
 
 def clipped(value: Any, limit: Any) -> Any:
-    """Return a value between -limit and limit, in arithmetic that symbols have too."""
+    """Return a value clipped to -limit and limit, in arithmetic that works on symbols too."""
     return 0.5 * (np.fabs(value + limit) - np.fabs(value - limit))
 
 
 class Sine(NamedTuple):
-    """A sine of displacement, and the harmonic of the force that is asked for; arrays broadcast.
+    """A sine of displacement, and the harmonic of the force to compute; arrays broadcast.
 
     Attributes
     ----------
@@ -48,8 +48,8 @@ class Sine(NamedTuple):
     omega : ndarray
         rad/s; 0 for a law that does not depend on the rate.
     harmonic : int or ndarray of int, shape (n,)
-        1: the fundamental; 0: the mean force over the amplitude. An array: that of each row, along
-        the last axis.
+        1 is the fundamental; 0 the mean force over the amplitude. An array holds that of each row,
+        along the last axis.
     """
 
     amplitude: FloatArray
@@ -66,26 +66,26 @@ class Path(NamedTuple):
     time: FloatArray | None = None
 
     def polynomials(self, intervals: FloatArray) -> FloatArray:
-        """Return x between samples, (4 or 6, n - 1), in powers of the share of each interval, s.
+        """Return coefficients of x between samples, (4 or 6, n - 1).
 
-        Hermite's: they have the velocities, and the accelerations where known, of both ends.
+        They belong to powers of the fraction of an interval; `intervals` are in s. The polynomials
+        have the velocities, and the accelerations where known, of both ends (Hermite).
         """
         x, v, a = self.displacement, np.asarray(self.velocity), self.acceleration
-        start, end = intervals * v[:-1], intervals * v[1:]
+        c1, slope = intervals * v[:-1], intervals * v[1:]
         if a is None:
-            place, speed = np.diff(x) - start, end - start
-            return np.stack([x[:-1], start, 3.0 * place - speed, speed - 2.0 * place])
-        two = 0.5 * intervals**2 * a[:-1]
-        last = 0.5 * intervals**2 * a[1:]
-        place = np.diff(x) - start - two
-        speed = end - start - 2.0 * two
-        bend = last - two
+            dx, dv = np.diff(x) - c1, slope - c1
+            return np.stack([x[:-1], c1, 3.0 * dx - dv, dv - 2.0 * dx])
+        c2 = 0.5 * intervals**2 * a[:-1]
+        dx = np.diff(x) - c1 - c2
+        dv = slope - c1 - 2.0 * c2
+        da = 0.5 * intervals**2 * a[1:] - c2
         return np.stack(
             [
-                x[:-1], start, two,
-                10.0 * place - 4.0 * speed + bend,
-                -15.0 * place + 7.0 * speed - 2.0 * bend,
-                6.0 * place - 3.0 * speed + bend,
+                x[:-1], c1, c2,
+                10.0 * dx - 4.0 * dv + da,
+                -15.0 * dx + 7.0 * dv - 2.0 * da,
+                6.0 * dx - 3.0 * dv + da,
             ]
         )  # fmt: skip
 
@@ -101,7 +101,7 @@ class StiffnessGradient(NamedTuple):
         dZ/dA.
     by_parameter : tuple of ndarray of complex
         dZ/dp for each parameter p of the element, in the order of its `parameters`; empty where
-        they are not asked for, and 0 for a fixed one where it would cost something.
+        they are not asked for, and 0 for a fixed one if it is not free to compute.
     """
 
     value: ComplexArray
@@ -110,7 +110,7 @@ class StiffnessGradient(NamedTuple):
 
 
 def each_harmonic(settled: Settled) -> Settled:
-    """Return the `settled` of a law for rows of several harmonics from that for one."""
+    """Return a law's `settled` extended from one harmonic to rows of several."""
 
     @wraps(settled)
     def of_rows(law: Any, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
@@ -120,7 +120,7 @@ def each_harmonic(settled: Settled) -> Settled:
         arguments = [np.asarray(v) for v in (*values, sine.amplitude, sine.omega)]
         shape = np.broadcast_shapes(orders.shape, *(v.shape for v in arguments))
         count = 1 + min(derivatives, 1) + len(values) * (derivatives > 1)
-        whole = [np.empty(shape, dtype=np.complex128) for _ in range(count)]
+        results = [np.empty(shape, dtype=np.complex128) for _ in range(count)]
         for k in np.unique(orders).tolist():
             rows = np.flatnonzero(orders == k)
             row_arguments = [v[..., rows] if v.shape[-1:] == orders.shape else v for v in arguments]
@@ -128,9 +128,9 @@ def each_harmonic(settled: Settled) -> Settled:
                 law, row_arguments[:-2], Sine(row_arguments[-2], row_arguments[-1], k), derivatives
             )
             pieces = (part.value, part.by_amplitude, *part.by_parameter)
-            for target, piece in zip(whole, pieces, strict=False):
+            for target, piece in zip(results, pieces, strict=False):
                 target[..., rows] = piece
-        return StiffnessGradient(whole[0], whole[min(derivatives, 1)], tuple(whole[2:]))
+        return StiffnessGradient(results[0], results[min(derivatives, 1)], tuple(results[2:]))
 
     return of_rows
 
@@ -159,11 +159,11 @@ class Mechanics(NamedTuple):
     Attributes
     ----------
     inertia
-        What multiplies the acceleration, kg.
+        Factor of the acceleration, kg.
     force
-        The rest of the force, N.
+        The remaining force, N.
     rates
-        Changes over time of the element's states, one each.
+        Time derivatives of the element's states.
     """
 
     inertia: Any
@@ -180,13 +180,13 @@ class Asymptote:
     name : str
         Such as "gross_slip".
     meaning : str
-        What the element is in this limit, a few words.
+        What the element is in this limit, in a few words.
     pinned : mapping of str to float
-        Values, by label, so far out that the element is its limit.
+        Values, by label, so extreme that the element is at its limit.
     follows : (str, str, float) or None
         ``label = factor * other``: a parameter that stays at a fixed ratio to another one.
     runs_away : mapping of str to float
-        The parameters that the data no longer determine and where they go, 0 or inf.
+        The parameters that the data no longer determine, and where they tend: 0 or inf.
     kept : tuple of (str, mapping of str to float)
         Combinations that stay determined: expression, and the power of each label in it.
     adds_to_spring : str or None
@@ -204,7 +204,7 @@ class Asymptote:
 
 
 class Combination(NamedTuple):
-    """A product of powers of parameters that data may determine where single ones are lost."""
+    """A product of powers of parameters, which data may determine where its factors are not."""
 
     expression: str
     powers: Mapping[str, float]
@@ -212,12 +212,12 @@ class Combination(NamedTuple):
 
 
 class UniversalCurve(NamedTuple):
-    """N over a stiffness as a function of beta alone, whatever the scale parameters.
+    """N over a stiffness as a function of beta only, independent of the scale parameters.
 
     Parameters
     ----------
     stiffness : float
-        What N is divided by, N/m.
+        The divisor of N, N/m.
     response : callable
         h(beta), for an array of beta.
     """
@@ -234,9 +234,9 @@ class Alternative(NamedTuple):
     elements : tuple of Element
         In parallel.
     shows : {"shape", "asymmetry", "speed", "masing"}
-        What of the data speaks for them: how force depends on amplitude and the odd harmonics;
-        the mean force and the even harmonics; a force that falls with the speed; or parallel
-        Jenkins elements that would leave much less.
+        The evidence for them: the dependence of force on amplitude, and the odd harmonics; the
+        mean force and the even harmonics; a force that falls with the speed; or parallel Jenkins
+        elements, which would leave a much smaller misfit.
     """
 
     elements: tuple[Element, ...]
@@ -251,4 +251,4 @@ def difference(function: Callable[[Any], Any], at: Any, step: Any) -> Any:
     >>> print(difference(np.exp, 0.0, STEP).round(12))
     1.0
     """
-    return sum(weight * function(at + place * step) for place, weight in STENCIL) / step
+    return sum(weight * function(at + offset * step) for offset, weight in STENCIL) / step

@@ -1,8 +1,8 @@
 r"""Dahl friction with any exponent, in normalised variables: the loop and its harmonics.
 
-Eqn. 2 on a stretch of one direction reads ``dz/dd = -z^alpha``: z = 1 - s F/f_max is the
-distance to full slip (s the direction of motion), d = sigma path / f_max the path. Everything
-here depends on ``beta = sigma A / f_max`` and ``alpha`` alone. With ``p = 1 - alpha`` and
+While the direction of motion s is constant, Eqn. 2 reads ``dz/dd = -z^alpha``: z = 1 - s F/f_max is
+the distance to full slip, d = sigma path / f_max the path. Everything here depends on
+``beta = sigma A / f_max`` and ``alpha`` only. With ``p = 1 - alpha`` and
 ``z = z_0 exp(-l)``,
 
     d = z_0^p E(l),    E(l) = (1 - exp(-p l)) / p        (E(l) = l for alpha = 1).
@@ -12,18 +12,19 @@ here depends on ``beta = sigma A / f_max`` and ``alpha`` alone. With ``p = 1 - a
 
     ln E(L) = ln(2 beta) + p ln((1 + exp(-L)) / 2).
 
-Newton's method solves it in ln E in about four steps from any start, because the slope lies between
-1/2 and 2. For alpha < 1 and ``beta >= 2^-alpha / (1 - alpha)`` the friction slips fully before it
-turns, and L is infinite.
+Newton's method solves it for ln E in about four steps from any start, because the slope lies
+between 1/2 and 2. For alpha < 1 and ``beta >= 2^-alpha / (1 - alpha)`` friction slips fully before
+the motion turns, and L is infinite.
 
 **Harmonics.** On the half cycle in which ``x = A cos(theta)`` falls, ``sin^2(theta/2) = d / 2 beta
 = E(l)/E(L)``, and integration by parts of Eqns. 13 and 14 gives, for odd k,
-``c_k = (a_k - j b_k)/f_max = (2j / pi k) Int exp(-j k theta) dz``. At small beta nearly all of this
-is the straight line of a spring, and cancels; without it, and with ``C = z_1^alpha``,
+``c_k = (a_k - j b_k)/f_max = (2j / pi k) Int exp(-j k theta) dz``. At small beta nearly all of dz
+is that of a spring, whose integral cancels to rounding errors; with it taken out, and
+``C = z_1^alpha``,
 
     c_k = C beta [k = 1] + (2j / pi k) Int_0^L exp(-j k theta) z (1 - exp(-alpha (L - l))) dl.
 
-**Derivatives** are taken under the integral at constant z, where theta alone moves. With
+**Derivatives** are taken under the integral at constant z, where only theta changes. With
 ``w = 1 / (1 + exp(alpha L))`` and ``R(l) = ln z_0 + d ln E(l) / dp``,
 
     dc_k                         = (2 / pi) Int exp(-j k theta) dtheta dz,
@@ -31,13 +32,13 @@ is the straight line of a spring, and cancels; without it, and with ``C = z_1^al
     sin(theta) dtheta/dalpha     = 2 (w R(L) - sin^2(theta/2) R(l)).
 
 **Nodes** are ``l = L sin^2(phi/2)`` at equidistant phi, which resolves the square roots at both
-turning points: the midpoint rule for integrals over sin(k theta), Fejer's weights for those over
-cos(k theta). Both converge geometrically.
+turning points. Integrals over sin(k theta) take the midpoint rule, those over cos(k theta) Fejer's
+weights; both converge geometrically.
 
 **Accuracy**, for alpha from 0.25 to 4 and beta from 1e-6 to 1e6: N and the harmonics up to the
-15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``), except within
-1e-12 of ``beta_s = 2^-alpha / (1 - alpha)``, where full slip sets in: for alpha below 1/3
-derivatives there change by up to 1e-5 with the last digit of beta.
+15th to 1e-12, derivatives to 1e-10 (``python -m benchmarks.general_dahl_accuracy``). The exception
+is beta within 1e-12 of ``beta_s = 2^-alpha / (1 - alpha)``, where full slip sets in: for alpha
+below 1/3 derivatives there change by up to 1e-5 with the last digit of beta.
 """
 
 from __future__ import annotations
@@ -55,13 +56,13 @@ _LEAST_BETA = 1e-200
 """Smaller loops are computed as one of this size, whose curvature underflows to zero."""
 
 _DEEPEST = 44.0
-"""Integrals over l end here: exp(-44) is negligible, even over a root where slip sets in."""
+"""Integrals over l end here: exp(-44) is negligible, even beside a root where slip sets in."""
 
 COUNTS = 1, 2, 4
-"""How many arrays are returned with 0, 1 and 2 derivatives."""
+"""Number of arrays that are returned for `derivatives` of 0, 1 and 2."""
 
 _NODES_PER_BLOCK = 8192
-"""Nodes in work at once, so that the scratch arrays stay small and in the cache."""
+"""Nodes computed at once, so that the scratch arrays fit in the cache."""
 
 
 def stiffness(
@@ -69,9 +70,9 @@ def stiffness(
 ) -> tuple[ComplexArray, ...]:
     """Return h_k = N_k/sigma = c_k/beta (Eqns. 51 and 52, for any exponent), and derivatives.
 
-    1: and, over sigma, dN_k/d ln f_max = -beta dh/dbeta; 2: and dN_k/d ln sigma = h + beta dh/dbeta
-    and dN_k/d alpha = dh/dalpha. All are 0 for even k. A block of loops at a time has the nodes of
-    its highest harmonic.
+    With `derivatives` of 1 also dN_k/d ln f_max = -beta dh/dbeta, over sigma; with 2 also
+    dN_k/d ln sigma = h + beta dh/dbeta and dN_k/dalpha = dh/dalpha. All are 0 for even k. Loops are
+    computed in blocks, with the nodes for the highest harmonic of the block.
 
     Examples
     --------
@@ -87,13 +88,13 @@ def stiffness(
     odd = np.flatnonzero(order % 2)
     odd = odd[np.argsort(order[odd, 0], kind="stable")]
     rows = max(1, _NODES_PER_BLOCK // quadrature_rule(int(order.max(initial=1))).rise.size)
-    whole = [np.zeros(b.size, dtype=np.complex128) for _ in range(COUNTS[derivatives])]
+    results = [np.zeros(b.size, dtype=np.complex128) for _ in range(COUNTS[derivatives])]
     for i in range(0, odd.size, rows):
-        some = odd[i : i + rows]
-        pieces = _stiffness(b[some], a[some], order[some], derivatives)
-        for target, piece in zip(whole, pieces, strict=True):
-            target[some] = piece[:, 0]
-    return tuple(target.reshape(shape) for target in whole)
+        block = odd[i : i + rows]
+        pieces = _stiffness(b[block], a[block], order[block], derivatives)
+        for target, piece in zip(results, pieces, strict=True):
+            target[block] = piece[:, 0]
+    return tuple(target.reshape(shape) for target in results)
 
 
 def turning_force(beta: FloatArray, alpha: FloatArray) -> FloatArray:
@@ -119,7 +120,7 @@ class _Closure(NamedTuple):
 def _close_loop(beta: FloatArray, alpha: FloatArray) -> _Closure:
     """Solve ln E(L) = ln(2 beta) + p ln((1 + exp(-L))/2); full slip gives E = 2 beta / 2^p."""
     p = 1.0 - alpha
-    p = np.where(p == 0.0, -1e-20, p)  # far below rounding, and spares every limit p -> 0
+    p = np.where(p == 0.0, -1e-20, p)  # far below rounding; avoids every limit p -> 0
     path = 2.0 * beta * np.exp2(-np.maximum(p, 0.0))
     slips = p * path >= 1.0
     for _ in range(30):
@@ -129,7 +130,7 @@ def _close_loop(beta: FloatArray, alpha: FloatArray) -> _Closure:
         slope = 1.0 + np.exp(-alpha * length) * p * path / (1.0 + back)
         step = np.where(slips, 0.0, residual / slope)
         path = path * np.exp(-step)
-        if np.max(np.abs(step), initial=0.0) < 1e-8:  # the next one would be of its square
+        if np.max(np.abs(step), initial=0.0) < 1e-8:  # the next one would be about its square
             break
     return _Closure(p, path, _length(p, path, slips))
 
@@ -151,7 +152,7 @@ class Rule(NamedTuple):
 
 @lru_cache
 def quadrature_rule(k: int) -> Rule:
-    """Return nodes and weights that resolve harmonic k; the number of nodes comes from trials."""
+    """Return nodes and weights that resolve harmonic k; the number of nodes is empirical."""
     nodes = 48 + 8 * k
     phi = (np.arange(nodes) + 0.5) * np.pi / nodes
     order = np.arange(1, nodes // 2 + 1)
@@ -167,10 +168,7 @@ def quadrature_rule(k: int) -> Rule:
 def _stiffness(
     beta: FloatArray, alpha: FloatArray, k: NDArray[np.int64], derivatives: int
 ) -> tuple[ComplexArray, ...]:
-    """Return h_k of the falling half of loops, (loops, 1), and its derivatives if asked for.
-
-    1: that with respect to ln f_max; 2: also those with respect to ln sigma and alpha.
-    """
+    """Return h_k of loops, (loops, 1), and its `derivatives` as :func:`stiffness` does."""
     beta = np.maximum(beta, _LEAST_BETA)
     p, path, length = _close_loop(beta, alpha)
     log_z0 = np.log1p(np.tanh(length / 2.0))
@@ -193,31 +191,32 @@ def _stiffness(
     scale = reach / np.pi
 
     def integral(odd: FloatArray, even: FloatArray) -> ComplexArray:
-        """Return Int (odd + j even) dl/pi over beta; 0 where it underflows, as loops at rest do."""
+        """Return Int (odd + j even) dl/pi over beta; 0 where it underflows, as at rest."""
         total = odd @ rule.midpoint[:, None] + 1j * (even @ rule.fejer[:, None])
         return np.asarray(scale * total / beta)
 
-    bent = integral(sin_k * curved, cos_k * curved) / k
+    curvature = integral(sin_k * curved, cos_k * curved) / k
     spring: ComplexArray = np.where(k == 1, line, 0.0) + 0j
     if not derivatives:
-        return (spring + bent,)
+        return (spring + curvature,)
 
-    def moved(shift: FloatArray) -> ComplexArray:
+    def change(shift: FloatArray) -> ComplexArray:
         """Return (2/pi) Int exp(-j k theta) 2 shift/sin(theta) dl over beta."""
         shift = shift / sin
         return np.asarray(2.0 * np.conj(integral(cos_k * shift, sin_k * shift)))
 
     decay = np.exp(-alpha * length)
-    turn = decay / (1.0 + decay)  # w
+    w = decay / (1.0 + decay)
     # of c_k without C beta; the integral of exp(-j k theta) dtheta is -2j/k
     tilt = 4j / (np.pi * k) * (line * beta * np.tanh(alpha * length / 2.0) / beta)
-    by_ln_beta = moved((turn - sin2) * curved) + tilt
+    by_ln_beta = change((w - sin2) * curved) + tilt
     if derivatives == 1:
-        return spring + bent, bent - by_ln_beta
+        return spring + curvature, curvature - by_ln_beta
     finite = np.where(np.isinf(length), 0.0, length)
-    whole = turn * (log_z0 + finite * _log_slope(p * finite))
-    by_alpha = moved((whole - sin2 * (log_z0 + depth * _log_slope(p * depth))) * z)
-    return spring + bent, bent - by_ln_beta, spring + by_ln_beta, by_alpha  # C cancels
+    at_end = w * (log_z0 + finite * _log_slope(p * finite))
+    by_alpha = change((at_end - sin2 * (log_z0 + depth * _log_slope(p * depth))) * z)
+    # the derivative of C cancels
+    return spring + curvature, curvature - by_ln_beta, spring + by_ln_beta, by_alpha
 
 
 def _log_slope(u: FloatArray) -> FloatArray:

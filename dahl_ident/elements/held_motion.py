@@ -1,8 +1,8 @@
-"""The force of a law under a displacement that is held, by the engine.
+"""The force of a law under a prescribed displacement, by the engine.
 
-Laws are compiled once, and moved along a history in one integration, with exact derivatives. A law
-that does not depend on the rate is moved at unit speed: time is then the path, and a step may be as
-long as the way between two turning points. One that does moves along polynomials in time.
+Laws are compiled once, and integrated along a history with exact derivatives. A rate-independent
+law is moved at unit speed: time is then the path, and a step may be as long as the path between two
+turning points. Other laws move along polynomials in time.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from dahl_ident.engine import Loops, System
 
 _SYSTEMS: dict[Hashable, System] = {}
-"""Compiled equations by law; not kept on the laws, which are sent to other processes."""
-_BOTH_WAYS: dict[Hashable, bool] = {}
-_FIRST: dict[Hashable, FirstState] = {}
+"""Compiled equations by law; not attributes of the laws, which are sent to other processes."""
+_IS_ODD: dict[Hashable, bool] = {}
+_FIRST_STATES: dict[Hashable, FirstState] = {}
 """The maps from the unknowns at the first sample to the states, by law."""
 
-_EVEN = 0.1  # of a step: what even sampling may leave unexplained
-_FINER = 10.0  # than a driven motion, where a step is not that across a narrow gap
+_EVEN = 0.1  # error of even sampling, over a step of the displacement, up to which it is assumed
+_FINER = 10.0  # times finer than a driven motion, for laws of one state
 
 
 def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -> System:
-    """Return the compiled equations of a law, whose fixed parameters have their values or vary."""
+    """Return the compiled equations of a law; parameters `chosen`, or not at their values, vary."""
     law = law.with_bound(
         tuple(
             p.freed() if i in chosen or p.value is None or bool(np.any(v != p.value)) else p
@@ -51,29 +51,29 @@ def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -
 def same_both_ways(law: Element) -> bool:
     """Return whether a law is the same in both directions, without compiling it."""
     form = form_of(law)
-    if form not in _BOTH_WAYS:
+    if form not in _IS_ODD:
         from dahl_ident.engine.translate import is_odd
 
-        _BOTH_WAYS[form] = is_odd(law_equations(law))
-    return _BOTH_WAYS[form]
+        _IS_ODD[form] = is_odd(law_equations(law))
+    return _IS_ODD[form]
 
 
-def _first_of(law: Element) -> FirstState:
+def _first_state_of(law: Element) -> FirstState:
     form = form_of(law)
-    if form not in _FIRST:
-        _FIRST[form] = FirstState(as_model(law))
-    return _FIRST[form]
+    if form not in _FIRST_STATES:
+        _FIRST_STATES[form] = FirstState(as_model(law))
+    return _FIRST_STATES[form]
 
 
 def form_of(law: Element) -> Hashable:
     """Return the key of a law's equations: its class, constants and other attributes."""
     constants = tuple(None if p.free else p.value for p in law.parameters)
-    others = tuple(
+    attributes = tuple(
         (name, form_of(value) if isinstance(value, Element) else repr(value))
         for name, value in sorted(law.__dict__.items())
         if name not in ("parameters", "_name")
     )
-    return (type(law), tuple(c if c in (0.0, 1.0) else None for c in constants), others)
+    return (type(law), tuple(c if c in (0.0, 1.0) else None for c in constants), attributes)
 
 
 def loops_of(
@@ -81,7 +81,7 @@ def loops_of(
 ) -> Loops:
     """Return the settled loops of a law at rows of amplitude, frequency and values.
 
-    If `gap`, a gap in the link to the law follows its values.
+    With `gap`, the width of a gap in series follows the law's values.
     """
     from dahl_ident.engine import loops
 
@@ -108,7 +108,7 @@ def force_along(
         times, knots, coefficients = _at_unit_speed(x)
     else:
         times, knots, coefficients = _in_time(path)
-    first, by_start, by_value = _first_of(law)(np.append([x[0], 0.0], state), numbers)
+    first, by_start, by_value = _first_state_of(law)(np.append([x[0], 0.0], state), numbers)
     by, by_first = np.zeros((len(values), x.size)), np.zeros((x.size, first.size))
     if not coefficients.size:
         speed = 0.0 if law.rate_independent else float(np.asarray(path.velocity)[0])
@@ -130,7 +130,7 @@ def force_along(
 
 
 def _at_unit_speed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the path at every sample, and at every turning point; straight lines between these."""
+    """Return the path at every sample, the path at turning points, and the lines between these."""
     steps = np.diff(x)
     path = np.append(0.0, np.cumsum(np.abs(steps)))
     moves = np.flatnonzero(steps)
@@ -143,8 +143,8 @@ def _at_unit_speed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _in_time(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the times of the samples, twice, and the polynomials of displacement between them.
 
-    Where the times are not known they follow from displacement and velocity, for even sampling or,
-    where that does not fit, for a constant acceleration between samples.
+    If the times are not known, they follow from displacement and velocity: for even sampling or, if
+    that does not fit, for a constant acceleration between samples.
     """
     x, v = path.displacement, np.asarray(path.velocity)
     if path.time is not None or x.size < 2:
@@ -153,14 +153,16 @@ def _in_time(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     from scipy.interpolate import CubicSpline
 
     steps = np.diff(x)
-    way = np.diff(CubicSpline(np.arange(x.size), v).antiderivative()(np.arange(x.size)))
-    even = float(steps @ way) / (float(way @ way) or 1.0)
-    size = np.abs(even * way)
-    intervals = np.full(steps.shape, even)
-    if not (even > 0.0 and np.all(np.abs(steps - even * way) <= _EVEN * (size + 0.1 * size.max()))):
+    integral = np.diff(CubicSpline(np.arange(x.size), v).antiderivative()(np.arange(x.size)))
+    interval = float(steps @ integral) / (float(integral @ integral) or 1.0)
+    even_steps = interval * integral
+    size = np.abs(even_steps)
+    intervals = np.full(steps.shape, interval)
+    fits = np.all(np.abs(steps - even_steps) <= _EVEN * (size + 0.1 * size.max()))
+    if not (interval > 0.0 and fits):
         with np.errstate(all="ignore"):
             intervals = np.asarray(2.0 * steps / (v[1:] + v[:-1]))
-        known = (intervals > 0.0) & (intervals < np.inf)
-        intervals[~known] = np.median(intervals[known]) if known.any() else 1.0
+        valid = (intervals > 0.0) & (intervals < np.inf)
+        intervals[~valid] = np.median(intervals[valid]) if valid.any() else 1.0
     times = np.append(0.0, np.cumsum(intervals))
     return times, times, path.polynomials(np.diff(times))

@@ -1,8 +1,8 @@
 r"""Laws that are parallel elastoplastic (Jenkins) elements, and so follow Masing's rules.
 
-A Jenkins element of stiffness k slips at the displacement d. Loaded from rest, any sum of them has
+A Jenkins element of stiffness k slips at the displacement d. Loaded from rest, a sum of them has
 the force V(x) = sum of k min(x, d), the **backbone curve**. After a reversal each element needs
-twice its d to slip the other way, so that the force follows V at twice the scale,
+twice its d to slip in the other direction, so that the force follows V at twice the scale,
 
     F = F_r + 2 s V(s (x - x_r)/2),
 
@@ -12,8 +12,8 @@ Under x = A cos(theta) partial integration gives, for odd k,
     N_k = F_k/A = (2 j/(pi k)) Int_0^pi V'(A sin^2(theta/2)) sin(theta) exp(-j k theta) dtheta.
 
 **Unique response.** A abs(L + N) rises with A for every passive L (Im L >= 0) where
-2 Im N + A Im N' >= A abs(N'). A Jenkins element has equality while it slips, both sides being
-4 k d/(pi A), and a sum of them keeps it: the left sides add, the right side is at most their sum.
+2 Im N + A Im N' >= A abs(N'). For a Jenkins element that slips both sides are equal, 4 k d/(pi A);
+so the inequality holds for a sum of them: the left sides add, the right side is at most their sum.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ class Masing(Friction):
     """Parallel Jenkins elements, defined by the force of a first loading; see the module."""
 
     one_state = False
-    starts = (("initial_load", "", "way from rest to the first sample, over that to full slip"),)
+    starts = (
+        ("initial_load", "", "displacement from rest to the first sample, over that to full slip"),
+    )
     unique_response = True
 
     @abstractmethod
@@ -69,15 +71,15 @@ class Masing(Friction):
         In plain arithmetic; as many as :attr:`n_states`.
         """
         raise ModelError(
-            f"{self!r} says of no Jenkins elements what it consists of, so it cannot be driven by "
-            "a force over time; add sliders() and n_states to it, or give records with measured "
-            "displacement and force"
+            f"{self!r} does not list its Jenkins elements, so it cannot be driven by a force over "
+            "time; add sliders() and n_states to it, or give records with measured displacement "
+            "and force"
         )
 
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return the springs' forces, and their changes: none for a spring that slips."""
+        """Return the total force of the springs, and their rates: 0 for a spring that slips."""
         rates = [
             k * velocity * (k * d - direction * force > 0.0)
             for k, d, force in zip(*self.sliders(values), states, strict=True)
@@ -87,33 +89,33 @@ class Masing(Friction):
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
         """Return the springs' forces on the backbone curve, loaded from rest."""
         stiffnesses, slips = self.sliders(values)
-        way = starts[0] * slips[-1]
-        return [k * clipped(way, d) for k, d in zip(stiffnesses, slips, strict=True)]
+        x = starts[0] * slips[-1]
+        return [k * clipped(x, d) for k, d in zip(stiffnesses, slips, strict=True)]
 
     def start_with(self, values: Sequence[Any], force: float) -> float:
-        """Return the way along the backbone curve to a force, over that to full slip."""
+        """Return the displacement on the backbone curve for a force, over that to full slip."""
         from scipy.optimize import brentq
 
         at = [np.asarray(v, dtype=np.float64) for v in values]
-        end = float(self.knee(at)[1])
+        full_slip = float(self.knee(at)[1])
         if abs(force) >= float(self.force_limits(at)[0]):
             return float(np.sign(force))
 
-        def excess(way: float) -> float:
-            return float(self.backbone(at, np.asarray(way * end))) - abs(force)
+        def excess(load: float) -> float:
+            return float(self.backbone(at, np.asarray(load * full_slip))) - abs(force)
 
         return float(np.sign(force) * brentq(excess, 0.0, 1.0, xtol=1e-300, rtol=_DIGITS))
 
     def start_bounds(self, values: Values) -> tuple[float, float]:
-        """Return those of loads, just below slip: at slip a spring forgets its load."""
+        """Return the bounds of a load, just below slip: at slip a spring forgets its load."""
         return -_NEARLY_SLIPS, _NEARLY_SLIPS
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force at every sample by Masing's rules, exactly, unchecked.
+        """Return the force at every sample by Masing's rules, exactly; arguments are not checked.
 
-        The element comes from rest along the backbone curve; `state` is its load there.
+        The element has come from rest along the backbone curve; `state` is its load on that curve.
         """
         if slopes:
             return self._differences(values, path, state)
@@ -122,9 +124,9 @@ class Masing(Friction):
         u = path.displacement - path.displacement[0] + start
         origins, parents, headings, path_of = _paths(u)
 
-        def along(place: FloatArray, path: NDArray[np.intp]) -> FloatArray:
-            """Return the force that is added on a path from its origin to a place."""
-            moved = place - origins[path]
+        def along(x: FloatArray, path: NDArray[np.intp]) -> FloatArray:
+            """Return the force added on a path from its origin to x."""
+            moved = x - origins[path]
             scale = np.where(path == 0, 1.0, 2.0)
             sign = np.where(path == 0, np.sign(moved), headings[path])
             return np.asarray(scale * sign * self.backbone(at, np.abs(moved) / scale))
@@ -138,7 +140,7 @@ class Masing(Friction):
         return HistoryGradient(force, np.ones(force.shape), ())
 
     def _differences(self, values: Sequence[Any], path: Path, state: float) -> HistoryGradient:
-        """Return the force with central differences by the state and every value."""
+        """Return the force, and central differences with respect to the state and every value."""
         numbers = [state, *(float(v) for v in values)]
 
         def force(i: int, number: float) -> FloatArray:
@@ -154,13 +156,13 @@ class Masing(Friction):
         return HistoryGradient(value, by_state, tuple(by))
 
     def answers(self, harmonic: int) -> bool:
-        """Return whether the harmonic is odd: both directions are alike."""
+        """Return whether the harmonic is odd, because both directions are alike."""
         return harmonic % 2 == 1
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the sum of all slip forces, for both directions."""
-        top = self.backbone(values, np.asarray(2.0 * self.knee(values)[1]))
-        return top, top
+        limit = self.backbone(values, np.asarray(2.0 * self.knee(values)[1]))
+        return limit, limit
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the stiffness at rest, and 4/pi of the force limit.
@@ -184,13 +186,12 @@ def _paths(
 ) -> tuple[FloatArray, NDArray[np.intp], FloatArray, NDArray[np.intp]]:
     """Return the paths of Masing's rules along displacements that begin on the backbone curve.
 
-    Each path begins at a reversal, which lies on a path before it, its parent; path 0 is the
-    backbone curve. Of each path the origin, its parent and its direction; of each displacement the
-    path on which it lies.
+    Path 0 is the backbone curve. Every other path begins at a reversal, on an earlier path, its
+    parent. Returns origin, parent and direction of each path, and the path of each displacement.
     """
     origins, parents, headings = [0.0], [0], [1.0]
     path_of = np.zeros(u.size, dtype=np.intp)
-    open_paths: list[int] = []  # that have been begun and not yet closed, outermost first
+    open_paths: list[int] = []  # begun and not yet closed, outermost first
     cut = stretches(u)
     first = 0
     for heading, last in zip(cut.heading.tolist(), np.cumsum(cut.samples) - 1, strict=True):
@@ -203,7 +204,7 @@ def _paths(
             headings.append(heading)
         first += 1
         while open_paths and first <= stop:
-            # a path ends where the one before it began; the first one mirrors its own origin
+            # a path ends where the one before it began, the first one opposite to its own origin
             path = open_paths[-1]
             limit = origins[open_paths[-2]] if len(open_paths) > 1 else -origins[path]
             inside = np.searchsorted(heading * u[first : stop + 1], heading * limit, side="right")

@@ -1,4 +1,4 @@
-"""Histories with memory: stretches of one direction, and linear recursions over many steps."""
+"""Histories with memory: stretches of one direction, and linear recursions over many samples."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Stretches:
 def stretches(displacement: FloatArray) -> Stretches:
     """Return a displacement's stretches of one direction.
 
-    A step of 0 goes on as the motion before it. A turning point belongs to the stretch that it
-    begins.
+    A step of 0 keeps the direction of the motion before it. A turning point belongs to the stretch
+    that it begins.
 
     Examples
     --------
@@ -63,7 +63,7 @@ def stretches(displacement: FloatArray) -> Stretches:
 
 
 def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
-    """Return y with y[0] = first, (c,), and y[i + 1] = keep[i] y[i] + term[i], numbers `keep`.
+    """Return y with y[0] = first, (c,), and y[i + 1] = keep[i] y[i] + term[i]; `keep` is (n,).
 
     Examples
     --------
@@ -76,8 +76,8 @@ def linear_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> F
 def matrix_recursion(keep: FloatArray, term: FloatArray, first: FloatArray) -> FloatArray:
     """Return y with y[0] = first, (order, c), and y[i + 1] = keep[i] y[i] + term[i].
 
-    `keep` are matrices, (n, order, order). One forward substitution in a banded triangular matrix,
-    by LAPACK.
+    `keep` holds matrices, (n, order, order). LAPACK solves the banded triangular system by one
+    forward substitution.
     """
     n, order, _ = keep.shape
     band = np.zeros((2 * order, (n + 1) * order), order="F")
