@@ -1,4 +1,4 @@
-"""A sampled drive between its samples: band-limited, as piecewise polynomials of degree 9."""
+"""Band-limited interpolation of a sampled drive, by piecewise polynomials of degree 9."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from scipy import fft
 
 from dahl_ident.arrays import FloatArray
 
-_DERIVATIVES = 4  # at five samples a period, the polynomials between miss 1e-9 of a sine
-_BAND = 0.8  # above this share of half the sampling rate a good extension has little
+_DERIVATIVES = 4  # of a sine with five samples a period the polynomials miss 1e-9
+_BAND = 0.8  # fraction of half the sampling rate above which a smooth extension has little power
 
 
 def band_limited(samples: FloatArray, interval: float) -> FloatArray:
     """Return polynomials of degree 9 between samples.
 
-    The record is extended beyond its ends and differentiated four times by Fourier transform;
-    between samples the polynomial has all derivatives (Hermite). A record that
-    ends where it began, such as whole periods of a multisine, is continued periodically; any
-    other is mirrored at its ends. Whichever leaves less above the band is taken.
+    The record is extended beyond its ends and differentiated four times by Fourier transform; each
+    polynomial has the derivatives of both its ends (Hermite). The extension is periodic, as for
+    whole periods of a multisine, or mirrored at the ends, whichever leaves less power above the
+    band.
 
     Examples
     --------
@@ -28,19 +28,16 @@ def band_limited(samples: FloatArray, interval: float) -> FloatArray:
     """
     n = samples.size
     line = np.linspace(samples[0], samples[-1], n)
-    rest = samples - line
-    candidates = [
-        (samples, samples[:0]),
-        (np.concatenate([rest, -rest[-2:0:-1]]), line),
+    deviation = samples - line
+    extensions = [samples, np.concatenate([deviation, -deviation[-2:0:-1]])]
+    spectra = [fft.rfft(wave) for wave in extensions]
+    beyond_band = [
+        float(np.sum(np.abs(spectrum[int(_BAND * spectrum.size) :]) ** 2)) / wave.size**2
+        for spectrum, wave in zip(spectra, extensions, strict=True)
     ]
-    spectra = [fft.rfft(wave) for wave, _ in candidates]
-    beyond = [
-        float(np.sum(np.abs(s[int(_BAND * s.size) :]) ** 2)) / wave.size**2
-        for s, (wave, _) in zip(spectra, candidates, strict=True)
-    ]
-    periodic = beyond[0] <= beyond[1]
-    spectrum, (wave, _) = (spectra[0], candidates[0]) if periodic else (spectra[1], candidates[1])
-    m = wave.size
+    periodic = beyond_band[0] <= beyond_band[1]
+    choice = 0 if periodic else 1
+    spectrum, m = spectra[choice], extensions[choice].size
     omega = 2.0 * np.pi * np.arange(spectrum.size) / (m * interval)
     derivatives = [
         fft.irfft(spectrum * (1j * omega) ** order, m)[:n] for order in range(_DERIVATIVES + 1)

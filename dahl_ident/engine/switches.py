@@ -1,9 +1,9 @@
-"""Kinks of a law, found in its own expression.
+"""Kinks of a law, found in its expression.
 
 A law in plain arithmetic has kinks where it takes an absolute value, a sign or a comparison. Their
-arguments are the switching functions: where one passes through zero, the law changes its branch.
-An integration that locates those places, and keeps to one branch in between, sees smooth
-functions alone.
+arguments are the switching functions: where one crosses zero, the law changes its branch. An
+integration that locates these crossings, and keeps to one branch in between, sees smooth functions
+only.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ def on_one_branch(
     motion: tuple[ca.SX, ca.SX] | None = None,
     constants: Sequence[ca.SX] = (),
 ) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
-    """Return an expression with every switch held, its switching functions and their sides.
+    """Return an expression with every switch fixed to a side, the switching functions and sides.
 
-    `motion` is a switching function that is known already, with its side. What depends on none of
-    the `variables`, only on `constants` and on sides, is no switch.
+    `motion` is a switching function that exists already, with its side. An expression that depends
+    on none of the `variables`, only on `constants` and on sides, is not a switch.
 
     Examples
     --------
@@ -37,15 +37,17 @@ def on_one_branch(
     inputs, moving = [*variables, *constants], ca.vertcat(*variables)
     function = ca.Function("f", inputs, [ca.densify(outputs)])
     work: dict[int, ca.SX] = {}
-    whole: dict[int, ca.SX] = {}  # with switches that are not held: roots take them beyond one too
+    # the same with switches that switch: roots and logarithms take these, which beyond a crossing
+    # stay in their domain
+    switching: dict[int, ca.SX] = {}
     functions, sides = ([motion[0]], [motion[1]]) if motion else ([], [])
-    held = [ca.SX(0.0)] * function.nnz_out(0)
+    fixed = [ca.SX(0.0)] * function.nnz_out(0)
 
     def side_of(argument: ca.SX) -> ca.SX:
-        for known, side in zip(functions, sides, strict=True):
-            if ca.is_equal(known, argument, 20):
+        for existing, side in zip(functions, sides, strict=True):
+            if ca.is_equal(existing, argument, 20):
                 return side
-            if ca.is_equal(known, -argument, 20):
+            if ca.is_equal(existing, -argument, 20):
                 return -side
         functions.append(argument)
         sides.append(ca.SX.sym(f"side{len(sides)}"))
@@ -56,23 +58,24 @@ def on_one_branch(
         target, source = function.instruction_output(k), function.instruction_input(k)
         if code == ca.OP_CONST:
             work[target[0]] = ca.SX(function.instruction_constant(k))
-            whole.pop(target[0], None)
+            switching.pop(target[0], None)
         elif code == ca.OP_INPUT:
             work[target[0]] = inputs[source[0]]
-            whole.pop(target[0], None)
+            switching.pop(target[0], None)
         elif code == ca.OP_OUTPUT:
-            held[target[1]] = work[source[0]]
+            fixed[target[1]] = work[source[0]]
         else:
             a = [work[i] for i in source]
-            if code in _OF_POSITIVE and source[0] in whole:
-                a[0] = whole[source[0]]
-            unheld = [whole.get(i, work[i]) for i in source]
-            switched = code in (ca.OP_FABS, ca.OP_FMAX, ca.OP_FMIN) or any(
-                i in whole for i in source
+            if code in _OF_POSITIVE and source[0] in switching:
+                a[0] = switching[source[0]]
+            arguments = [switching.get(i, work[i]) for i in source]
+            switches = code in (ca.OP_FABS, ca.OP_FMAX, ca.OP_FMIN) or any(
+                i in switching for i in source
             )
-            whole.pop(target[0], None)
-            if switched and code not in _OF_POSITIVE:
-                whole[target[0]] = (ca.SX.unary if len(a) == 1 else ca.SX.binary)(code, *unheld)
+            switching.pop(target[0], None)
+            if switches and code not in _OF_POSITIVE:
+                form = ca.SX.unary if len(a) == 1 else ca.SX.binary
+                switching[target[0]] = form(code, *arguments)
             kink = code in (*_SIGNED, *_COMPARED) and ca.depends_on(ca.vertcat(*a), moving)
             if kink and code in _SIGNED:
                 side = side_of(a[0])
@@ -93,20 +96,20 @@ def on_one_branch(
                 work[target[0]] = ca.SX.unary(code, a[0])
             else:
                 work[target[0]] = ca.SX.binary(code, a[0], a[1])
-    known = 1 if motion else 0  # the velocity, which is not a switch of the law
-    return _effective(ca.vertcat(*held), functions[known:], sides[known:])
+    skip = 1 if motion else 0  # the velocity is not a switch of the law
+    return _effective(ca.vertcat(*fixed), functions[skip:], sides[skip:])
 
 
 def _effective(
     rows: ca.SX, functions: list[ca.SX], sides: list[ca.SX]
 ) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
-    """Return all that without the switches that change nothing, as in sign(x) |x| = x."""
+    """Return the arguments without the switches that change nothing, as in sign(x) |x| = x."""
     for i, side in enumerate(sides):
-        rest = functions[:i] + functions[i + 1 :]
-        whole = ca.vertcat(rows, *rest)
-        above, below = (ca.substitute(whole, side, ca.SX(value)) for value in (1.0, -1.0))
-        if all(ca.is_equal(above[j], below[j], 20) for j in range(whole.numel())):
+        others = functions[:i] + functions[i + 1 :]
+        stacked = ca.vertcat(rows, *others)
+        above, below = (ca.substitute(stacked, side, ca.SX(value)) for value in (1.0, -1.0))
+        if all(ca.is_equal(above[j], below[j], 20) for j in range(stacked.numel())):
             n = rows.numel()
-            rest = [above[n + j] for j in range(len(rest))]
-            return _effective(above[:n], rest, sides[:i] + sides[i + 1 :])
+            others = [above[n + j] for j in range(len(others))]
+            return _effective(above[:n], others, sides[:i] + sides[i + 1 :])
     return rows, functions, sides
