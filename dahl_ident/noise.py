@@ -1,4 +1,4 @@
-r"""Noise models, which scale measured minus predicted responses to residuals of unit variance.
+r"""Noise models, which turn measured minus predicted responses into residuals of equal variance.
 
 Each row of data is one complex number R and gives two residuals, stored as the real and imaginary
 part of one complex residual y. There are three models:
@@ -9,37 +9,37 @@ part of one complex residual y. There are three models:
     ``(nu - 2) ln(1 + |y|^2/nu)`` in place of ``|y|^2``; see below.
 ``relative``
     Constant unknown variance of (ln gain, phase): ``y = ln(R / R_model)``. Weights do not
-    depend on the parameters, so least squares is maximum likelihood; dividing R - R_model by
-    |R| or |R_model| would not be. A harmonic's error scales with the fundamental of the same
-    point: ``y = (R_k - R_k,model) / |R_1|`` with the measured fundamental.
+    depend on the parameters, so least squares is maximum likelihood; least squares of
+    R - R_model over |R| or |R_model| would not be. A harmonic's error is proportional to the
+    fundamental of the same point: ``y = (R_k - R_k,model) / |R_1|``, R_1 as measured.
 ``absolute``
     Constant unknown variance of (Re R, Im R), in the data's own quantity: ``y = R - R_model``.
 
 **Estimated covariances.** Rows whose error was by chance estimated too small must not dominate the
 fit: with nu = 6, weights 1/C give 95 % intervals with a coverage of 60 to 75 %. With W = nu C and r
-the residual, the loss a ln(1 + r' W^-1 r) has the score a (W + r r')^-1 r, and W + r r' is a
-Wishart matrix of nu + 1 degrees of freedom in which r is one of nu + 1 equivalent terms. Hence, for
-any true covariance V, the score's variance is a^2 V^-1/((nu + 1)(nu - 2)) and its mean derivative a
-V^-1/(nu + 1). The two agree, as they do for a likelihood, if a = nu - 2: then curvature, likelihood
-ratios and stated covariances are correct, also for rows of different nu. (The density of Student's
-t that Jeffreys' prior of V leads to has a = nu + 1, and states variances (nu + 1)/(nu
-- 2) times too small.) An unbiased estimate of V^-1 is (nu - 2) (W + r r')^-1, so the information of
-  a row is (nu - 2)^2/(nu + 1) J' (W + r r')^-1 J. A row with one part, the mean force (k = 0),
-  which is real and has no imaginary part, has nu - 1 instead of nu - 2.
+the residual, the loss a ln(1 + r' W^-1 r) has the score a (W + r r')^-1 r. W + r r' is a Wishart
+matrix of nu + 1 degrees of freedom in which r is one of nu + 1 equivalent terms. Hence, for any
+true covariance V, the score has the variance a^2 V^-1/((nu + 1)(nu - 2)) and the mean derivative
+a V^-1/(nu + 1). The two agree, as they do for a likelihood, if a = nu - 2. Then curvature,
+likelihood ratios and stated covariances are correct, even for rows of different nu. (A Jeffreys
+prior of V leads to Student's t with a = nu + 1, which states variances too small by a factor of
+(nu + 1)/(nu - 2).) An unbiased estimate of V^-1 is (nu - 2) (W + r r')^-1, so the information of a
+row is (nu - 2)^2/(nu + 1) J' (W + r r')^-1 J. The row of a mean force (k = 0), which is real, has
+nu - 1 instead of nu - 2.
 
 **Noise in the measured amplitude** (``measured`` only). The true ln A of a row is unknown; its
-measured value has a known error, correlated with that of R because R is a quotient with the
-displacement. Given the parameters, the best true amplitude minimises the joint chi-square of both;
-the minimum is
+measured value has an error of known variance, correlated with that of R because R is a quotient
+with the displacement. For given parameters, the best true amplitude minimises the joint chi-square
+of both; the minimum is
 
     |y|^2 = r' V^-1 r,    r = R - R_model - e d,    V = C - c d' - d c' + s^2 d d',
 
 with d = dR_model/dln A at the best amplitude, s and c the standard deviation of ln A and its
-covariance with R, and e = (c - s^2 d)' V^-1 r the estimated error. This is the likelihood with the
-true amplitudes profiled out, which is the same as integrating under their Jeffreys prior. Although
-V depends on the parameters, the sum must not include ln det V: with it, or with fixed weights and
-the model evaluated at the measured amplitudes, estimates would be biased towards a flatter curve
-for any number of rows (the attenuation of errors-in-variables regression).
+covariance with R, and e = (c - s^2 d)' V^-1 r the estimated error. This is the profile likelihood
+over the true amplitudes; integration under their Jeffreys prior gives the same. Although V depends
+on the parameters, the sum must not include ln det V: with it, or with fixed weights and the model
+evaluated at the measured amplitudes, estimates would be biased towards a flatter curve for any
+number of rows (the attenuation of errors-in-variables regression).
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ Rho = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 ROUNDING = 2.0**-46  # relative rounding error of a response when its residual is computed
 _GAUSSIAN = 1e15  # degrees of freedom at which the loss is z to rounding
-_AMPLITUDE_STEPS = 40  # iterations, a limit if they do not settle
+_AMPLITUDE_STEPS = 40  # most iterations, if they do not converge
 _AMPLITUDE_TOLERANCE = 1e-7  # in standard deviations; residuals err by less than its square
-_ROUNDED = 0.01  # in the same unit: a shorter step that does not shrink is due to rounding
+_ROUNDED = 0.01  # standard deviations; a shorter step that does not shrink is a rounding error
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Relative:
         return np.where(harmonic, (self.response - predicted) / size, _logarithm(ratio))
 
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
-        """Return the residual's derivative where the prediction has the derivative `by`."""
+        """Return the derivative of the residual for a derivative `by` of the prediction."""
         if self.fundamental is None:
             return -by / predicted
         return -by / np.where(self.fundamental > 0.0, self.fundamental, predicted)
@@ -115,9 +115,9 @@ class Relative:
 
 @dataclass(frozen=True)
 class Measured:
-    """Covariance of (Re R, Im R), and of ln A where `amplitude` is given.
+    """Covariance of (Re R, Im R), and of ln A if `amplitude` is not None.
 
-    That of "absolute" noise, whose scale is unknown, is 1 in both parts.
+    "absolute" noise, whose scale is unknown, has the unit matrix.
     """
 
     response: ComplexArray
@@ -128,30 +128,30 @@ class Measured:
     amplitude: AmplitudeError | None = None
     name: str = "measured"
     rounding: FloatArray = field(default_factory=lambda: np.zeros(()))
-    """Size of residuals that may be rounding errors alone, () or (S,); 0 where it is known."""
+    """Size of residuals that may be mere rounding errors, () or (S,); 0 if the scale is known."""
 
     @property
     def scale_known(self) -> bool:
-        """Whether residuals have unit variance as they are."""
+        """Whether residuals have unit variance."""
         return self.name == "measured"
 
     @property
     def weights(self) -> FloatArray:
-        """One over the root mean square of the parts' standard deviations."""
+        """One over the root mean square of the standard deviations of both parts."""
         parts = np.where(self.covariance.ii == 0.0, 1.0, 2.0)
         return np.sqrt(parts / (self.covariance.rr + self.covariance.ii))
 
     @property
     def tail(self) -> Student | None:
-        """The loss of rows whose covariance was estimated; None where all are known."""
+        """The loss of rows whose covariance was estimated; None if all covariances are known."""
         if self.dof is None:
             return None
         return Student(self.dof, np.where(self.covariance.ii == 0.0, 1.0, 2.0))
 
     def widened(self, variance: FloatArray) -> Measured:
-        """Return Gaussian noise with a further variance of both parts of every row, (n,).
+        """Return Gaussian noise with a further `variance` of both parts of every row, (n,).
 
-        A covariance of few degrees of freedom counts as the one that Student's t has.
+        A covariance of few degrees of freedom is replaced by that of Student's t.
         """
         t = 1.0 if self.dof is None else self.dof / (self.dof - 2.0)
         rr, ri, ii = self.covariance
@@ -169,7 +169,7 @@ class Measured:
         return self.whitening(self.response - predicted)
 
     def change(self, predicted: ComplexArray, by: ComplexArray) -> ComplexArray:
-        """Return the residual's derivative where the prediction has the derivative `by`."""
+        """Return the derivative of the residual for a derivative `by` of the prediction."""
         return -self.whitening(by)
 
     def replicate(self, predicted: ComplexArray, residual: ComplexArray) -> ComplexArray:
@@ -191,7 +191,7 @@ class Covariance(NamedTuple):
 class Whitening(NamedTuple):
     """Inverse Cholesky factors [[a, 0], [b, c]], which act on a complex number's two parts.
 
-    c is 0 in rows of one part: a real number without an imaginary part to weigh.
+    c is 0 in rows of one part, that is of a real number.
     """
 
     a: FloatArray
@@ -202,7 +202,7 @@ class Whitening(NamedTuple):
     def of(cls, covariance: Covariance) -> Whitening:
         """Return the whitening of `covariance`; NaN or infinite where it is singular.
 
-        A covariance of the real part alone whitens that part alone.
+        Where only the real part has a covariance, only that part is whitened.
         """
         rr, ri, ii = covariance
         real = (ri == 0.0) & (ii == 0.0)
@@ -258,11 +258,11 @@ def correct_amplitude(
     noise: Measured,
     predict: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]],
 ) -> tuple[ComplexArray, Whitening, FloatArray]:
-    """Return residuals with every true amplitude at its best value, their whitening, and ln errors.
+    """Return residuals at the best true amplitudes, their whitening, and the errors of ln A.
 
-    `predict` takes the error e of ln A, and returns the response and its derivative with respect to
-    ln A at the amplitude measured over exp(e). Each row is a fixed-point iteration of one variable,
-    which secants of its last two steps shorten unless it hardly contracts.
+    `predict` takes the error e of ln A; it returns the response and its derivative with respect to
+    ln A, at the measured amplitude over exp(e). Each row is a fixed-point iteration of one number,
+    accelerated by the secant of its last two steps unless it hardly contracts.
     """
     error = noise.amplitude
     assert error is not None
@@ -320,13 +320,12 @@ def noise_for(rows: Rows, kind: str | None) -> Noise:
         if empty.any():
             table = f" of table {int(np.argmax(empty))}" if empty.ndim else ""
             raise DataError(f"every response{table} is 0; there is nothing to estimate from")
-        one = np.ones(rows.response.shape)
-        none = np.zeros(rows.response.shape)
+        one, zero = np.ones(rows.response.shape), np.zeros(rows.response.shape)
         return Measured(
             rows.response,
-            Covariance(one, none, one),
-            Whitening(one, none, one),
-            none.sum(axis=-1),
+            Covariance(one, zero, one),
+            Whitening(one, zero, one),
+            zero.sum(axis=-1),
             name="absolute",
             rounding=np.asarray(ROUNDING * np.sqrt(np.mean(np.abs(rows.response) ** 2, axis=-1))),
         )
@@ -396,7 +395,7 @@ def _measured(rows: Rows) -> Measured:
 
 
 def _amplitude_error(rows: Rows) -> AmplitudeError | None:
-    """Return the error of the level that the model uses: ln A, or ln of the drive; None if none."""
+    """Return the error of ln A, or of ln of the drive in force-controlled rows; None if 0."""
     variance, cross = np.zeros(rows.n), np.zeros(rows.n, dtype=np.complex128)
     for level, std, covariance, held in (
         (rows.amplitude, rows.amplitude_std, rows.amplitude_covariance, ~rows.forced),
@@ -412,7 +411,7 @@ def _amplitude_error(rows: Rows) -> AmplitudeError | None:
 
 
 def _first(bad: NDArray[np.bool_]) -> str:
-    """Return the index of the first bad row, of the first bad table where several are stacked."""
+    """Return the index of the first bad row, after that of its table if several are stacked."""
     return str([int(i) for i in np.argwhere(bad)[0]])
 
 
@@ -424,10 +423,10 @@ def squares_of(residuals: FloatArray, parts: int = 2) -> FloatArray:
 def weighted(
     rows: FloatArray, m: int, size: FloatArray, along: FloatArray, parts: int = 2
 ) -> FloatArray:
-    """Return residuals times `size`, derivatives d of each row y as size d + along y (y' d).
+    """Return size y for the residuals y of each row, and size d + along y (y' d) for derivatives d.
 
-    `rows` are residuals and, below them, their derivatives, (..., 1 + P, k); what stands after
-    the first `m` residuals, those of priors, stays.
+    `rows` are residuals and, below them, their derivatives, (..., 1 + P, k). Those after the first
+    `m`, of priors, do not change.
     """
     y, by = rows[..., :1, :m], rows[..., 1:, :m]
     lever = along[..., None, :] * sum(y[..., i::parts] * by[..., i::parts] for i in range(parts))
@@ -439,12 +438,11 @@ def weighted(
 
 
 def bend(rows: FloatArray, m: int, rho: Rho, parts: int = 2) -> FloatArray:
-    """Return rows as those of `weighted`, whose squares are rho(|y|^2) in the same directions."""
+    """Return `rows`, see `weighted`, with residuals scaled so that |y|^2 becomes rho(|y|^2)."""
     z = squares_of(rows[..., 0, :m], parts)
     loss, slope, _ = rho(z)
     flat = z <= 1e-12  # here rho(z) = rho'(0) z to rounding
     safe = np.where(flat, 1.0, z)
     factor = np.sqrt(np.where(flat, slope, loss / safe))
-    # d factor / dz, times 2
-    turn = np.where(flat, 0.0, (slope - loss / safe) / (safe * factor))
-    return weighted(rows, m, factor, turn, parts)
+    by_z = np.where(flat, 0.0, (slope - loss / safe) / (safe * factor))  # 2 d factor/dz
+    return weighted(rows, m, factor, by_z, parts)

@@ -1,4 +1,4 @@
-"""The phasors of a segment with their errors, and the responses that they give.
+"""The phasors of a segment with their errors, and the responses that follow from them.
 
 With the phasors X of displacement and F of force and their errors e_X, e_F,
 
@@ -7,8 +7,9 @@ With the phasors X of displacement and F of force and their errors e_X, e_F,
     N_k = F_k exp(-j k phi)/A         dN_k = e_Fk exp(-j k phi)/A - N_k (dA/A + j k dphi)
     N_0 = F_0/A                       dN_0 = e_F0/A - N_0 dA/A,   real
 
-A velocity or an acceleration is divided by ``j k omega`` once or twice. Where the force was held
-and harmonics of the displacement are asked for, X and F change places.
+A velocity or an acceleration is divided by ``j k omega`` once or twice. If the force was controlled
+and harmonics of the displacement are wanted, X and F change places. The channel in the denominator
+is called `held` here, the other one the answer.
 """
 
 from __future__ import annotations
@@ -51,15 +52,15 @@ from dahl_ident.extraction.sine_fit import (
 from dahl_ident.extraction.transient import SIGNIFICANT, Transient
 from dahl_ident.units import percent
 
-_DISTORTED = 0.02  # share of harmonics; above it the fundamental misses percents of the loss
+_DISTORTED = 0.02  # share of harmonics above which the fundamental misses percents of the loss
 _MOVING_MEAN = 0.02  # drift of the mean over the amplitude, if the force is controlled
-_BEYOND_NOISE = 5.0  # standard errors by which a drift exceeds white noise
+_BEYOND_NOISE = 5.0  # standard errors above which a drift is more than white noise
 _ROUNDING = 1e-9  # least relative standard deviation of a response
 _ALIASED = 0.01  # alias as a fraction of the fundamental above which it is reported
-_LOOKED_AT = 10_000  # samples at most from which the residual is computed
+_RESIDUAL_SAMPLES = 10_000  # most samples from which the residual is computed
 _FEW_STEPS = 10.0  # amplitude in steps of the sensor below which rounding matters
 Row = tuple[complex, FloatArray, FloatArray, float]
-"""A response, its covariance, that of what was held with it, and its degrees of freedom."""
+"""A response, its covariance, its covariance with the held size, and degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Settings:
 
     @property
     def of_displacement(self) -> bool:
-        """Whether the rows are X_k/F_1, and not F_k/X_1."""
+        """Whether the rows are X_k/F_1 instead of F_k/X_1."""
         return self.controlled == "force" and self.harmonics != (1,)
 
     @property
@@ -105,7 +106,7 @@ class Settings:
 
     @property
     def transient_channel(self) -> int:
-        """Where the transient shows: in the force, or in a displacement that is free."""
+        """The channel with the transient: the force, or a displacement that is free to move."""
         free = self.controlled == "force" and self.motion_channel == "displacement"
         return 0 if free else 1
 
@@ -114,8 +115,8 @@ class Settings:
 class Phasors:
     """Displacement and force of one segment with their noise.
 
-    `fit` is without the transient where that is significant; `transient_phasors` is what it adds to
-    the phasors of its channel. `steps` are those of the two sensors, 0 where they have none.
+    `fit` excludes the transient if that is significant; `transient_phasors` is what it adds to the
+    phasors of its channel. `steps` are the resolutions of the two sensors, 0 if there is none.
     """
 
     fit: SineFit
@@ -139,13 +140,12 @@ class Phasors:
         *,
         sweep: bool = False,
     ) -> Phasors:
-        """Fit a segment without its transient, which is not noise, and join the phasors' noise."""
+        """Fit a segment without its transient, which is not noise, and estimate the noise."""
         fit = sine_fit(without(transient, segment, settings), trend=sweep)
         orders = [1, *sorted({*settings.harmonics, *EVEN} - {1})]
         orders = [k for k in orders if k <= fit.orders]
         noise = dict(zip(orders, line_noise(fit, orders, cycles, fit.residual), strict=True))
-        added = transient.phasors(fit)
-        return cls(fit, cycles, settings, noise, transient, added, steps, samples)
+        return cls(fit, cycles, settings, noise, transient, transient.phasors(fit), steps, samples)
 
     @property
     def harmonics(self) -> list[int]:
@@ -154,7 +154,7 @@ class Phasors:
 
     @property
     def held(self) -> int:
-        """The channel over which responses are: 0 for the motion, 1 for the force."""
+        """The channel in the denominator of responses: 0 is the motion, 1 the force."""
         return int(self.settings.of_displacement)
 
     def integrator(self, harmonic: int) -> ComplexArray:
@@ -164,10 +164,10 @@ class Phasors:
 
     def phasors(self, harmonic: int) -> ComplexArray:
         """Return the phasors of the motion channel and the force, shape (2,)."""
-        both = self.fit.phasors(harmonic)
+        phasors = self.fit.phasors(harmonic)
         if self.transient.significant and harmonic:  # the mean is that of the steady loop
-            both[self.settings.transient_channel] += self.transient_phasors[harmonic]
-        return both
+            phasors[self.settings.transient_channel] += self.transient_phasors[harmonic]
+        return phasors
 
     @cached_property
     def fundamentals(self) -> ComplexArray:
@@ -176,31 +176,31 @@ class Phasors:
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """Root mean square error of a phasor of the motion channel and the force by rounding."""
+        """RMS error of a phasor of the motion channel and of the force due to quantisation."""
         if not self.steps.any():
             return np.zeros(2)
         fit, segment = self.fit, self.fit.segment
         residual = np.sqrt(fit.residual_variance)  # of single samples
         if segment.block > 1:
-            time = scattered(self.samples.time, _LOOKED_AT)
-            shown = segment.with_samples(time, scattered(self.samples.channels, _LOOKED_AT))
+            time = scattered(self.samples.time, _RESIDUAL_SAMPLES)
+            some = segment.with_samples(time, scattered(self.samples.channels, _RESIDUAL_SAMPLES))
             tau = (time - segment.centre) / segment.half_width
-            sine = fit.coefficients.T @ columns(shown.theta, tau, fit.orders, fit.trending)
-            left = without(self.transient, shown, self.settings).channels - sine
-            residual = np.sqrt(np.mean(left**2, axis=1))
+            sine = fit.coefficients.T @ columns(some.theta, tau, fit.orders, fit.trending)
+            errors = without(self.transient, some, self.settings).channels - sine
+            residual = np.sqrt(np.mean(errors**2, axis=1))
         amplitudes = np.abs(fit.phasors(1))
         samples = self.samples.time.size
         return quantisation_errors(amplitudes, self.steps, residual, samples / self.cycles)
 
     @cached_property
     def repeating(self) -> dict[int, FloatArray]:
-        """Errors of the phasors of both channels that are alike in every cycle, by harmonic."""
+        """Errors of the phasors of both channels that repeat in every cycle, by harmonic."""
         aliased = {k: alias_error(self.fit, k, self.cycles) for k in self.noise}
         return {k: np.hypot(self.rounding, error) for k, error in aliased.items()}
 
     @cached_property
     def errors(self) -> ComplexArray:
-        """Errors of the fundamental phasors of displacement and force; their products sum up."""
+        """Errors of the fundamental phasors of displacement and force, (2, independent sources)."""
         scale = self.integrator(1)[:, None]
         noise = self.noise[1].lines * np.sqrt(self.fit.phasor_variance(1))
         return np.asarray(scale * np.hstack([noise, np.diag(self.repeating[1])]))
@@ -213,8 +213,8 @@ class Phasors:
 
     @cached_property
     def distorted(self) -> float:
-        """The harmonics of what was held, beyond their noise, over its fundamental."""
-        # to a harmonic of what answers each adds about the response times its own size
+        """The harmonics of the held channel, in excess of their noise, over its fundamental."""
+        # each adds about its size times the response to the same harmonic of the answer
         power, channel = 0.0, self.held
         for k in (k for k in self.noise if k > 1):
             scale = abs(self.integrator(k) / self.integrator(1))[channel] ** 2
@@ -224,7 +224,7 @@ class Phasors:
         return float(np.sqrt(power) / abs(self.fit.phasors(1)[channel]))
 
     def forgotten(self, harmonic: int) -> float:
-        """Return the standard deviation that the transient's size leaves in what answers."""
+        """Return the standard deviation of the answer due to that of the transient's size."""
         if self.settings.transient_channel == self.held or self.transient.departure == 0.0:
             return 0.0
         added = complex(self.transient_phasors[harmonic])
@@ -233,11 +233,11 @@ class Phasors:
 
     @property
     def held_variance(self) -> float:
-        """Variance of the size of what was held."""
+        """Variance of the size of the held fundamental."""
         return 0.5 * float(np.sum(np.abs(self.errors[self.held]) ** 2))
 
     def referred(self, answer: complex, harmonic: int) -> complex:
-        """Return a phasor over the size of what was held, turned by k times its phase."""
+        """Return a phasor over the size of the held fundamental, turned back by k of its phases."""
         H = complex(self.fundamentals[self.held])
         return complex(answer * (abs(H) / H) ** harmonic / abs(H))
 
@@ -247,7 +247,7 @@ class Phasors:
         return self.referred(complex(answers[1 - self.held]), harmonic)
 
     def changed(self, changes: dict[int, ComplexArray]) -> ComplexArray:
-        """Return how the responses change where phasors of the motion channel and the force do."""
+        """Return the changes of the responses due to `changes` of both channels' phasors."""
         relative = complex(changes[1][self.held] / self.phasors(1)[self.held])
         return np.array(
             [
@@ -260,13 +260,14 @@ class Phasors:
     @property
     def bias(self) -> ComplexArray:
         """The transient's contribution to the response of each harmonic."""
-        one = np.eye(2)[self.settings.transient_channel]  # to whose mean it adds nothing
-        added = {k: self.transient_phasors[k] * one * (k > 0) for k in (1, *self.harmonics)}
+        channel = np.eye(2)[self.settings.transient_channel]
+        # it adds nothing to the mean
+        added = {k: self.transient_phasors[k] * channel * (k > 0) for k in (1, *self.harmonics)}
         return self.changed(added)
 
     @property
     def lag(self) -> ComplexArray:
-        """Half of what the response of each harmonic changes in a cycle; 0 but in a sweep."""
+        """Half the change of each harmonic's response in a cycle of a sweep; otherwise 0."""
         # the force lags the amplitude by less than half a cycle, whatever beta is
         if not self.fit.trending:
             return np.zeros(len(self.harmonics), dtype=np.complex128)
@@ -275,20 +276,20 @@ class Phasors:
 
     @property
     def mean_moves(self) -> bool:
-        """Whether the mean of a free displacement is still on its way to its place."""
-        # where a soft spring alone centres it, its approach is not an exponential
+        """Whether the mean of a free displacement has not settled."""
+        # if only a soft spring centres it, its approach is not exponential
         fit, channel = self.fit, self.settings.transient_channel
         moved = 2.0 * float(fit.coefficients[1, channel])
         if self.transient.significant:
             first, last = self.transient.waveform(fit.segment)[[0, -1]]
             moved += float(last - first)
-        by_noise = 2.0 * np.sqrt(fit.inverse[1, 1] * fit.residual_variance[channel])
-        least = max(
+        stderr = 2.0 * np.sqrt(fit.inverse[1, 1] * fit.residual_variance[channel])
+        limit = max(
             _MOVING_MEAN * abs(self.phasors(1)[0]),
-            _BEYOND_NOISE * float(by_noise),
+            _BEYOND_NOISE * float(stderr),
             SIGNIFICANT * self.transient.departure_std,
         )
-        return channel == 0 and abs(moved) > least
+        return channel == 0 and abs(moved) > limit
 
     @property
     def fundamental(self) -> Row:
@@ -302,7 +303,7 @@ class Phasors:
         return N, 0.5 * variance * np.eye(2), cross, self.noise[1].dof
 
     def harmonic(self, k: int, distorted: float) -> Row:
-        """Return a row above the fundamental, or of the mean."""
+        """Return the row of a higher harmonic, or of the mean."""
         noise = self.noise[k]
         A, N = abs(self.fundamentals[self.held]), self.response(k)
         along = np.array([N.real, N.imag])
@@ -321,7 +322,7 @@ class Phasors:
         return N, covariance, -along * relative * A, dof
 
     def rows(self, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Return the responses, their joint covariance with what was held, and dof."""
+        """Return the responses, their joint covariance with the held size, and dof."""
         rows = [self.fundamental if k == 1 else self.harmonic(k, distorted) for k in self.harmonics]
         response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
         joint = np.empty((len(rows), 3, 3))
@@ -338,7 +339,7 @@ class Phasors:
             return 0.0
         even = [k for k in EVEN if k <= fit.orders]
         motion, force = np.array([fit.phasors(k) for k in [1, *even]]).T
-        # the transient has even harmonics too: what its error leaves of them is noise
+        # the transient has even harmonics too: what its error leaves of these counts as noise
         variance = [float(self.variance(k)[1]) + self.forgotten(k) ** 2 for k in even]
         orders = np.array(even, dtype=np.float64)
         return asymmetry(
@@ -385,7 +386,7 @@ class Phasors:
         if aliased.any() or aliases_unseen(fit, self.cycles):
             samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
             objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
-        held = ("displacement", "force")[self.held]  # which the rows take for a sine
+        held = ("displacement", "force")[self.held]  # assumed to be a sine
         distorted = quality[f"{held}_distortion"]
         if distorted > _DISTORTED:
             objections.append(f"{held} distorted {percent(distorted)}")
@@ -399,7 +400,7 @@ class Phasors:
 
 
 def without(transient: Transient, segment: Segment, settings: Settings) -> Segment:
-    """Return the segment without its transient, where that stands out of the noise."""
+    """Return the segment without its transient, if that is significant."""
     if not transient.significant:
         return segment
     channels = segment.channels.copy()

@@ -17,17 +17,14 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.problem import Problem
 
-_RESCALINGS = 100  # searches until the noise's scale agrees; five are usual
+_RESCALINGS = 100  # most searches until the noise's scale agrees; five are usual
 _SAME_SCALE = 1e-9  # change of ln scale at which it agrees
-# longest step of the secant in plain steps, whose sum it stands for where they shrink slowly
-_LONGEST_SECANT = 20.0
+_LONGEST_SECANT = 20.0  # longest step of the secant, in plain steps
 _AT_BOUND = 1e-8  # relative distance from a bound within which an estimate lies at it
-# eigenvalue of the information, scaled to a unit diagonal, below which it is rounding: nothing is
-# known in its direction
-_NULL = 1e-13
-_PART = 1e-4  # part in such a direction from which on a parameter counts as undetermined
-_NOTHING = 1e-100  # root of the information on a parameter, below which there is none
-_BARELY = 1.001  # scale over that of rounding, below which the residuals are rounding
+_NULL = 1e-13  # eigenvalue of the information, of unit diagonal, up to which it is rounding
+_PART = 1e-4  # component in such a direction above which a parameter is undetermined
+_NOTHING = 1e-100  # root of the information on a parameter that counts as zero
+_BARELY = 1.001  # scale over that of rounding, below which residuals are rounding errors
 
 
 class Status(Enum):
@@ -107,7 +104,7 @@ _AT_INFINITY = (
 
 @dataclass(frozen=True)
 class DeterminedCombination:
-    """A combination of parameters that the data determine although its parts run away."""
+    """A combination of parameters that the data determine although the parameters run away."""
 
     expression: str
     value: float
@@ -116,10 +113,10 @@ class DeterminedCombination:
 
 @dataclass(frozen=True)
 class ConstraintCost:
-    """The rise of the sum of squares that constraints which hold with equality make.
+    """The rise of the sum of squares due to the active constraints.
 
-    `rise` is over the variance of the noise, which has `dof` degrees of freedom, infinite where it
-    is known.
+    `rise` is divided by the variance of the noise, which has `dof` degrees of freedom, infinite if
+    it is known.
     """
 
     texts: tuple[str, ...]
@@ -128,7 +125,7 @@ class ConstraintCost:
 
     @property
     def p_value(self) -> float:
-        """Probability of such a rise where the constraints are right."""
+        """Probability of at least such a rise if the constraints are right."""
         count = len(self.texts)
         if np.isinf(self.dof):
             return float(special.chdtrc(count, self.rise))
@@ -137,22 +134,22 @@ class ConstraintCost:
 
 @dataclass(frozen=True)
 class Optimum:
-    """The minimum of a problem's sum of squares; the problem's `names` order every array."""
+    """The minimum of a problem's sum of squares; arrays are in the order of its `names`."""
 
     problem: Any
     theta: FloatArray
-    """Search coordinates, (P,). Where the optimum lies at infinity, a finite point so far out that
-    the prediction is that of the limit."""
+    """Search coordinates, (P,). For an optimum at infinity, a finite point so far out that the
+    prediction is that of the limit."""
     values: FloatArray
-    """Parameter values, (P,); infinite or zero where the optimum has them so."""
+    """Parameter values, (P,); infinite or zero where the optimum lies there."""
     covariance: FloatArray
     """Covariance of theta: scale^2 over the Fisher information; infinite where undetermined."""
     scale: float
-    """Standard deviation of the residuals: 1 where the noise model knows it, else estimated as
-    (sum of squares / dof)^(1/2), but no less than rounding makes it."""
+    """Standard deviation of the residuals: 1 if the noise model states it, otherwise estimated as
+    (sum of squares / dof)^(1/2), but not less than that of rounding errors."""
     scale_known: bool
     dof: int
-    """Residuals, those of priors included, less the parameters determined."""
+    """Number of residuals, including those of priors, minus that of determined parameters."""
     cost: float
     """Half the sum of squares of `residuals`; with a robust loss, half the sum of the losses,
     times scale^2 where the scale is unknown."""
@@ -206,9 +203,9 @@ class Optimum:
 
     @cached_property
     def log_likelihood(self) -> float:
-        """Log-density of the data at theta, at the likeliest scale where that is unknown.
+        """Log-density of the data at theta, for the most likely scale if that is unknown.
 
-        With a robust loss, that of the density proportional to exp(-rho/2).
+        With a robust loss, the density is the one proportional to exp(-rho/2).
         """
         problem = self.problem
         loss = loss_named(self.loss, problem.parts)
@@ -225,12 +222,12 @@ class Optimum:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion, -2 ln L + 2 k; k counts an unknown scale, nothing at infinity."""
+        """Akaike's criterion, -2 ln L + 2 k; k counts determined parameters and unknown scale."""
         return -2.0 * self.log_likelihood + 2.0 * self._counted
 
     @property
     def bic(self) -> float:
-        """Schwarz's criterion, -2 ln L + k ln n, of n residuals; k as for `aic`."""
+        """Schwarz's criterion, -2 ln L + k ln n, for n residuals and k as in `aic`."""
         return -2.0 * self.log_likelihood + float(np.log(self.problem.n_numbers)) * self._counted
 
     @property
@@ -254,7 +251,7 @@ class Optimum:
 class OptimumBatch:
     """The minima of S problems of one shape; ``batch[i]`` is the :class:`Optimum` of one.
 
-    Arrays are those of the optima, led by S.
+    Arrays are those of the optima, stacked along the first axis, S.
     """
 
     problem: Problem
@@ -270,9 +267,9 @@ class OptimumBatch:
     method: str
     loss: str
     combinations: Mapping[int, tuple[DeterminedCombination, ...]]
-    """Determined combinations of the tables at a limit."""
+    """Determined combinations, by index, of the optima at infinity."""
     meanings: Mapping[int, str]
-    """Meanings of their limits, where the status does not state them."""
+    """Meanings of their limits, by index; empty where the status states them."""
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -325,8 +322,8 @@ class OptimumBatch:
         """Return the optima of all parts, one after the other, as those of `problem`."""
         combinations, meanings, first = {}, {}, 0
         for part in parts:
-            combinations.update({first + at: c for at, c in part.combinations.items()})
-            meanings.update({first + at: text for at, text in part.meanings.items()})
+            combinations.update({first + i: c for i, c in part.combinations.items()})
+            meanings.update({first + i: text for i, text in part.meanings.items()})
             first += len(part)
         names = ("theta", "values", "covariance", "scale", "dof", "cost", "nfev", "undetermined")
         arrays: dict[str, Any] = {
@@ -346,24 +343,23 @@ class OptimumBatch:
             ends = {np.inf: "without bound", -np.inf: "without bound below", 0.0: "to zero"}
             if status is Status.RUNS_AWAY and self.meanings[index]:
                 parts.append(f"In this limit {self.meanings[index]}.")
-            gone = [
+            limits = [
                 f"{p.name} {ends[value]}"
                 for p, value in zip(problem.parameters, values.tolist(), strict=True)
                 if np.isinf(value) or (value == 0.0 and p.positive)
             ]
-            parts.append(f"Here: {', '.join(gone)}.")
-            left = [
+            parts.append(f"Here: {', '.join(limits)}.")
+            determined = [
                 f"{c.expression} = {c.value:.4g} ± {c.stderr:.2g}" for c in self.combinations[index]
             ]
-            if left:
-                parts.append(f"The limit depends on {', '.join(left)}.")
+            if determined:
+                parts.append(f"The limit depends on {', '.join(determined)}.")
         elif status is Status.SINGULAR:
-            lost = self.undetermined[index]
-            names = [n for n, gone in zip(problem.names, lost, strict=True) if gone]
+            names = np.array(problem.names)[self.undetermined[index]]
             parts.append(f"Involved: {', '.join(names)}.")
         elif status is Status.AT_BOUND:
-            hit = at_bound(problem, self.theta[index])
-            hits = zip(problem.names, values, hit, strict=True)
+            is_hit = at_bound(problem, self.theta[index])
+            hits = zip(problem.names, values, is_hit, strict=True)
             parts.append(f"At its bound: {', '.join(f'{n} = {v:g}' for n, v, at in hits if at)}.")
         return " ".join(parts)
 
@@ -379,7 +375,7 @@ def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
 def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.intp]) -> FloatArray:
     """Return the standard deviation of residuals whose half sum of squares is `cost`.
 
-    It is what rounding makes it where the residuals are smaller, and NaN without freedom.
+    It is not less than that of rounding errors, and NaN without degrees of freedom.
     """
     variance = 2.0 * np.asarray(cost) / np.where(np.asarray(dof) > 0, dof, np.nan)
     return np.maximum(np.sqrt(variance), problem.rounding)
@@ -388,9 +384,9 @@ def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.int
 def _scale_ratio(
     problem: Problem, theta: FloatArray, scale: float, loss: Loss | None, dof: float
 ) -> float:
-    """Return the scale that the residuals at `theta` have, over the `scale` that was assumed.
+    """Return the scale of the residuals at `theta` over the assumed `scale`.
 
-    It is that of rounding where the residuals are smaller, and `scale` itself without freedom.
+    The former is not less than that of rounding errors; the ratio is 1 without degrees of freedom.
     """
     if dof <= 0:
         return 1.0
@@ -405,20 +401,20 @@ def agreed_scale(
     search: Callable[[float], tuple[FloatArray, float]],
     scale: float,
 ) -> float:
-    """Return the noise's scale on which a search and its residuals agree.
+    """Return the scale of the noise that agrees with the residuals of a search with that scale.
 
-    `search` takes a scale and returns where it ends with it, and the degrees of freedom there.
+    `search` takes a scale; it returns the theta at which it ends, and the degrees of freedom.
     """
     step, last = 0.0, 0.0
     for _ in range(_RESCALINGS):
         theta, dof = search(scale)
-        now = float(np.log(_scale_ratio(problem, theta, scale, loss, dof)))
-        if abs(now) < _SAME_SCALE or not np.isfinite(now):
+        change = float(np.log(_scale_ratio(problem, theta, scale, loss, dof)))
+        if abs(change) < _SAME_SCALE or not np.isfinite(change):
             break
-        # the secant's step where it goes the same way, else the plain one
-        factor = step / (last - now) if last != now else 1.0
-        step = now * (factor if 0.0 < factor < _LONGEST_SECANT else 1.0)
-        last, scale = now, scale * float(np.exp(step))
+        # the secant's step if it has the same direction, otherwise the plain one
+        factor = step / (last - change) if last != change else 1.0
+        step = change * (factor if 0.0 < factor < _LONGEST_SECANT else 1.0)
+        last, scale = change, scale * float(np.exp(step))
     return scale
 
 
@@ -448,10 +444,10 @@ def information_of(
 
 
 def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the covariance and which parameters are undetermined, (..., P, P) and (..., P).
+    """Return the covariance, (..., P, P), and which parameters are undetermined, (..., P).
 
-    Parameters with a part in a null direction of the information have infinite variance and no
-    covariance; the others keep what is determined.
+    Parameters with a component in a null direction of the information have infinite variance and
+    zero covariances; those of the other parameters are finite.
     """
     finite = np.isfinite(information)
     if not finite.all():
@@ -470,14 +466,14 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
 
 
 def blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatArray:
-    """Return `covariance` with infinite variances and no covariances of the undetermined."""
+    """Return `covariance` with infinite variances and zero covariances of the undetermined."""
     either = undetermined[..., :, None] | undetermined[..., None, :]
     diagonal = either & np.eye(covariance.shape[-1], dtype=np.bool_)
     return np.where(diagonal, np.inf, np.where(either, 0.0, covariance))
 
 
 def propagated(covariance: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Return D covariance D with D = diag(slopes); what is undetermined stays infinite."""
+    """Return D covariance D with D = diag(slopes); undetermined variances stay infinite."""
     with np.errstate(invalid="ignore", over="ignore"):
         product = slopes[..., :, None] * covariance * slopes[..., None, :]
     return np.where(np.isnan(product), np.inf, product)
