@@ -235,7 +235,7 @@ class TestPlan:
         ("options", "message"),
         [
             ({"sample_rate": None}, "motions in time need sample_rate"),
-            ({"sample_rate": 0.5}, "expected at least 10 samples in a trapezoid's way"),
+            ({"sample_rate": 0.5}, "expected at least 10 samples in a trapezoid's move"),
             ({"noise": 0.01}, "give that of a force sample alone"),
             ({"noise": None}, "the noise of the force is unknown"),
             ({"candidates": "square"}, "one of trapezoid, multisine"),

@@ -1,9 +1,9 @@
 """Information in the records of motions in time.
 
-A motion is a period of displacement that is repeated; one record holds all its repeats and is
-fitted in time, so nothing has to settle. Its information is that of the record's fit
-(:mod:`dahl_ident.problem.record_problem`): J'J/s^2 of the predicted force with white noise s, from
-which the record's own unknowns (state at the first sample, offset, drift) are eliminated.
+A motion is a repeated period of displacement; one record holds all repeats and is fitted in time,
+so nothing has to settle. Its information is that of the record's fit
+(:mod:`dahl_ident.problem.record_problem`): J'J/s^2 of the predicted force with white noise s, after
+elimination of the record's unknowns (state at the first sample, offset, drift).
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from dahl_ident.planning.question import BenchLimits, RecordedForce, limit
 from dahl_ident.planning.trajectories import SAMPLES_PER_CYCLE, Multisine, PlannedMotion, Trapezoid
 from dahl_ident.problem.record_problem import RecordProblem
 
-_PER_PERIOD = 400  # samples at which derivatives are computed: integrals err by 1e-3
+_PER_PERIOD = 400  # most samples at which derivatives are computed: integrals err by 1e-3
 _LEAST_SAMPLES = 16  # in a period, even if the sample rate is low
 _SIMULATED = 4  # repeats from rest, after which the friction force repeats as well
 _REPEATS = 8  # repeats for which the search computes the information
-_LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # of the candidates that a kind stands for
+_LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # of the candidates of each kind of motion
 _SLOWER = 2.0  # factor from one speed or band to the next
 _LINES = 10  # highest over lowest frequency of a multisine
 
 
 def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> list[PlannedMotion]:
-    """Return the candidates that a kind of motion stands for, within the limits."""
+    """Return the candidates of a kind of motion within the limits."""
     amplitudes = np.geomspace(*levels, _LEVELS).tolist()
     low, high = limits.frequency_hz
     if kind == "multisine":
@@ -59,15 +59,15 @@ def motions_of(kind: str, limits: BenchLimits, levels: tuple[float, float]) -> l
 
 @dataclass(frozen=True)
 class RepeatSums:
-    """Information in the repeats of a motion, their own unknowns included, for unit noise."""
+    """Information in the repeats of a motion, before the record's unknowns are eliminated."""
 
-    # (S, repeats, n, n) J'J of each repeat; n = P + states + offset + drift, the drift from the
-    # repeat's start
+    # (S, repeats, n, n) J'J of each repeat for unit noise; n = P + states + offset + drift, the
+    # drift from the start of the repeat
     products: FloatArray
     parameters: int  # P
     period: float  # seconds
     force: FloatArray  # (S,) largest, N
-    weight: float  # samples measured for each one that was computed, over the variance of the noise
+    weight: float  # measured samples for each computed one, over the variance of the noise
 
     @classmethod
     def of(cls, knowledge: Knowledge, motion: PlannedMotion, recorded: RecordedForce) -> RepeatSums:
@@ -92,24 +92,24 @@ class RepeatSums:
         return cls(np.array(products), P, motion.period, np.array(force), weight)
 
     def rows(self, repeats: int) -> FloatArray:
-        """Return J of one of so many repeats in a record, (S, P, P), its unknowns eliminated."""
+        """Return J of a mean repeat in a record of `repeats`, (S, P, P), unknowns eliminated."""
         n, P = self.products.shape[-1], self.parameters
-        whole = np.zeros((len(self.products), n, n))
+        total = np.zeros((len(self.products), n, n))
         for k in range(min(repeats, _SIMULATED)):
             shift = np.eye(n)
             shift[-2, -1] = k * self.period  # drift = within the repeat + the time of its start
-            whole += shift.T @ self.products[:, k] @ shift
+            total += shift.T @ self.products[:, k] @ shift
         later = np.arange(_SIMULATED, repeats) * self.period
         last, one = self.products[:, -1], np.zeros((n, n))
         one[-2, -1] = 1.0
         cross = last @ one
-        whole += later.size * last + later.sum() * (cross + cross.swapaxes(1, 2))
-        whole += (later**2).sum() * (one.T @ last @ one)
-        unknowns = whole[:, P:, P:]
+        total += later.size * last + later.sum() * (cross + cross.swapaxes(1, 2))
+        total += (later**2).sum() * (one.T @ last @ one)
+        unknowns = total[:, P:, P:]
         size = np.sqrt(np.maximum(np.diagonal(unknowns, axis1=1, axis2=2), 1e-300))
         units = size[:, :, None] * size[:, None, :]
         inverse = np.linalg.pinv(unknowns / units, hermitian=True, rcond=1e-10) / units
-        information = whole[:, :P, :P] - whole[:, :P, P:] @ inverse @ whole[:, P:, :P]
+        information = total[:, :P, :P] - total[:, :P, P:] @ inverse @ total[:, P:, :P]
         values, vectors = np.linalg.eigh(information * (self.weight / repeats))
         return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., None] * vectors.swapaxes(-1, -2))
 
@@ -121,9 +121,9 @@ def evaluate_motions(
     recorded: RecordedForce,
     lasting: float | None = None,
 ) -> Candidates:
-    """Return the candidates that every limit allows, with the information of a repeat.
+    """Return the candidates that all limits allow, with the information of a repeat.
 
-    It is the mean over the repeats of a record of `lasting` s, or of `_REPEATS` repeats.
+    This is the mean over the repeats in a record of `lasting` s, by default over `_REPEATS`.
     """
     rate = recorded.sample_rate
     resolved = [one for one in motions if one.fastest_hz * SAMPLES_PER_CYCLE <= rate]
@@ -131,7 +131,7 @@ def evaluate_motions(
         slowest = min(one.fastest_hz for one in motions)
         raise ValidationError(
             f"sample_rate is {rate:g} Hz; expected at least {SAMPLES_PER_CYCLE} samples in a "
-            f"trapezoid's way from end to end or a multisine's shortest cycle: "
+            f"trapezoid's move from end to end or a multisine's shortest cycle: "
             f"{SAMPLES_PER_CYCLE * slowest:.3g} Hz for the slowest motion; or slow the motions down"
         )
     peaks = np.array([motion.peaks for motion in resolved])
@@ -144,15 +144,15 @@ def evaluate_motions(
     }
     if any(one.kind != "trapezoid" for one in resolved):
         sizes["frequency_hz"] = np.array([[one.fastest_hz for one in resolved]])
-    kept = np.flatnonzero(allowed(limits, sizes, len(resolved)))
-    period = np.array([one.period for one in resolved])[kept]
+    within = np.flatnonzero(allowed(limits, sizes, len(resolved)))
+    period = np.array([one.period for one in resolved])[within]
     rows = [
         sums[k].rows(_REPEATS if lasting is None else max(int(lasting / T), LEAST_CYCLES))
-        for k, T in zip(kept.tolist(), period.tolist(), strict=True)
+        for k, T in zip(within.tolist(), period.tolist(), strict=True)
     ]
-    S, level = len(knowledge.theta), peaks[kept, 0]
+    S, level = len(knowledge.theta), peaks[within, 0]
     return Candidates(
-        "displacement", level, 1.0 / period, np.broadcast_to(level, (S, kept.size)),
-        sizes["force"][:, kept], np.stack(rows, axis=1), np.ones((S, kept.size)),
-        tuple(resolved[k] for k in kept.tolist()),
+        "displacement", level, 1.0 / period, np.broadcast_to(level, (S, within.size)),
+        sizes["force"][:, within], np.stack(rows, axis=1), np.ones((S, within.size)),
+        tuple(resolved[k] for k in within.tolist()),
     )  # fmt: skip

@@ -13,24 +13,24 @@ from dahl_ident.arrays import FloatArray, non_negative_array, positive_number
 from dahl_ident.errors import ValidationError
 
 KINDS = ("trapezoid", "multisine")
-SAMPLES_PER_CYCLE = 10  # at least, in the fastest part of a waveform
+SAMPLES_PER_CYCLE = 10  # fewest samples in the fastest part of a waveform
 UNITS = {
     "stroke": "m", "speed": "m/s", "acceleration": "m/s^2", "dwell": "s", "lowest_hz": "Hz",
     "highest_hz": "Hz", "peak": "m", "rms": "m",
 }  # fmt: skip
-_FINE = 64  # points for each spectral line, which give a multisine's peak within 0.1 %
+_FINE = 64  # points for each spectral line: a multisine's peak then errs by less than 0.1 %
 
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """There and back about zero with trapezoidal velocity, and a dwell at both ends.
+    """A stroke forwards and back about zero, with trapezoidal velocity and dwells at the ends.
 
     Attributes
     ----------
     stroke : float
-        From end to end, m.
+        Displacement from end to end, m.
     speed, acceleration : float
-        Highest, m/s and m/s^2.
+        Largest values, m/s and m/s^2.
     dwell : float, default 0
         Seconds at each end.
 
@@ -59,44 +59,45 @@ class Trapezoid:
         return dict(vars(self))
 
     @property
-    def _reached(self) -> float:
+    def _top_speed(self) -> float:
+        """The speed that is reached, m/s."""
         return min(self.speed, float(np.sqrt(self.acceleration * self.stroke)))
 
     @property
-    def _way(self) -> float:
+    def _move_time(self) -> float:
         """Seconds from end to end."""
-        return self.stroke / self._reached + self._reached / self.acceleration
+        return self.stroke / self._top_speed + self._top_speed / self.acceleration
 
     @property
     def period(self) -> float:
         """Seconds."""
-        return 2.0 * (self._way + self.dwell)
+        return 2.0 * (self._move_time + self.dwell)
 
     @property
     def fastest_hz(self) -> float:
         """One over the time from end to end."""
-        return 1.0 / self._way
+        return 1.0 / self._move_time
 
     @property
     def peaks(self) -> tuple[float, float, float]:
         """Largest displacement, speed and acceleration."""
-        return 0.5 * self.stroke, self._reached, self.acceleration
+        return 0.5 * self.stroke, self._top_speed, self.acceleration
 
     def displacement(self, time: FloatArray) -> FloatArray:
         """Return the displacement, m; it begins at the negative end."""
         t = np.mod(time, self.period)
         back = t >= 0.5 * self.period
-        s = np.clip(np.where(back, t - 0.5 * self.period, t), 0.0, self._way)
-        v, a = self._reached, self.acceleration
-        rise, left = np.minimum(s, v / a), np.minimum(self._way - s, v / a)
-        way = 0.5 * a * rise**2 + v * np.clip(s - v / a, 0.0, self._way - 2.0 * v / a)
-        way = way + 0.5 * a * ((v / a) ** 2 - left**2)
-        return np.asarray((way - 0.5 * self.stroke) * np.where(back, -1.0, 1.0))
+        s = np.clip(np.where(back, t - 0.5 * self.period, t), 0.0, self._move_time)
+        v, a = self._top_speed, self.acceleration
+        rise, left = np.minimum(s, v / a), np.minimum(self._move_time - s, v / a)
+        x = 0.5 * a * rise**2 + v * np.clip(s - v / a, 0.0, self._move_time - 2.0 * v / a)
+        x = x + 0.5 * a * ((v / a) ** 2 - left**2)
+        return np.asarray((x - 0.5 * self.stroke) * np.where(back, -1.0, 1.0))
 
 
 @dataclass(frozen=True)
 class Multisine:
-    """Equal sines at all multiples of the lowest frequency up to the highest, Schroeder's phases.
+    """Sines of equal amplitude and Schroeder's phases, at all multiples of the lowest frequency.
 
     It starts at its largest displacement, at rest. Source of the phases: Schroeder, *IEEE Trans.
     Inf. Theory* 16, 85 (1970).
@@ -104,7 +105,7 @@ class Multisine:
     Attributes
     ----------
     lowest_hz, highest_hz : float
-        Band; the lowest is one over the period.
+        Band, Hz; the period is one over the lowest.
     peak : float
         Largest displacement, m.
 
@@ -153,7 +154,7 @@ class Multisine:
         w = 2.0 * np.pi * self.lowest_hz * k
         fine = self._fine(k.size)
         start = float(fine[np.argmax(np.abs(np.cos(np.outer(fine, w) + phase).sum(axis=-1)))])
-        for _ in range(8):  # to where the velocity vanishes
+        for _ in range(8):  # Newton's method, to zero velocity
             angle = w * start + phase
             start -= float((w * np.sin(angle)).sum() / (w**2 * np.cos(angle)).sum())
         top = float(np.cos(w * start + phase).sum())
@@ -173,8 +174,8 @@ class Multisine:
         w, phase, _, gain = self._shape()
         angle = np.multiply.outer(self._fine(w.size), w) + phase
         speed = abs(gain) * float(np.abs((w * np.sin(angle)).sum(axis=-1)).max())
-        pull = abs(gain) * float(np.abs((w**2 * np.cos(angle)).sum(axis=-1)).max())
-        return self.peak, speed, pull
+        acceleration = abs(gain) * float(np.abs((w**2 * np.cos(angle)).sum(axis=-1)).max())
+        return self.peak, speed, acceleration
 
 
 PlannedMotion = Trapezoid | Multisine
@@ -182,11 +183,9 @@ PlannedMotion = Trapezoid | Multisine
 
 
 def seconds_of_move(distance: float, speed: float, acceleration: float) -> float:
-    """Return the least time of a quintic from rest to rest within a speed and an acceleration."""
-    by_speed, by_acceleration = 15.0 / 8.0, 10.0 / np.sqrt(3.0)  # its peaks for one m in one s
-    return max(
-        by_speed * distance / speed, float(np.sqrt(by_acceleration * distance / acceleration))
-    )
+    """Return the shortest time of a quintic from rest to rest at most this fast."""
+    v, a = 15.0 / 8.0, 10.0 / np.sqrt(3.0)  # its peaks for 1 m in 1 s
+    return max(v * distance / speed, float(np.sqrt(a * distance / acceleration)))
 
 
 def course(
@@ -194,23 +193,23 @@ def course(
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
     """Return displacement, number of the motion, and whether it is measured, at any times.
 
-    The exciter begins at zero and moves from motion to motion along a quintic, at rest at both
-    ends, in `change_over` seconds.
+    The exciter begins at zero and moves from motion to motion along a quintic, from rest to rest,
+    in `change_over` seconds.
     """
     value, measured = np.zeros(time.size), np.zeros(time.size, dtype=np.bool_)
     number = np.full(time.size, len(motions), dtype=np.int64)
-    start = place = 0.0
+    start = position = 0.0
     for i, (motion, count) in enumerate(zip(motions, repeats, strict=True)):
         first = float(motion.displacement(np.zeros(1))[0])
         begin = start + change_over
         stop = begin + count * motion.period
         moving = (time >= start) & (time < begin)
         tau = (time[moving] - start) / change_over if change_over > 0.0 else time[moving]
-        value[moving] = place + (first - place) * tau**3 * (10.0 - tau * (15.0 - 6.0 * tau))
+        value[moving] = position + (first - position) * tau**3 * (10.0 - tau * (15.0 - 6.0 * tau))
         inside = (time >= begin - 1e-9) & (time < stop - 1e-9)
         value[inside] = motion.displacement(time[inside] - begin)
         number[(time >= start) & (time < stop)] = i + 1
         measured |= inside
-        start, place = stop, first
-    value[time >= start - 1e-9] = place
+        start, position = stop, first
+    value[time >= start - 1e-9] = position
     return value, number, measured
