@@ -458,7 +458,7 @@ class TestPlan:
         [
             ({"ranges": {}}, "nothing is known about f_max, sigma; give ranges="),
             ({"limits": {"time": 3}}, r"limits\['frequency_hz'\] is missing"),
-            ({"limits": KNEE}, "without a wanted uncertainty the time is needed"),
+            ({"limits": KNEE}, "without a target uncertainty the time is needed"),
             ({"limits": {**KNEE, "time": 0.5}}, "the quickest level takes"),
             ({"limits": {**KNEE, "time": 9, "force": 1e-9}}, "force excludes"),
             ({"noise": None}, "the noise is unknown before any data"),

@@ -1,4 +1,4 @@
-"""The public function that makes a plan from prior knowledge and the limits of the bench."""
+"""The public function that plans measurements from prior knowledge and the limits of the bench."""
 
 from __future__ import annotations
 
@@ -65,64 +65,65 @@ def plan(
     Parameters
     ----------
     source : Element, FitResult or Posterior
-        What is known: a model with `ranges` before any data, or the result of earlier ones,
+        Prior knowledge: a model with `ranges` before any data, or the result of earlier data,
         whose information is added.
     limits : mapping
         ``frequency_hz`` (needed for sines), ``displacement``, ``force``, ``speed`` and
         ``acceleration``: the highest value, or lowest and highest, zero-to-peak, SI; ``time``:
-        seconds for everything.
+        seconds in total.
     target : mapping, sequence of str, or str, optional
-        Mapping from a parameter, or a product of powers such as ``"f_max/sigma"``, to its wanted
+        Mapping from a parameter, or a product of powers such as ``"f_max/sigma"``, to its target
         relative standard uncertainty, or from ``"U(f_max)"`` to its relative expanded uncertainty
-        (95.45 %): the least time that reaches all. Names alone: their least uncertainty in
-        ``limits["time"]``. Left out: D-optimal in that time. ``"response"`` is the device's
-        response over the candidates, root mean square of ln gain and phase.
+        (95.45 %): the plan meets all targets in the least time. Names only: the plan minimises
+        their uncertainty in ``limits["time"]``. By default the plan is D-optimal in that time.
+        ``"response"`` is the device's response over the candidates, root mean square of ln gain
+        and phase.
     ranges : mapping of str to (float, float), optional
         Range that contains a parameter with 95 % probability. The search uses it, but the predicted
         uncertainty does not include it.
     noise : float or mapping, optional
         Of one cycle: standard deviation of ln gain and phase, or a mapping with ``relative``,
         ``force`` and ``displacement`` (N and m, standard deviation of each part of the
-        fundamental). Left out, that of the earlier data. For motions in time ``{"force": s}``, the
+        fundamental). By default that of the earlier data. For motions in time ``{"force": s}``, the
         standard deviation of a sample, N.
     scatter : float, optional
-        Standard deviation of ln gain and phase between runs. Left out, that of the earlier data,
-        else 0.
+        Standard deviation of ln gain and phase between runs. By default that of the earlier data,
+        or 0.
     runs : int, optional
-        Left out, as many as are best: 1 without scatter, else up to 8.
+        Number of runs. By default the best one: 1 without scatter, otherwise up to 8.
     controlled : {"displacement", "force"}
-        What the exciter holds. With "force", levels are drives of the whole plant.
+        The controlled quantity. With "force", levels are drives of the whole plant.
     candidates : int, sequence of (level, frequency_hz), str, or sequence of motions, default 240
-        How many levels to choose from, or which. ``"trapezoid"`` and ``"multisine"`` stand for
+        The levels to choose from, or their number. ``"trapezoid"`` and ``"multisine"`` stand for
         motions in time within the limits, to be fitted as records; or give them as
         :class:`dahl_ident.planning.Trapezoid` and :class:`dahl_ident.planning.Multisine`.
     larger : Element, optional
-        Model in which `suspects` are parameters; left out, the model itself.
+        Model in which `suspects` are parameters; by default the model itself.
     suspects : mapping of str to float, optional
         Parameters that may be needed although the model fixes or omits them, such as ``{"alpha":
-        0.1}``, and the standard uncertainty that the plan must reach for each in the larger model:
+        0.1}``, and the standard uncertainty of each in the larger model that the plan must meet:
         relative for positive parameters, absolute for others.
     change_over : float, default 1
         Seconds from one level to the next.
     settled : float, default 0.01
-        Share of the friction force below which a transient counts as settled.
+        Fraction of the friction force below which a transient counts as settled.
     between_runs : float, default 0
         Seconds that each run takes in addition to its levels.
     sample_rate : float, optional
-        Samples a second of the records of motions in time, which need it.
+        Of the records of motions in time, Hz; required for these.
     steady : {"exact", "describing function"}, optional
-        With ``controlled="force"``: how the response is predicted. Left out, as in the fit given,
-        or "exact".
+        With ``controlled="force"``: how the response is predicted. By default as in the earlier
+        fit, or "exact".
     draws : int, default 200
-        Parameter vectors that the criterion is averaged over; of motions in time, and of exact
-        steady motions, at most 24.
+        Number of parameter vectors over which the criterion is averaged; at most 24 for motions in
+        time and for exact steady motions.
     seed : int, default 0
-        Of the draws.
+        Seed of the draws.
 
     Returns
     -------
     Plan
-        Printed: table, predicted uncertainties, what stays undetermined and why.
+        Prints as a table, predicted uncertainties, and what stays undetermined and why.
 
     Raises
     ------
@@ -132,12 +133,13 @@ def plan(
 
     Notes
     -----
-    From a fit, the plan takes its noise, model error and scatter between runs. The model error is
-    alike at levels close to each other, so levels are spread; where the earlier data are too few
-    to tell it from noise, levels are chosen as if both were equally large. A posterior has none.
+    A plan from a fit takes the fit's noise, model error and scatter between runs. The model error
+    is similar at levels close to each other, so levels are spread; if the earlier data are too few
+    to distinguish it from noise, levels are chosen as if both were equally large. A plan from a
+    posterior has no model error.
 
-    Without earlier data, a plan has as many levels as a fit to them alone needs to tell a wrong
-    model from noise; where the time does not allow it, the target is not reached.
+    Without earlier data, a plan has as many levels as a fit needs to distinguish a wrong model from
+    noise; if the time does not allow so many, the target is not met.
 
     The criterion is the mean of its logarithm over the draws; see
     :mod:`dahl_ident.planning.design`.
@@ -165,7 +167,7 @@ def plan(
     wanted, has_numbers = target_of(target)
     if not has_numbers and not np.isfinite(bench.time):
         raise ValidationError(
-            f"plan: without a wanted uncertainty the time is needed: give {limit('time')}, or "
+            f"plan: without a target uncertainty the time is needed: give {limit('time')}, or "
             f"{argument('target', {'f_max': 0.02})}"
         )
     costs = {
@@ -175,7 +177,7 @@ def plan(
     }
     motions = motions_among(candidates)
     if motions:
-        of_sines = {
+        for_sines_only = {
             "target 'response'": RESPONSE in wanted,
             "scatter": bool(scatter),
             "suspects": bool(suspects),
@@ -183,15 +185,14 @@ def plan(
             "runs": runs not in (None, 1),
             argument("controlled", "force"): controlled == "force",
         }
-        if any(of_sines.values()):
-            name = next(name for name, stated in of_sines.items() if stated)
+        if stated := [name for name, is_stated in for_sines_only.items() if is_stated]:
             raise ValidationError(
-                f"plan: {name} is planned with settled sines only; leave it out for motions in "
-                "time, or leave candidates out"
+                f"plan: {stated[0]} is planned with settled sines only; leave it out for motions "
+                "in time, or leave candidates out"
             )
-        known = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
+        thinned = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
         recorded = recorded_force(noise, sample_rate, knowledge)
-        arguments = (known, bench, wanted, has_numbers, costs)
+        arguments = (thinned, bench, wanted, has_numbers, costs)
         return _of_motions(PlanRequest(*arguments, recorded=recorded, motions=motions))
     if sample_rate is not None:
         raise ValidationError(
@@ -222,9 +223,9 @@ def plan(
 def _of_motions(question: PlanRequest) -> Plan:
     """Return the better of two plans of motions.
 
-    The first takes a repeat as worth the same share of a long record for every motion; the second
-    as worth what it is in a record as long as the first plan, so that a motion of which that time
-    holds few repeats, whose first is spent on the record's own unknowns, is not preferred.
+    Both need the information of a repeat, which depends on their number, because a record's
+    unknowns take about one repeat. The first plan assumes the same number for all motions; the
+    second the number that fits into the time of the first plan.
     """
     first = Search(question, options_of(question, question.limits))
     first_best = first.best()
