@@ -89,7 +89,7 @@ def test_files_keep_them(tmp_path):
 
 
 def test_a_describing_function_has_none():
-    with pytest.raises(DataError, match=r"takes that for a sine \(as asked for\): leave them out"):
+    with pytest.raises(DataError, match=r"takes for a sine \(as asked for\): leave them out"):
         di.fit(table(), di.Dahl(alpha=1.0) + FREE, steady="describing function")
     with pytest.raises(DataError, match="the model has no mass"):
         di.fit(table(), di.Dahl(alpha=1.0) + di.Spring())

@@ -1,4 +1,4 @@
-"""The predicted samples of a record, and the unknowns that records add to those of a model."""
+"""The predicted samples of a record, and the unknowns that records add to a model's parameters."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Predicted:
 
     output: FloatArray
     by: FloatArray
-    """Derivatives with respect to the problem's values, (n, P); P = 0 where not asked for."""
+    """Derivatives with respect to the problem's values, (n, P); P = 0 if they are not wanted."""
     by_delay: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """With respect to the delay, of a motion."""
+    """Derivative of a motion with respect to the delay."""
 
 
 def force_of(
@@ -47,7 +47,7 @@ def force_of(
     for element, at in problem.model.of(problem.full_values(values)):
         stop = start + (len(element.starts) if element.has_memory else element.n_states)
         states, moved = of_record[start:stop], x
-        state: Any = 0.0  # or several
+        state: Any = 0.0  # an array for elements of several unknowns
         if isinstance(element, Friction):
             state, moved = states if states.size > 1 else float(states[0]), path
         history = element.history(at, Path(moved, v, a, time), state, slopes=derivatives)
@@ -97,11 +97,11 @@ def motion_of(
     return Predicted(motion.output + of_record[starts], by, motion.by_delay)
 
 
-_SMALL = 0.1  # rate of either sign, times the size of the motion, below which ln is not searched
+_SMALL = 0.1  # rate times the size of the motion up to which the rate is searched as a number
 
 
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:
-    """Return what each record adds: first states, an offset and, for forces, a drift."""
+    """Return the unknowns of each record: initial states, an offset and, of forces, a drift."""
     unknowns = []
     channel = records[0].motion_channel
     unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]
@@ -131,24 +131,23 @@ def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Param
     name, count = occurrences.most_common(1)[0]
     if count > 1:
         raise ModelError(
-            f"a fit of records calls an unknown of several elements {name}; give each a name, "
-            "such as Dahl(name='pivot')"
+            f"several elements have an unknown called {name} in a fit of records; give each a "
+            "name, such as Dahl(name='pivot')"
         )
     for p in model.parameters:
         if p.name in occurrences:
             raise ModelError(
-                f"{model!r} has a parameter called {p.name}, as a fit of records calls one of its "
-                "own; expected another name: change it in the law's declaration"
+                f"{model!r} has a parameter called {p.name}, which is also an unknown of a fit of "
+                "records; expected another name: change it in the law's declaration"
             )
     return unknowns
 
 
 def bends(free: Sequence[Parameter], count: int, records: Sequence[Record]) -> FloatArray:
-    """Return the size below which a parameter is searched as a number, above as a logarithm.
+    """Return the size up to which a parameter is searched as a number, above as a logarithm.
 
-    Rates such as those of Bouc-Wen may have either sign, but beyond a tenth of the motion's
-    inverse size they go with a stiffness in proportion. 0 for those that are searched in one
-    way alone.
+    Rates such as those of Bouc-Wen may have either sign, but above a tenth of the motion's inverse
+    size they vary in proportion to a stiffness. 0 for parameters searched in one way only.
     """
     time, length = 1.0, 1.0
     wave = np.concatenate([y - y.mean() for y in (r.motion_samples for r in records)])

@@ -45,17 +45,17 @@ _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDi
 _Kind = TypeVar("_Kind", bound="TableProblem")
 
 _LOST = 2e-6
-"""Noise of the data's mean over that of a calibration, below which its part of the information
-(1e-12 of it, as a square) is near rounding."""
+"""Noise of the data's mean over that of a calibration, below which the calibration's share of the
+information (its square) is near rounding."""
 
 
 class TableProblem(Problem):
     """Data, model, noise and sensors: residuals, Jacobian and likelihood of one estimate.
 
     Displacement-controlled rows need an amplitude, force-controlled rows a drive. `noise` is by
-    default "measured" where the data have a covariance, else "relative". Without `sensors` the
-    channels are exact. `free` names given parameters that are estimated all the same, from their
-    values; `fixed` holds parameters. `steady` is how rows whose force was controlled are predicted.
+    default "measured" if the data have a covariance, otherwise "relative". Without `sensors` the
+    channels are exact. `free` names parameters with values that are estimated nevertheless, from
+    there; `fixed` holds parameters. `steady` is how force-controlled rows are predicted.
 
     Examples
     --------
@@ -75,12 +75,12 @@ class TableProblem(Problem):
     arguments = ("data", "model", "noise", "sensors", "steady")
     kind, called = "table", "a table"
     refused: ClassVar[Mapping[str, str]] = {
-        "output": "rows say what was controlled, by which they are predicted",
+        "output": "it follows from the quantity that was controlled in each row",
         "excitation": "rows are responses to a force",
     }
     output_in_words = "the fundamental"
     _orbits: dict[int, FloatArray]
-    _coarse = False  # whether measured amplitudes are taken as they are
+    _coarse = False  # whether measured amplitudes are taken as exact
 
     def __init__(
         self,
@@ -115,13 +115,13 @@ class TableProblem(Problem):
         self._set_rows(self._rows_of([as_response(table, model) for table in tables]), noise)
         if self._rows.of_displacement.any() and not self.is_exact:
             raise DataError(
-                "the rows hold harmonics of the displacement, and the describing function takes "
-                f"that for a sine ({self.obstacle_to_exact or 'as asked for'}): leave them out "
-                f"with {fundamental_alone()}"
+                "the rows hold harmonics of the displacement, which the describing function takes "
+                f"for a sine ({self.obstacle_to_exact or 'as asked for'}): leave them out with "
+                f"{fundamental_alone()}"
             )
 
     def _checked(self, data: Any) -> list[FrequencyResponse]:
-        """Return `data` as a tuple of one table, checked."""
+        """Return `data` as a list of one table, checked."""
         return [checked_table(data)]
 
     def _rows_of(self, tables: list[FrequencyResponse]) -> Rows:
@@ -154,12 +154,12 @@ class TableProblem(Problem):
         self.tail: Student | None = noise.tail
 
     def widened(self, misfit: FloatArray) -> TableProblem:
-        """Return the problem whose stated covariances have a misfit's variance each, (n,), added.
+        """Return the problem with the variance of a misfit, (n,), added to stated covariances.
 
-        Rows are Gaussian then; see ``Measured.widened`` in noise.py.
+        Its rows are Gaussian; see ``Measured.widened`` in noise.py.
         """
-        there = bool(misfit.any())
-        widened = self.altered("stiffness_data", _misfit=misfit, has_misfit=there)
+        has_misfit = bool(misfit.any())
+        widened = self.altered("stiffness_data", _misfit=misfit, has_misfit=has_misfit)
         widened._set_noise(noise_for(self._rows, self.noise))
         return widened
 
@@ -191,11 +191,11 @@ class TableProblem(Problem):
         return self.data
 
     def at(self, table: FrequencyResponse) -> TableProblem:
-        """Return what model and sensors predict for another table."""
+        """Return the problem of the same model and sensors for another table."""
         return self.like(data=table, noise="absolute")
 
     def unpredicted(self, residuals: FloatArray) -> str:
-        """Return why residuals are not finite, with what to do; nothing where they are."""
+        """Return why residuals are not finite, and what to do; empty if they are."""
         lost = np.flatnonzero(~np.isfinite(residuals))
         if not lost.size:
             return ""
@@ -212,7 +212,7 @@ class TableProblem(Problem):
 
     @cached_property
     def obstacle_to_exact(self) -> str:
-        """Why the model has no exact steady motion under a force; nothing where it has one."""
+        """Why the model has no exact steady motion under a force; empty if it has one."""
         return obstacle(self.model)
 
     @cached_property
@@ -237,7 +237,7 @@ class TableProblem(Problem):
         )
 
     def unstable_rows(self, theta: ArrayLike) -> list[int]:
-        """Return the rows whose predicted steady motion is not stable, as no stable one exists."""
+        """Return the rows for which no stable steady motion exists, so an unstable one is used."""
         if not isinstance(self._predictor, Predictor):
             return []
         with np.errstate(all="ignore"):
@@ -250,9 +250,9 @@ class TableProblem(Problem):
         return problem
 
     def coarser(self) -> Self:
-        """Return a problem that costs less and has nearly the same optimum; else itself.
+        """Return a cheaper problem with nearly the same optimum; itself if there is none.
 
-        Measured amplitudes are taken as they are; their noise counts to first order.
+        Measured amplitudes are taken as exact in predictions; their noise counts to first order.
         """
         model = self.model.coarser() if self.is_exact else self.model
         if model is self.model and self._noise.amplitude is None:
@@ -263,9 +263,9 @@ class TableProblem(Problem):
         return coarse
 
     def takes_energy(self, theta: FloatArray) -> bool:
-        """Return whether every motion takes energy from the drive, by the describing function.
+        """Return whether all rows take energy from the drive, by the describing function.
 
-        Where a plant gives energy, at the amplitude measured, it has no steady motion to be found.
+        A plant that gives energy at the measured amplitude has no steady motion there.
         """
         sine = self.with_steady("describing function")
         Z = sine.predicted_stiffness(theta)
@@ -273,10 +273,10 @@ class TableProblem(Problem):
         return bool(np.all(Z.stiffness.imag[first] > 0.0))
 
     def near(self, theta: FloatArray) -> TableProblem:
-        """Return a problem that predicts as this one does near theta, and much faster.
+        """Return a problem that predicts nearly the same near theta, (P,), and much faster.
 
-        Exact steady motions are taken to second order in the distance from theta, shape (P,), see
-        ``Nearby`` in problem/prediction.py. The problem itself where it has none.
+        Exact steady motions are computed to second order in the distance from theta; see ``Nearby``
+        in problem/prediction.py. Returns the problem itself if it has no exact steady motions.
         """
         if not self.is_exact or isinstance(self._predictor, Nearby):
             return self
@@ -292,7 +292,10 @@ class TableProblem(Problem):
         return Predictor(self.model, self.sensors, self.space, self._rows, shooting, self._orbits)
 
     def assuming(self, spread: Mapping[str, float]) -> TableProblem:
-        """Return the problem with parameters free, with priors of such a `spread` of ln."""
+        """Return the problem with parameters free, of which ln has the standard deviation `spread`.
+
+        They scatter about their values.
+        """
         freed = self.like(free=spread)
         values = {p.name: p.value or 1.0 for p in freed.parameters}
         freed.ranges = {n: (float(np.log(values[n])), std) for n, std in spread.items()}
@@ -302,24 +305,24 @@ class TableProblem(Problem):
 
     @cached_property
     def friction_columns(self) -> NDArray[np.intp]:
-        """Which parameters are those of elements that depend on the amplitude."""
+        """Indices of the parameters of elements that depend on the amplitude."""
         names = {p.name for e in self.model.elements if not e.is_linear for p in e.parameters}
         return np.flatnonzero([name in names for name in self.names])
 
     def in_order(self, theta: ArrayLike) -> FloatArray:
-        """Return theta with interchangeable elements ordered by rising knee, Dahl's by x_c.
+        """Return theta with interchangeable elements in order of their knees, for Dahl x_c.
 
-        Elements are interchangeable where they follow one law, with the same parameters free and
-        the others alike; without an order their labels could switch.
+        Elements are interchangeable if they follow one law, with the same parameters free and the
+        others equal; without an order their labels could switch.
         """
         return self._alike.in_order(self.space.checked(theta), self.space)
 
     # Predictions
 
     def predict(self, theta: ArrayLike) -> ComplexArray:
-        """Return the response that the model predicts, in the data's quantity, (n,) or (S, n).
+        """Return the predicted response, in the data's quantity, (n,) or (S, n).
 
-        Sensors included; NaN where a driven plant has no steady amplitude.
+        It includes the sensors; NaN where a driven plant has no steady amplitude.
         """
         theta = self.space.checked(theta)
         prediction = self._prediction(theta)
@@ -328,12 +331,12 @@ class TableProblem(Problem):
     fitted = predict
 
     def level_slope(self, theta: FloatArray) -> ComplexArray:
-        """Return dR by ln of the amplitude, or of the drive where that is controlled, (n,)."""
+        """Return dR/d ln of the amplitude, or of the drive in force-controlled rows, (n,)."""
         slope = self._prediction(theta, 2).by_ln_amplitude
         return np.array(np.broadcast_to(slope, self._shape(theta)))
 
     def _prediction(self, theta: FloatArray, derivatives: int = 0) -> Prediction:
-        """Return the prediction; judging asks for that at one theta many times."""
+        """Return the prediction; the last one is cached, because many checks use the same theta."""
         if theta.ndim > 1:
             return self._predictor(theta, derivatives=derivatives)
         key, latest = theta.tobytes(), self._latest
@@ -353,7 +356,7 @@ class TableProblem(Problem):
         return np.array(np.broadcast_to(prediction.value, shape)), np.stack(changes, axis=-1)
 
     def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
-        """Return the size of a unit in each row, by powers of force, displacement and time."""
+        """Return the size in each row of a unit of such powers of force, displacement and time."""
         view, (force, displacement, time) = self.stiffness_data, dimension
         size = (np.abs(view.stiffness) * view.amplitude) ** force * view.amplitude**displacement
         return np.asarray(size / view.omega**time)
@@ -370,22 +373,22 @@ class TableProblem(Problem):
 
     @property
     def rounding(self) -> FloatArray:
-        """Size of residuals that may be rounding errors alone; no estimated scale is smaller.
+        """Size of residuals that may be mere rounding errors; no estimated scale is smaller.
 
-        It is also large enough that rounding keeps the calibrations' information on gains.
+        It is also large enough that rounding does not lose the calibrations' information on gains.
         """
         widths = [float(p.std()) for name, p in self.priors.items() if name.endswith("_gain")]
-        known = _LOST * max(widths, default=0.0) * self.n_residuals**0.5 / ROUNDING
-        return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT, known))
+        calibrated = _LOST * max(widths, default=0.0) * self.n_residuals**0.5 / ROUNDING
+        return np.asarray(self._noise.rounding * max(1.0, self.accuracy / EXPLICIT, calibrated))
 
     @property
     def log_area(self) -> Any:
-        """Return ln of the size of the residuals' units, in those of Re R and Im R."""
+        """Return the sum of ln |dy/dR|, which changes residuals into units of Re R and Im R."""
         return self._noise.log_area
 
     @property
     def accuracy(self) -> float:
-        """Relative error of predictions: rounding, or what shooting and true amplitudes leave."""
+        """Relative error of predictions: rounding, or that of shooting and of true amplitudes."""
         return EXPLICIT if self._noise.amplitude is None and not self.is_exact else ACCURACY
 
     # Residuals
@@ -393,10 +396,10 @@ class TableProblem(Problem):
     def data_rows(
         self, theta: FloatArray, *, derivatives: bool = True, tails: bool = True
     ) -> FloatArray:
-        """Return the data's residuals and their derivatives, two numbers a row, see ``Problem``.
+        """Return the data's residuals and their derivatives, two for each row; see ``Problem``.
 
         With noise in the amplitude the residuals are defined up to a rotation of each pair. The
-        derivatives leave that out, so that J' r is the exact gradient of half the sum of squares.
+        derivatives omit that rotation; J' r is still the exact gradient of half the sum of squares.
         """
         noise = self._noise
 
@@ -419,13 +422,13 @@ class TableProblem(Problem):
                 by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
                 changes = [-whiten(d) for d in by]
             pairs = np.empty((*self._shape(theta)[:-1], len(changes) + 1, self._rows.n), complex)
-            for index, numbers in enumerate((y, *changes)):
-                pairs[..., index, :] = numbers
+            for index, column in enumerate((y, *changes)):
+                pairs[..., index, :] = column
             rows = pairs.view(np.float64)
             return bend(rows, self.n_residuals, self.tail) if tails and self.tail else rows
 
     def residual_change(self, theta: FloatArray, change: ComplexArray) -> FloatArray:
-        """Return how the data's residuals change, (..., 2 n), where predictions change, (..., n).
+        """Return the change of the data's residuals, (..., 2 n), for one of predictions, (..., n).
 
         A covariance of few degrees of freedom is taken as known.
         """
@@ -441,10 +444,10 @@ class TableProblem(Problem):
     def draw(
         self, theta: ArrayLike, scale: float, size: int, rng: np.random.Generator
     ) -> ComplexArray:
-        """Return sets of responses, (size, n), drawn from the likelihood: measurements repeated.
+        """Return `size` simulated repetitions of the responses, (size, n), from the likelihood.
 
-        An error of the measured amplitudes appears, to first order, in the responses, so that
-        amplitudes stay as they were measured.
+        Errors of the measured amplitudes appear, to first order, in the responses, so that the
+        amplitudes do not change.
         """
         theta = self.space.checked(theta)
         shape, noise = (size, self._rows.n), self._noise
@@ -476,5 +479,5 @@ class TableProblem(Problem):
         return counted @ J.swapaxes(-1, -2)
 
     def _shape(self, theta: FloatArray) -> tuple[int, ...]:
-        """Return the shape of the rows' numbers for `theta`."""
+        """Return the shape of one number for each row and each theta."""
         return (*theta.shape[:-1], self._rows.n)
