@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LARGEST_DISC = 250.0  # area, points squared
-_MOST_JOINED = 6  # curves; lines between the points of more only confuse
+_MOST_JOINED = 6  # curves up to which lines join their points; more would confuse
 _HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\", "----")
 
 
@@ -36,8 +36,8 @@ def plot_residuals(
 ) -> Axes:
     """Draw the two residuals of every point, in standard deviations.
 
-    Points of a group are joined where no two of them share a position, so that sequences of one
-    sign are visible; with many groups, points are not joined.
+    Points of a group are joined if no two of them share a position, so that sequences of one sign
+    are visible; with many groups, points are not joined.
 
     Parameters
     ----------
@@ -46,13 +46,13 @@ def plot_residuals(
     first, second : array_like, shape (n,)
         Residuals in units of the noise.
     names : tuple of str
-        What the two residuals are.
+        Names of the two residuals.
     x_label : str
         Axis label with unit.
     group : array_like, shape (n,), optional
-        To which curve each point belongs; one curve where left out.
+        The curve to which each point belongs; by default there is one curve.
     suspicious : array_like of int
-        Indices to ring.
+        Indices of the points to ring.
 
     Examples
     --------
@@ -81,11 +81,11 @@ def plot_residuals(
 
 
 def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[NDArray[np.intp]]:
-    """Yield the rows of each group in order of their place, where no two share one."""
-    of = np.zeros(x.size) if group is None else np.asarray(group)
-    names = np.unique(of)
-    for name in names[: names.size if names.size <= _MOST_JOINED else 0]:
-        rows = np.flatnonzero(of == name)
+    """Yield the rows of each group in order of x, if no two of them have the same x."""
+    groups = np.zeros(x.size) if group is None else np.asarray(group)
+    names = np.unique(groups)
+    for name in names if names.size <= _MOST_JOINED else ():
+        rows = np.flatnonzero(groups == name)
         if np.unique(x[rows]).size == rows.size:
             yield rows[np.argsort(x[rows])]
 
@@ -101,7 +101,7 @@ def plot_profile(
     log: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the profile of the deviance over one parameter, with the levels of its intervals.
+    """Draw the profile of the deviance over one parameter, with the heights of its intervals.
 
     Parameters
     ----------
@@ -186,8 +186,8 @@ def plot_information(
     x : array_like, shape (n,)
         Amplitude of each point.
     shares : mapping of str to array_like, shape (n,)
-        For each parameter, each point's share of the information, summing to 1; NaN where
-        there is none.
+        For each parameter, the share of each point in the information, summing to 1; NaN if there
+        is none.
     x_label : str
         Axis label with unit.
 
@@ -232,8 +232,8 @@ def plot_budget(
     Parameters
     ----------
     rows : sequence of (parameter, source, share)
-        Shares between 0 and 1; those of one parameter sum to 1. Bars stand in the order in which
-        parameters first appear, sources likewise.
+        Shares between 0 and 1; those of one parameter sum to 1. Parameters and sources are drawn in
+        the order in which they first appear.
     x_label : str
         Axis label.
 
@@ -285,10 +285,10 @@ def plot_bench_time(
     Parameters
     ----------
     curves : mapping of str to (time, planned, grid)
-        For each quantity: seconds, and its uncertainty by plans and by a logarithmic grid; NaN
+        For each quantity: seconds, and its uncertainty with plans and with a logarithmic grid; NaN
         where a time is too short.
     target : mapping of str to float, optional
-        Wanted uncertainties, drawn as dotted lines.
+        Target uncertainties, drawn as dotted lines.
 
     Examples
     --------
@@ -320,18 +320,18 @@ def plot_bench_time(
 def plot_devices(devices: pd.DataFrame, mean: float, *, label: str, ax: Axes | None = None) -> Axes:
     """Draw each device's own estimate, the one shrunk towards the population, and the mean.
 
-    `devices` is that of :class:`dahl_ident.campaigns.population.PopulationParameter`; up to 40
+    `devices` is the table of :class:`dahl_ident.campaigns.population.PopulationParameter`; up to 40
     devices are named.
     """
     axis = style.axes(ax, size=(6.4, 3.2))
     table = devices.sort_values("own", kind="stable")
-    place = np.arange(len(table))
+    x = np.arange(len(table))
     axis.axhline(mean, color=style.GREY, lw=1.0, label="population mean")
     axis.errorbar(
-        place, table["shrunken"], 2.0 * table["u"], fmt="o", color=style.BLUE, capsize=0,
+        x, table["shrunken"], 2.0 * table["u"], fmt="o", color=style.BLUE, capsize=0,
         lw=1.0, label="shrunk towards the population, with 2 u",
     )  # fmt: skip
-    axis.plot(place, table["own"], "x", color=style.VERMILION, label="own estimate")
+    axis.plot(x, table["own"], "x", color=style.VERMILION, label="own estimate")
     marked = np.flatnonzero(table["outlying"])
     if marked.size:
         axis.plot(
@@ -339,7 +339,7 @@ def plot_devices(devices: pd.DataFrame, mean: float, *, label: str, ax: Axes | N
             label="outside the population",
         )  # fmt: skip
     if len(table) <= 40:
-        axis.set_xticks(place, table.index, rotation=90)
+        axis.set_xticks(x, table.index, rotation=90)
     else:
         axis.set_xlabel(f"{len(table)} devices in the order of their own estimate")
     axis.set_ylabel(label)
@@ -351,10 +351,10 @@ def plot_devices(devices: pd.DataFrame, mean: float, *, label: str, ax: Axes | N
 def plot_control_charts(
     fits: pd.DataFrame, *, label: str, x_label: str = "fit", ax: Sequence[Axes] | None = None
 ) -> tuple[Axes, ...]:
-    """Draw the individuals chart of fits and, where they have an order in time, the EWMA chart.
+    """Draw the individuals chart of fits and, if they have an order in time, the EWMA chart.
 
-    `fits` is that of :class:`dahl_ident.campaigns.population.PopulationParameter`; points outside
-    the limits are marked.
+    `fits` is the table of :class:`dahl_ident.campaigns.population.PopulationParameter`; points
+    outside the limits are marked.
     """
     charts = [(label, "value", "limit")]
     if "ewma" in fits:
@@ -364,13 +364,13 @@ def plot_control_charts(
     n = np.arange(1, len(fits) + 1)
     centre = fits["centre"]
     for axis, (name, column, limit) in zip(axes, charts, strict=True):
-        line, width = fits[column], fits[limit]
+        values, width = fits[column], fits[limit]
         axis.axhline(centre.iloc[0], color=style.GREY, lw=1.0)
         for bound in (centre + width, centre - width):
             axis.plot(n, bound, "--", color=style.GREY, lw=1.0)
-        axis.plot(n, line, "-o", color=style.BLUE, lw=0.8, ms=3)
-        beyond = ((line - centre).abs() > width).to_numpy()
-        axis.plot(n[beyond], line[beyond], "s", mfc="none", ms=8, color=style.VERMILION)
+        axis.plot(n, values, "-o", color=style.BLUE, lw=0.8, ms=3)
+        outside = ((values - centre).abs() > width).to_numpy()
+        axis.plot(n[outside], values[outside], "s", mfc="none", ms=8, color=style.VERMILION)
         axis.set_ylabel(name)
     axes[-1].set_xlabel(x_label)
     return tuple(axes)
@@ -425,8 +425,8 @@ def plot_corner(
             continue
         axis.set_xscale("log" if logs[j] else "linear")
         axis.set_yscale("log" if logs[i] and i != j else "linear")
-        for line in (axis.xaxis, axis.yaxis):
-            style.few_plain_ticks(line)
+        style.few_plain_ticks(axis.xaxis)
+        style.few_plain_ticks(axis.yaxis)
         if i == j:
             axis.hist(
                 values[:, i], edges[i], color=style.PALE_BLUE, ec=style.BLUE, histtype="stepfilled"
@@ -496,7 +496,7 @@ def plot_trace(
 
 
 def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:
-    """Return which axes are logarithmic: on a narrow range logarithmic ticks are hard to read."""
+    """Return which axes are logarithmic: those that are wanted so, and have a wide range."""
     low, high = np.quantile(values, [0.001, 0.999], axis=0)
     wanted = list(log) or [False] * values.shape[1]
     return [bool(w and b > _WIDE * a) for w, a, b in zip(wanted, low, high, strict=True)]

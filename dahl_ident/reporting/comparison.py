@@ -1,4 +1,4 @@
-"""Parameters of several measurements compared: side by side, and what changed or disagrees."""
+"""Parameters of several measurements side by side, and their changes or disagreements."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from dahl_ident.reporting.document import (
 from dahl_ident.results import FitResult
 from dahl_ident.results.changes import SIGNIFICANT, Change, changes, headline, is_usable
 
-_HOW_BOTH = (
+_ON_DIFFERENCES = (
     "The same parameters, estimated from the table and sample by sample from the waveforms. The "
     "standard uncertainty u of the difference combines both budgets as if they had no error in "
     "common; p is the two-sided probability of a difference this large if there is none. A "
-    f"difference is called a disagreement where p times the number of rows is below {SIGNIFICANT}."
+    f"difference is called a disagreement if p times the number of rows is below {SIGNIFICANT}."
 )
-_HOW = (
+_ON_CHANGES = (
     "A change is the difference of two estimates. Its standard uncertainty u combines both "
     "budgets; for a fit of a single run, the scatter between runs that the other fit shows is "
     "added. p is the two-sided probability of a change this large if there is no real change; "
     f"below {SIGNIFICANT:g} it is called significant, unless no fit shows scatter between runs."
 )
 KINDS = {"table": "Table", "records": "Waveforms"}
-"""How reports call what was measured."""
+"""Names of the kinds of data in reports."""
 
 
 def of_kind(kind: str, results: Iterable[Any]) -> list[Any]:
@@ -51,7 +51,7 @@ def of_kind(kind: str, results: Iterable[Any]) -> list[Any]:
 
 @dataclass(frozen=True)
 class Compared:
-    """What a report says of fits of different measurements, compared with each other."""
+    """The part of a report that compares fits of different measurements."""
 
     status: tuple[str, ...] = ()
     verdict: tuple[str, ...] = ()
@@ -74,7 +74,7 @@ def comparison_of(fits: Sequence[FitResult]) -> Compared:
 
 
 def changed_between(names: Sequence[str], fits: Sequence[FitResult]) -> Compared:
-    """Return what changed from each fit to the next; nothing where they share no parameter."""
+    """Return what changed from each fit to the next; empty if they share no parameter."""
     changed = changes(dict(zip(names, fits, strict=True)))
     if not changed:
         return Compared()
@@ -88,13 +88,13 @@ def changed_between(names: Sequence[str], fits: Sequence[FitResult]) -> Compared
         for c in changed
     ]
     table = TextTable.of("Changes from each measurement to the next", rows)
-    section = Section("Changes", (table, Paragraph(_HOW)))
+    section = Section("Changes", (table, Paragraph(_ON_CHANGES)))
     facts = {"changes": [change.to_dict() for change in changed]}
     return Compared((), tuple(headline(changed)), (section,), facts)
 
 
 def numbered(names: Sequence[str]) -> list[str]:
-    """Return names with a number where several are the same."""
+    """Return names, with numbers added to those that occur more than once."""
     return [n if names.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(names, 1)]
 
 
@@ -109,15 +109,15 @@ def _of_both(fits: Sequence[FitResult]) -> Compared:
     verdict, disagree = [], []
     rows: list[Row] = []
     for c, both in differences:
-        says = "agree" if math.isfinite(c.p) else "cannot be compared"
+        finding = "agree" if math.isfinite(c.p) else "cannot be compared"
         if c.p * comparable < SIGNIFICANT:
-            says = "disagree"
+            finding = "disagree"
             disagree.append(c.parameter)
             of_table, of_waveforms = (with_unit(e.value, e.stderr or 0.0, c.unit) for e in both)
             verdict.append(
                 f"Table and waveforms disagree: {c.parameter} is {of_table} from the table and "
                 f"{of_waveforms} from the waveforms ({c.p_text}). At least one has an error "
-                "that its uncertainty does not hold."
+                "that its uncertainty does not include."
             )
         texts = (" \u00b1 ".join(rounded(e.value, e.stderr or 0.0)) for e in both)
         cells = [Cell(text, e.value) for text, e in zip(texts, both, strict=True)]
@@ -126,7 +126,7 @@ def _of_both(fits: Sequence[FitResult]) -> Compared:
                 "parameter": c.parameter,
                 **dict(zip(("table", "waveforms"), cells, strict=True)),
                 **_sizes("difference", c, c.p_text),
-                "finding": says,
+                "finding": finding,
             }
         )
     if not verdict:
@@ -135,19 +135,19 @@ def _of_both(fits: Sequence[FitResult]) -> Compared:
             verdict = [
                 "Table and waveforms cannot be compared: they have no usable estimate in common."
             ]
-    # one model, with its uncertainties, then does not describe both
+    # if they disagree, one model with its uncertainties does not describe both
     status = (str(VerdictStatus.NOT_DESCRIBED),) if disagree else ()
     sections: tuple[Section, ...] = ()
     if rows:
         caption = "Parameters from the table and from the waveforms, with standard uncertainties"
-        blocks = (TextTable.of(caption, rows), Paragraph(_HOW_BOTH))
+        blocks = (TextTable.of(caption, rows), Paragraph(_ON_DIFFERENCES))
         sections = (Section("Table and waveforms", blocks),)
     facts = {"changes": [change.to_dict() for change, _ in differences], "disagree": disagree}
     return Compared(status, tuple(verdict), sections, facts)
 
 
 def _sizes(what: str, change: Change, p: str) -> Row:
-    """Return a change, its uncertainty, their unit and p as written; struck if not usable."""
+    """Return a change, its uncertainty, their unit and p; struck through if not usable."""
     value, error = rounded(change.change, change.u)
     usable = math.isfinite(change.p)
     u = change.u if math.isfinite(change.u) else None
@@ -160,7 +160,7 @@ def _sizes(what: str, change: Change, p: str) -> Row:
 
 
 def side_by_side(names: Sequence[str], fits: Sequence[FitResult]) -> Compared:
-    """Return the estimates of fits of different tables, what changed, pictures and verdicts."""
+    """Return the estimates of fits of different tables, their changes, pictures and verdicts."""
     rows = []
     for name in dict.fromkeys(name for fit in fits for name in fit.params):
         unit = next(fit.params[name].unit for fit in fits if name in fit.params)

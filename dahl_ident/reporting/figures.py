@@ -1,4 +1,4 @@
-"""The figures of a report, each with a caption and a description of what is seen."""
+"""The figures of a report, each with a caption and a description in words."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from dahl_ident.results import FitResult, Posterior
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
-_LEVELS, _POINTS = 5, 160  # of the plant's response over levels
-_APART = 1.2  # ratio of the largest frequency to the smallest above which they are drawn as several
+_LEVELS, _POINTS = 5, 160  # of the plant's response at several levels
+_APART = 1.2  # ratio of the largest frequency to the smallest above which there are several
 _PROFILE_POINTS = 41
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 _WIDE = 20.0  # ratio of amplitudes above which loops are drawn over displacement / amplitude
@@ -69,23 +69,23 @@ def _of_table(fit: FitResult) -> Iterator[Picture]:
 def _of_records(fit: FitResult) -> Iterator[Picture]:
     """Yield the figures of the record that a fit describes worst."""
     worst = fit.goodness.worst_record - 1
-    of = f" of record {worst + 1}, which is described worst" if len(fit.data) > 1 else ""
+    of_record = f" of record {worst + 1}, which is described worst" if len(fit.data) > 1 else ""
     share = percent(fit.goodness.share_left**0.5)
-    over = partial(fit.plot_residuals, record=worst)
-    shown: dict[str, tuple[str, Callable[[], Any]]] = {
+    draw_residuals = partial(fit.plot_residuals, record=worst)
+    figures: dict[str, tuple[str, Callable[[], Any]]] = {
         "time": (f"Measured and fitted {fit.problem.output}", partial(fit.plot_fit, record=worst)),
-        "residuals": ("Residuals over time", over),
+        "residuals": ("Residuals over time", draw_residuals),
     }
     if fit.data[worst].displacement is not None:
-        shown["loop"] = "Force over displacement", partial(fit.plot, "loop", record=worst)
-        shown["residuals_displacement"] = (
-            "Residuals over displacement", partial(over, against="displacement")
+        figures["loop"] = "Force over displacement", partial(fit.plot, "loop", record=worst)
+        figures["residuals_displacement"] = (
+            "Residuals over displacement", partial(draw_residuals, against="displacement")
         )  # fmt: skip
-    for kind, (caption, draw) in shown.items():
+    for kind, (caption, draw) in figures.items():
         yield Picture(
             f"record_{kind}",
-            f"{caption}{of}.",
-            f"{caption}{of}: the residuals are {share} rms of the measured signal.",
+            f"{caption}{of_record}.",
+            f"{caption}{of_record}: the residuals are {share} rms of the measured signal.",
             draw,
         )
 
@@ -94,7 +94,7 @@ _PICTURES = {"table": _of_table, "records": _of_records}
 
 
 def budget_picture(budget: Budget) -> Picture:
-    """Return the shares of the sources in each parameter's variance."""
+    """Return the picture of the shares of the sources in each parameter's variance."""
     largest = (
         f"{p.name}: {p.rows[0].source}, {100.0 * p.rows[0].share:.0f} %" for p in budget.parameters
     )
@@ -157,8 +157,12 @@ def _is_plant_over_amplitude(fit: FitResult) -> bool:
     """Return whether a plant was driven by force at a few widely spaced frequencies."""
     data = fit.data.select(harmonic=1)
     low, high = _ends(data.frequency_hz)
-    several = len(fit.model.elements) > 1 and high > _APART * low
-    return several and curves.is_force_controlled(data) and not curves.is_over_frequency(data)
+    return (
+        len(fit.model.elements) > 1
+        and high > _APART * low
+        and curves.is_force_controlled(data)
+        and not curves.is_over_frequency(data)
+    )
 
 
 def _ends(values: FloatArray) -> tuple[float, float]:
@@ -183,7 +187,7 @@ def _residuals(fit: FitResult) -> Picture:
 def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
     sigma = curve.stiffness
     normalised = fit.data.select(harmonic=1).to("dynamic_stiffness").response / sigma
-    off = float(np.max(np.abs(normalised - fit.best_fit[fit.data.harmonic == 1] / sigma)))
+    largest = float(np.max(np.abs(normalised - fit.best_fit[fit.data.harmonic == 1] / sigma)))
 
     def draw() -> Any:
         marks = [(b, complex(curve.response(np.array([b]))[0])) for b in _MARKED_BETA]
@@ -195,14 +199,14 @@ def _universal(fit: FitResult, curve: UniversalCurve) -> Picture:
         "universal_curve",
         "Data divided by the fitted stiffness, and the universal curve h(beta), which every set of "
         "parameters of this law follows; numbers are beta.",
-        f"Points in the complex plane along the curve; the farthest is {off:.2g} from it, in units "
-        "of the stiffness.",
+        f"Points in the complex plane along the curve; the farthest is {largest:.2g} from it, in "
+        "units of the stiffness.",
         draw,
     )
 
 
 def _profiles(fit: FitResult) -> Picture:
-    """Return the profile of every free parameter, two panels a row."""
+    """Return the picture of all parameters' profiles, two panels in each row."""
     best = [f"{name} is {v:.4g}" for name, v in zip(fit.var_names, fit.optimum.values, strict=True)]
 
     def draw() -> Any:
@@ -226,7 +230,7 @@ def _profiles(fit: FitResult) -> Picture:
 
 
 def _draw_profile(fit: FitResult, index: int, axis: plots.Axes) -> None:
-    """Draw a profile out to its widest limit; over three decades if it is open."""
+    """Draw a profile out to its widest limit, or over three decades if that is open."""
     name, parameter = fit.var_names[index], fit.problem.parameters[index]
     profiler = Profiler(fit.optimum)
     q = thresholds(fit.optimum, np.array(LEVELS))
@@ -264,7 +268,7 @@ def _information(fit: FitResult) -> Picture:
     share = shares(fit.optimum)
     x = fit.problem.stiffness_data.amplitude
     unit = si_unit("displacement", fit.data.motion)
-    places = [
+    findings = [
         f"{name} is determined mostly at an amplitude of {x[int(np.argmax(row))]:.3g} {unit}"
         for name, row in zip(fit.var_names, share, strict=True)
         if np.isfinite(row).all()
@@ -273,8 +277,8 @@ def _information(fit: FitResult) -> Picture:
         "information",
         "Amplitudes that carry the information on each parameter: the area of a disc is the "
         "share of one point, and the largest share is written.",
-        "Discs on one line for each parameter; " + "; ".join(places) + "."
-        if places
+        "Discs on one line for each parameter; " + "; ".join(findings) + "."
+        if findings
         else "No point distinguishes the parameters.",
         lambda: plots.plot_information(
             x,
@@ -286,33 +290,38 @@ def _information(fit: FitResult) -> Picture:
 
 def _is_friction_alone(fit: FitResult) -> bool:
     """Return whether the data are the dynamic stiffness of one law, with exact channels."""
-    elements = fit.model.elements
-    exact = fit.problem.sensors.are_exact and not curves.is_force_controlled(fit.data)
-    whole = bool((fit.data.harmonic == 1).all()) and fit.data.quantity == "dynamic_stiffness"
-    free = all(not p.free or p.dimension[0] for e in elements for p in e.parameters)
-    return len(elements) == 1 and elements[0].has_memory and exact and whole and free
+    elements, data = fit.model.elements, fit.data
+    return (
+        len(elements) == 1
+        and elements[0].has_memory
+        and fit.problem.sensors.are_exact
+        and not curves.is_force_controlled(data)
+        and bool((data.harmonic == 1).all())
+        and data.quantity == "dynamic_stiffness"
+        and all(not p.free or p.dimension[0] for p in elements[0].parameters)
+    )
 
 
 def _loops(fit: FitResult, friction: Friction) -> Picture:
     """Return the picture of the loops at the smallest, a middle and the largest amplitude."""
-    sizes, measured = _chosen(fit, friction)
+    sizes, measured = _measured_loops(fit, friction)
     unit, force_unit = (si_unit(kind, fit.data.motion) for kind in ("displacement", "force"))
     lost = [
         f"{with_unit(q.value, q.stderr, 'J')} at {q.amplitude:.3g} {unit}"
         for q in fit.derived(sizes.tolist())
         if q.name == ENERGY
     ]
-    drawn = [friction.loop(float(A), 6 * (_LOOP_POINTS - 1) + 1) for A in sizes]
+    fitted = [friction.loop(float(A), 6 * (_LOOP_POINTS - 1) + 1) for A in sizes]
     over_amplitude = bool(sizes[-1] > _WIDE * sizes[0])
 
     def draw() -> Any:
         scale = sizes if over_amplitude else np.ones_like(sizes)
-        model = [
+        loops = [
             (x / by, force, engineering(A, unit))
-            for A, by, (x, force) in zip(sizes, scale, drawn, strict=True)
+            for A, by, (x, force) in zip(sizes, scale, fitted, strict=True)
         ]
         return plots.plot_loops(
-            model,
+            loops,
             measured=[(x / by, force) for by, (x, force) in zip(scale, measured, strict=False)],
             displacement_label="displacement over amplitude"
             if over_amplitude
@@ -326,19 +335,19 @@ def _loops(fit: FitResult, friction: Friction) -> Picture:
         caption += "The data hold no higher harmonics of the force, so there is no measured loop."
         return Picture("loops", caption, finding, draw)
     caption += "Dots: the sum of the measured harmonics, less the force of the other elements."
-    away = [
+    deviations = [
         np.sqrt(np.mean((force - model[:: (model.size - 1) // (force.size - 1)]) ** 2))
         / np.abs(force).max()
-        for (_, model), (_, force) in zip(drawn, measured, strict=True)
+        for (_, model), (_, force) in zip(fitted, measured, strict=True)
     ]
-    finding += f" The measured loops are within {percent(max(away))} rms of the model's."
+    finding += f" The measured loops are within {percent(max(deviations))} rms of the model's."
     return Picture("loops", caption, finding, draw)
 
 
-def _chosen(
+def _measured_loops(
     fit: FitResult, friction: Friction
 ) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]]]:
-    """Return three amplitudes and their measured loops, where harmonics were measured."""
+    """Return three amplitudes, and their measured loops if harmonics were measured."""
     data = fit.data
     fundamental = data.harmonic == 1
     if fundamental.all() or not fit.problem.sensors.are_exact:
@@ -349,14 +358,14 @@ def _chosen(
     run = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
     points = np.stack([data.frequency_hz, A, run])
     rows_of = [np.flatnonzero((points[:, i] == points.T).all(axis=1)) for i in range(data.n)]
-    full = [i for i in np.flatnonzero(fundamental) if rows_of[i].size > 1]
-    rank = [full[i] for i in np.argsort(A[full])]
-    three = [rank[0], rank[len(rank) // 2], rank[-1]]
+    with_harmonics = [i for i in np.flatnonzero(fundamental) if rows_of[i].size > 1]
+    ranked = [with_harmonics[i] for i in np.argsort(A[with_harmonics])]
+    three = [ranked[0], ranked[len(ranked) // 2], ranked[-1]]
     others = fit.best_fit - friction.dynamic_stiffness(A, 2.0 * np.pi * data.frequency_hz)
     friction_alone = np.where(fundamental, data.response - others, data.response)
     theta = np.linspace(0.0, 2.0 * np.pi, _LOOP_POINTS)
     cycles = []
-    for i in three:  # from F_k/X_1, X_1 taken as real
+    for i in three:  # rows are F_k/X_1, with X_1 real
         turning = np.exp(1j * np.outer(data.harmonic[rows_of[i]], theta))
         force = A[i] * (friction_alone[rows_of[i]] @ turning).real
         cycles.append((A[i] * np.cos(theta), force))
@@ -364,7 +373,7 @@ def _chosen(
 
 
 def settling(data: FrequencyResponse, record: Record) -> Picture:
-    """Return the figure of the point with the largest ratio of bias to error."""
+    """Return the figure of how the point with the largest ratio of bias to error settled."""
     _check_origin(data, record)
     points = data.select(harmonic=1)
     assert points.covariance is not None  # extraction gives it
@@ -372,21 +381,21 @@ def settling(data: FrequencyResponse, record: Record) -> Picture:
     error = np.sqrt(0.5 * np.trace(points.covariance, axis1=1, axis2=2))
     excess = np.hypot(points.quality["bias_real"], points.quality["bias_imag"]) / error
     i = int(np.argmax(excess))
-    f, dropped = float(points.frequency_hz[i]), int(points.quality["settling_periods"][i])
+    f, omitted = float(points.frequency_hz[i]), int(points.quality["settling_periods"][i])
     start, end = (float(points.quality[name][i]) for name in ("start_time", "end_time"))
-    response, mean = cycle_by_cycle(record, f, start - dropped / f, end)
-    one_cycle = float(error[i]) * np.sqrt(max(response.size - dropped, 1))
-    used = response[dropped:]
+    response, mean = cycle_by_cycle(record, f, start - omitted / f, end)
+    one_cycle = float(error[i]) * np.sqrt(max(response.size - omitted, 1))
+    used = response[omitted:]
     scatter = float(np.std(used) / np.abs(np.mean(used)))
-    where = f"{f:.4g} Hz, {points.amplitude[i]:.3g} {si_unit('displacement', data.motion)}"
+    point = f"{f:.4g} Hz, {points.amplitude[i]:.3g} {si_unit('displacement', data.motion)}"
     return Picture(
         "cycles",
-        f"Settling of the point at {where}, which has the largest ratio of bias to error: "
-        f"{dropped} of {response.size} cycles are left out. The grey band is two standard "
+        f"Settling of the point at {point}, which has the largest ratio of bias to error: "
+        f"{omitted} of {response.size} cycles are left out. The grey band is two standard "
         "deviations of one cycle.",
         f"The response of the {used.size} cycles used scatters by {percent(scatter)}; the bias is "
         f"{excess[i]:.2g} standard errors.",
-        lambda: plots.plot_cycles(response, mean, left_out=dropped, response_std=one_cycle),
+        lambda: plots.plot_cycles(response, mean, left_out=omitted, response_std=one_cycle),
     )
 
 
@@ -411,20 +420,20 @@ def cycle_by_cycle(
 
 def _check_origin(data: FrequencyResponse, record: Record) -> None:
     digest = dict(record.provenance or {}).get("sha256")
-    known = [source.sha256 for source in sources([data.provenance]) if source.sha256]
+    hashes = [source.sha256 for source in sources([data.provenance]) if source.sha256]
     if (
         "start_time" not in data.quality
         or len(parts([data.provenance])) > 1
-        or digest not in (*known, None)
+        or digest not in (*hashes, None)
     ):
         raise ValidationError(
-            "the data were not extracted from this record alone; give the one that they were "
-            "extracted from, or none"
+            "the data were not extracted from this record alone; give the one from which they were "
+            "extracted, or none"
         )
 
 
 def corner(posterior: Posterior) -> Picture:
-    """Return the densities of a posterior's parameters and pairs."""
+    """Return the picture of the densities of a posterior's parameters and of pairs of them."""
     covariance = np.atleast_2d(np.cov(posterior.values.T, aweights=posterior.weights))
     size = np.sqrt(covariance.diagonal())
     correlation = covariance / np.outer(size, size)
@@ -444,7 +453,7 @@ def corner(posterior: Posterior) -> Picture:
 
 
 def trace(posterior: Posterior) -> Picture:
-    """Return the walkers' paths of a chain."""
+    """Return the picture of the paths of a chain's walkers."""
     return Picture(
         "trace",
         "Paths of the walkers; the shaded warm-up is not used in any result.",

@@ -1,4 +1,4 @@
-"""``report(results, path)``: writes results as HTML, PDF, Markdown or JSON."""
+"""``report(results, path)`` writes results as HTML, PDF, Markdown or JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from dahl_ident.reporting.sections import Result, document
 from dahl_ident.results import FitResult, Posterior
 
 BLANK = "________________"
-SCHEMA = 2  # of the JSON report: it rises when readers have to change
+SCHEMA = 2  # version of the JSON report, raised when readers have to change
 _LONGEST_TITLE = 200  # characters
 FORMATS = (".html", ".pdf", ".md", ".json")
 
@@ -51,10 +51,10 @@ def report(
 ) -> Path:
     """Write a report on one or several results.
 
-    Results on the same data are reported together. Fits on different data (devices, dates) are
-    overlaid, and the changes of their parameters listed with their significance. Of a fit of a
-    table and a fit of the waveforms of the same test, the parameters are compared, and the report
-    begins with whether they agree.
+    Results on the same data are reported together. Fits of different data (devices, dates) are
+    overlaid, and the changes of their parameters are listed with their significance. If a fit of a
+    table and one of the waveforms of the same test are given, their parameters are compared, and
+    the report begins with whether they agree.
 
     Parameters
     ----------
@@ -66,19 +66,19 @@ def report(
     title : str, optional
         First line; by default the file's name.
     command : str, optional
-        The command that reproduces it; by default the one that fits the same model.
+        The command that reproduces the report; by default the one that fits the same model.
     record : Record, optional
-        The waveforms that the data were extracted from; the report shows how a point settled.
+        The waveforms from which the data were extracted; the report shows how a point settled.
     metadata : mapping or path of a TOML file, optional
         Metadata from the laboratory: title, number, laboratory, customer, specimen, method,
         received and measured (dates), place, ambient, instruments, traceability, operator,
-        authorised_by, role, remarks. The usual fields left out are printed as lines to fill in.
+        authorised_by, role, remarks. Missing usual fields are printed as lines to fill in.
         An instrument's channel, uncertainty and k are its calibration, which the fit must have
         counted: ``sensors=Sensors.from_metadata(metadata)``.
     overwrite : bool, default False
-        Replace a report that is there already.
+        Whether to replace an existing report.
     progress : callable, optional
-        Called with the number of pictures drawn and of all pictures.
+        Called with the number of pictures drawn, and the number of all pictures.
 
     Returns
     -------
@@ -88,13 +88,13 @@ def report(
     Raises
     ------
     ValidationError
-        If there is no result, the ending is another one, the record is of other data, a field of
+        If there is no result, the path has another ending, the record is of other data, a field of
         the metadata is unknown, an instrument states an uncertainty that the fit did not count,
         a posterior is on other data than the first result, or fits of records are given together
         with fits of several tables.
     DataError
-        If the metadata cannot be read, a file is there already and `overwrite` is not set, or the
-        place cannot be written to.
+        If the metadata cannot be read, the file exists and `overwrite` is not set, or the place
+        cannot be written to.
 
     Examples
     --------
@@ -109,14 +109,14 @@ def report(
     if not overwrite:
         refuse_existing(place)
     listed = list(results) if isinstance(results, Sequence) else [results]
-    known = metadata_of(metadata)
+    stated = metadata_of(metadata)
     _check(listed)
-    _check_calibrations(listed, known)
+    _check_calibrations(listed, stated)
     of_tables = of_kind("table", listed)
     if record is not None and not of_tables:
         raise ValidationError(
-            f"{argument('record', option='waveforms')} is given, the waveforms of a table, but no "
-            "result on a table; leave it out"
+            f"{argument('record', option='waveforms')} gives the waveforms of a table, but there "
+            "is no result on a table; leave it out"
         )
     apart = any(not np.array_equal(t.data.response, of_tables[0].data.response) for t in of_tables)
     if apart and len(of_tables) < len(listed):
@@ -124,23 +124,23 @@ def report(
             "fits of several tables are reported together with no fit of records; give those of "
             "one table, or write a report for each"
         )
-    whole = document(
-        listed, title=title, command=command, record=record, metadata=known, apart=apart
+    draft = document(
+        listed, title=title, command=command, record=record, metadata=stated, apart=apart
     )
-    whole = whole.finished(_one_line(whole.title), progress)
+    finished = draft.finished(_one_line(draft.title), progress)
     kind = place.suffix.lower()
     if kind == ".md":
         folder = place.with_name(f"{place.stem}_pictures")
-        _write_pictures(whole, folder, overwrite)
-        content = markdown(whole, folder.name)
+        _write_pictures(finished, folder, overwrite)
+        content = markdown(finished, folder.name)
     else:
-        content = content_of(whole, kind)
+        content = content_of(finished, kind)
     write_whole(place, content, overwrite=overwrite)
     return place
 
 
 def _check(results: Sequence[object]) -> None:
-    """Refuse what is not a result that can be reported."""
+    """Refuse objects that are not results."""
     if not results:
         raise ValidationError("there is no result to report on; expected at least one")
     for i, result in enumerate(results):
@@ -150,9 +150,9 @@ def _check(results: Sequence[object]) -> None:
             )
 
 
-def _check_calibrations(results: Sequence[Result], known: Metadata) -> None:
-    """Refuse results that do not count what the instruments state."""
-    for name, u in known.calibrations().items():
+def _check_calibrations(results: Sequence[Result], stated: Metadata) -> None:
+    """Refuse results that do not count the uncertainties which the instruments state."""
+    for name, u in stated.calibrations().items():
         for result in results:
             counted = result.problem.calibrations.get(name, 0.0)
             if not math.isclose(counted, u, rel_tol=0.01):
@@ -165,9 +165,9 @@ def _check_calibrations(results: Sequence[Result], known: Metadata) -> None:
 
 
 def _one_line(title: str) -> str:
-    """Return a title that every format can hold: no half characters, no control signs, not long."""
-    whole = re.sub(r"[\s\x00-\x1f\x7f]+", " ", title.encode(errors="replace").decode())
-    return whole if len(whole) <= _LONGEST_TITLE else f"{whole[:_LONGEST_TITLE]}..."
+    """Return a short title for every format, without surrogates and control characters."""
+    clean = re.sub(r"[\s\x00-\x1f\x7f]+", " ", title.encode(errors="replace").decode())
+    return clean if len(clean) <= _LONGEST_TITLE else f"{clean[:_LONGEST_TITLE]}..."
 
 
 def content_of(whole: Document, kind: str) -> bytes:
@@ -201,27 +201,27 @@ def machine_readable(whole: Document) -> bytes:
         "verdict": list(whole.verdict),
         **whole.facts,
     }
-    known = plain_data(facts, not_finite=lambda _: None)
-    return json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False).encode(errors="replace")
+    plain = plain_data(facts, not_finite=lambda _: None)
+    return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False).encode(errors="replace")
 
 
 def html(document: Document) -> bytes:
     """Return the page; text is escaped, and the page's security policy forbids network access."""
-    room = files("dahl_ident.reporting")
+    package = files("dahl_ident.reporting")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
     )
-    page = environment.from_string((room / "page.html.j2").read_text(encoding="utf-8"))
+    page = environment.from_string((package / "page.html.j2").read_text(encoding="utf-8"))
     return page.render(
         document=document,
         foot=_css_text(f"{document.title} {document.identity}".strip()),
-        style=(room / "page.css").read_text(encoding="utf-8"),
-        script=(room / "page.js").read_text(encoding="utf-8"),
+        style=(package / "page.css").read_text(encoding="utf-8"),
+        script=(package / "page.js").read_text(encoding="utf-8"),
     ).encode(errors="replace")
 
 
 def _css_text(text: str) -> str:
-    """Return a string of a style sheet that holds nothing but letters, digits and escapes."""
+    """Return a text as a string for a style sheet, of letters, digits and escapes only."""
     return '"' + "".join(c if c.isalnum() else f"\\{ord(c):x} " for c in text) + '"'
 
 
@@ -231,7 +231,7 @@ def markdown(document: Document, folder: str) -> bytes:
     lines += [_escaped(line) for line in document.verdict]
     if document.header:
         rows = [
-            f"| {name} | {_escaped('; '.join(given)) or BLANK} |" for name, given in document.header
+            f"| {name} | {_escaped('; '.join(texts)) or BLANK} |" for name, texts in document.header
         ]
         lines.append("\n".join(("| | |", "| --- | --- |", *rows)))
     if document.identity:
@@ -243,7 +243,7 @@ def markdown(document: Document, folder: str) -> bytes:
 
 
 def _with_signature(document: Document) -> Iterator[Section]:
-    """Yield the sections, and before the details a field for the signature."""
+    """Yield the sections, with a field for the signature before the first of the details."""
     sections = document.sections
     name = ", ".join(document.signatory) or BLANK
     signature = Section("Signature", (Paragraph(f"Date {BLANK} Name {name} Signature {BLANK}"),))
@@ -269,8 +269,7 @@ def _block(block: Block, folder: str) -> str:
 
 
 def _table(table: TextTable) -> str:
-    rows = [table.header, tuple("---" for _ in table.header)]
-    lines = [" | ".join(map(_escaped, rows[0])), " | ".join(rows[1])]
+    lines = [" | ".join(map(_escaped, table.header)), " | ".join("---" for _ in table.header)]
     lines += [" | ".join(map(_cell, row)) for row in table.rows]
     return f"**{_escaped(table.caption)}**\n\n" + "\n".join(f"| {line} |" for line in lines)
 

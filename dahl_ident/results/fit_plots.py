@@ -1,4 +1,4 @@
-"""Pictures of a fit: what to draw is decided here, how it looks in :mod:`dahl_ident.plots`."""
+"""Pictures of a fit: their content; :mod:`dahl_ident.plots` decides how they look."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _POINTS = 200  # points of a curve, which then looks smooth
 
 
 def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
-    """Draw a fit in one of the kinds that its data have; the first where none is given."""
+    """Draw a fit in one of the kinds that its data have, by default the fit over the data."""
     of_table = fit.problem.response is not None
     kinds: dict[str, Callable[[], Any]] = {
         "fit": lambda: _fit_of_table(fit, ax) if of_table else _fit_of_record(fit, ax, record),
@@ -57,7 +57,7 @@ def draw_budget(budget: Budget, ax: Axes | None = None) -> Axes:
 
 
 def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
-    """Draw data with error bars and fit with its band, over amplitude or over frequency."""
+    """Draw data with error bars, and the fit with its band, over amplitude or frequency."""
     return curves.draw(
         fit.data,
         ax,
@@ -67,9 +67,9 @@ def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes
 
 
 def standardized_residuals(fit: FitResult) -> FloatArray:
-    """Return both residuals of each row in standard deviations, (n, 2); NaN where there is none.
+    """Return both residuals of each row in standard deviations, (n, 2).
 
-    A mean force is real, so that its row has a first residual only.
+    A mean force is real, so that the second residual of its row is NaN.
     """
     scale = fit.scale if fit.scale > 0.0 else 1.0
     residuals = fit.residual[: fit.problem.n_residuals].reshape(-1, 2) / scale
@@ -85,7 +85,7 @@ def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None) ->
         against = "frequency" if over_frequency else "amplitude"
     amplitude = fit.problem.stiffness_data.amplitude
     units = {kind: si_unit(kind, data.motion) for kind in ("displacement", "velocity")}
-    places = {
+    abscissae = {
         "amplitude": (amplitude, f"displacement amplitude [{units['displacement']}]"),
         "frequency": (data.frequency_hz, "frequency [Hz]"),
         "velocity": (
@@ -93,9 +93,10 @@ def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None) ->
             f"velocity amplitude [{units['velocity']}]",
         ),
     }
-    if against not in places:
-        raise ValidationError(f"against is {against!r}; expected one of {choices(places, against)}")
-    x, label = places[against]
+    if against not in abscissae:
+        expected = choices(abscissae, against)
+        raise ValidationError(f"against is {against!r}; expected one of {expected}")
+    x, label = abscissae[against]
     of_curve = np.stack([curves.curve_of_row(data), data.harmonic])
     first, second = standardized_residuals(fit).T
     return plot_residuals(
@@ -121,21 +122,21 @@ def _stds(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, F
 
 
 def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Curve:
-    """Return the fitted response between some rows, what was held interpolated between them."""
+    """Return the fitted response between rows; the controlled amplitude is interpolated."""
     x = curves.abscissa(part, over_frequency)
     order = np.argsort(x)
     grid = np.geomspace(x[order[0]], x[order[-1]], _POINTS)
 
-    def between(values: FloatArray) -> FloatArray:
+    def on_grid(values: FloatArray) -> FloatArray:
         return np.exp(np.interp(np.log(grid), np.log(x[order]), np.log(values[order])))
 
     if over_frequency:
-        frequency, held = grid, between(curves.held_amplitude(part))
+        frequency, level = grid, on_grid(curves.held_amplitude(part))
     else:
-        frequency, held = between(part.frequency_hz), grid
+        frequency, level = on_grid(part.frequency_hz), grid
     forced = curves.is_force_controlled(part)
     band = fit.predict(
-        frequency, drive=held if forced else None, amplitude=None if forced else held
+        frequency, drive=level if forced else None, amplitude=None if forced else level
     )
     return Curve(grid, band.response, band.gain(), band.phase())
 
@@ -145,35 +146,36 @@ def _fit_of_record(fit: FitResult, ax: Axes | None, record: int) -> Axes:
     measured, _, channel = _output(fit, record)
     waves, axes = [(channel, measured)], None if ax is None else [ax]
     fitted = [fit.best_fit[record]]
-    axis: Axes = plot_waveforms(fit.data[record].time, waves, fitted=fitted, ax=axes)[0]
+    axis: Axes
+    (axis,) = plot_waveforms(fit.data[record].time, waves, fitted=fitted, ax=axes)
     return axis
 
 
 def _draw_loop(fit: FitResult, ax: Axes | None, record: int) -> Axes:
-    """Draw force over displacement, measured and, where it was predicted, fitted."""
-    one = fit.data[record]
-    x, labels = _displacement(one), _labels(one)
+    """Draw the measured force over displacement and, if force was predicted, the fitted one."""
+    data = fit.data[record]
+    x, labels = _displacement(data), _labels(data)
     fitted = fit.best_fit[record] if fit.problem.output == "force" else None
     return plot_recorded_loops(
-        x, one.force_samples, fitted=fitted, ax=ax, displacement_label=labels["displacement"],
+        x, data.force_samples, fitted=fitted, ax=ax, displacement_label=labels["displacement"],
         force_label=labels.get("force", "force"),
     )  # fmt: skip
 
 
 def _residuals_of_record(fit: FitResult, against: str | None, ax: Axes | None, record: int) -> Axes:
     """Draw measured minus fitted output of a record over time or displacement."""
-    one = fit.data[record]
+    data = fit.data[record]
     _, residual, channel = _output(fit, record)
-    over, label = one.time, "time [s]"
+    x, label = data.time, "time [s]"
     if against == "displacement":
-        over, label = _displacement(one), _labels(one)["displacement"]
+        x, label = _displacement(data), _labels(data)["displacement"]
     elif against not in (None, "time"):
         raise ValidationError(f"against is {against!r}; expected time or displacement")
-    return plot_sample_residuals(over, residual, x_label=label, channel=channel, ax=ax)
+    return plot_sample_residuals(x, residual, x_label=label, channel=channel, ax=ax)
 
 
 def _output(fit: FitResult, record: int) -> tuple[FloatArray, FloatArray, str]:
-    """Return what was measured and fitted, its residuals and the name of the channel."""
+    """Return the measured output, its residuals and the name of its channel."""
     channel = "force" if fit.problem.output == "force" else fit.data[record].motion_channel
     return fit.problem.measured[record], fit.residuals[record], channel
 
