@@ -8,12 +8,14 @@ channel lags the other. With F and X the true phasors,
 
 so the measured dynamic stiffness of harmonic k is
 ``(force_gain / displacement_gain) exp(+j k omega delay) Z_k``, because the phase of F_k is
-referred to k times the displacement's phase. The measured X_k/F_1 of a driven plant is
-``(displacement_gain / force_gain) exp(-j k omega delay)`` times the true one, its phase referred to
-k times the force's. All six quantities follow from it. A gain also affects
-the amplitudes of a table: the true amplitude is the measured one divided by `displacement_gain`,
-and the true drive is the measured one divided by `force_gain`. For friction alone, an unknown force
-gain therefore leaves only x_c determined, and an unknown displacement gain only f_max.
+referred to k times the displacement's phase. All six quantities follow from it. The measured
+X_k/F_1 of a driven plant is ``(displacement_gain / force_gain) exp(-j k omega delay)`` times the
+true one, because its phase is referred to k times the force's.
+
+A gain also affects the amplitudes of a table: the true amplitude is the measured one divided by
+`displacement_gain`, and the true drive is the measured one divided by `force_gain`. For friction
+without other elements, an unknown force gain therefore leaves only x_c determined, and an unknown
+displacement gain only f_max.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ class Prior(Protocol):
 
 
 def calibrations(metadata: Metadata) -> dict[str, Any]:
-    """Return the priors of the sensors' parameters that a report's metadata state, by name."""
+    """Return the priors of the sensors' parameters from a report's metadata, by name."""
     if not (stated := metadata.calibrations()):
         return {}
     from scipy import stats
@@ -101,7 +103,7 @@ class Sensors:
         _ = self.parameters  # checks the bounds
 
     def stated_uncertainties(self) -> dict[str, float]:
-        """Return the standard deviation of each prior about a channel that is right, by name.
+        """Return the standard deviation of each channel's prior, by name.
 
         Raises
         ------
@@ -115,22 +117,23 @@ class Sensors:
         {'force_gain': 0.005}
         """
         uncertainties = {}
-        for name, _, _, right in _CHANNELS:
+        for name, _, _, neutral in _CHANNELS:
             stated = getattr(self, name)
-            if stated is not None and not hasattr(stated, "logpdf") and stated == right:
+            if isinstance(stated, float) and stated == neutral:
                 continue
-            if stated is None or not hasattr(stated, "logpdf") or float(stated.mean()) != right:
+            if stated is None or isinstance(stated, float) or float(stated.mean()) != neutral:
                 raise ValidationError(
                     f"sensors state {name}={stated!r}; a fit of records expects a prior about "
-                    f"{right:g}, such as scipy.stats.norm({right:g}, 0.005), which counts in the "
-                    "uncertainty: correct the record for what is known, or fit an extracted table"
+                    f"{neutral:g}, such as scipy.stats.norm({neutral:g}, 0.005), which counts in "
+                    "the uncertainty: correct the record for what is known, or fit an extracted "
+                    "table"
                 )
             uncertainties[name] = float(stated.std())
         return uncertainties
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any] | str | Path) -> Sensors:
-        """Return the sensors whose calibrations a report's metadata state.
+        """Return the sensors with the calibrations in a report's metadata.
 
         Each instrument with a channel (force, displacement or delay), an uncertainty and its
         coverage factor k gives a normal prior of the standard deviation ``uncertainty / k``.

@@ -1,4 +1,4 @@
-"""The motion of a mechanism in time, by the engine: displacement under a force, or the reverse."""
+"""Simulation of a mechanism in time: displacement under a force, or force under a displacement."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dahl_ident.engine import Equations, march, translate
 from dahl_ident.errors import FitError, ModelError
 from dahl_ident.synthetic.waveform import SineStep, Waveform
 
-_PER_PERIOD, _POINTS = 24, 8  # polynomials, and their points: they miss 1e-13 of a sine
-_FINER = 1e4  # times finer than records are fitted: motions err by about 1e-11
+_PER_PERIOD, _POINTS = 24, 8  # polynomials in a period, and their points: errors of 1e-13
+_FINER = 1e4  # times finer than for fits of records: motions err by about 1e-11
 
 Signal = Callable[[FloatArray], FloatArray]
-"""A channel's true value at any times, (n,) -> (n,)."""
+"""The true value of a channel at any times, (n,) -> (n,)."""
 
 Progress = Callable[[float], None]
 """Called with the completed fraction of a simulation."""
@@ -33,7 +33,7 @@ class Mechanism:
 
     plant: Model
     laws: tuple[Element, ...]
-    """Those that are not linear."""
+    """The elements that are not linear."""
     linear: Rational
 
     @classmethod
@@ -113,8 +113,8 @@ class Mechanism:
 def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equations:
     """Return the motion of laws with a spring, a damper or both, without a mass.
 
-    ``k v + c dv/dt + (rate of the laws' force) = du/dt``, driven by du/dt; without a damper the
-    force takes the place of a displacement that is held, since all turn where it turns.
+    ``k v + c dv/dt + (rate of the laws' force) = du/dt``, driven by du/dt. Without a damper the
+    force u is prescribed as a displacement is elsewhere, because everything turns where u turns.
     """
     import casadi as ca
 
@@ -126,20 +126,20 @@ def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equa
         for law in laws:
             law_states = [ca.SX.sym(f"y{len(states) + i}") for i in range(law.n_states)]
             part = traced(law, _values(law), x, s, s, law_states)
-            rates = ca.vertcat(*part.rates) * s  # over the displacement
+            rates = ca.vertcat(*part.rates) * s  # derivatives with respect to displacement
             tangent += ca.mtimes(ca.jacobian(part.force, ca.vertcat(*law_states)), rates)
             states, slopes = [*states, *law_states], [*slopes, rates]
     if damping:
         rates = ca.vertcat(v, (u - tangent * v) / damping, *(slope * v for slope in slopes))
         return Equations([x, v, *states], u, s, [], rates, x, held=False)
-    moved = ca.SX.sym("moved")
+    displacement = ca.SX.sym("displacement")  # here x and v are the force and its rate
     speed = v / tangent
     rates = ca.vertcat(v, 0.0, speed, *(slope * speed for slope in slopes))
-    return Equations([x, v, moved, *states], u, s, [], rates, moved, held=True)
+    return Equations([x, v, displacement, *states], u, s, [], rates, displacement, held=True)
 
 
 class EngineMotion:
-    """The solution of equations along a waveform, from rest, at any times within it."""
+    """The solution of equations of motion along a waveform, from rest, at any times within it."""
 
     def __init__(
         self,
@@ -164,14 +164,14 @@ class EngineMotion:
                 progress(segment.stop / waveform.duration)
 
     def __call__(self, time: FloatArray) -> FloatArray:
-        """Return the output at any times; that of the ends outside."""
+        """Return the output at any times; outside the waveform, that at its ends."""
         output = np.empty(np.shape(time))
-        for i, here, t in self._waveform.by_segment(time):
-            output[here], _ = self._along(self._waveform.segments[i], self._first[i], t)
+        for i, within, t in self._waveform.by_segment(time):
+            output[within], _ = self._along(self._waveform.segments[i], self._first[i], t)
         return output
 
     def _jump(self, before: SineStep, after: SineStep, damping: float) -> None:
-        """Take the states at the start of a segment over the jump of the force there."""
+        """Continue the states at the start of a segment over the jump of the force there."""
         at = np.array([before.stop])
         value = before.motion(at).value
         jump = after.motion(at).value - value
@@ -180,25 +180,25 @@ class EngineMotion:
         elif jump[0]:
             ends, signal = np.array([0.0, 1.0]), np.array([value, jump])
             first = np.append([signal[0, 0], 0.0], self._first[-1][2:])
-            moved = march(self._system, ends, signal, ends, first, self._values, finer=_FINER)
-            self._first[-1] = moved.states[-1]
+            motion = march(self._system, ends, signal, ends, first, self._values, finer=_FINER)
+            self._first[-1] = motion.states[-1]
 
     def _along(
         self, segment: SineStep, first: FloatArray, time: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the output at some times of a segment, and the states at its end."""
+        """Return the output at times within a segment, and the states at its end."""
         steps = int(np.ceil(segment.duration * max(segment.frequency_hz) * _PER_PERIOD)) + 1
         knots = np.linspace(segment.start, segment.stop, steps + 1)
-        place = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
-        at = knots[:-1, None] + np.diff(knots)[:, None] * place
+        nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)  # Chebyshev
+        at = knots[:-1, None] + np.diff(knots)[:, None] * nodes
         wave = segment.motion(at.ravel())
         values = (wave.velocity if self._damping else wave.value).reshape(at.shape)
-        signal: FloatArray = np.linalg.inv(np.vander(place, increasing=True)) @ values.T
-        samples, back = np.unique(np.concatenate([knots, time]), return_inverse=True)
+        signal: FloatArray = np.linalg.inv(np.vander(nodes, increasing=True)) @ values.T
+        samples, inverse = np.unique(np.concatenate([knots, time]), return_inverse=True)
         if self._system.held:
             first = np.array([signal[0, 0], 0.0, *first[2:]])
         motion = march(self._system, knots, signal, samples, first, self._values, finer=_FINER)
-        return motion.output[back[knots.size :]], motion.states[-1]
+        return motion.output[inverse[knots.size :]], motion.states[-1]
 
 
 def _law_force(element: Element, displacement: Waveform) -> Signal:
@@ -206,10 +206,10 @@ def _law_force(element: Element, displacement: Waveform) -> Signal:
     turns = displacement.turning_times()
 
     def force(time: FloatArray) -> FloatArray:
-        every, back = np.unique(np.concatenate([turns, time]), return_inverse=True)
-        motion = displacement.motion(every)
+        times, inverse = np.unique(np.concatenate([turns, time]), return_inverse=True)
+        motion = displacement.motion(times)
         forces = element.force_history(_values(element), motion.value, motion.velocity)
-        return np.asarray(forces[back[turns.size :]])
+        return np.asarray(forces[inverse[turns.size :]])
 
     return force
 
