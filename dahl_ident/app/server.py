@@ -268,13 +268,13 @@ class App:
         report = page.read_text("utf-8") if page.exists() else ""
         parts = []
         for part in sorted(folder.glob("*-[0-9]*"), key=lambda p: p.stat().st_mtime):
-            one = self.jobs.state(part)
-            text = work.in_users_words(output(part, len(one["steps"]) - 1))
-            parts.append((part.name, one, text, self._files(part)))
+            state = self.jobs.state(part)
+            text = work.in_users_words(output(part, len(state["steps"]) - 1))
+            parts.append((part.name, state, text, self._files(part)))
         return self._page(
             "run", work=work, state=work.state, folder=folder, job=job, parts=parts,
             report=report.partition("<main>")[2].partition("</main>")[0],
-            typed=_typed([JobStep(one["title"], tuple(one["words"])) for one in job["steps"]]),
+            typed=_typed([JobStep(step["title"], tuple(step["words"])) for step in job["steps"]]),
             program=(folder / "program.py").read_text("utf-8"), files=self._files(folder),
             failed=work.in_users_words(job["error"]), exports=_EXPORTS,
             is_table=_is_table(folder), busy=self.jobs.is_running(folder),

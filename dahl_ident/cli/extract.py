@@ -129,8 +129,8 @@ def _note_fast_sweeps(
             words += ["--mass", "free", "--damping", "free", "--stiffness", "free"]
         command = shlex.join(["dahl-ident", "fit", "--record", *files, *words])
         console.note(
-            f"{fast.sum()} of {points.n} points were swept too fast to settle, which biases them "
-            f"by about {percent(np.median(bias[fast]))} (median), at most "
+            f"{fast.sum()} of {points.n} points were swept too fast to settle, and are biased by "
+            f"about {percent(np.median(bias[fast]))} (median), at most "
             f"{percent(bias[fast].max())}. A fit of the waveforms does not have that error: "
             f"{command}"
         )

@@ -126,13 +126,9 @@ class LoopMargins:
 
         if self.gain_margin.ndim == 1:
             return plot_margins(self.amplitude, self.gain_margin, self.phase_margin_deg, ax=ax)
-        gain, _ = self.band("gain_margin", 0.0)
-        phase, _ = self.band("phase_margin_deg", 0.0)
-        gain_band = self.band("gain_margin")
-        phase_band = self.band("phase_margin_deg")
-        return plot_margins(
-            self.amplitude, gain, phase, gain_band=gain_band, phase_band=phase_band, ax=ax
-        )
+        (gain, _), (phase, _) = self.band("gain_margin", 0.0), self.band("phase_margin_deg", 0.0)
+        bands = {"gain_band": self.band("gain_margin"), "phase_band": self.band("phase_margin_deg")}
+        return plot_margins(self.amplitude, gain, phase, ax=ax, **bands)
 
 
 def loop_margins(

@@ -171,7 +171,7 @@ class FrequencyResponse(Tabular):
                 f"frequency_hz: expected one number for each point, got shape {frequency.shape}"
             )
         n = frequency.size
-        values = {name: one.checked(columns[name], name, n) for name, one in COLUMNS.items()} | {
+        values = {k: column.checked(columns[k], k, n) for k, column in COLUMNS.items()} | {
             "quantity": one_of(quantity, "quantity", (*QUANTITIES, "backbone")),
             "motion": one_of(motion, "motion", MOTIONS),
             "drive_factor_uncertainty": non_negative_number(
@@ -425,13 +425,13 @@ class FrequencyResponse(Tabular):
         array([2.])
         """
         keep = np.ones(self.n, dtype=bool)
-        for name, label, known in (("level", level, self.levels), ("run", run, self.runs)):
+        for name, label, existing in (("level", level, self.levels), ("run", run, self.runs)):
             if label is None:
                 continue
             labels = [label] if np.ndim(label) == 0 else list(label)
-            absent = [w for w in labels if w not in known]
-            if not known or absent:
-                raise ValidationError(f"no {name} {absent}; there are {listed(known) or 'none'}")
+            absent = [label for label in labels if label not in existing]
+            if not existing or absent:
+                raise ValidationError(f"no {name} {absent}; there are {listed(existing) or 'none'}")
             keep &= np.isin(getattr(self, name), labels)
         if frequency_hz is not None:
             low, high = frequency_hz
@@ -518,10 +518,10 @@ class FrequencyResponse(Tabular):
             )
         form = "backbone" if self.quantity == "backbone" else "polar" if polar else "rectangular"
         columns: dict[str, Any] = {}
-        for name, one in RESPONSE_COLUMNS.items():
-            unit = f" [{one.unit_of(self.motion, self.quantity)}]" if one.unit else ""
-            if one.form in ("", form):
-                columns[one.header or f"{name}{unit}"] = one.saved(self)
+        for name, column in RESPONSE_COLUMNS.items():
+            unit = f" [{column.unit_of(self.motion, self.quantity)}]" if column.unit else ""
+            if column.form in ("", form):
+                columns[column.header or f"{name}{unit}"] = column.saved(self)
         columns = {n: c for n, c in (columns | dict(self.quality)).items() if c is not None}
         frame = pd.DataFrame(columns)
         frame.attrs["dahl_ident"] = {

@@ -113,7 +113,7 @@ class Rows:
             quantity=quantity,
             forced=columns["controlled"] == "force",
             omega=2.0 * np.pi * columns["frequency_hz"],
-            **{one.name: columns[one.name] for one in fields(cls) if one.name in columns},
+            **{field.name: columns[field.name] for field in fields(cls) if field.name in columns},
         )
 
     @classmethod
@@ -141,11 +141,11 @@ class Rows:
     def take(self, tables: NDArray[np.intp] | slice | int) -> Rows:
         """Return one or some of the stacked tables; shared columns stay as they are."""
         taken: dict[str, Any] = {}
-        for one in fields(self):
-            column = getattr(self, one.name)
-            row = COLUMNS[one.name].shape if one.name in COLUMNS else ()
-            if isinstance(column, np.ndarray) and column.ndim > 1 + len(row):
-                taken[one.name] = column[tables]
+        for name in (field.name for field in fields(self)):
+            column = getattr(self, name)
+            shape = COLUMNS[name].shape if name in COLUMNS else ()
+            if isinstance(column, np.ndarray) and column.ndim > 1 + len(shape):
+                taken[name] = column[tables]
         return replace(self, **taken)
 
 

@@ -152,21 +152,18 @@ class Profiler:
         `thresholds` are roots of the deviance. Minus and plus infinity where a side is open.
         """
         P, L = self._problem.n_reported, len(thresholds)
-        lower, upper = np.full((L, P), -np.inf), np.full((L, P), np.inf)
-        if np.isfinite(self._scale) and np.isfinite(thresholds).all():
-            ends = np.stack([lower, upper])
-            side, level, index = (a.ravel() for a in np.indices((2, L, P)))
-            search = np.flatnonzero(~self._open[side, index])
-            if search.size:
-                ends[side[search], level[search], index[search]] = self._ends(
-                    index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
-                )
-                if self._searched is not self._problem and not self._agrees(ends):
-                    self._searched = self._problem
-                    del self._at_optimum
-                    return self.limits(thresholds)
-            lower, upper = ends
-        return lower, upper
+        ends = np.stack([np.full((L, P), -np.inf), np.full((L, P), np.inf)])
+        side, level, index = (a.ravel() for a in np.indices((2, L, P)))
+        search = np.flatnonzero(~self._open[side, index])
+        if np.isfinite(self._scale) and np.isfinite(thresholds).all() and search.size:
+            ends[side[search], level[search], index[search]] = self._ends(
+                index[search], 2.0 * side[search] - 1.0, thresholds[level[search]]
+            )
+            if self._searched is not self._problem and not self._agrees(ends):
+                self._searched = self._problem
+                del self._at_optimum
+                return self.limits(thresholds)
+        return ends[0], ends[1]
 
     def _agrees(self, ends: FloatArray) -> bool:
         """Return whether the exact steady motion has the same deviance at the widest limits.
@@ -340,10 +337,10 @@ class Profiler:
         expected = np.diagonal(inverse(self._at_optimum.hessian)[0])
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = expected / np.diagonal(self._optimum.covariance)
-        known = np.isfinite(ratio) & (ratio > 0.0)
-        if not in_time:
-            ratio = np.full(ratio.shape, np.median(ratio[known]) if known.any() else 1.0)
-        return np.where(known if in_time else True, ratio, 1.0)
+        valid = np.isfinite(ratio) & (ratio > 0.0)
+        if in_time:
+            return np.where(valid, ratio, 1.0)
+        return np.full(ratio.shape, np.median(ratio[valid]) if valid.any() else 1.0)
 
     # Where a search begins and where it gives up
 

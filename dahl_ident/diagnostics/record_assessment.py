@@ -293,8 +293,8 @@ class RecordAssessment(Assessment):
     @cached_property
     def device(self) -> tuple[Optimum, None, None]:
         """The estimate as that of a table of one row, whose noise is the model's misfit."""
-        one = FrequencyResponse([1.0], [1.0], [1.0], motion=self.problem.motion)
-        problem: TableProblem = self.problem.at(one).like(noise="relative")
+        row = FrequencyResponse([1.0], [1.0], [1.0], motion=self.problem.motion)
+        problem: TableProblem = self.problem.at(row).like(noise="relative")
         count = self.problem.n_reported
         values = self.optimum.values[:count]
         least = np.where(problem.space.positive, _LEAST, -np.inf)

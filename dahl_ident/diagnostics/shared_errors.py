@@ -19,8 +19,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
         return None
     counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
     # residuals in units of the noise of each single row, or of an unknown scale
-    known = problem.scale_known
-    unit, size = (1.0, 1.0) if known else (errors.noises[0], estimate.scale)
+    unit, size = (1.0, 1.0) if problem.scale_known else (errors.noises[0], estimate.scale)
     root = np.sqrt(unit * errors.state.weights[errors.state.model.group[:m]])
     jacobian = size * root[:, None] * estimate.columns[:m]
     columns = [
@@ -50,7 +49,7 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
     return RowErrors(
         counted, W, np.maximum(ratios, 0.0), volume, factors, *_dof_and_share(errors), jacobian,
-        size * root * estimate.y[:m], known, np.where(scatters, errors.theta, np.nan),
+        size * root * estimate.y[:m], problem.scale_known, np.where(scatters, errors.theta, np.nan),
         np.where(scatters, slopes[:m], 0.0), basis,
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,6 @@ Values = Sequence[FloatArray]
 
 Orders = int | NDArray[np.int64]
 """One harmonic, or that of each row along the last axis."""
-
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 Settled = Callable[[Any, Values, "Sine", int], "StiffnessGradient"]
 """A law's method that returns the stiffness of settled loops."""

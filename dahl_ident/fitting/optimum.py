@@ -88,18 +88,7 @@ class Status(Enum):
     @property
     def at_infinity(self) -> bool:
         """Whether the optimum lies at infinite or vanishing parameters."""
-        return self in _AT_INFINITY
-
-
-_AT_INFINITY = (
-    Status.MICROSLIP,
-    Status.NO_LOSS,
-    Status.GROSS_SLIP,
-    Status.SHARP_KNEE,
-    Status.NO_FULL_SLIP,
-    Status.NO_FRICTION,
-    Status.RUNS_AWAY,
-)
+        return not self.found_optimum and self not in (Status.SINGULAR, Status.NOT_CONVERGED)
 
 
 @dataclass(frozen=True)

@@ -126,16 +126,16 @@ def evaluate_motions(
     This is the mean over the repeats in a record of `lasting` s, by default over `_REPEATS`.
     """
     rate = recorded.sample_rate
-    resolved = [one for one in motions if one.fastest_hz * SAMPLES_PER_CYCLE <= rate]
+    resolved = [motion for motion in motions if motion.fastest_hz * SAMPLES_PER_CYCLE <= rate]
     if not resolved:
-        slowest = min(one.fastest_hz for one in motions)
+        slowest = min(motion.fastest_hz for motion in motions)
         raise ValidationError(
             f"sample_rate is {rate:g} Hz; expected at least {SAMPLES_PER_CYCLE} samples in a "
             f"trapezoid's move from end to end or a multisine's shortest cycle: "
             f"{SAMPLES_PER_CYCLE * slowest:.3g} Hz for the slowest motion; or slow the motions down"
         )
     peaks = np.array([motion.peaks for motion in resolved])
-    sums = [RepeatSums.of(knowledge, one, recorded) for one in resolved]
+    sums = [RepeatSums.of(knowledge, motion, recorded) for motion in resolved]
     sizes: dict[str, Any] = {
         "displacement": peaks[None, :, 0],
         "force": np.stack([one.force for one in sums], axis=1),
