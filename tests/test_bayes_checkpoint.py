@@ -126,7 +126,7 @@ def test_foreign_runs_are_refused(begun):
 def test_damaged_files_are_refused(begun):
     whole = begun.read_bytes()
     begun.write_bytes(whole[: len(whole) // 2])
-    refused(begun, "cannot be read as a chain .*damaged or something else")
+    refused(begun, "cannot be read as a chain .*damaged or of another kind")
     begun.write_bytes(b"amplitude,gain\n1,2\n")
     refused(begun, "cannot be read as a chain")
     begun.write_bytes(whole)

@@ -160,5 +160,5 @@ def test_a_prior_without_moments_is_told_by_its_quantiles():
 
 
 def test_priors_of_unknown_names_are_refused():
-    with pytest.raises(ModelError, match="a prior for alpha, but free are f_max, sigma"):
+    with pytest.raises(ModelError, match="a prior for alpha; the free parameters are f_max, sigma"):
         joint_prior(problem(), {"alpha": (0.1, 10.0)})

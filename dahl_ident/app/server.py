@@ -105,7 +105,7 @@ class Guard:
     def _early_response(self, request: Request) -> Response | None:
         """Return the response to a request that is not passed on, None for others."""
         if request.headers.get("host") not in self._hosts:
-            return PlainTextResponse("This server answers to 127.0.0.1 alone.", 421)
+            return PlainTextResponse("This server answers requests to 127.0.0.1 only.", 421)
         origin = request.headers.get("origin")
         is_read = request.method in ("GET", "HEAD")
         if (origin or not is_read) and origin not in {f"http://{host}" for host in self._hosts}:

@@ -156,20 +156,19 @@ def _read(path: Path) -> tuple[Chain, dict[str, str]]:
             values = [file[name][()] for name in _ARRAYS] if readable else []
     except (OSError, KeyError, RuntimeError) as exc:
         raise SamplingError(
-            f"{path} cannot be read as a chain ({exc}); it is damaged or something else. Give "
-            "another file; this one is left as it is"
+            f"{path} cannot be read as a chain ({exc}); it is damaged or of another kind. Give "
+            "another file; this one was not changed"
         ) from exc
     if not readable:
         raise SamplingError(
             f"{path} is an HDF5 file, but not a chain that this version can resume: format and "
-            f"version are {stated}, expected {_FORMAT}. Give another file; this one is left as it "
-            "is"
+            f"version are {stated}, expected {_FORMAT}. Give another file; this one was not changed"
         )
     text, seed = attributes["identity"], attributes["seed"]
     if _digest(text, seed, *values) != attributes["digest"]:
         raise SamplingError(
             f"{path} is damaged: its content does not match the digest that was written with it. "
-            "Give another file, or a copy that is whole; this one is left as it is"
+            "Give another file, or an undamaged copy; this one was not changed"
         )
     points, log_density, start, key, position = values
     place, has_gauss, cached = position.tolist()

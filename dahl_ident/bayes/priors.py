@@ -11,7 +11,7 @@ They are proper and wide enough to have little influence:
   1e5 times the largest, because a law's knee can lie decades away from the data;
 - parameters of either sign, such as stiffness, damping and mass: up to a thousand times the
   largest size (at a resonance they cancel), or ten times the least-squares estimate;
-- parameters that declare a range of their own, such as an exponent: five times wider than that;
+- parameters that declare a range, such as an exponent: five times wider than that range;
 - gains: from 0.1 to 10; delay: half a period of the highest frequency either way.
 
 The priors are part of the result, and reports print them. The unknown scale s of the noise has the
@@ -184,7 +184,8 @@ def joint_prior(
     unknown = [name for name in sources["given"] if name not in names]
     if unknown:
         raise ModelError(
-            f"there is a prior for {', '.join(unknown)}, but free are {choices(names, *unknown)}"
+            f"there is a prior for {', '.join(unknown)}; the free parameters are "
+            f"{choices(names, *unknown)}"
         )
     parts = []
     for i, parameter in enumerate(parameters):

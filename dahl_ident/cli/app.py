@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
         console.write_error(f"error: {' '.join(str(exc).split())}")
         status = console.BAD_INPUT
     except MemoryError:
-        console.write_error("error: this takes more memory than there is; give smaller files")
+        console.write_error("error: this takes more memory than is available; give smaller files")
         status = console.BAD_INPUT
     except OSError as exc:
         if not isinstance(exc, BrokenPipeError):  # a reader such as head has closed the pipe

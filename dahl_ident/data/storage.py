@@ -254,7 +254,7 @@ def read_metadata(text: Any) -> dict[str, Any]:
     except (RecursionError, TypeError) as exc:
         raise ValueError("the comment of this package is not JSON") from exc
     if not valid:
-        raise ValueError("the comment of this package holds something else than it wrote")
+        raise ValueError("the comment of this package is not in the form that it writes")
     return dict(content)
 
 

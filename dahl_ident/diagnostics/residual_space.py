@@ -88,7 +88,7 @@ def run_deviations(
 ) -> RunDeviations | None:  # fmt: skip
     """Return the deviations of runs that minimise each run's residuals and deviations together.
 
-    None where the model has no response at the `mean`, as may be if a parameter is hardly known.
+    None if the model has no response at the `mean`, as may happen for a poorly known parameter.
     """
     problem, scale = estimate.problem, estimate.scale
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0

@@ -99,7 +99,7 @@ class StiffnessGradient(NamedTuple):
         dZ/dA.
     by_parameter : tuple of ndarray of complex
         dZ/dp for each parameter p of the element, in the order of its `parameters`; empty where
-        they are not asked for, and 0 for a fixed one if it is not free to compute.
+        they are not asked for, and 0 for a fixed parameter if the derivative would take time.
     """
 
     value: ComplexArray

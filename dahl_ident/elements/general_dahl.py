@@ -56,7 +56,7 @@ _LEAST_BETA = 1e-200
 """Smaller loops are computed as one of this size, whose curvature underflows to zero."""
 
 _DEEPEST = 44.0
-"""Integrals over l end here: exp(-44) is negligible, even beside a root where slip sets in."""
+"""Integrals over l end here: exp(-44) is negligible, even near a root where slip sets in."""
 
 COUNTS = 1, 2, 4
 """Number of arrays that are returned for `derivatives` of 0, 1 and 2."""

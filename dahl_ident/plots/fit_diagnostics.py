@@ -496,7 +496,7 @@ def plot_trace(
 
 
 def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:
-    """Return which axes are logarithmic: those that are wanted so, and have a wide range."""
+    """Return which axes are logarithmic: the requested ones, if their range is wide."""
     low, high = np.quantile(values, [0.001, 0.999], axis=0)
     wanted = list(log) or [False] * values.shape[1]
     return [bool(w and b > _WIDE * a) for w, a, b in zip(wanted, low, high, strict=True)]

@@ -130,7 +130,7 @@ class TableProblem(Problem):
         rates = [type(e).__name__ for e in self.model.elements if not e.rate_independent]
         if rates and assumes_frequency(self.data.provenance):
             raise DataError(
-                f"the table says no frequency, on which the force of {', '.join(rates)} depends; "
+                f"the table states no frequency, on which the force of {', '.join(rates)} depends; "
                 f"give it when the table is read: {argument('frequency', 1.0)} (Hz)"
             )
         self.runs = tuple(self.data.runs or ())

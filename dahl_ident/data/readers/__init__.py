@@ -338,8 +338,8 @@ def _parsed(file: File, sheet: str | None) -> RawFile:
         raise
     except MemoryError as exc:
         raise DataError(
-            f"{file.name}: reading takes more memory than there is; expected a smaller table. Cut "
-            "the file into parts"
+            f"{file.name}: reading takes more memory than is available; expected a smaller table. "
+            "Cut the file into parts"
         ) from exc
     except Exception as exc:  # libraries raise errors of every kind on damaged files
         if not form.damaged:
@@ -392,8 +392,8 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
         ) from exc
     if match is None or not match.re.groups:
         raise DataError(
-            f"{name}: level_from_name {expression!r} finds no group in the name; put what is the "
-            "level in round brackets, such as '([0-9.]+)N'"
+            f"{name}: level_from_name {expression!r} finds no group in the name; put the level in "
+            "round brackets, such as '([0-9.]+)N'"
         )
     groups: dict[str, Any] = {k: v for k, v in match.groupdict().items() if v is not None}
     level = str(groups.get("level", match[1]))

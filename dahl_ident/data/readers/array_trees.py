@@ -189,7 +189,7 @@ def read_hdf5(file: File) -> RawFile:
     at = {0: 24, 1: 28}.get(block[8], 12) + 2 * width
     end = int.from_bytes(block[at : at + width], "little")
     if file.length != end:
-        raise ValueError(f"it has {file.length} bytes, and says that it ends after {end}")
+        raise ValueError(f"it has {file.length} bytes, but its header says {end}")
     text = root.attrs.get("dahl_ident")
     metadata = {} if text is None else read_metadata(text)
     tree = _Tree(file, root, h5py)
