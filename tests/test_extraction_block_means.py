@@ -76,7 +76,7 @@ def test_a_look_at_some_samples_says_whether_noise_dithers(monkeypatch):
         record = Record(t, displacement=rounded, force=force)
         some = extract(record).amplitude_std
         with monkeypatch.context() as patch:
-            patch.setattr("dahl_ident.extraction.phasors._LOOKED_AT", t.size)
+            patch.setattr("dahl_ident.extraction.phasors._RESIDUAL_SAMPLES", t.size)
             every = extract(record).amplitude_std
         np.testing.assert_array_equal(some, every)
         errors.append(every[0])

@@ -35,7 +35,7 @@ def test_a_parameter_called_as_one_of_the_records_is_refused(label):
             return values[0] * (1.0 - direction * force / values[1])
 
     for model in (Own(), Own(30.0), Own(None, 0.1) + di.Spring()):
-        with pytest.raises(ModelError, match=f"has a parameter called {label}, as a fit of rec"):
+        with pytest.raises(ModelError, match=f"{label}, which is also an unknown of a fit of rec"):
             di.fit(record(TRUE + NOISE), model)
 
 
@@ -49,7 +49,9 @@ def test_unknowns_of_two_elements_have_names_of_their_own():
         def slope(self, force, direction, velocity, values):
             return values[0] * (1.0 - direction * force / values[1])
 
-    with pytest.raises(ModelError, match="unknown of several elements initial_force; give each a"):
+    with pytest.raises(
+        ModelError, match="unknown called initial_force in a fit of records; give each"
+    ):
         di.fit(record(TRUE + NOISE), MODEL + Own())
     problem = di.fit(record(TRUE + NOISE), MODEL + Own(3.0, 1e-3, name="own")).problem
     assert {"initial_force", "own_initial_force"} < set(problem.names)
