@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -492,6 +492,7 @@ def _further(moved: FloatArray, last: FloatArray | None) -> float:
     return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
 
 
+@lru_cache(maxsize=64)  # asked for at every step of a search
 def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the number of each row's test, and the row of its fundamental, (n,) each.
 
