@@ -74,7 +74,7 @@ class Relative:
     fundamental: FloatArray | None
     """|R_1| in rows of harmonics, 0 in rows of the fundamental; None without harmonics."""
     log_area: FloatArray
-    """Sum over rows of ln |dy/dR|, the log of the whitening's determinant, plus constants."""
+    """Sum over rows of ln abs(dy/dR), the log of the whitening's determinant, plus constants."""
     name: ClassVar = "relative"
     scale_known: ClassVar = False
     rounding: ClassVar = np.asarray(ROUNDING)  # of a logarithm

@@ -383,7 +383,7 @@ class TableProblem(Problem):
 
     @property
     def log_area(self) -> Any:
-        """Return the sum of ln |dy/dR|, which changes residuals into units of Re R and Im R."""
+        """Return the sum of ln abs(dy/dR), which changes residuals into units of Re R and Im R."""
         return self._noise.log_area
 
     @property
