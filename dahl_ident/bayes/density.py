@@ -275,10 +275,10 @@ class Density(LogDensity):
         """Return the residuals whose squares are added, (S, P) -> (S, K)."""
         if self.errors is None:
             return self.quick.whitened(theta)
-        y = self.quick.whitened(self.errors.held(theta), tails=False)
+        y = self.quick.whitened(self.errors.at_centre(theta), tails=False)
         parts = np.broadcast_to(y, (len(theta), y.shape[-1]))
         with np.errstate(invalid="ignore", over="ignore"):
-            return self.errors.uncorrelated(parts + self.errors.moved(theta))
+            return self.errors.uncorrelated(parts + self.errors.change(theta))
 
     @property
     def weights(self) -> FloatArray:
@@ -297,8 +297,8 @@ class Density(LogDensity):
         errors, m = self.errors, self.problem.n_residuals
         assert errors is not None
         at = theta[None]
-        y, by = self.problem.residuals_and_jacobian(errors.held(at), tails=False)
-        y = y[..., :m] + errors.moved(at)
+        y, by = self.problem.residuals_and_jacobian(errors.at_centre(at), tails=False)
+        y = y[..., :m] + errors.change(at)
         by = np.where(np.isnan(errors.centre), by[..., :m, :], errors.slopes)
         with np.errstate(invalid="ignore", over="ignore"):
             y = errors.independent(y)

@@ -8,16 +8,16 @@ Statistics 39, 2012), are split again and again where they spread most, and each
 component, so that curved ridges are followed. One component is the prior: it finds modes apart from
 the centre, and bounds the weights where the data leave a parameter open.
 
-The result rests on independent randomizations of one Sobol sequence, with the mixture held. Their
-scatter is the error: of the evidence, and of the probabilities below the limits of intervals.
+The result comes from independent randomizations of one Sobol sequence, with the mixture fixed.
+Their scatter is the error: of the evidence, and of the probabilities below the limits of intervals.
 
-Where a density is not far from normal, polynomials take the place of its residuals, which are
-smooth functions of the parameters: nearly linear ones, and in a wider range those of second, third
-or fourth degree. The coefficients follow by least squares from exact residuals at points of a
+Where a density is not far from normal, its residuals are replaced by polynomials, because they are
+smooth functions of the parameters: nearly linear, or of second, third or fourth degree over a wider
+range. The coefficients follow by least squares from exact residuals at points of a
 heavy-tailed distribution around the optimum, weighted by the posterior there. At other points the
-density p with exact residuals is compared with q, that with interpolated ones: no probability, and
-not the evidence, errs by more than Int |p - q| / Int p. Points of the prior find modes elsewhere,
-unless the density is one around a known centre by definition.
+density p with exact residuals is compared with q, that with interpolated ones: the error of the
+evidence and of every probability is at most Int |p - q| / Int p. Points drawn from the prior find
+modes elsewhere; they are not drawn for a density that is by definition around a known centre.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ Rows = NDArray[np.intp]
 _DOF = 4.0
 _WIDER = 1.5  # covariance of a component over that of its points, so that components overlap
 _PARTS = 16  # most components
-_LEAST = 40  # fewest effective points from which one is made
+_FEWEST_POINTS = 40  # effective points of a component, at least
 _ROUND = 1024  # points drawn before the mixture is fitted again
 _ROUNDS = 12  # most fits; two or three are usual
-_ALIKE = 0.5  # effective points, over the points of a round, at which the mixture is good enough
+_GOOD = 0.5  # effective points, over the points of a round, at which the mixture is good enough
 # independent randomizations, whose scatter is the error: the fewer, the more even each one's points
 _REPEATS = 6
 _FIRST = 128  # points drawn from each component at first; their number then doubles
@@ -72,11 +72,11 @@ class WeightedDraws:
 
     @classmethod
     def alike(cls, theta: FloatArray) -> WeightedDraws:
-        """Return draws that count the same."""
+        """Return draws of equal weight."""
         return cls(theta, np.full(len(theta), 1.0 / len(theta)))
 
     def drawn(self, size: int, seed: int) -> FloatArray:
-        """Return some of them by chance, (size, D)."""
+        """Return a random selection of the draws, (size, D)."""
         shares = None if np.ptp(self.weights) == 0.0 else self.weights
         return np.random.default_rng(seed).choice(self.theta, size=size, p=shares)
 
@@ -140,7 +140,7 @@ def integrate(
 
 
 def in_blocks(function: Function, theta: FloatArray) -> FloatArray:
-    """Return a function of many points, (S, D), that is faster for few at once."""
+    """Return the values of a function at points (S, D), computed in blocks, which is faster."""
     return np.concatenate([function(theta[i : i + _BLOCK]) for i in range(0, len(theta), _BLOCK)])
 
 
@@ -196,7 +196,7 @@ class _Mixture:
         return target.at(np.concatenate([*phi, prior]))
 
     def log_density(self, batch: _Batch) -> FloatArray:
-        """Return that of the mixture, (S,)."""
+        """Return the log-density of the mixture, (S,)."""
         count, D = self.means.shape
         half = 0.5 * (_DOF + 1.0)
         constant = D * (gammaln(half) - gammaln(0.5 * _DOF) - 0.5 * np.log(_DOF * np.pi))
@@ -227,7 +227,7 @@ def _fitted(target: _Integrand, centre: FloatArray, covariance: FloatArray) -> _
         drawn = logsumexp([m.log_density(seen) for m in mixtures], axis=0)
         mixtures.append(_split(seen.phi, _normalised(seen.log_density - drawn)))
         weights = _normalised(new.log_density - mixture.log_density(new))
-        if number > 1 and _effective(weights) > _ALIKE * len(weights):
+        if number > 1 and _effective(weights) > _GOOD * len(weights):
             break
     return mixtures[-1]
 
@@ -237,7 +237,7 @@ def _split(phi: FloatArray, weights: FloatArray) -> _Mixture:
     root = _root(phi, weights)
     x = np.linalg.solve(root, phi.T).T.astype(np.float64)  # so that axes can be compared
     parts = [np.flatnonzero(weights)]
-    while 2 * len(parts) * _LEAST <= _effective(weights) and len(parts) < _PARTS:
+    while 2 * len(parts) * _FEWEST_POINTS <= _effective(weights) and len(parts) < _PARTS:
         parts = [half for part in parts for half in _halves(part, x, weights)]
     means = np.array([np.average(x[part], axis=0, weights=weights[part]) for part in parts])
     roots = [np.sqrt(_WIDER) * _root(x[part], weights[part]) for part in parts]
@@ -305,7 +305,7 @@ def _normalised(log_weights: FloatArray) -> FloatArray:
 
 
 def _effective(weights: FloatArray) -> float:
-    """Return the number of equal weights that are worth as much."""
+    """Return the effective number of points."""
     return float(weights.sum() ** 2 / (weights @ weights))
 
 
@@ -323,14 +323,16 @@ class Interpolation:
     centre: FloatArray  # (P,) and (P, P): theta = centre + root u
     root: FloatArray
     degree: int  # of the residuals' polynomials
-    factors: FloatArray  # (M, T, T) from the T terms to M sets of numbers, of which squares add up
-    error: float  # the largest one of a probability
+    factors: FloatArray  # (M, T, T): from the T terms to M sets of numbers whose squares are summed
+    error: float  # largest error of a probability
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """Return sums of squares at theta, (S, P): (S, M)."""
         u = np.asarray(np.linalg.solve(self.root, (theta - self.centre).T).T)
         terms = _terms(u, self.degree)
-        return np.stack([np.sum((terms @ one.T) ** 2, axis=1) for one in self.factors], axis=1)
+        return np.stack(
+            [np.sum((terms @ factor.T) ** 2, axis=1) for factor in self.factors], axis=1
+        )
 
 
 def interpolated(
@@ -340,7 +342,7 @@ def interpolated(
     covariance: FloatArray,
     tolerance: float,
 ) -> Interpolation | None:
-    """Return interpolated sums of squares; None where probabilities would err by more.
+    """Return interpolated sums of squares; None if probabilities err by more than `tolerance`.
 
     `residuals_of` computes the exact residuals.
     """
@@ -371,21 +373,21 @@ def interpolated(
         exact = in_blocks(lambda x: density.added(residuals_of(x)), far)
         seen.append([near, in_blocks(residuals_of, near), far, exact])
         theta, rows, far, exact = map(np.concatenate, zip(*seen, strict=True))
-        log_p = density.marginal(theta, _returning(density.added(rows)))
+        log_p = density.marginal(theta, _constant(density.added(rows)))
         log_p -= log_drawn(theta, _TAILS[0])
         chosen = np.isfinite(rows).all(axis=1) & (log_p > -np.inf)
         roots = np.exp(0.5 * (log_p[chosen, None] - log_p.max()))
         terms = _terms(np.linalg.solve(root, (theta[chosen] - centre).T).T, degree)
         coefficients = np.linalg.lstsq(roots * terms, roots * rows[chosen], rcond=None)[0]
         factors = [
-            np.linalg.qr((coefficients * np.sqrt(counted)).T, mode="r")
-            for counted in density.weights.T
+            np.linalg.qr((coefficients * np.sqrt(weights)).T, mode="r")
+            for weights in density.weights.T
         ]
         result = Interpolation(centre, root, degree, np.array(factors), 0.0)
         drawn = log_drawn(far, _TAILS[1])
         if wide:
             drawn = np.logaddexp(drawn, density.prior.log_density(far))
-        log_p = density.marginal(far, _returning(exact)) - drawn
+        log_p = density.marginal(far, _constant(exact)) - drawn
         log_q = density.marginal(far, result) - drawn
         with np.errstate(over="ignore", invalid="ignore"):  # where q is far too high
             p, q = np.exp([log_p, log_q] - log_p.max())
@@ -395,7 +397,8 @@ def interpolated(
     return None
 
 
-def _returning(sums: FloatArray) -> Function:
+def _constant(sums: FloatArray) -> Function:
+    """Return a function with these values at any points."""
     return lambda _: sums
 
 

@@ -1,6 +1,6 @@
-r"""What the rows of a table share in addition to independent noise, in a likelihood.
+r"""Errors that the rows of a table share in addition to independent noise, in a likelihood.
 
-Residuals y have the covariance s^2 (V_n + lambda V_c): noise V_n and what rows have in common V_c
+Residuals y have the covariance s^2 (V_n + lambda V_c): noise V_n and shared errors V_c
 (scatter between runs and levels, a smooth model error), both relative to the noise's scale s. In
 coordinates W y in which V_n is the unit matrix and V_c is diagonal, mu,
 
@@ -12,8 +12,8 @@ its budget: with p the share of V_c in its squared uncertainty, p lambda + 1 - p
 nu/chi^2_nu. The likelihood is the mean of the likelihoods with each lambda, each divided by its
 integral over the parameters (Laplace's).
 
-Where a parameter differs from run to run, V_c holds what that does to the residuals to first order,
-so the residuals are linear in that parameter: it is the mean over runs, and no run is there.
+Where a parameter differs from run to run, V_c includes the effect on the residuals to first order,
+so the residuals are linear in that parameter, which is the mean over runs.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ class RowErrors:
 
     @cached_property
     def _variances(self) -> FloatArray:
-        """Weights of each coordinate, shape (k, M)."""
+        """Variance of each coordinate for each lambda, (k, M)."""
         return 1.0 + self.shared[:, None] * self.sizes
 
     @cached_property
     def log_weights(self) -> FloatArray:
-        """Ln of what each likelihood counts, (M,); all integrals are that of lambda = 1."""
+        """Ln of each likelihood's weight, (M,): all integrals become that of lambda = 1."""
         every = np.column_stack([1.0 + self.shared, self._variances])
         at_one, *each = [self._log_integral(variances) for variances in every.T]
         volume = self.log_volume - 0.5 * float(np.log1p(self.shared).sum())
@@ -76,22 +76,22 @@ class RowErrors:
         root = np.sqrt(variances)
         Q, R = np.linalg.qr(self.turn @ self.jacobian / root[:, None])
         z = self.turn @ self.residuals / root
-        left = float(z @ z - np.sum((Q.T @ z) ** 2))
+        squares = float(z @ z - np.sum((Q.T @ z) ** 2))
         if self.inside is not None:  # where rows share nothing
             y = self.residuals
-            left += max(float(y @ y - np.sum((y @ self.inside) ** 2)), 0.0)
+            squares += max(float(y @ y - np.sum((y @ self.inside) ** 2)), 0.0)
         size = -float(np.log(np.abs(np.diagonal(R))).sum())
         if self.scale_known:
-            return size - 0.5 * left
-        return size - 0.5 * (len(self.residuals) - len(R)) * float(np.log(left))
+            return size - 0.5 * squares
+        return size - 0.5 * (len(self.residuals) - len(R)) * float(np.log(squares))
 
-    def held(self, theta: FloatArray) -> FloatArray:
+    def at_centre(self, theta: FloatArray) -> FloatArray:
         """Return theta, (S, P), with parameters that differ from run to run at their centre."""
         return np.where(np.isnan(self.centre), theta, self.centre)
 
-    def moved(self, theta: FloatArray) -> FloatArray:
-        """Return what those parameters add to the residuals, (S, m)."""
-        return np.asarray((theta - self.held(theta)) @ self.slopes.T)
+    def change(self, theta: FloatArray) -> FloatArray:
+        """Return the change of the residuals with these parameters from their centre, (S, m)."""
+        return np.asarray((theta - self.at_centre(theta)) @ self.slopes.T)
 
     def uncorrelated(self, y: FloatArray) -> FloatArray:
         """Return uncorrelated residuals, (..., m) -> (..., K), the last not shared by rows."""
@@ -108,7 +108,7 @@ class RowErrors:
         return np.concatenate([1.0 / self._variances, np.ones((alone, len(self.sizes)))])
 
     def independent(self, y: FloatArray) -> FloatArray:
-        """Return independent residuals, (..., m) -> (..., K), whose squares count alike.
+        """Return independent residuals, (..., m) -> (..., K), whose squares have equal weight.
 
         Their sum of squares is that of lambda = 1.
         """
