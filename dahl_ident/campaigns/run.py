@@ -58,8 +58,8 @@ _JOURNAL = "journal.jsonl"
 _TRIALS = 3  # fits that show whether the options of a new campaign can be used at all
 _ROWS_AT_ONCE = 2000
 """Rows that are in memory as dictionaries, which are ten times as large as in a table."""
-_OF_JOURNAL = ("key", "retry", "refused")
-_FIRST = ("device", "run", "status", "error", "statements")
+_JOURNAL_ONLY = ("key", "retry", "refused")
+_FIRST_COLUMNS = ("device", "run", "status", "error", "statements")
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Campaign:
         title : str
             First line.
         overwrite : bool, default False
-            Replace a report that is there already.
+            Replace an existing report.
 
         Returns
         -------
@@ -128,10 +128,10 @@ class Campaign:
         Raises
         ------
         ValidationError
-            If the ending is another one.
+            If `path` has another ending.
         DataError
-            If there is no table yet, a column is missing, or the file is there already and
-            `overwrite` is not set.
+            If there is no table yet, a column is missing, or the file exists and `overwrite` is
+            not set.
         """
         from dahl_ident.campaigns.campaign_report import FORMATS, campaign_document
         from dahl_ident.campaigns.population import USABLE, marked, population
@@ -226,8 +226,8 @@ def campaign(
 
     Notes
     -----
-    Each fit runs in a separate process. Laws that a script defines are known there because its file
-    is run once more, so such a script must call this under ``if __name__ == "__main__":``.
+    Each fit runs in a separate process. To define the laws of a script there, the script is run
+    once more, so it must call this under ``if __name__ == "__main__":``.
 
     Examples
     --------
@@ -287,13 +287,13 @@ def campaign(
                             progress(number, len(missing), row)
                 except LostError as exc:
                     lost = exc
-            there = [key for key in tasks if key in journal.places]
-            rows = zip(there, journal.rows(there), strict=True)
+            available = [key for key in tasks if key in journal.places]
+            rows = zip(available, journal.rows(available), strict=True)
             statuses = write_tables((_whole(tasks[key], row) for key, row in rows), folder)
     if lost is not None:
         raise DataError(
-            f"{lost}; {len(there)} of {len(tasks)} fits are in {folder / 'results.csv'}, and the "
-            "same command does the others"
+            f"{lost}; {len(available)} of {len(tasks)} fits are in {folder / 'results.csv'}, and "
+            "the same command does the others"
         ) from lost
     return replace(outcome, statuses=statuses)
 
@@ -322,31 +322,31 @@ def _unless_refused(
 ) -> Iterator[tuple[_Tag, Row]]:
     """Pass rows on, unless the first `trials` all say that the options or the model are wrong.
 
-    A device alone may have data that some option does not fit, so that one such row says nothing.
+    One such row proves nothing: an option may not suit the data of one device.
     """
-    held: list[tuple[_Tag, Row]] = []
+    first: list[tuple[_Tag, Row]] = []
     for tagged in done:
-        held.append(tagged)
-        errors = {row.get("error", "") for _, row in held}
-        if len(errors) == 1 and all(row.get("refused") for _, row in held):
-            if len(held) < trials:
+        first.append(tagged)
+        errors = {row.get("error", "") for _, row in first}
+        if len(errors) == 1 and all(row.get("refused") for _, row in first):
+            if len(first) < trials:
                 continue
             raise DataError(f"{source}: the first fits all fail: {tagged[1]['error']}")
-        yield from held
+        yield from first
         break
     yield from done
 
 
 def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
-    row = {name: value for name, value in row.items() if name not in _OF_JOURNAL}
+    row = {name: value for name, value in row.items() if name not in _JOURNAL_ONLY}
     labels = {"device": task.device} | ({"run": task.run} if task.run else {})
     return {**labels, **task.covariates, **row, "version": __version__}
 
 
-def _split(definition: Definition, tasks: Mapping[str, Task], known: Container[str]) -> Campaign:
+def _split(definition: Definition, tasks: Mapping[str, Task], keys: Container[str]) -> Campaign:
     done, to_do = (
-        tuple(task.name for key, task in tasks.items() if (key in known) == there)
-        for there in (True, False)
+        tuple(task.name for key, task in tasks.items() if (key in keys) == is_finished)
+        for is_finished in (True, False)
     )
     return Campaign(definition.folder, done, to_do, {})
 
@@ -396,7 +396,7 @@ def _by_key(definition: Definition, limits: Limits) -> dict[str, Task]:
     """Return the tasks by their keys.
 
     A file's digest is computed again only if its size or modification time differs from that stored
-    with the last digest. A file that takes longer than a fit may is left to its fit.
+    with the last digest. A file whose digest takes longer than a fit may take is left to its fit.
     """
     cache_path = definition.folder / "digests.json"
     try:
@@ -406,18 +406,18 @@ def _by_key(definition: Definition, limits: Limits) -> dict[str, Task]:
     digests: dict[str, list[Any]] = {}
     tasks = {}
     for task in definition.tasks:
-        of_files = []
+        file_digests = []
         for path in task.files:
             try:
                 state = path.stat()
-                known = cache.get(str(path))
-                if known is None or known[:2] != [state.st_size, state.st_mtime_ns]:
-                    known = [state.st_size, state.st_mtime_ns, _digest(path, limits.seconds)]
-                digests[str(path)] = known
+                entry = cache.get(str(path))
+                if entry is None or entry[:2] != [state.st_size, state.st_mtime_ns]:
+                    entry = [state.st_size, state.st_mtime_ns, _digest(path, limits.seconds)]
+                digests[str(path)] = entry
             except (OSError, DataError):
-                known = [0, 0, "unreadable"]  # a row that says so, until it can be read
-            of_files.append(known[2])
-        tasks[definition.key([task.name, *task.runs, *of_files], __version__)] = task
+                entry = [0, 0, "unreadable"]  # a row that says so, until it can be read
+            file_digests.append(entry[2])
+        tasks[definition.key([task.name, *task.runs, *file_digests], __version__)] = task
     if definition.folder.is_dir() and digests != cache:
         write_whole(cache_path, json.dumps(digests).encode(), overwrite=True)
     return tasks
@@ -441,7 +441,7 @@ def _digest(path: Path, seconds: float) -> str:
 
 
 class Journal:
-    """The lines of one campaign: where that of each finished key is, and how long fits took."""
+    """The lines of one campaign: the position of each finished key's line, and the fits' times."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -509,7 +509,7 @@ def write_tables(rows: Iterable[Mapping[str, Any]], folder: Path) -> dict[str, i
     flat = ({name: _plain(value) for name, value in row.items()} for row in rows)
     blocks = iter(lambda: list(islice(flat, _ROWS_AT_ONCE)), [])
     table = pd.concat([pd.DataFrame(), *map(pd.DataFrame, blocks)], ignore_index=True)
-    first = [name for name in _FIRST if name in table]
+    first = [name for name in _FIRST_COLUMNS if name in table]
     table = table[[*first, *sorted(map(str, set(table) - set(first)))]]
     is_number = pd.api.types.is_numeric_dtype
     table = table.astype({c: "float64" if is_number(table[c]) else "string" for c in table})

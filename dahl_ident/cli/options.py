@@ -38,17 +38,17 @@ def take_options(ctx: typer.Context, path: Path | None) -> Path | None:
         content = tomllib.loads(read_text(path))
     except (DataError, tomllib.TOMLDecodeError) as exc:
         raise DataError(f"{path}: no TOML file of options: {exc}") from exc
-    here = ctx.info_name or ""
+    command = ctx.info_name or ""
     tables = {k: v for k, v in content.items() if isinstance(v, dict)}
     shared = {k.replace("-", "_"): v for k, v in content.items() if k not in tables}
-    of_command = {k.replace("-", "_"): v for k, v in tables.get(here, {}).items()}
+    specific = {k.replace("-", "_"): v for k, v in tables.get(command, {}).items()}
     every: Mapping[str, Any] = getattr(ctx.find_root().command, "commands", {})
-    commands = {name: {p.name for p in one.params} - {"config"} for name, one in every.items()}
-    known = commands.get(here, set())
+    commands = {name: {p.name for p in c.params} - {"config"} for name, c in every.items()}
+    known = commands.get(command, set())
     _refuse_unknown(path, "no command is called", tables, commands.keys())
-    _refuse_unknown(path, f"{here} has no option", of_command, known)
+    _refuse_unknown(path, f"{command} has no option", specific, known)
     _refuse_unknown(path, "no command has the option", shared, set().union(*commands.values()))
-    chosen = {k: v for k, v in shared.items() if k in known} | of_command
+    chosen = {k: v for k, v in shared.items() if k in known} | specific
     parameters = ctx.command.params
     several = {p.name for p in parameters if getattr(p, "multiple", False) or p.nargs != 1}
     ctx.default_map = {k: _typed(v, several=k in several) for k, v in chosen.items()}
@@ -134,13 +134,13 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
             parameters.append(parameter.replace(annotation=hints[name]))
             continue
         group = groups[name]
-        types = get_type_hints(groups[name])
-        for one in fields(group):
-            declared = one.metadata["option"]
+        types = get_type_hints(group)
+        for item in fields(group):
+            declared = item.metadata["option"]
             panel = {"panel": group.panel} | declared.keywords
-            declared = Annotated[types[one.name], declared(**panel)]
+            declared = Annotated[types[item.name], declared(**panel)]
             parameters.append(
-                parameter.replace(name=one.name, default=one.default, annotation=declared)
+                parameter.replace(name=item.name, default=item.default, annotation=declared)
             )
 
     @functools.wraps(command)
@@ -158,18 +158,18 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def starting(names: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return what completes the beginning of a word."""
+    """Return a function that completes the beginning of a word."""
     return lambda incomplete: [name for name in names if name.startswith(incomplete)]
 
 
 def steady_setting(default: str | None = "exact") -> Any:
-    """Return the option of how the response to a force that is held is predicted."""
+    """Return the option that says how the response to a controlled force is predicted."""
     help_text = "Response to a force that is held: exact, or 'describing function' (sine assumed)."
     return setting(help_text, default, one_of="exact|describing function")
 
 
 def controlled_setting(default: str | None = "displacement") -> Any:
-    """Return the option of what was held."""
+    """Return the option for the controlled quantity."""
     help_text = "Controlled quantity: displacement or force."
     return setting(help_text, default, one_of="displacement|force")
 
