@@ -36,15 +36,15 @@ from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError, ValidationError
 
-_AMPLITUDES_PER_DECADE = 60  # 4 % apart: N is smooth, and crossings are sought between
-_FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get more of their own
+_AMPLITUDES_PER_DECADE = 60  # 4 % apart: N is smooth, and crossings are searched for in between
+_FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get additional ones
 _BEYOND_KNEES = (1e-6, 1e8)  # there N has reached its limits, sigma and a force over A
 _BEYOND_ROOTS = 1e3  # beyond all poles and zeros L is a power of the frequency
 _AROUND_RESONANCE = np.geomspace(0.01, 300.0, 60)  # times |Re| of a pole, its half width
 _PAIRS_AT_ONCE = 2**20  # of segments: 16 MB for each complex array
 _STEP = 1e-5  # relative, of the frequency: truncation 1e-10, rounding 2e-11
 _NEWTON_STEPS = 40  # of at most 0.5 in a logarithm: almost nine decades
-_RESIDUAL = 1e-6  # of ln(-L/N): where Newton's method converges, far less is left
+_RESIDUAL = 1e-6  # of ln(-L/N); where Newton's method converges, it is far smaller
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class LimitCycle:
         describing function: a disturbance of the amplitude.
     share : float
         Root sum of squares of the displacement's mean and harmonics 2 to 9 over its fundamental;
-        0 of the describing function, which takes the motion for a sine.
+        0 of the describing function, which assumes a sine.
 
     Examples
     --------
@@ -90,7 +90,7 @@ class LimitCycle:
 class LimitCycles(tuple[LimitCycle, ...]):
     """Limit cycles by rising amplitude; where there is none, `reason` says why.
 
-    `approximate` says why they are those of the describing function, where they are.
+    Where they are those of the describing function, `approximate` says why.
 
     Examples
     --------
@@ -129,7 +129,7 @@ def limit_cycles(
     steady : {"exact", "describing function"}, default "exact"
         "exact": the periodic motion itself, with all harmonics, by shooting from each solution. A
         loop that has no equation of motion (an FRD, a discrete or delayed one) keeps the
-        describing function's.
+        result of the describing function.
 
     Returns
     -------
@@ -198,10 +198,10 @@ def limit_cycles(
             )
         )
         if crossings and not cycles:
-            one = crossings[0]
+            crossing = crossings[0]
             cycles.reason = (
-                f"the describing function has one of {one.amplitude:.3g} m at "
-                f"{one.frequency_hz:.3g} Hz, but no periodic motion is near it"
+                f"the describing function has one of {crossing.amplitude:.3g} m at "
+                f"{crossing.frequency_hz:.3g} Hz, but no periodic motion is near it"
             )
             return cycles
     else:
@@ -247,7 +247,9 @@ def _grid(low: float, high: float, per_decade: int) -> FloatArray:
     return np.geomspace(low, high, 2 + int(np.ceil(per_decade * np.log10(high / low))))
 
 
-def _frequencies(linear: Model, contact: float, asked_hz: tuple[float, float] | None) -> FloatArray:
+def _frequencies(
+    linear: Model, contact: float, requested_hz: tuple[float, float] | None
+) -> FloatArray:
     """Return angular frequencies to scan, with more of them around sharp resonances."""
     low, high = known_range(linear)
     roots = np.zeros(0, dtype=np.complex128)
@@ -262,13 +264,13 @@ def _frequencies(linear: Model, contact: float, asked_hz: tuple[float, float] | 
         stuck = np.polyadd(numerator, contact * denominator)
         roots = np.concatenate([np.roots(p) for p in (numerator, denominator, stuck)])
         roots = roots[np.abs(roots) > 0.0]
-    if asked_hz is not None:
-        asked = 2.0 * np.pi * positive_array(asked_hz, "frequency_range_hz")
-        if asked.shape != (2,) or not asked[0] < asked[1]:
+    if requested_hz is not None:
+        requested = 2.0 * np.pi * positive_array(requested_hz, "frequency_range_hz")
+        if requested.shape != (2,) or not requested[0] < requested[1]:
             raise ValidationError(
-                f"frequency_range_hz is {asked_hz!r}; expected two rising frequencies"
+                f"frequency_range_hz is {requested_hz!r}; expected two rising frequencies"
             )
-        low, high = max(low, float(asked[0])), min(high, float(asked[1]))
+        low, high = max(low, float(requested[0])), min(high, float(requested[1]))
     elif roots.size:
         low = max(low, np.abs(roots).min() / _BEYOND_ROOTS)
         high = min(high, np.abs(roots).max() * _BEYOND_ROOTS)
@@ -288,12 +290,12 @@ def _crossings(first: ComplexArray, second: ComplexArray) -> list[tuple[int, int
         p = np.log(np.abs(first)) + 1j * np.angle(first)
         q = np.log(np.abs(second)) + 1j * np.angle(second)
     step_p, step_q = np.diff(p), np.diff(q)
-    whole = np.isfinite(step_p) & (np.abs(step_p.imag) < np.pi)
+    possible = np.isfinite(step_p) & (np.abs(step_p.imag) < np.pi)
     for part in (np.real, np.imag):
         low = np.minimum(part(p[1:]), part(p[:-1]))
         high = np.maximum(part(p[1:]), part(p[:-1]))
-        whole &= (high >= part(q).min()) & (low <= part(q).max())
-    candidates = np.flatnonzero(whole)
+        possible &= (high >= part(q).min()) & (low <= part(q).max())
+    candidates = np.flatnonzero(possible)
     pairs: list[tuple[int, int]] = []
     together = max(1, _PAIRS_AT_ONCE // q.size)
     for start in range(0, candidates.size, together):
@@ -304,8 +306,8 @@ def _crossings(first: ComplexArray, second: ComplexArray) -> list[tuple[int, int
         with np.errstate(divide="ignore", invalid="ignore"):  # parallel segments do not cross
             s = (between.conj() * b).imag / area
             t = (between.conj() * a).imag / area
-        hit = (s >= 0.0) & (s <= 1.0) & (t >= 0.0) & (t <= 1.0)
-        pairs += [(int(chunk[i]), int(j)) for i, j in np.argwhere(hit)]
+        crosses = (s >= 0.0) & (s <= 1.0) & (t >= 0.0) & (t <= 1.0)
+        pairs += [(int(chunk[i]), int(j)) for i, j in np.argwhere(crosses)]
     return pairs
 
 
@@ -316,9 +318,9 @@ def _refine(linear: Model, friction: Model, amplitude: float, omega: float) -> L
     for _ in range(_NEWTON_STEPS):
         A, w = np.exp(place[:1]), np.clip(np.exp(place[1:]), low, high)
         N, slope = (v[0] for v in friction_and_slope(friction, A))
-        L, by_omega = stiffness_of(linear, w)[0], stiffness_slope(linear, w)[0]
+        L, L_slope = stiffness_of(linear, w)[0], stiffness_slope(linear, w)[0]
         residual = np.log(-L / N)
-        columns = np.array([-slope / N, w[0] * by_omega / L])
+        columns = np.array([-slope / N, w[0] * L_slope / L])
         jacobian = np.array([columns.real, columns.imag])
         if not np.isfinite(jacobian).all() or np.linalg.matrix_rank(jacobian) < 2:
             return None
@@ -328,15 +330,15 @@ def _refine(linear: Model, friction: Model, amplitude: float, omega: float) -> L
         place = place + step * min(1.0, 0.5 / np.max(np.abs(step)))
     if abs(residual) > _RESIDUAL:
         return None
-    return LimitCycle(float(A[0]), float(w[0] / (2.0 * np.pi)), float((slope / by_omega).imag))
+    return LimitCycle(float(A[0]), float(w[0] / (2.0 * np.pi)), float((slope / L_slope).imag))
 
 
 def _distinct(cycles: Iterable[LimitCycle]) -> tuple[LimitCycle, ...]:
     """Return the cycles by rising amplitude, each once."""
     distinct: list[LimitCycle] = []
-    for one in sorted(cycles, key=lambda c: (c.amplitude, c.frequency_hz)):
-        place = one.amplitude, one.frequency_hz
+    for cycle in sorted(cycles, key=lambda c: (c.amplitude, c.frequency_hz)):
+        place = cycle.amplitude, cycle.frequency_hz
         others = ((c.amplitude, c.frequency_hz) for c in distinct)
-        if not any(np.allclose(place, known, rtol=1e-6, atol=0.0) for known in others):
-            distinct.append(one)
+        if not any(np.allclose(place, other, rtol=1e-6, atol=0.0) for other in others):
+            distinct.append(cycle)
     return tuple(distinct)
