@@ -89,27 +89,27 @@ def response_from(
                 f"magnitude and phase in degrees; if they are, give {polar}"
             )
     parts = []
-    for label, one in by_level(source, columns).items():
-        named, of = source, ""
+    for label, level_columns in by_level(source, columns).items():
+        named, prefix = source, ""
         if label is not None:
             options = replace(options, level=label)
-            of = f"level {label}: "
+            prefix = f"level {label}: "
             named = replace(source, name=f"{source.name}, level {label}")
-        table = _TableBinding(named, one, options)
+        table = _TableBinding(named, level_columns, options)
         try:
             parts.append(table.response())
         except ValidationError as exc:
             raise DataError(f"{named.name}: {exc}") from exc
         whole.used |= table.used
         whole.notes += table.notes
-        whole.doubts += [f"{of}{text}" for text in table.doubts]
+        whole.doubts += [f"{prefix}{text}" for text in table.doubts]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     assumed = {"frequency": ASSUMED} if _UNKNOWN_FREQUENCY in whole.notes else {}
     return replace(data, provenance=whole.provenance() | assumed)
 
 
 def _as_gain(channel: RawChannel) -> RawChannel:
-    """Return an "amplitude" in the unit of a response as what it is, a gain."""
+    """Return a channel called amplitude as a gain if its unit is that of a response."""
     named = plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names
     if named and RESPONSE_COLUMNS["gain"].measures(channel.unit, channel.name):
         return replace(channel, role="gain")
@@ -127,8 +127,8 @@ def _with_stated(
     elif "drive" in stated and columns.drive_factor is None:
         _, kind, _ = parse_quantity(stated["drive"], DRIVE_KINDS, "drive")
         stated = stated if kind == "force" else {}
-    known = options.drive or options.amplitude or levels.keys() & columns.roles.keys()
-    if known or any(c.is_called(level) for c in source.channels for level in levels.values()):
+    is_stated = options.drive or options.amplitude or levels.keys() & columns.roles.keys()
+    if is_stated or any(c.is_called(level) for c in source.channels for level in levels.values()):
         return source, options
     notes = [f"{role} {text}, as the file's header states" for role, text in stated.items()]
     return replace(source, notes=(*source.notes, *notes)), replace(options, **stated)
@@ -261,17 +261,17 @@ class _TableBinding(Binding):
 
     def _add(self, role: str, values: FloatArray, unit: str, option: str, text: Any) -> None:
         """Add a column that an option states, unless the table has one."""
-        known = self.channel(role)
-        if known is not None:
+        existing = self.channel(role)
+        if existing is not None:
             raise ValidationError(
-                f"{argument(option, text)} is given, and column {known.name!r} holds the {role} "
+                f"{argument(option, text)} is given, and column {existing.name!r} holds the {role} "
                 "too; leave out one of them"
             )
         channels = (*self.source.channels, RawChannel(str(text), values, unit, role))
         self.source = replace(self.source, channels=channels)
 
     def _refuse_waveforms(self) -> None:
-        """Say so where samples in time were given for responses."""
+        """Refuse samples in time that were given in place of responses."""
         channels = self.source.channels
         roles = ("time", *MOTION_KINDS, "force")
         called = [r for r in roles if any(c.is_called(RECORD_COLUMNS[r]) for c in channels)]
@@ -361,7 +361,7 @@ class _TableBinding(Binding):
         return self.map.quantity, gain * np.exp(1j * self._phase())
 
     def _form(self, forms: tuple[tuple[str, ...], ...]) -> tuple[str, ...] | None:
-        """Return the one form whose columns are all there; the map decides between several."""
+        """Return the form whose columns are all in the table; the map decides between several."""
         mapped = [f for f in forms if self.map.roles.keys() >= {*f}]
         complete = [f for f in mapped or forms if all(self.has(role) for role in f)]
         complete = [f for f in complete if f[0] in self.map.roles] or complete
@@ -451,24 +451,24 @@ class _TableBinding(Binding):
         return self.source.numbers(channel)
 
     def _controlled(self, force_only: bool) -> Any:
-        held = self.map.controlled
-        if isinstance(held, Mapping):
+        controlled = self.map.controlled
+        if isinstance(controlled, Mapping):
             label = str(self._labels("level", self.level))
-            matches = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, held.get(w, ""))]
+            matches = [w for w in CONTROLLED if fnmatch.fnmatchcase(label, controlled.get(w, ""))]
             if len(matches) != 1:
                 raise ValidationError(
                     f"level {label!r} matches {'both patterns' if matches else 'no pattern'} of "
-                    f"controlled: {dict(held)}"
+                    f"controlled: {dict(controlled)}"
                 )
             return matches[0]
-        if held is None and (channel := self.channel("controlled")) is not None:
+        if controlled is None and (channel := self.channel("controlled")) is not None:
             words = np.char.strip(np.atleast_1d(channel.values).astype(str))
             self.source.require(np.isin(words, CONTROLLED), channel, "displacement or force")
             return words
-        if held is None:
-            held = "force" if force_only else "displacement"
-            self.notes.append(f"controlled: {held}, as the table does not say")
-        return held
+        if controlled is None:
+            controlled = "force" if force_only else "displacement"
+            self.notes.append(f"controlled: {controlled}, as the table does not say")
+        return controlled
 
     def _quality(self, n: int) -> dict[str, NDArray[Any]]:
         """Return columns without a role, as covariates: those of an earlier save in their types."""
@@ -493,7 +493,7 @@ def _per_drive(text: str) -> tuple[str, str, int] | None:
     for kind, symbol in (("voltage", "V"), ("current", "A")):
         forms += [(kind, f"({text})*{symbol}/N", -1), (kind, f"({text})*N/{symbol}", 1)]
     form = next((f for f in forms if RESPONSE_COLUMNS["gain"].measures(f[1], "the gain")), None)
-    return form if form and form[2] else None  # none of one of the six quantities as it is
+    return form if form and form[2] else None  # None for a unit of the six quantities
 
 
 def _typed(values: NDArray[Any], kind: str) -> NDArray[Any]:

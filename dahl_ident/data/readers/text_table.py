@@ -56,7 +56,7 @@ _TRACE = re.compile(
 )
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
-_SMALL = 1 << 16  # bytes
+_SMALL = 1 << 16  # bytes, at most, of a table that is read without pandas
 _LIKE_DATA = (
     "the line begins as a comment, yet its cells look like data, {!r}; expected a measured number "
     "in each. Delete the line, or put a number there"
@@ -182,11 +182,11 @@ def _split(line: str, delimiter: str | None) -> list[str]:
 
 def _layout(lines: list[str], name: str) -> _Layout:
     """Find dialect and start of the numbers, and read the header above them."""
-    passed = [not text.strip() or _COMMENT.match(text) is not None for text in lines]
-    texts = [text for text, skip in zip(lines, passed, strict=True) if not skip]
+    skipped = [not text.strip() or _COMMENT.match(text) is not None for text in lines]
+    texts = [text for text, skip in zip(lines, skipped, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
         tried = (
-            _in_dialect(lines, passed, delimiter, mark)
+            _in_dialect(lines, skipped, delimiter, mark)
             for delimiter, mark in _possible(dialects, texts)
         )
         candidates = [candidate for candidate in tried if candidate is not None]
@@ -214,25 +214,25 @@ def _possible(
 
 
 def _in_dialect(
-    lines: list[str], passed: list[bool], delimiter: str | None, mark: str
+    lines: list[str], skipped: list[bool], delimiter: str | None, mark: str
 ) -> tuple[tuple[bool, int], _Layout] | None:
     """Return the layout in one dialect and its merit, if there are numbers in it."""
     rows = [
-        None if skip else _split(text, delimiter) for text, skip in zip(lines, passed, strict=True)
+        None if skip else _split(text, delimiter) for text, skip in zip(lines, skipped, strict=True)
     ]
     run = best_run(rows, mark)
     if run is None:
         return None
-    if mark[1:]:  # some cell can only be read with a mark of thousands, as 1,234.5 can
+    if mark[1:]:  # accepted only if a cell needs the mark of thousands, such as 1,234.5
         group = rf"\s*[-+]?\d{{1,3}}(?:\{mark[1]}\d{{3}})"
-        sure = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*").fullmatch
-        if not any(sure(cell) for row in rows[run.start :] for cell in row or ()):
+        has_thousands = re.compile(rf"{group}+\{mark[0]}\d*\s*|{group}{{2,}}\s*").fullmatch
+        if not any(has_thousands(cell) for row in rows[run.start :] for cell in row or ()):
             return None
     start = run.start
-    repeated = lines[start - 1].strip() if start and not passed[start - 1] else ""
-    if repeated:  # a header seen before: the numbers began there
+    repeated = lines[start - 1].strip() if start and not skipped[start - 1] else ""
+    if repeated:  # the same header may stand further up: the numbers then begin there
         first = next(i for i, text in enumerate(lines) if text.strip() == repeated)
-        later = next((i for i in range(first + 1, start + 1) if not passed[i]), start)
+        later = next((i for i in range(first + 1, start + 1) if not skipped[i]), start)
         row = rows[later]
         start = later if row is not None and len(row) == run.width else start
     filled = max((i + 1 for i, c in enumerate(rows[start] or []) if c.strip()), default=run.width)
@@ -242,8 +242,8 @@ def _in_dialect(
         named = header(_commented(lines[:start], delimiter), run.width, filled)
         comments = tuple(text.strip() for text in lines[:start]) if named.names else ()
         repeated = next((text for text in reversed(comments) if text), "")
-    seen = repeated.encode() if named.names else b""
-    layout = _Layout(delimiter, mark, start, run.width, named, seen, comments)
+    repeated_line = repeated.encode() if named.names else b""
+    layout = _Layout(delimiter, mark, start, run.width, named, repeated_line, comments)
     return (bool(named.names), run.score), layout
 
 
@@ -272,7 +272,7 @@ def _body(data: bytes, offset: int, layout: _Layout, file: File) -> tuple[bytes,
     """Return the lines of numbers, all else blanked, and the rows at which a run begins."""
     body = data[offset:]
     above = _LINE_END.split(data[:offset])[:-1]
-    for i in range(len(above) - 1, -1, -1):  # directly above are comments, by their first sign
+    for i in range(len(above) - 1, -1, -1):  # upwards through the comments directly above
         text = above[i].decode("utf-8", "replace")
         if text.strip() and not _COMMENT.match(text):
             break
@@ -328,10 +328,10 @@ def _is_another_header(text: str, layout: _Layout) -> bool:
         return False
     cells = next(iter(_commented([text], layout.delimiter)), [""])
     names, units = zip(*(split_header(cell) for cell in cells), strict=True)
-    known = sorted(plain(name) for name in layout.header.names if name)
-    return (bool(known) and sorted(plain(name) for name in names if name) == known) or (
-        len(cells) == layout.header.cells > 1 and not any(units) and are_units(cells)
-    )
+    header_names = sorted(plain(name) for name in layout.header.names if name)
+    return (
+        bool(header_names) and sorted(plain(name) for name in names if name) == header_names
+    ) or (len(cells) == layout.header.cells > 1 and not any(units) and are_units(cells))
 
 
 def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
@@ -356,7 +356,7 @@ def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
 
 
 def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list[int]]:
-    """Blank every later line that repeats the header, and name the rows behind them."""
+    """Blank every later line that repeats the header, and return the first rows below them."""
     if not layout.repeated or layout.repeated not in body:
         return body, []
     lines = re.split(rb"(\r\n|\n|\r)", body)
@@ -364,14 +364,14 @@ def _without_repeated_headers(body: bytes, layout: _Layout) -> tuple[bytes, list
     rows = 0
     for i in range(0, len(lines), 2):
         if lines[i].strip() != layout.repeated:
-            rows += _counts(lines[i])
+            rows += _is_row(lines[i])
             continue
         lines[i] = b""
         for k in range(i - 2, -1, -2):  # and the lines of its header above it
             cells = _split(lines[k].decode("utf-8", "replace"), layout.delimiter)
             if any(CELL[layout.mark].fullmatch(cell) for cell in cells):
                 break
-            rows -= _counts(lines[k])
+            rows -= _is_row(lines[k])
             lines[k] = b""
         runs.append(rows)
     return b"".join(lines), runs
@@ -381,15 +381,15 @@ def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
     """Refuse a last line with missing fields, or with missing digits and no line end."""
     start = max(0, len(body) - _HEAD_BYTES)
     start = max(body.rfind(b"\n", 0, start), body.rfind(b"\r", 0, start)) + 1
-    ends = _LINE_END.split(body[start:])
-    *before, last = [t.decode("utf-8", "replace") for t in ends if _counts(t)] or [""]
+    lines = _LINE_END.split(body[start:])
+    *before, last = [t.decode("utf-8", "replace") for t in lines if _is_row(t)] or [""]
     cells = _split(last, layout.delimiter)
     if len(cells) < layout.width:
         raise DataError(
             f"{name}: the last line has {len(cells)} fields, {last[:40]!r}, where the others have "
             f"{layout.width}; the file looks cut off"
         )
-    if not ends[-1] or len(before) < _MANY_LINES:
+    if not lines[-1] or len(before) < _MANY_LINES:
         return
     numbers = [_split(line, layout.delimiter)[-1].strip() for line in [last, *before[1:]]]
     decimals, *others = [len(number.partition(layout.mark)[2]) for number in numbers]
@@ -401,14 +401,14 @@ def _refuse_cut_end(body: bytes, layout: _Layout, name: str) -> None:
         )
 
 
-def _counts(line: bytes) -> bool:
-    """Return whether a line among the numbers is one, and not blank or a comment."""
+def _is_row(line: bytes) -> bool:
+    """Return whether a line is a row of numbers: not blank, and not a comment."""
     return bool(line.strip()) and not _COMMENT_LINE.match(line)
 
 
 def _places(body: bytes) -> list[int]:
     """Return the line of each row below the first, past blank lines and comments."""
-    return [i for i, text in enumerate(_LINE_END.split(body)) if _counts(text)]
+    return [i for i, text in enumerate(_LINE_END.split(body)) if _is_row(text)]
 
 
 def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] | None:
@@ -421,17 +421,17 @@ def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] 
     columns: list[NDArray[Any]] = []
     for i, column in enumerate(zip(*rows, strict=True)):
         cells = [cell.strip() for cell in column]
-        as_they_are = cells == list(column)
+        unpadded = cells == list(column)
         if str(i) in texts:
-            if not as_they_are or any(cell[:1] == "'" for cell in cells):
+            if not unpadded or any(cell[:1] == "'" for cell in cells):
                 return None
             columns.append(words(cells))
         elif all(map(_FLOAT.fullmatch, cells)):
             whole = all(map(_INTEGER.fullmatch, cells))
             columns.append(np.array([int(cell) if whole else float(cell) for cell in cells]))
-        elif as_they_are and {*cells} <= {"True", "False"}:
+        elif unpadded and {*cells} <= {"True", "False"}:
             columns.append(np.array([cell == "True" for cell in cells]))
-        elif as_they_are and all(map(_WORD.fullmatch, cells)):
+        elif unpadded and all(map(_WORD.fullmatch, cells)):
             columns.append(words(cells))
         else:
             return None
@@ -442,10 +442,10 @@ def _parse(
     body: bytes, layout: _Layout, metadata: Mapping[str, Any], name: str
 ) -> list[NDArray[Any]]:
     keys = [str(i) for i in range(layout.width)]
-    known = metadata.get("text", [])
+    text_names = metadata.get("text", [])
     if layout.mark[1:]:  # read strictly when they are used: 12,34 is not 1234
-        known = list(layout.header.names)
-    texts = {key for key, n in zip(keys, layout.header.names, strict=False) if n in known}
+        text_names = list(layout.header.names)
+    texts = {key for key, n in zip(keys, layout.header.names, strict=False) if n in text_names}
     small = _small(body, layout, texts)
     if small is not None:
         return small
