@@ -135,7 +135,7 @@ class ErrorModel(ErrorContributions):
 
     @property
     def labels(self) -> list[str]:
-        """The name of the source that each variance is of."""
+        """The name of each variance's source."""
         return [NOISE] * self.state.model.noises + [source.name for source in self.sources]
 
     @cached_property
@@ -189,10 +189,11 @@ class ErrorModel(ErrorContributions):
     def at_estimate(self) -> Optimum:
         """The estimate as an optimum: its residuals have the stated weights."""
         problem, theta, optimum = self.problem, self.theta, self.optimum
-        known = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
-        held = np.array([self.holds(name) for name in self.names])
+        at_optimum = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
+        holds = np.array([self.holds(name) for name in self.names])
         values = [
-            v if h else known.get(n, v) for h, (n, v) in zip(held, self.values.items(), strict=True)
+            v if h else at_optimum.get(n, v)
+            for h, (n, v) in zip(holds, self.values.items(), strict=True)
         ]
         y, m = problem.residuals(theta), problem.n_residuals
         scale = 1.0
@@ -200,7 +201,7 @@ class ErrorModel(ErrorContributions):
             free = max(optimum.dof - float(y[m:] @ y[m:]), 1.0)
             loss = self.estimate.loss
             scale = agreed_scale(problem, loss, lambda _: (theta, free), self.estimate.scale)
-        at = replace(optimum, theta=theta, covariance=blanked(self.covariance, ~held), scale=scale)
+        at = replace(optimum, theta=theta, covariance=blanked(self.covariance, ~holds), scale=scale)
         return self._of_problem(at, problem, np.array(values))
 
     @cached_property
@@ -209,8 +210,8 @@ class ErrorModel(ErrorContributions):
 
         What was assumed is held at its estimate.
         """
-        held = {name: self.values[name] for name in self.assumed}
-        problem = self.problem.like(fixed=held) if held else self.problem
+        fixed = {name: self.values[name] for name in self.assumed}
+        problem = self.problem.like(fixed=fixed) if fixed else self.problem
         problem, stated = problem.widened(self.estimate.misfit_variance), self.at_estimate
         kept = [self.names.index(name) for name in problem.names]
         theta, lost = self.theta[kept], ~np.isfinite(np.diagonal(stated.covariance)[kept])
@@ -289,7 +290,7 @@ class ErrorModel(ErrorContributions):
         return min(1.0, _KINDS * min(alone.chance_of(k, known=known) for k in of_model))
 
     def rms(self, name: str) -> float:
-        """Return the rms of ln gain and phase that noise beyond a stated one, or a source, makes.
+        """Return the rms of ln gain and phase by one source, or by noise beyond the stated one.
 
         Of the differences between runs, those of gain and phase count.
         """
@@ -340,9 +341,8 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     if not few:
         sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
     state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
-    if (
-        few and problem.scale_known and not estimate.problem.has_misfit
-    ):  # too few to doubt the noise
+    if few and problem.scale_known and not estimate.problem.has_misfit:
+        # too few to doubt the noise
         state = state.model.at(np.zeros(state.model.count))
     noises = state.model.noises
     shown = np.flatnonzero(state.variances[noises:] > 0.0)
@@ -350,12 +350,12 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     state = state.model.only(shown).at(state.variances[[*range(noises), *(noises + shown)]])
     exponents = set[str]()
     if estimate.regular:
-        exponents = {name for name, one in assumed.items() if one.source == EXPONENT}
+        exponents = {name for name, p in assumed.items() if p.source == EXPONENT}
     tests = rows_of_tests(problem.data)
     by_tests = estimate.jackknife(tests) if estimate.regular else None
     labels = [NOISE] * noises + [source.name for source in sources]
     labels += [CHANNELS.get(name, name) for name in problem.priors]
-    labels += [one.source for one in assumed.values()]
+    labels += [p.source for p in assumed.values()]
     # with the exponents estimated, and with exact ones
     units = np.array(
         [_unit_covariances(estimate.lever(exact), state) for exact in (set[str](), exponents)]
@@ -404,8 +404,8 @@ def _standing_apart(optimum: Optimum) -> list[int]:
 def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
     """Return the mixed model of the estimate's residuals.
 
-    A stated noise is the least that fundamentals have, and harmonics in addition to their own
-    misfit: that is not an error of the fundamental.
+    Fundamentals have at least the stated noise. Harmonics have it in addition to their misfit,
+    which is not an error of the fundamental.
     """
     problem, m = estimate.problem, estimate.problem.n_residuals
     harmonics = np.repeat(problem.data.harmonic != 1, 2) & problem.scale_known
@@ -420,7 +420,7 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
 
 
 def _unit_covariances(lever: FloatArray, state: MixedState) -> FloatArray:
-    """Return what the lever (Q, M) makes of noises, sources and priors of unit size, (k, Q, Q)."""
+    """Return the estimate's covariances by noises, sources, priors of unit size: (k, Q, Q)."""
     model, G = state.model, state.model.noises
     moved = lever @ model.U
     columns = [lever[:, model.group == g] for g in range(G)]
@@ -430,7 +430,7 @@ def _unit_covariances(lever: FloatArray, state: MixedState) -> FloatArray:
 
 
 def _by_source(labels: Sequence[str], parts: FloatArray) -> dict[str, FloatArray]:
-    """Return sums of the parts (k, Q, Q) that are of one source."""
+    """Return the sum of the parts (k, Q, Q) of each source."""
     by_source = dict[str, FloatArray]()
     for name, part in zip(labels, parts, strict=True):
         by_source[name] = by_source.get(name, 0.0) + part

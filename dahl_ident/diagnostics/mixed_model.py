@@ -80,9 +80,9 @@ class MixedModel:
         self, y: FloatArray, J: FloatArray, kept: Iterable[int] | None = None, *more: FloatArray
     ) -> MixedModel:
         """Return sources, or some of them and `more`, with other residuals and derivatives."""
-        those = list(range(len(self.starts)) if kept is None else kept)
-        Z = [*(self.U[:, self.columns(k)] for k in those), *more]
-        most = np.append(self.most[self.noises :][those], np.full(len(more), np.inf))
+        chosen = list(range(len(self.starts)) if kept is None else kept)
+        Z = [*(self.U[:, self.columns(k)] for k in chosen), *more]
+        most = np.append(self.most[self.noises :][chosen], np.full(len(more), np.inf))
         return MixedModel(y, J, Z, self.group, self.known, self.noises, most)
 
     def at(self, variances: FloatArray) -> MixedState:
@@ -112,9 +112,9 @@ class MixedModel:
         if (state.gradient[doubtful] <= price[doubtful]).all():
             return state  # the highest, with or without them
         free = self.most.copy()
-        asked = self._highest(state.variances, least, free, price)
-        free[doubtful] = np.where(asked.variances[doubtful] > 0.0, free[doubtful], 0.0)
-        return self._highest(asked.variances, least, free, np.zeros(self.count))
+        penalised = self._highest(state.variances, least, free, price)
+        free[doubtful] = np.where(penalised.variances[doubtful] > 0.0, free[doubtful], 0.0)
+        return self._highest(penalised.variances, least, free, np.zeros(self.count))
 
     def _highest(
         self, s: FloatArray, least: FloatArray, most: FloatArray, price: FloatArray
@@ -214,10 +214,10 @@ class MixedState:
         return 0.5 * sums
 
     def chance_of(self, k: int, *, known: bool) -> float:
-        """Return how often noise alone makes a source as likely as it is here, where it has none.
+        """Return the probability that noise alone makes a source as likely as it is here.
 
-        By the ratio of restricted likelihoods, which has no distribution of a simple form for few
-        rows: it is drawn. Rows of a known variance, such as priors, do not show an unknown scale:
+        By the ratio of restricted likelihoods. For few rows its distribution has no simple form, so
+        it is drawn. Rows of a known variance, such as priors, do not show an unknown scale:
         what the parameters leave of them does not count as degrees of freedom. Source: Crainiceanu
         and Ruppert, J. Royal Statistical Society B 66 (2004) 165.
         """
@@ -303,8 +303,8 @@ class MixedState:
         most, G = 0.5 * self.model.most, self.model.noises
         std_alone = self.variances[G:] * np.sqrt(2.0 / np.minimum(self.degrees, 2.0))
         most[G:] = np.minimum(most[G:], std_alone)
-        least = np.minimum(1.0, most[kept] / std)
-        covariance[part] = inverse * np.outer(least, least)
+        factor = np.minimum(1.0, most[kept] / std)
+        covariance[part] = inverse * np.outer(factor, factor)
         return covariance
 
     @cached_property

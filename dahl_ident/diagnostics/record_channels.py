@@ -1,9 +1,10 @@
-"""What errors of the measured channels do to a fit of records: noise, calibration, delay, window.
+"""Effects of errors of the measured channels on fits of records: noise, calibration, delay, window.
 
-A friction force goes on from where the motion turned. So an error of the displacement at a turning
-point stays in the force for some x_c of path, where the parameters show most, while elsewhere it
-passes. White noise is seen in the displacement itself; a correlated error, such as that of an
-encoder between its lines, is hidden by the motion, but not in the residuals after each reversal.
+A friction force depends on where the motion turned last. An error of the displacement at a turning
+point therefore stays in the force over a path of some x_c, where the parameters show most;
+elsewhere it does not last. White noise is seen in the displacement itself; a correlated error, such
+as that of an encoder between its lines, is hidden by the motion, but not in the residuals after
+each reversal.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that a source may shift without being counted
-_DRIVE_DRAWS = 4, 16  # of the drive's noise, least and most: the latter know it to a third
-_DRIVE_SAMPLES = 50_000  # that they may have in all: half a second
+_DRIVE_DRAWS = 4, 16  # of the drive's noise, fewest and most; the most give it to a third
+_DRIVE_SAMPLES = 50_000  # of all these draws: half a second
 _BENT = 6.0  # times the displacement's noise: exceeded by a second difference by chance once in 100
 _OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
-_DRAWS = 8  # of noise: the mean square of what they change is known to a half
-_MOST = 40  # turning points of a record that are looked at
+_DRAWS = 8  # of noise: give the mean square change to a half
+_MOST_TURNS = 40  # turning points of a record that are evaluated
 _STEP = 1e-5  # of the displacement's range, for slopes
 _HIDDEN = 10.0  # times the noise in differences: a correlation of 0.98 leaves a tenth
 _FORGOTTEN = 1e-3  # of a pattern's peak, below which the force has forgotten the turn
@@ -76,9 +77,9 @@ def motion_sources(
 
 
 def by_other_motions(fit: LinearFit) -> dict[str, Sequence[FloatArray]]:
-    """Return how the outputs change by motions that may as well be right, by what makes them.
+    """Return how the outputs change with motions that may as well be right, by source.
 
-    That is what samples miss of the turning points between them, and the window of differentiation.
+    The sources are turning points between samples, and the window of differentiation.
     """
     problem, changes = fit.problem, dict[str, Sequence[FloatArray]]()
     if problem.output == "force" and not problem.model.rate_independent:
@@ -106,8 +107,8 @@ def _squared(change: FloatArray) -> FloatArray:
 def by_calibration(fit: LinearFit) -> Iterator[tuple[str, FloatArray]]:
     """Yield what stated calibrations contribute.
 
-    A gain changes the units of force or of displacement, and every parameter with them, if all were
-    estimated; known ones stay, which changes the others as if they had been given wrongly. A delay
+    A gain changes the units of force or of displacement, and every parameter with them, if all are
+    estimated; known ones stay, which changes the others as if the known ones were wrong. A delay
     shifts the output in time.
     """
     problem = fit.problem
@@ -165,20 +166,20 @@ def _by_wander(fit: LinearFit, stds: Sequence[float]) -> FloatArray:
 
     It moves the plant most where it resonates or where friction slips, and parameters are
     determined at these places. The covariance by noise takes the residuals as equally large
-    everywhere, so that it shows such noise in part. Draws of the noise have both.
+    everywhere, so it includes only a part of such noise. Draws of the noise give both.
     """
     problem, known = fit.problem, fit.by_noise[0]
     draws = int(np.clip(_DRIVE_SAMPLES // problem.n_residuals, *_DRIVE_DRAWS))
-    moved, seen, none = np.zeros_like(known), np.zeros_like(known), np.zeros_like(known)
+    moved, seen, zero = np.zeros_like(known), np.zeros_like(known), np.zeros_like(known)
     for draw in range(draws):
         try:
             noisy = problem.with_noisier_drive(stds, draw).outputs(fit.values)
         except FitError:
-            return none
+            return zero
         wander = [problem.filtered(b - a) for a, b in zip(fit.outputs, noisy, strict=True)]
         change = fit.projected(wander)
         if not draw and not (change**2 > _MATTERS**2 * known.diagonal()).any():
-            return none
+            return zero
         moved += np.outer(change, change) / draws
         seen += sandwich(fit.jacobians, wander)[0] / draws
     certain = np.isfinite(known.diagonal()) & (known.diagonal() > 0.0)
@@ -243,9 +244,9 @@ def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...
 def _at_turns(fit: LinearFit) -> FloatArray:
     """Return the covariance (P, P) of an estimate by errors of displacements at turning points.
 
-    Their variance is that by which the residuals exceed what their mean spectrum explains in the
-    directions of such errors; as it cannot be negative, its mean over a normal distribution cut
-    off at zero is taken. It is at most ten times what noise the displacement's differences show.
+    Their variance is the excess of the residuals, in the directions of such errors, over what their
+    mean spectrum explains; as it cannot be negative, it is the mean of a normal distribution cut
+    off at zero. It is at most ten times what noise the displacement's differences show.
     """
     excess, strength, scatter = 0.0, 0.0, 0.0
     moved = np.zeros(fit.inverse.shape)
@@ -279,14 +280,17 @@ def _at_turns(fit: LinearFit) -> FloatArray:
 def _patterns(fit: LinearFit, number: int) -> tuple[FloatArray, IntArray, int]:
     """Return derivatives of the force with respect to some turns, one after the other.
 
-    All turns are moved at once; of these, so few that each is forgotten before the next. The
-    derivatives begin at the first of them; with it the samples of the turns, and the number of all.
+    The chosen turns are moved at once; they are so few that the force forgets each before the next.
+    The derivatives begin at the first of them. Also returned are the samples of these turns, and
+    the number of all turns.
     """
     problem = fit.problem
     x, v, a = problem.motions[number]
     samples = stretches(x).samples
     turns = (np.cumsum(samples) - samples)[1:]
-    chosen = turns[np.unique(np.linspace(0, turns.size - 1, min(_MOST, turns.size)).astype(int))]
+    chosen = turns[
+        np.unique(np.linspace(0, turns.size - 1, min(_MOST_TURNS, turns.size)).astype(int))
+    ]
     step, pattern = _STEP * float(np.ptp(x)), x[:0]
     while chosen.size:
         ends = []
