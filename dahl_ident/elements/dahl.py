@@ -44,16 +44,16 @@ from dahl_ident.elements.maxwell_slip import MaxwellSlip
 from dahl_ident.elements.parameter import Assumed, Parameter
 from dahl_ident.errors import ValidationError
 
-_EXPONENTS = (1e-9, 1e3)  # beyond them the loop is that of the limit, to rounding
+_EXPONENTS = (1e-9, 1e3)  # beyond them the loop equals that of the limit
 _ALPHA = Assumed(1.0)  # linear Dahl, the law of the closed forms; a user may give another
 _JENKINS = 3  # elements of Maxwell slip compared with Dahl: six numbers, more than most tables give
 _AT_REST = 1e-30
-"""Smaller beta are rest, to more digits than a number has."""
+"""Smaller beta count as rest: the difference is below rounding."""
 _NO_LOSS, _MICROSLIP, _GROSS_SLIP = 1e9, 1e5, 1e-16
 """x_c over the largest amplitude, twice, and over the smallest: the limits, to every digit."""
 _SHARP, _SOFT = 1e-6, 1e3  # alpha
 _ONE_SIDED = 0.9  # asymmetry
-_NONE: ComplexArray = np.zeros((), dtype=np.complex128)  # a derivative that is not asked for
+_NO_DERIVATIVE: ComplexArray = np.zeros((), dtype=np.complex128)  # not asked for
 _TWO_LIMITS = (
     "dF/dx = sigma |1 - s F/f|^alpha sgn(1 - s F/f), f = f_max (1 + s asymmetry), s = sgn(dx/dt)"
 )
@@ -174,9 +174,9 @@ class Dahl(Friction):
         amplitude : array_like
             Zero-to-peak displacement A >= 0, m.
         names : iterable of str, optional
-            The derivatives wanted; all of them where left out. Without alpha, which takes a
-            quadrature, an element with alpha = 1 answers from closed forms, some twenty times
-            faster.
+            The derivatives to return; by default all of them. Without alpha, which takes a
+            quadrature, an element with alpha = 1 uses closed forms, which are some twenty
+            times faster.
 
         Returns
         -------
@@ -202,13 +202,13 @@ class Dahl(Friction):
         if unknown:
             raise ValidationError(f"names has {unknown[0]!r}; expected some of {', '.join(known)}")
         values = self.known_values()
-        asked = [replace(p, free=p.name in chosen) for p in self.parameters]
-        result = self.with_bound(tuple(asked)).settled(values, Sine(A, np.zeros(())), 2)
+        parameters = [replace(p, free=p.name in chosen) for p in self.parameters]
+        result = self.with_bound(tuple(parameters)).settled(values, Sine(A, np.zeros(())), 2)
         every = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
         return {name: every[name][()] for name in chosen}
 
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return F_k/X_1 at `values`, unchecked; the engine's where there are two limits.
+        """Return F_k/X_1 at `values`, unchecked; by the engine where there are two limits.
 
         The derivative with respect to alpha costs a quadrature; while alpha is fixed it is left at
         zero, which no estimate uses.
@@ -349,15 +349,15 @@ class Dahl(Friction):
         return tuple(limits if linear else limits[:3])
 
     def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
-        """Return the other exponent, two elements, and the laws that real devices ask for."""
+        """Return the other exponent, two elements, and laws that real devices may need."""
         f_max, sigma = values[:2]
         alpha, name = self.parameter("alpha"), self.name
         exponent = "exponent 1" if alpha.free else "exponent free"
         other_alpha = alpha.fixed(1.0) if alpha.free else alpha.freed()
         changed = self.with_bound(tuple(other_alpha if p is alpha else p for p in self.parameters))
         two = [
-            Dahl(name=which).started((force * f_max, stiffness * sigma, 1.0))
-            for which, force, stiffness in (("early", 0.3, 0.6), ("late", 0.7, 0.4))
+            Dahl(name=label).started((force * f_max, stiffness * sigma, 1.0))
+            for label, force, stiffness in (("early", 0.3, 0.6), ("late", 0.7, 0.4))
         ]
         alternatives = {
             exponent: Alternative((changed.started((f_max, sigma, 1.0, *values[3:])),)),
@@ -401,17 +401,18 @@ class Dahl(Friction):
 def _scaled(values: Values, sine: Sine, parts: Sequence[ComplexArray]) -> StiffnessGradient:
     """Return the stiffness and its derivatives from those over sigma.
 
-    By ln f_max, ln sigma and alpha, as many as there are; the first gives that by the amplitude.
+    The derivatives are with respect to ln f_max, ln sigma and alpha, as many as were computed; the
+    first also gives the derivative with respect to the amplitude.
     """
     f_max, sigma, _ = values
-    h, *by = parts
-    by_amplitude: ComplexArray = _NONE
+    h, *slopes = parts
+    by_amplitude: ComplexArray = _NO_DERIVATIVE
     by_parameter: tuple[ComplexArray, ...] = ()
-    if by:
+    if slopes:
         beta = sigma * sine.amplitude / f_max
-        by_amplitude = _by_amplitude(values, beta, sine.harmonic, by[0])
-    if len(by) > 1:
-        by_parameter = (sigma / f_max * by[0], by[1], sigma * by[2])
+        by_amplitude = _by_amplitude(values, beta, sine.harmonic, slopes[0])
+    if len(slopes) > 1:
+        by_parameter = (sigma / f_max * slopes[0], slopes[1], sigma * slopes[2])
     return StiffnessGradient(sigma * h, by_amplitude, by_parameter)
 
 

@@ -4,7 +4,7 @@
     dF_i/dt = slope_i(F_i, sgn v, v) v    for every element with memory
 
 Base motion: x is the displacement relative to the base, and the drive is -m times the base's
-acceleration. The states are x, v and the elements' own: one force for most that have memory.
+acceleration. The states are x, v and those of the elements: one force for most that have memory.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ Channel = Literal["displacement", "velocity", "acceleration"]
 
 @contextmanager
 def numpy_names() -> Iterator[None]:
-    """Allow numpy's names, which laws in plain arithmetic may use; casadi answers, and warns."""
+    """Allow numpy's names, which laws in plain arithmetic may use; casadi takes them, but warns."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         yield
 
 
 def law_equations(element: Element) -> Equations:
-    """Return the force of one element for a displacement that is held."""
+    """Return the force of one element under a prescribed displacement."""
     import casadi as ca
 
     from dahl_ident.engine import Equations
@@ -76,9 +76,9 @@ def plant_equations(
     rates: list[ca.SX] = []
     with numpy_names():
         for element, numbers in model.of(values):
-            mine = [ca.SX.sym(f"y{len(states) + i}") for i in range(element.n_states)]
-            states += mine
-            part = traced(element, numbers, x, v, s, mine)
+            element_states = [ca.SX.sym(f"y{len(states) + i}") for i in range(element.n_states)]
+            states += element_states
+            part = traced(element, numbers, x, v, s, element_states)
             if excitation == "base" and element.is_linear and element.n_states:
                 raise ModelError(
                     f"{element!r} has inertia inside, and how the base moves it is not known; "
@@ -91,8 +91,8 @@ def plant_equations(
             f"{model!r} has no mass, so a force does not determine its motion; add "
             "Mass(), or give records with measured displacement and force"
         )
-    push = u if excitation == "force" else -inertia * u
-    acceleration = (push - total) / inertia
+    applied = u if excitation == "force" else -inertia * u
+    acceleration = (applied - total) / inertia
     output = {"displacement": x, "velocity": v, "acceleration": acceleration}[channel]
     names = [ca.SX.sym(p.name) if v.is_constant() else v for p, v in _pairs(model, values)]
     return Equations(
@@ -114,7 +114,7 @@ def _pairs(element: Element, values: list[ca.SX]) -> Iterator[tuple[Parameter, c
 
 
 class FirstState:
-    """The first state of a driven plant, from what a record leaves unknown there."""
+    """The first state of a driven plant, as a function of its unknowns and the parameters."""
 
     def __init__(self, model: Model) -> None:
         import casadi as ca
@@ -125,9 +125,9 @@ class FirstState:
         with numpy_names():
             for element, numbers in model.of(values):
                 count = len(element.starts) if element.has_memory else element.n_states
-                mine = [ca.SX.sym(f"start{len(unknown) + i}") for i in range(count)]
-                states += element.initial_states(numbers, mine)
-                unknown += mine
+                element_starts = [ca.SX.sym(f"start{len(unknown) + i}") for i in range(count)]
+                states += element.initial_states(numbers, element_starts)
+                unknown += element_starts
         first, starts, parameters = (ca.vertcat(*group) for group in (states, unknown, values))
         slopes = [ca.densify(ca.jacobian(first, group)) for group in (starts, parameters)]
         self._function = ca.Function("first", [starts, parameters], [first, *slopes])

@@ -1,4 +1,4 @@
-"""Sums of elements, in parallel: models; as plain data too, for files of results."""
+"""Models: elements in parallel. Also models as plain data, for files of results."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Model(Element):
         return HistoryGradient(value, by_state, tuple(d for p in parts for d in p.by_parameter))
 
     def start_with(self, values: Sequence[Any], force: float) -> float:
-        """Return the unknown of the friction, of which there is one if there is a force."""
+        """Return the friction's unknown; at most one element has memory if there is a force."""
         return sum(e.start_with(numbers, force) for e, numbers in self.of(values) if e.has_memory)
 
     @property
@@ -107,15 +107,15 @@ class Model(Element):
         return any(element.has_inertia for element in self._elements)
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
-        remember = [(e, numbers) for e, numbers in self.of(values) if e.has_memory]
-        if not remember:
+        with_memory = [(e, numbers) for e, numbers in self.of(values) if e.has_memory]
+        if not with_memory:
             super()._check_start(values, initial_force)
-        if initial_force and len(remember) > 1:
+        if initial_force and len(with_memory) > 1:
             raise ValidationError(
-                f"initial_force is {initial_force!r} for {len(remember)} elements with memory; "
+                f"initial_force is {initial_force!r} for {len(with_memory)} elements with memory; "
                 "evaluate them one by one, or leave it out"
             )
-        for element, numbers in remember:
+        for element, numbers in with_memory:
             element._check_start(numbers, initial_force)
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
@@ -154,7 +154,7 @@ class Model(Element):
         )
 
     def coarser(self) -> Model:
-        """Return the model of elements whose motion under a force costs less, or itself."""
+        """Return a model of elements whose motion under a force costs less, or this model."""
         elements = [element.coarser() for element in self._elements]
         same = all(new is old for new, old in zip(elements, self._elements, strict=True))
         return self if same else Model(*elements)
@@ -211,8 +211,8 @@ def as_model(model: Element) -> Model:
 def describe_model(model: Element) -> list[dict[str, Any]]:
     """Return a model as a list of plain dicts, ready for JSON or TOML.
 
-    A number is a fixed value, {"assumed": number} a default that nobody gave, "free" a parameter
-    to estimate, a table a free one with its start.
+    A number is a fixed value, {"assumed": number} a default that the user did not give, "free" a
+    parameter to estimate, a dict a free one with its start or bounds.
 
     Examples
     --------

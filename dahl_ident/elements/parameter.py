@@ -43,7 +43,7 @@ class Parameter:
     value : float or None
         The fixed value, or the start if `free`; None if there is none.
     free : bool or None
-        Whether the parameter is estimated. None (the default): exactly where `value` is None.
+        Whether the parameter is estimated. None (the default): estimated if `value` is None.
     lower, upper : float
         Bounds, in `unit`.
     transform : {"log", "linear"}
@@ -83,8 +83,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if self.value is not None:
-            number = positive_number if self.positive else finite_number
-            value = number(self.value, self.name)
+            checked = positive_number if self.positive else finite_number
+            value = checked(self.value, self.name)
             if not self.lower <= value <= self.upper:
                 high = "" if np.isinf(self.upper) else f" and <= {self.upper:g}"
                 raise ValidationError(
@@ -98,7 +98,7 @@ class Parameter:
 
     @property
     def positive(self) -> bool:
-        """Whether it is above zero, and searched by its logarithm."""
+        """Whether the value is above zero, and searched by its logarithm."""
         return self.transform == "log"
 
     def nearest(self, value: float) -> float:
@@ -107,7 +107,7 @@ class Parameter:
 
     @property
     def is_mechanical(self) -> bool:
-        """Whether the unit is made of those of force, displacement and time."""
+        """Whether the unit is a product of powers of force, displacement and time."""
         return _dimension(self.unit) is not None
 
     @property
@@ -187,7 +187,7 @@ class Assumed(float):
 
 @lru_cache(maxsize=256)
 def _dimension(unit: str) -> tuple[int, int, int] | None:
-    """Return powers of force, displacement and time in a unit; None where it has others."""
+    """Return powers of force, displacement and time in a unit; None if it has other units."""
     total = [0, 0, 0]
     for place, part in enumerate(unit.split("/")):
         for factor in part.split():

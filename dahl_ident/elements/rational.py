@@ -17,10 +17,10 @@ class Rational:
     denominator: FloatArray
 
     def __add__(self, other: Rational) -> Rational:
-        crossed = np.polymul(self.numerator, other.denominator)
-        crossed = np.polyadd(crossed, np.polymul(other.numerator, self.denominator))
-        below = np.polymul(self.denominator, other.denominator).astype(np.float64)
-        return Rational(crossed.astype(np.float64), below).without_common_zeros_at_0()
+        numerator = np.polymul(self.numerator, other.denominator)
+        numerator = np.polyadd(numerator, np.polymul(other.numerator, self.denominator))
+        denominator = np.polymul(self.denominator, other.denominator).astype(np.float64)
+        return Rational(numerator.astype(np.float64), denominator).without_common_zeros_at_0()
 
     @property
     def degrees(self) -> tuple[int, int]:
@@ -33,12 +33,12 @@ class Rational:
         return Rational(_leading(self.numerator, rate), _leading(self.denominator, rate))
 
     def split(self) -> tuple[FloatArray, Rational]:
-        """Return the polynomial part and the strictly proper rest."""
+        """Return the polynomial part and the strictly proper remainder."""
         quotient, remainder = np.polydiv(self.numerator, self.denominator)
         return np.atleast_1d(quotient), Rational(np.atleast_1d(remainder), self.denominator)
 
     def without_common_zeros_at_0(self) -> Rational:
-        """Return the same function with powers of s that cancel left out."""
+        """Return the same function without powers of s that cancel."""
         n, d = self.numerator, self.denominator
         while n.size > 1 and d.size > 1 and n[-1] == 0.0 and d[-1] == 0.0:
             n, d = n[:-1], d[:-1]
