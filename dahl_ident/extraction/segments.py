@@ -1,8 +1,9 @@
-"""Segments: the spans of a record as samples with their phase.
+"""Segments: the samples of a record's spans, with their phase.
 
 Each span gets its frequency, and the cycles next to it that the same sine fits. Where a ramp begins
-or ends, cycles depart by a percent. The m cycles inside tell how far is too far: what a fundamental
-explains of each cycle's residual, Q_i, scatters with the noise, and with h the error of the sine
+or ends, cycles deviate by a percent. The m cycles inside show how far is too far: the part Q_i of
+each cycle's residual that a fundamental explains scatters with the noise, and with h the error of
+the sine
 
     s^2 = sum_i Q_i / (2 m - 4),      F = Q / (2 (1 + h) s^2)
 
@@ -53,7 +54,7 @@ _FEWEST_SAMPLES = 4  # samples in a cycle, more than its sine and offset have nu
 _STRAY_BY_CHANCE = 1e-3  # share of the cycles that belong to a segment but are called stray
 _NEGLIGIBLE = 1e-4  # fraction of the amplitude that a cycle may stray in any case
 _UNJUDGED = 2  # cycles at either end that are not part of the reference ...
-_OF_THOSE = 5  # ... but at most one in this many of all
+_CYCLES_PER_UNJUDGED = 5  # ... but at most one in this many of all
 _SOLVABLE = 1e8  # largest condition number of normal equations
 _STRAYING = 0.005  # fraction of the amplitude that a further cycle may stray from the sine
 _MOST_CYCLES_MORE = 2  # cycles by which a segment may grow on either side
@@ -68,7 +69,7 @@ def record_spans(
     mode: Mode,
     window: int | None,
 ) -> list[Span]:
-    """Return the spans of a record in order of time, each with where its neighbours end and begin.
+    """Return the spans of a record in order of time, each with the ends of its neighbours.
 
     In noise that drowns the crossings, periods of the strongest line are tried as well.
     """
@@ -128,7 +129,7 @@ def segment_of(
     if span.sweep:
         return track_phase(segment, _SWEEP_DEGREE)
     if frequency is not None and segment.whole_cycles < FEWEST_CYCLES:
-        return segment  # which whoever measures it will refuse
+        return segment  # refused when it is measured
     if frequency is None:
         segment = estimate_frequency(track_phase(segment, 1))
     else:
@@ -144,15 +145,15 @@ def segment_of(
 
 def _refuse_drift(segment: Segment) -> None:
     """Refuse a given frequency at which the motion's phase drifts from cycle to cycle."""
-    few = segment.thinned()
-    cuts = np.searchsorted(few.time, _cycle_edges(segment))
+    thinned = segment.thinned()
+    cuts = np.searchsorted(thinned.time, _cycle_edges(segment))
     counts = np.diff(cuts)
     cycle = np.flatnonzero(counts >= _FEWEST_SAMPLES)
     dof = 2 * cycle.size - 4
     if dof < 1:
         return
     bounds = np.column_stack([cuts[:-1], cuts[1:]])[cycle].ravel()
-    phasor, _ = sine_in_each(few.theta, few.channels[0], bounds, counts[cycle])
+    phasor, _ = sine_in_each(thinned.theta, thinned.channels[0], bounds, counts[cycle])
     phasors = np.zeros(counts.size, dtype=np.complex128)
     phasors[cycle] = phasor
     power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
@@ -167,8 +168,8 @@ def _refuse_drift(segment: Segment) -> None:
         evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * turns)
     turns += float(np.polyfit(cycle, phases, 1)[0]) / (2.0 * np.pi)
     drift = 2.0 * np.pi * turns * counts.size
-    left = float(np.sum(np.abs(phasor) ** 2)) - power[peak]
-    clear = (power[peak] - power[0]) * dof > 2.0 * _highest_by_chance(_BY_CHANCE, dof) * left
+    remainder = float(np.sum(np.abs(phasor) ** 2)) - power[peak]
+    clear = (power[peak] - power[0]) * dof > 2.0 * _highest_by_chance(_BY_CHANCE, dof) * remainder
     if clear and evenly and abs(drift) > _DRIFTED:
         stated = segment.omega / (2.0 * np.pi)
         shown = stated * (1.0 + turns)
@@ -204,7 +205,7 @@ def _steady_part(
         start, stop = (second if early else start), (last if late else stop)
         edges = edges[int(early) : edges.size - int(late)]
         fewer += [early, late]
-    if inside is not None:  # enough are left: the cycle next to a stray departs as well, if less
+    if inside is not None:  # enough cycles remain: those next to strays deviate a little as well
         start = int(np.searchsorted(time, edges[1])) if start > part.start else start
         stop = int(np.searchsorted(time, edges[-2])) if stop < part.stop else stop
     room = slice(
@@ -227,7 +228,7 @@ def _cycle_edges(segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Inside:
-    """The sine of the cycles inside, which may change linearly; `variance` of scatter about it."""
+    """The sine of the cycles inside, which may change linearly, and the variance about it."""
 
     segment: Segment
     coefficients: FloatArray
@@ -241,8 +242,8 @@ class _Inside:
         basis = columns(np.asarray(self.segment.phase(tau)), tau, 1, 1)
         sine = basis[2:4] - basis[2:4].mean(axis=1, keepdims=True)  # the mean may wander
         inverse = np.linalg.pinv(sine @ sine.T)
-        left = sine @ (motion - self.coefficients @ basis)
-        explained = float(left @ inverse @ left)
+        products = sine @ (motion - self.coefficients @ basis)
+        explained = float(products @ inverse @ products)
         onto = sine @ basis.T
         fitted = 0.5 * float(np.trace(inverse @ onto @ self.inverse @ onto.T))
         bound = _highest_by_chance(_STRAY_BY_CHANCE, self.dof)
@@ -253,7 +254,7 @@ class _Inside:
 
 def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
     """Return the sine of all but the cycles at the ends, None where too few are left."""
-    unjudged = min(_UNJUDGED, (edges.size - 1) // _OF_THOSE)
+    unjudged = min(_UNJUDGED, (edges.size - 1) // _CYCLES_PER_UNJUDGED)
     if unjudged == 0:
         return None
     cuts = np.searchsorted(segment.time, edges[unjudged:-unjudged])
@@ -281,9 +282,9 @@ def _cycle_sums(segment: Segment, cuts: NDArray[np.intp], coefficients: FloatArr
     for first, last in groups_of_cycles(cuts):
         part = slice(int(cuts[first]), int(cuts[last]))
         basis = columns(segment.theta[part], segment.tau[part], 1, 1)
-        left = segment.channels[0, part] - coefficients @ basis
+        residual = segment.channels[0, part] - coefficients @ basis
         cos, sin = basis[2:4]
-        products = np.stack([cos * cos, sin * sin, cos * sin, cos * left, sin * left])
+        products = np.stack([cos * cos, sin * sin, cos * sin, cos * residual, sin * residual])
         running = np.cumsum(np.pad(products, ((0, 0), (1, 0))), axis=1)
         sums[:, first:last] = np.diff(running[:, cuts[first : last + 1] - cuts[first]], axis=1)
     return sums
@@ -294,9 +295,9 @@ def _extended(
     inside: _Inside | None,
 ) -> slice:  # fmt: skip
     """Return the slice with the cycles before and after it that the segment's sine fits as well."""
-    few = segment.thinned()
-    basis = columns(few.theta, few.tau, 1)
-    fitted = solvable_inverse(basis @ basis.T, few) @ (basis @ few.channels[0])
+    thinned = segment.thinned()
+    basis = columns(thinned.theta, thinned.tau, 1)
+    fitted = solvable_inverse(basis @ basis.T, thinned) @ (basis @ thinned.channels[0])
     cycle = 2.0 * np.pi / segment.omega
 
     def misfit(where: slice) -> float:
