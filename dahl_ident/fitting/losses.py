@@ -13,7 +13,7 @@ model rho(z) = z.
 **Scale.** Where the noise's scale s is unknown it has to be robust as well: mean chi(z) = E[chi(z)]
 with E taken for Gaussian noise and z in units of s^2 (p n - P)/(p n), so that s^2 is the noise's
 variance when there are no outliers. chi = psi^2 = rho'(z)^2 z is Huber's proposal 2; for student_t,
-whose psi^2 falls again, chi = rho'(z) z, the scale equation of its likelihood.
+whose psi^2 decreases for large z, chi = rho'(z) z, the scale equation of its likelihood.
 
 **Likelihood**: that of the density proportional to exp(-rho/2), at the likeliest scale.
 
@@ -72,13 +72,13 @@ class Loss:
         """Return residuals (m,) with which least squares gives the estimate of the loss.
 
         They are psi(y)/mean(psi'), y in units of the noise: their scatter gives its covariance,
-        and what moves y moves them as much on average. Source: Huber, section 7.10.
+        and a change of y changes them by as much on average. Source: Huber, section 7.10.
         """
         z = np.sum(y.reshape(-1, self.parts) ** 2, axis=1)
         return y * np.repeat(self.slope(z) / self.mean_slope(z), self.parts)
 
     def counts(self, z: FloatArray, dof: float) -> FloatArray:
-        """Return the part of each square `z` in the scale; for noise alone their sum is dof."""
+        """Return each square's weight in the scale; for noise alone weighted squares sum to dof."""
         weight = self.slope(z * (self.parts * z.size / dof)) ** self.power
         return weight * (self.parts / self.gaussian_chi)
 

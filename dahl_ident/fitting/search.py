@@ -1,7 +1,7 @@
 """Least squares for one table or for many at once: one search.
 
-1. Starts by variable projection (:mod:`dahl_ident.fitting.global_start`); what the user gave is
-   one more.
+1. Starts by variable projection (:mod:`dahl_ident.fitting.global_start`); the user's
+   values are one more.
 2. Levenberg and Marquardt's method from all of them together, exact Jacobian, search coordinates.
    With ``method="scipy"``, `scipy.optimize.least_squares` from each of the same starts; only
    charts and limits are searched as before.
@@ -57,8 +57,8 @@ _STEPS = 80  # most steps of a search, of which ten are usual
 _BRIEF = 30  # the same where no limit is searched: a repetition is near its optimum
 # fall of the cost, over that of one residual, for which such a search takes no further step
 _SLIGHT = 1e-5
-_FIRST_LOOK = 15  # steps after which a search at a limit goes on only where it may still win
-_HOPELESS = 3.0  # cost there, over the least so far, at which it may not
+_FIRST_LOOK = 15  # steps after which a search at a limit continues only where it may still win
+_HOPELESS = 3.0  # cost there, over the lowest so far, from which it cannot win
 _PATIENCE = 1000  # most steps where friction is so faint that each step gains little
 _AT_LIMIT = 1e4  # factor on the tolerance at a limit, where large terms cancel
 _MANY = 30.0  # factor on the tolerance for many tables: 3e-7 standard deviations are near enough
@@ -104,10 +104,10 @@ def solve(
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
     _check(problem, start or {})
-    either: Any = problem
+    any_problem: Any = problem
     if problem.kind == "records":
-        return solve_records(either, method, loss, start or {}, tell)
-    return _solve_table(either, method, loss, start or {}, limits=limits)
+        return solve_records(any_problem, method, loss, start or {}, tell)
+    return _solve_table(any_problem, method, loss, start or {}, limits=limits)
 
 
 def _solve_table(
@@ -128,16 +128,16 @@ def _solve_table(
         sine = problem.with_steady("describing function")
         by_sine = _solve_table(sine, method, loss, start, limits=True)
         if not problem.takes_energy(by_sine.theta):
-            return by_sine  # no steady motion is to be found there
+            return by_sine  # the exact steady motion is not found there
     return optimum
 
 
 def starts_of(problem: Problem) -> FloatArray:
     """Return the search coordinates of global starts."""
-    one: Any = problem
+    any_problem: Any = problem
     if problem.kind == "records":
-        return np.asarray(one.to_search(record_starts(one)))
-    return global_starts(one).theta
+        return np.asarray(any_problem.to_search(record_starts(any_problem)))
+    return global_starts(any_problem).theta
 
 
 def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> OptimumBatch:
@@ -205,7 +205,7 @@ def repetitions(
 
 
 def _check(problem: Problem, start: Mapping[str, float]) -> None:
-    """Refuse starts of parameters that are not free, and more of these than numbers."""
+    """Refuse starts of parameters that are not free, and fewer numbers than free parameters."""
     names, m = problem.names, problem.n_residuals + len(problem.priors)
     if not isinstance(start, Mapping):
         raise ValidationError(f"start is {start!r}; expected a mapping of names to numbers")
@@ -222,7 +222,7 @@ def _check(problem: Problem, start: Mapping[str, float]) -> None:
 
 
 class TableSearch:
-    """One search for all tables of a problem: what its steps share."""
+    """One search for all tables of a problem."""
 
     def __init__(
         self,
@@ -260,17 +260,17 @@ class TableSearch:
             scale = max(size, float(np.max(self.problem.rounding)))
         end = self._search(begin, scale)
         if self.rescales:
-            every = 0
+            evaluations = 0
 
             def search(scale: float) -> tuple[FloatArray, int]:
-                nonlocal end, every
-                if every:
+                nonlocal end, evaluations
+                if evaluations:
                     end = self._search(Starts(np.zeros(1, np.intp), end.theta), scale)
-                every += int(end.evaluations[0])
+                evaluations += int(end.evaluations[0])
                 return end.theta[0], self.m - int(end.determined[0])
 
             scale = agreed_scale(self.problem.table(0), self.loss, search, scale)
-            end.evaluations[:] = every
+            end.evaluations[:] = evaluations
         return optima(self.problem, end, scale, self.loss, self.method)
 
     def _search(self, begin: Starts, scale: float) -> Minima:
@@ -376,8 +376,8 @@ class TableSearch:
     ) -> None:
         """Look for other optima, and for limits, with the describing function.
 
-        Exact steady motions far out cost too much. A search that ended nowhere goes on from the
-        optimum of the describing function, and ends at its limit where it still has none.
+        Exact steady motions far out cost too much. A search without an optimum goes on from that of
+        the describing function, and ends at the latter's limit if it still has none.
         """
         sine = TableSearch(
             self.problem.with_steady("describing function"), self.loss, self.method, self.tolerance
@@ -403,10 +403,10 @@ class TableSearch:
         begin = Starts(every, end.theta).joined(begin)
         charts = microslip_charts(problem) + microslip_charts(problem, scale_given=True)
         for chart in charts:
-            there = self._descend(begin, scale, chart)
-            theta = chart.theta(there.theta)
+            minima = self._descend(begin, scale, chart)
+            theta = chart.theta(minima.theta)
             hessian = problem.quadratic(theta, scale, self.loss).hessian
-            end = end.better(replace(there, theta=theta, hessian=hessian))
+            end = end.better(replace(minima, theta=theta, hessian=hessian))
         faint = np.flatnonzero(~end.converged & self.reach(end.theta))
         if faint.size:
             part = self._of(faint)
@@ -419,16 +419,16 @@ class TableSearch:
         return end
 
     def _put_limits(self, end: Minima, edges: Starts, scale: float) -> None:
-        """Let the tables end at the best limit whose cost is no higher than where they are."""
+        """End each table at the best limit whose cost is no higher than that of its optimum."""
         candidates: list[tuple[Limit, Minima]] = []
         for limit in sorted(limits(self.problem), key=lambda lim: lim.chart.matrix.shape[1]):
-            there = self._descend(edges, scale, limit.chart, limit=True, steps=_FIRST_LOOK)
-            further = np.flatnonzero(~there.converged & (there.cost < _HOPELESS * end.cost))
+            minima = self._descend(edges, scale, limit.chart, limit=True, steps=_FIRST_LOOK)
+            further = np.flatnonzero(~minima.converged & (minima.cost < _HOPELESS * end.cost))
             if further.size:
                 charts = limit.chart.of(further)
-                begin = Starts(np.arange(further.size), charts.theta(there.theta[further]))
-                there.put(further, self._of(further)._descend(begin, scale, charts, limit=True))
-            candidates.append((limit, there))
+                begin = Starts(np.arange(further.size), charts.theta(minima.theta[further]))
+                minima.put(further, self._of(further)._descend(begin, scale, charts, limit=True))
+            candidates.append((limit, minima))
         if not candidates:
             return
         costs = np.array([np.where(m.converged, m.cost, np.inf) for _, m in candidates])
@@ -439,13 +439,13 @@ class TableSearch:
         real = end.converged & np.isfinite(self._friction_error(end, scale))
         ceiling = end.cost * (1.0 + np.where(real, _TIE, NEARLY))
         for table in np.flatnonzero(costs.min(axis=0, initial=np.inf) < np.inf):
-            limit, there = candidates[chosen[table]]
-            if there.cost[table] <= ceiling[table]:
-                limit, phi = limit.of(int(table)), there.theta[table]
+            limit, minima = candidates[chosen[table]]
+            if minima.cost[table] <= ceiling[table]:
+                limit, phi = limit.of(int(table)), minima.theta[table]
                 end.theta[table] = limit.chart.theta(phi)
-                end.cost[table], end.converged[table] = there.cost[table], True
-                end.evaluations[table] += there.evaluations[table]
-                end.limit[table] = AtLimit(limit, phi, there.hessian[table])
+                end.cost[table], end.converged[table] = minima.cost[table], True
+                end.evaluations[table] += minima.evaluations[table]
+                end.limit[table] = AtLimit(limit, phi, minima.hessian[table])
 
     def _trust_region(self, table: int, end: Minima, begin: Starts, scale: float) -> Minima:
         """Return the best end of scipy's bounded searches for one table."""

@@ -1,4 +1,4 @@
-"""The search for levels, cycles and runs: the best in a time, the least time for targets."""
+"""The search for levels, cycles and runs: the best plan in a time, or the shortest for targets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _HELPS = 0.1  # more time is useless below this fraction of the gain by the squa
 _CLOSE = 0.985  # fraction of the target at which the search stops
 _AIMED = 0.995  # fraction of the target that a corrected time aims at
 _NARROWS = 0.6  # a correction that leaves more than this of the log interval is replaced by halving
-_APART = 2.0  # in ranges that a fit takes as one amplitude: measured amplitudes are not exact
+_APART = 2.0  # span of levels, in ranges that a fit takes as one amplitude: these are not exact
 _GRID_LEVELS = 10  # levels of the usual logarithmic plan with which the best one is compared
 _CORRECTIONS = 6  # of the repeats of motions, each with the whole information
 _FILLED = 0.999  # fraction of the target that corrected repeats aim at
@@ -56,7 +56,7 @@ class Search:
         self._pool: NDArray[np.intp] | None = None
 
     def best(self) -> Design:
-        """Return the least time that reaches the targets, or the best in the time allowed."""
+        """Return the shortest plan that reaches the targets, or the best in the time allowed."""
         q = self.question
         design = self.least_time() if q.has_numbers else self.solve(q.limits.time)
         if design is None:
@@ -87,7 +87,7 @@ class Search:
             ratios.append((self.suspect_ratio(design), design))
             if ratios[-1][0] <= 1.0:
                 break
-        return min(ratios, key=lambda one: one[0])[1]
+        return min(ratios, key=lambda pair: pair[0])[1]
 
     def _solve(self, time: float, weight: float, start: Sequence[int]) -> Design | None:
         q, best = self.question, None
@@ -203,8 +203,8 @@ class Search:
     def _exactly(self, design: Design) -> Design:
         """Return the repeats that reach the targets by the information of the whole records.
 
-        The search takes each repeat of a motion as worth the same; the first ones, which also have
-        to determine the state at the start, the offset and the drift, are worth less.
+        The search gives every repeat of a motion the same information. The first repeats give less,
+        because they also have to determine the state at the start, the offset and the drift.
         """
         q, candidates, levels = self.question, self.forecast.candidates, design.levels
         assert q.recorded is not None
@@ -212,8 +212,8 @@ class Search:
         risen, best = False, design
         for attempt in range(_CORRECTIONS):
             rows, cycles = candidates.rows.copy(), best.cycles
-            for k, one, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
-                rows[:, k] = one.rows(int(repeats)) * q.knowledge.units
+            for k, motion_sums, repeats in zip(levels.tolist(), sums, cycles.tolist(), strict=True):
+                rows[:, k] = motion_sums.rows(int(repeats)) * q.knowledge.units
             self.forecast = replace(self.forecast, candidates=replace(candidates, rows=rows))
             best = replace(best, ratio=self.ratio(best), seconds=self.bench.seconds(levels, cycles))
             better = np.maximum(np.ceil(cycles * (best.ratio / _FILLED) ** 2), float(LEAST_CYCLES))
