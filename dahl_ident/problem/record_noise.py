@@ -17,8 +17,10 @@ from scipy.special import comb
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
 
-HIGHEST_ORDER = 60  # most coefficients of an autoregression, to limit time; Akaike's chooses
-SAMPLES_PER_ORDER = 20  # samples that each needs: with fewer, it follows the noise
+HIGHEST_ORDER = (
+    60  # most coefficients of an autoregression, to limit time; Akaike's criterion chooses
+)
+SAMPLES_PER_ORDER = 20  # samples for each coefficient: with fewer, it follows the noise
 _BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
 _OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
 
@@ -60,10 +62,10 @@ def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
     except np.linalg.LinAlgError:
         return np.ones(1)
     explained = np.linalg.solve(lower, products[1:, 0]) ** 2
-    left = (products[0, 0] - np.concatenate([[0.0], np.cumsum(explained)])) / n
-    if not left[-1] > 0.0:
+    variance = (products[0, 0] - np.concatenate([[0.0], np.cumsum(explained)])) / n
+    if not variance[-1] > 0.0:
         return np.ones(1)
-    order = int(np.argmin(n * np.log(left) + 2.0 * np.arange(highest + 1)))
+    order = int(np.argmin(n * np.log(variance) + 2.0 * np.arange(highest + 1)))
     inner = products[1 : order + 1, 1 : order + 1]
     return np.concatenate([[1.0], -np.linalg.solve(inner, products[1 : order + 1, 0])])
 
@@ -123,16 +125,16 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     bins = np.flatnonzero(power >= _BAND * power.max())
     highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
     lowest = 0.5 * bins[0] / power.size
-    place = np.arange(spectrum.size) / spectrum.size
-    spectrum[place > highest] = 0.0
+    fraction = np.arange(spectrum.size) / spectrum.size
+    spectrum[fraction > highest] = 0.0
     order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
     waves = []
-    for wanted in range(order, 3):
-        factor = s ** (wanted - order)
+    for derivative in range(order, 3):
+        factor = s ** (derivative - order)
         wave = np.fft.irfft(spectrum * factor, m)[:n]
-        if wanted == order:
+        if derivative == order:
             wave = wave + line
-        elif wanted == order + 1:
+        elif derivative == order + 1:
             wave = wave + (y[-1] - y[0]) / record.duration
         waves.append(wave)
     if order:
@@ -140,10 +142,10 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
         from scipy.signal import butter, detrend, sosfiltfilt
 
         cut = min(max(lowest, 1.0 / n), 0.5)
-        passed = butter(4, cut, "highpass", output="sos")
+        highpass = butter(4, cut, "highpass", output="sos")
         for _ in range(order):
             wave = cumulative_trapezoid(waves[0], dx=1.0 / record.sample_rate, initial=0)
-            waves.insert(0, np.asarray(sosfiltfilt(passed, detrend(wave))))
+            waves.insert(0, np.asarray(sosfiltfilt(highpass, detrend(wave))))
     return waves[0], waves[1], waves[2]
 
 
@@ -151,7 +153,7 @@ def _power(wave: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.fft.rfft(np.hanning(wave.size) * (wave - wave.mean()))) ** 2)
 
 
-_ORDER = 4  # order of differences: little of any motion is left in them
+_ORDER = 4  # order of differences: they contain little of any motion
 _BLOCKS = 50  # parts of a record, in some of which there is little motion
 _QUIET = 0.25  # quantile of the parts, by their noise, that counts as quiet
 _MEDIAN = 0.6745  # median of a normal variable's absolute value, in standard deviations

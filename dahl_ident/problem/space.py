@@ -14,7 +14,7 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 
-_INSIDE = 1.0 - 1e-9  # largest share of the way to a bound: on it the slope is zero
+_INSIDE = 1.0 - 1e-9  # largest part of the way to a bound, at which the slope is zero
 
 
 class Space:
@@ -53,7 +53,7 @@ class Space:
         self._all_positive = bool(self.positive.all())
 
     def checked(self, theta: ArrayLike, name: str = "theta") -> FloatArray:
-        """Return `theta` as an array of shape (P,) or (S, P), or say what it is instead."""
+        """Return `theta` as an array of shape (P,) or (S, P), and refuse other shapes."""
         array = real_array(theta, name)
         P = len(self.parameters)
         if array.ndim not in (1, 2) or array.shape[-1] != P:
@@ -103,9 +103,9 @@ class Space:
         """Return d value / d theta at parameter values."""
         slopes = np.where(self.positive, values, 1.0)
         if self._curved:
-            of_angles = values[..., self._angles]
-            aside = self._scaled(of_angles) - self._middle
-            unit = np.where(self._by_log, of_angles, 1.0)
+            bounded = values[..., self._angles]
+            aside = self._scaled(bounded) - self._middle
+            unit = np.where(self._by_log, bounded, 1.0)
             slopes[..., self._angles] = unit * np.sqrt(np.maximum(self._reach**2 - aside**2, 0.0))
             slopes[..., self._bent] = np.hypot(values[..., self._bent], self._size)
         return slopes
@@ -174,8 +174,8 @@ class Interchangeable:
         for elements, columns in zip(self._sets, self._columns, strict=True):
             values = space.to_values(array)
             knees = []
-            for element, of_element in zip(elements, columns, strict=True):
-                free = iter(values[..., column] for column in of_element)
+            for element, element_columns in zip(elements, columns, strict=True):
+                free = iter(values[..., column] for column in element_columns)
                 at = [next(free) if p.free else np.asarray(p.value) for p in element.parameters]
                 knees.append(np.broadcast_to(element.knee(at)[0], theta.shape[:-1]))
             _exchange(array, columns, np.stack(knees, axis=-1))
@@ -185,8 +185,8 @@ class Interchangeable:
 def _exchange(array: FloatArray, columns: NDArray[np.intp], key: FloatArray) -> None:
     """Exchange the rows of `columns` in `array` until the key rises."""
     order = np.argsort(key, axis=-1)
-    for kind in columns.T:
-        array[..., kind] = np.take_along_axis(array[..., kind], order, axis=-1)
+    for alike in columns.T:
+        array[..., alike] = np.take_along_axis(array[..., alike], order, axis=-1)
 
 
 def with_changes(
