@@ -63,7 +63,7 @@ class Change:
         return f"p {self.p_number}" if self.p < 1e-4 else f"p = {self.p_number}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it for machines."""
+        """Return the change as plain data."""
         names = {"before": "from", "after": "to"}
         facts = {names.get(name, name): value for name, value in vars(self).items()}
         return facts | {"significant": self.significant}
@@ -105,25 +105,26 @@ def is_usable(fit: FitResult, name: str) -> bool:
     return fit.verdict_on(name)[0].known and fit.status is not VerdictStatus.NOT_DESCRIBED
 
 
-def _change(name: str, a: str, fit: FitResult, b: str, later: FitResult) -> Change:
-    earlier_value, later_value = fit.params[name], later.params[name]
+def _change(name: str, before: str, earlier: FitResult, after: str, later: FitResult) -> Change:
+    earlier_value, later_value = earlier.params[name], later.params[name]
     if earlier_value.unit != later_value.unit:
         raise ValidationError(
-            f"{name} is in {earlier_value.unit} of {a} and in {later_value.unit} of {b}"
+            f"{name} is in {earlier_value.unit} of {before} and in {later_value.unit} of {after}"
         )
-    known = [_scatter(each, name) for each in (fit, later)]
-    stated = max((share for share in known if share is not None), default=0.0)
+    scatters = [_scatter(fit, name) for fit in (earlier, later)]
+    stated = max((share for share in scatters if share is not None), default=0.0)
     missing = [
         stated * abs(p.value)
-        for p, share in zip((earlier_value, later_value), known, strict=True)
+        for p, share in zip((earlier_value, later_value), scatters, strict=True)
         if share is None
     ]
     u = math.hypot(earlier_value.stderr or 0.0, later_value.stderr or 0.0, *missing)
-    usable = is_usable(fit, name) and is_usable(later, name) and 0.0 < u < math.inf
+    usable = is_usable(earlier, name) and is_usable(later, name) and 0.0 < u < math.inf
     change = later_value.value - earlier_value.value
     relative = change / earlier_value.value if earlier_value.value else math.nan
     p = float(2.0 * special.ndtr(-abs(change) / u)) if usable else math.nan
-    return Change(name, earlier_value.unit, a, b, change, relative, u, len(missing) < len(known), p)
+    runs_known = len(missing) < len(scatters)
+    return Change(name, earlier_value.unit, before, after, change, relative, u, runs_known, p)
 
 
 def _scatter(fit: FitResult, name: str) -> float | None:

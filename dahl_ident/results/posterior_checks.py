@@ -1,7 +1,7 @@
 """Checks of a posterior: whether the model explains the data, and what the prior decides.
 
 Predictive checks: statistics of the whitened residuals at draws from the posterior are compared
-with the same of replicated ones, which are noise by construction (Gelman et al., Bayesian Data
+with those of replicated residuals, which are noise by construction (Gelman et al., Bayesian Data
 Analysis, 2013, chapter 6):
 
 - ``size``: the sum of squares; only where the noise's scale is known;
@@ -9,14 +9,14 @@ Analysis, 2013, chapter 6):
 - ``neighbours``: the correlation of residuals of rows next to each other, in order of frequency
   and amplitude: a model of the wrong shape leaves runs of residuals of one sign.
 
-A share of replicates at least as extreme of 0.01 or less speaks of a misfit.
+A share of 0.01 or less of replicates that are at least as extreme shows a misfit.
 
 The prior determines a parameter where the posterior is nearly as wide as the prior, or where at an
 end of the prior there is still as much posterior probability as prior probability, so that the
-interval ends where the prior does. A posterior that is narrow and lies as a whole in such an end is
-another matter: prior and data contradict each other.
+interval ends where the prior does. If the whole of a narrow posterior lies in such an end, prior
+and data contradict each other.
 
-Responses that a posterior predicts, with bands, at its draws: without any linearization.
+Predicted responses and their bands are computed at the draws, without linearization.
 """
 
 from __future__ import annotations
@@ -36,15 +36,13 @@ from dahl_ident.bayes.sample import ChainSample
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.storage import library
 from dahl_ident.diagnostics.checks import assumptions, reading
+from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 if TYPE_CHECKING:
     from dahl_ident.results.posterior_result import Posterior
 
-
-from dahl_ident.diagnostics.confidence_levels import checked_levels
-
-_NEARLY_AS_WIDE = 0.5  # width over the prior's, from which the data tell little
+_NEARLY_AS_WIDE = 0.5  # width over the prior's, from which the data add little
 _END = 0.01  # probability of the prior that counts as its end
 _PRIOR_DRAWS = 1000  # draws of the prior for ArviZ: probabilities to 1.6 %
 _MISFIT = 0.01  # probability at which a check of a right model fails
@@ -152,7 +150,7 @@ _STATISTICS = {"size": _size, "largest": _largest, "neighbours": _correlation}
 
 @dataclass(frozen=True)
 class PriorInfluence:
-    """One such parameter: the posterior's width over the prior's, and the ends it reaches.
+    """A parameter that the prior determines: its width over the prior's, and the ends it reaches.
 
     `contradicted` says that the whole posterior lies in the last hundredth of the prior.
     """
@@ -169,7 +167,7 @@ class PriorInfluence:
         values = {
             "name": self.name,
             "width": self.width,
-            "ends": tuple(end for end, there in reached.items() if there),
+            "ends": tuple(end for end, is_reached in reached.items() if is_reached),
             "contradicted": self.contradicted,
         }
         return Finding(Question.DETERMINED, severity, "prior_influence", values)
@@ -180,20 +178,21 @@ class PriorInfluence:
 
 def prior_influences(prior: JointPrior, points: FloatArray) -> tuple[PriorInfluence, ...]:
     """Return the parameters that the prior determines, from posterior draws of theta."""
-    rules = [_rule(part, points[:, i]) for i, part in enumerate(prior.priors)]
-    return tuple(rule for rule in rules if rule is not None)
+    influences = [_influence(p, points[:, i]) for i, p in enumerate(prior.priors)]
+    return tuple(influence for influence in influences if influence is not None)
 
 
-def _rule(part: ParameterPrior, theta: FloatArray) -> PriorInfluence | None:
+def _influence(prior: ParameterPrior, theta: FloatArray) -> PriorInfluence | None:
+    """Return the prior's influence on one parameter; None where the data determine it."""
     low, high = np.quantile(theta, [0.16, 0.84])
-    width = float(high - low) / part.width
-    probability = part.probability(theta)
+    width = float(high - low) / prior.width
+    probability = prior.probability(theta)
     below, above = np.mean(probability < _END), np.mean(probability > 1.0 - _END)
     at_lower, at_upper = bool(below >= _END), bool(above >= _END)
     if width < _NEARLY_AS_WIDE and not (at_lower or at_upper):
         return None
     contradicted = bool(max(below, above) > 1.0 - _END)
-    return PriorInfluence(part.parameter.name, width, at_lower, at_upper, contradicted)
+    return PriorInfluence(prior.parameter.name, width, at_lower, at_upper, contradicted)
 
 
 def findings_of(posterior: Posterior) -> Iterator[Finding]:
@@ -210,10 +209,10 @@ def _objections(posterior: Posterior) -> Iterator[Finding]:
     severity = VerdictStatus.TRUSTED if converged else VerdictStatus.NOT_DETERMINED
     yield Finding(Question.DETERMINED, severity, code, {"message": posterior.message})
     lost = VerdictStatus.NOT_DESCRIBED if converged else VerdictStatus.NOT_DETERMINED
-    for rule in posterior.prior_influences:
-        by_default = rule.name in posterior.default_priors
+    for influence in posterior.prior_influences:
+        by_default = influence.name in posterior.default_priors
         left_open = VerdictStatus.NOT_DETERMINED if by_default else VerdictStatus.TRUSTED
-        yield rule.finding(lost if rule.contradicted else left_open)
+        yield influence.finding(lost if influence.contradicted else left_open)
     yield from (replace(finding, severity=lost) for finding in _misfits(posterior))
     if fit is not None and fit.status is not VerdictStatus.NOT_DESCRIBED:
         yield from (f for f in fit.findings if f.severity is VerdictStatus.APPROXIMATE)

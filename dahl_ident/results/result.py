@@ -101,7 +101,7 @@ class Parameters(dict[str, Estimate]):
 
 
 def part(path: str, text: str) -> Any:
-    """Return a property that hands on a part of what a result consists of."""
+    """Return a property that reads an attribute of a part of the result."""
     return property(attrgetter(path), doc=text)
 
 
@@ -191,7 +191,7 @@ class Result(ABC):
         path : path
             Ending in ``.json``.
         overwrite : bool, default False
-            Replace a file that is there already.
+            Replace an existing file.
 
         Returns
         -------
@@ -201,9 +201,9 @@ class Result(ABC):
         Raises
         ------
         ValidationError
-            If the ending is another one.
+            If `path` has another ending.
         DataError
-            If a file is there already, or the place cannot be written to.
+            If the file exists, or cannot be written.
         """
         place = place_of(path, self._called, FORMATS)
         write_whole(place, self.to_json().encode(), overwrite=overwrite)
@@ -225,12 +225,12 @@ class Result(ABC):
         to : str
             "mujoco" and "mujoco-frictionloss" (MJCF), "urdf", "modelica", "matlab", "c" (the
             friction force as a function), "gtc" (uncertain numbers with influences), "ufloat",
-            "latex", or "draws" (a table of parameter values for domain randomisation). Of a
-            posterior, "draws" alone.
+            "latex", or "draws" (a table of parameter values for domain randomisation). A
+            posterior has only "draws".
         path : path, optional
             File; draws as ``.csv`` or ``.parquet``. Left out: the text is returned.
         overwrite : bool, default False
-            Replace a file that is there already.
+            Replace an existing file.
         size, seed : int
             Number of draws, and seed of their random numbers.
 
