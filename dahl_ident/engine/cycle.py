@@ -18,11 +18,10 @@ from dahl_ident.engine.radau import (
     TABLE,
     VECTOR,
     Signal,
+    at_unit_velocity,
     compiled,
     eliminate,
-    evaluate,
     layout,
-    put,
     put_parameters,
     restart,
 )
@@ -47,10 +46,7 @@ def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
     """
     n, o = at.n, at.outputs
     m = n + 1 + at.k
-    put(y, w)
-    evaluate(f, signal, 0.0, 0.0, w, at)
-    w[0], w[2] = 2.0, 1.0  # at unit velocity the rate is the change by displacement
-    f(w.ctypes)
+    at_unit_velocity(f, signal, 0.0, y, w, at)
     for i in range(2, n):
         g = w[o + i]
         follows = g != 0.0

@@ -22,6 +22,7 @@ from dahl_ident.engine.radau import (
     NODES,
     SLOPE_AFTER,
     STAGES,
+    at_unit_velocity,
     compiled,
     error_of,
     evaluate,
@@ -53,10 +54,7 @@ def begin(f, followers, signal, t, y, w, at):
     n, k, o = at.n, at.k, at.outputs
     m = n + 1 + k
     if followers.size:
-        put(y, w)
-        evaluate(f, signal, t, 0.0, w, at)
-        w[0], w[2] = 2.0, 1.0  # at unit velocity the rate is the change by displacement
-        f(w.ctypes)
+        at_unit_velocity(f, signal, t, y, w, at)
         for b in followers:
             w[at.follow + b] = w[o + b]
             for z in range(1 + at.P):

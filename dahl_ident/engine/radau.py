@@ -227,6 +227,15 @@ def put(y, w):
 
 
 @compiled
+def at_unit_velocity(f, signal, t, y, w, at):
+    """Evaluate the function at the states y and unit velocity, where rates are changes by x."""
+    put(y, w)
+    evaluate(f, signal, t, 0.0, w, at)
+    w[0], w[2] = 2.0, 1.0
+    f(w.ctypes)
+
+
+@compiled
 def put_place(y, place, w, at):
     """Put the state at a place of the step, 0 to 1, into the inputs."""
     weigh(place, w, at)
