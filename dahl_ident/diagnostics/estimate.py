@@ -353,7 +353,7 @@ class LinearRows:
         """Return the rows of a problem whose misfit is zero."""
         m = stated.n_residuals
         y, J = stated.residuals_and_jacobian(theta)
-        D = by_row(stated, theta, np.abs(stated.data.response)[tests_of(stated.data)[1]])
+        D = by_row(stated, theta, fundamental_sizes(stated.data))
         growth, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
         return cls(
             np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)),
@@ -509,13 +509,18 @@ def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp
     return test, np.where(others, fundamental[test], np.arange(data.n))
 
 
+def fundamental_sizes(data: FrequencyResponse) -> FloatArray:
+    """Return the size of the response's fundamental in each row's test, (n,)."""
+    return np.abs(data.response)[tests_of(data)[1]]
+
+
 def _weights(
     stated: TableProblem, theta: FloatArray, loss: Loss | None
 ) -> tuple[FloatArray, float]:
     """Return what the misfit adds to each row's variance, and the scale of the residuals."""
     if stated.scale_known:
         square = LinearRows.at(stated, theta).squares(loss)
-        return square * np.abs(stated.data.response)[tests_of(stated.data)[1]] ** 2, 1.0
+        return square * fundamental_sizes(stated.data) ** 2, 1.0
     m, dof = stated.n_residuals, stated.n_numbers - len(stated.names)
     # with the derivatives, which the weighted ones will need
     y = stated.residuals_and_jacobian(theta, tails=loss is None)[0]
