@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD, changed, refuse, written
-from dahl_ident.cli.model import ModelOptions, prior, values
+from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.options import (
     General,
     Laws,
@@ -23,6 +23,7 @@ from dahl_ident.cli.options import (
     with_option_groups,
 )
 from dahl_ident.cli.reading import Channels, Files, Reading
+from dahl_ident.cli.values import prior, values
 from dahl_ident.errors import FitInterrupted, ValidationError
 
 if TYPE_CHECKING:

@@ -16,10 +16,7 @@ from dahl_ident.cli.model import (
     OTHERS,
     ModelOptions,
     elements,
-    ends,
     in_parallel,
-    number,
-    numbers,
     refuse_with_elements,
 )
 from dahl_ident.cli.options import (
@@ -34,6 +31,7 @@ from dahl_ident.cli.options import (
     steady_setting,
     with_option_groups,
 )
+from dahl_ident.cli.values import ends, number, numbers
 from dahl_ident.errors import ModelError, UnitError, ValidationError
 
 if TYPE_CHECKING:

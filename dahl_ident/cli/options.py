@@ -25,6 +25,7 @@ import typer
 
 from dahl_ident.cli import console
 from dahl_ident.cli.console import STANDARD
+from dahl_ident.cli.values import number
 from dahl_ident.errors import DataError, ModelError, UnitError, ValidationError, choices
 
 
@@ -102,8 +103,6 @@ def option(
     if unit:
 
         def parse(text: str) -> float:
-            from dahl_ident.cli.model import number
-
             try:
                 return number("it", str(text), unit)
             except (ModelError, UnitError) as exc:
