@@ -197,7 +197,8 @@ def problem_at(
         f, np.ones(f.shape), **held_at, controlled=controlled, quantity=quantity or usual,
         motion=problem.motion,
     )  # fmt: skip
-    return problem.at(grid)
+    there: TableProblem = problem.at(grid)
+    return there
 
 
 def describing_function_band(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +18,6 @@ from dahl_ident.noise import Rho, squares_of, weighted
 from dahl_ident.problem.space import Space
 from dahl_ident.sensors import EXACT, Prior, Sensors
 from dahl_ident.units import Motion
-
-if TYPE_CHECKING:
-    from dahl_ident.problem.table_problem import TableProblem
 
 EXPLICIT = 1e-13
 """Relative error of predictions in closed form or by roots."""
@@ -84,7 +81,7 @@ class Problem(ABC):
         return None
 
     @abstractmethod
-    def at(self, table: FrequencyResponse) -> TableProblem:
+    def at(self, table: FrequencyResponse) -> Any:
         """Return what model and sensors predict for a table, its covariance left out."""
 
     def unpredicted(self, residuals: FloatArray) -> str:

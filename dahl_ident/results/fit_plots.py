@@ -19,16 +19,16 @@ from dahl_ident.plots import (
     plot_sample_residuals,
     plot_waveforms,
 )
+from dahl_ident.results.fitted_model import FittedModel
 from dahl_ident.units import polar_std, si_unit
 
 if TYPE_CHECKING:
     from dahl_ident.diagnostics.budget import Budget
-    from dahl_ident.results.fit_result import FitResult
 
 _POINTS = 200  # points of a curve, which then looks smooth
 
 
-def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
+def draw(fit: FittedModel, kind: str | None, ax: Any, record: int) -> Any:
     """Draw a fit in one of the kinds that its data have, by default the fit over the data."""
     of_table = fit.problem.response is not None
     kinds: dict[str, Callable[[], Any]] = {
@@ -43,7 +43,7 @@ def draw(fit: FitResult, kind: str | None, ax: Any, record: int) -> Any:
     return kinds[kind or "fit"]()
 
 
-def draw_residuals(fit: FitResult, against: str | None, ax: Axes | None, record: int) -> Axes:
+def draw_residuals(fit: FittedModel, against: str | None, ax: Axes | None, record: int) -> Axes:
     """Draw residuals over a quantity, by default the one that suits the data."""
     if fit.problem.response is not None:
         return _residuals_of_table(fit, against, ax)
@@ -56,7 +56,7 @@ def draw_budget(budget: Budget, ax: Axes | None = None) -> Axes:
     return plot_budget(shares, ax=ax)
 
 
-def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
+def _fit_of_table(fit: FittedModel, ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
     """Draw data with error bars, and the fit with its band, over amplitude or frequency."""
     return curves.draw(
         fit.data,
@@ -66,7 +66,7 @@ def _fit_of_table(fit: FitResult, ax: Sequence[Axes] | None) -> tuple[Axes, Axes
     )
 
 
-def standardized_residuals(fit: FitResult) -> FloatArray:
+def standardized_residuals(fit: FittedModel) -> FloatArray:
     """Return both residuals of each row in standard deviations, (n, 2).
 
     A mean force is real, so that the second residual of its row is NaN.
@@ -77,7 +77,7 @@ def standardized_residuals(fit: FitResult) -> FloatArray:
     return residuals
 
 
-def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None) -> Axes:
+def _residuals_of_table(fit: FittedModel, against: str | None, ax: Axes | None) -> Axes:
     """Draw both residuals of every row over a quantity, by default the one that suits the table."""
     data = fit.data
     if against is None:
@@ -111,7 +111,7 @@ def _residuals_of_table(fit: FitResult, against: str | None, ax: Axes | None) ->
     )
 
 
-def _stds(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
+def _stds(fit: FittedModel, data: FrequencyResponse) -> tuple[FloatArray | None, FloatArray | None]:
     """Return the standard deviations of gain and phase that the noise model has."""
     gain = data.gain
     if fit.noise == "relative":
@@ -121,7 +121,7 @@ def _stds(fit: FitResult, data: FrequencyResponse) -> tuple[FloatArray | None, F
     return (None, None) if data.covariance is None else polar_std(data.response, data.covariance)
 
 
-def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Curve:
+def _curve(fit: FittedModel, part: FrequencyResponse, over_frequency: bool) -> Curve:
     """Return the fitted response between rows; the controlled amplitude is interpolated."""
     x = curves.abscissa(part, over_frequency)
     order = np.argsort(x)
@@ -141,7 +141,7 @@ def _curve(fit: FitResult, part: FrequencyResponse, over_frequency: bool) -> Cur
     return Curve(grid, band.response, band.gain(), band.phase())
 
 
-def _fit_of_record(fit: FitResult, ax: Axes | None, record: int) -> Axes:
+def _fit_of_record(fit: FittedModel, ax: Axes | None, record: int) -> Axes:
     """Draw the measured and the fitted output of a record over time."""
     measured, _, channel = _output(fit, record)
     waves, axes = [(channel, measured)], None if ax is None else [ax]
@@ -151,7 +151,7 @@ def _fit_of_record(fit: FitResult, ax: Axes | None, record: int) -> Axes:
     return axis
 
 
-def _draw_loop(fit: FitResult, ax: Axes | None, record: int) -> Axes:
+def _draw_loop(fit: FittedModel, ax: Axes | None, record: int) -> Axes:
     """Draw the measured force over displacement and, if force was predicted, the fitted one."""
     data = fit.data[record]
     x, labels = _displacement(data), _labels(data)
@@ -162,7 +162,9 @@ def _draw_loop(fit: FitResult, ax: Axes | None, record: int) -> Axes:
     )  # fmt: skip
 
 
-def _residuals_of_record(fit: FitResult, against: str | None, ax: Axes | None, record: int) -> Axes:
+def _residuals_of_record(
+    fit: FittedModel, against: str | None, ax: Axes | None, record: int
+) -> Axes:
     """Draw measured minus fitted output of a record over time or displacement."""
     data = fit.data[record]
     _, residual, channel = _output(fit, record)
@@ -174,7 +176,7 @@ def _residuals_of_record(fit: FitResult, against: str | None, ax: Axes | None, r
     return plot_sample_residuals(x, residual, x_label=label, channel=channel, ax=ax)
 
 
-def _output(fit: FitResult, record: int) -> tuple[FloatArray, FloatArray, str]:
+def _output(fit: FittedModel, record: int) -> tuple[FloatArray, FloatArray, str]:
     """Return the measured output, its residuals and the name of its channel."""
     channel = "force" if fit.problem.output == "force" else fit.data[record].motion_channel
     return fit.problem.measured[record], fit.residuals[record], channel

@@ -5,21 +5,19 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dahl_ident.diagnostics.comparison import compare_models
 from dahl_ident.diagnostics.confidence_levels import level_text
 from dahl_ident.diagnostics.formatting import interval, rounded, table
 from dahl_ident.diagnostics.intervals import ConfidenceIntervals
-
-if TYPE_CHECKING:
-    from dahl_ident.results.fit_result import FitResult
+from dahl_ident.results.fitted_model import FittedModel
 
 _CORRELATED = 0.1  # least correlation shown; smaller ones change an uncertainty by 0.5 %
 _BRIEF = 15  # lines of a short report: what a reader takes in at a glance
 
 
-def facts(fit: FitResult) -> dict[str, Any]:
+def facts(fit: FittedModel) -> dict[str, Any]:
     """Return a fit's statements for machines, apart from its parameters."""
     budget = fit.stated_budget
     return {
@@ -37,7 +35,7 @@ def facts(fit: FitResult) -> dict[str, Any]:
 _Section = tuple[str, list[str]]  # a heading with its lines
 
 
-def fit_report(fit: FitResult, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
+def fit_report(fit: FittedModel, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
     """Return the whole report as text, or verdict and parameters on at most 15 lines."""
     sections = _all(fit, intervals)
     if details:
@@ -57,14 +55,14 @@ def _lines(sections: Iterable[_Section]) -> Iterator[str]:
         yield from (f"    {line}" for line in lines)
 
 
-def as_html(fit: FitResult, intervals: ConfidenceIntervals) -> str:
+def as_html(fit: FittedModel, intervals: ConfidenceIntervals) -> str:
     """Return the whole report as HTML."""
     parts = [(title, html.escape("\n".join(lines))) for title, lines in _all(fit, intervals)]
     body = "".join(f"<h4>{title}</h4><pre>{lines}</pre>" for title, lines in parts)
     return f"<div>{body}</div>"
 
 
-def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[_Section]:
+def _all(fit: FittedModel, intervals: ConfidenceIntervals) -> Iterator[_Section]:
     first, *others = fit.statements
     warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
     yield "Verdict", [first, *warnings, *others]
@@ -86,7 +84,9 @@ def _all(fit: FitResult, intervals: ConfidenceIntervals) -> Iterator[_Section]:
     yield "Solver", _solver(fit)
 
 
-def _parameters(fit: FitResult, intervals: ConfidenceIntervals, names: Iterable[str]) -> list[str]:
+def _parameters(
+    fit: FittedModel, intervals: ConfidenceIntervals, names: Iterable[str]
+) -> list[str]:
     level = float(intervals.levels[-1])
     rows = [["", "value", "stderr", "unit", f"{level_text(level)} ({intervals.method})", ""]]
     for name in names:
@@ -111,7 +111,7 @@ def _parameters(fit: FitResult, intervals: ConfidenceIntervals, names: Iterable[
     return [*table(rows, left=(0, 3, 4, 5)).splitlines(), f"({intervals.note})"]
 
 
-def _correlations(fit: FitResult) -> list[str]:
+def _correlations(fit: FittedModel) -> list[str]:
     names = fit.var_names[: fit.problem.n_reported]
     pairs = [
         (a, b, c)
@@ -123,7 +123,7 @@ def _correlations(fit: FitResult) -> list[str]:
     return [f"{a}, {b}: {c:+.3f}" for a, b, c in pairs]
 
 
-def _solver(fit: FitResult) -> list[str]:
+def _solver(fit: FittedModel) -> list[str]:
     assumed = [p for p in fit.problem.model.parameters if p.assumed]
     held = "".join(f", at {p.name} = {p.value:g}" for p in assumed)
     lines = [
