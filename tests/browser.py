@@ -91,11 +91,11 @@ class Page:
         self.call("Page.navigate", url=place.as_uri() if isinstance(place, Path) else place)
         self.value(_LOADED)
 
-    def resize(self, width: int) -> None:
+    def resize(self, width: int, mobile: bool = False) -> None:
         """Give the window this width."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
-            width=width, height=900, deviceScaleFactor=1, mobile=False,
+            width=width, height=900, deviceScaleFactor=1, mobile=mobile,
         )  # fmt: skip
 
     def choose(self, selector: str, files: Sequence[Path]) -> None:

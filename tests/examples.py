@@ -144,7 +144,7 @@ def main(names: list[str]) -> None:
     """Renew the files that are named, or all."""
     if not names:
         where = os.environ | {"DAHL_IDENT_PICTURES": str(ROOT / "docs" / "images")}
-        test = [sys.executable, "-m", "pytest", "-q", "tests/test_app_browser.py", "-k", "table"]
+        test = [sys.executable, "-m", "pytest", "-q", "tests/test_app.py", "-k", "accessible"]
         subprocess.run(test, cwd=ROOT, env=where, check=True)
     chosen = [Path(name).resolve() for name in names] or [*pages(), *notebooks()]
     for each in chosen:

@@ -1,17 +1,27 @@
-"""The page's server: who may use it, what it keeps, and what it does with bad input."""
+"""The page: who may use it, what it keeps, and the way from files to a report in a browser."""
 
+import io
 import json
+import os
 import subprocess
 import sys
 from html import unescape
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 import dahl_ident as di
 from tests.app_server import started
+from tests.browser import CHROMIUM, chromium
+from tests.test_record_fit import DAHL, recorded
 
+IN_A_BROWSER = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 NOISY = Path(__file__).parents[1] / "datasets" / "synthetic" / "noisy.csv"
+_READY = "document.readyState == 'complete'"
+_RUN = "location.pathname.includes('/run-')"
+_ENDED = f"{_RUN} && {_READY} && !document.getElementById('progress')"
 LAW = '''
 import dahl_ident as di
 
@@ -108,20 +118,10 @@ def test_of_two_files_with_one_name_both_are_kept(server):
     assert "run.csv (2), run.csv (3)" in server.page(place)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "empty"),
-        (b"\x00\x01\x02\x03" * 100, "a file.csv"),
-        (b"frequency [Hz],amplitude [m],gain [N/m],phase [deg]\n1,1e-3,30,5\n1,2e-3,x9,6\n", "x9"),
-    ],
-)
-def test_a_bad_file_is_refused_in_the_reader_s_words(server, content, message):
-    page = unescape(server.page(server.upload([("a file.csv", content)])))
-    assert 'role="alert"' in page
+def test_a_bad_file_is_refused_in_the_reader_s_words(server):
+    page = unescape(server.page(server.upload([("a file.csv", b"")])))
     alert = page.partition('role="alert"')[2].partition("</div>")[0]
-    assert message in alert
-    assert "a file.csv" in alert
+    assert "a file.csv: the file is empty" in alert
     assert 'value="model" disabled' in page
 
 
@@ -198,8 +198,153 @@ def test_work_is_found_again_and_laws_of_the_user_are_run_only_where_they_were_n
         assert second.send(f"{work}/model", law="dahl").endswith("run-2")
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
-    words = [sys.executable, "-m", "dahl_ident.cli", "app", str(tmp_path / "none")]
-    ended = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert ended.returncode == 1
-    assert "none is not a folder" in ended.stderr
+def test_a_folder_that_is_not_there_is_named(run):
+    ended = run("app", "none")
+    assert ended.status == 1
+    assert "none is not a folder" in ended.err
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with chromium(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture
+def page(server, browser):
+    """A page that has been opened with the token; nothing may come from another machine."""
+    browser.requests.clear()
+    browser.open(server.address, 1100)
+    yield browser
+    browser.open("about:blank", 1100)
+    inside = (server.address[:17], "data:", "about:")
+    assert [url for url in browser.requests if not url.startswith(inside)] == []
+    assert browser.problems == []
+
+
+def _check_access(page, place):
+    """Check labels, contrast and the like, contrast in the dark as well, and a phone's width."""
+    page.value((files("axe_core_python") / "axe.min.js").read_text("utf-8") + "; 1")
+    for scheme, rules in (("light", "{}"), ("dark", "{runOnly: ['color-contrast']}")):
+        wanted = {"name": "prefers-color-scheme", "value": scheme}
+        page.call("Emulation.setEmulatedMedia", features=[wanted])
+        found = page.value(f"axe.run({rules}).then(r => JSON.stringify(r.violations))")
+        broken = [(v["id"], [n["html"] for n in v["nodes"]][:3]) for v in json.loads(found)]
+        assert broken == [], (place, scheme)
+    page.call("Emulation.setEmulatedMedia", features=[])
+    page.resize(390, mobile=True)
+    assert page.value("document.documentElement.scrollWidth") <= 390, place
+    page.resize(1100)
+
+
+def _click(page, selector, until):
+    page.value(f"document.querySelector({json.dumps(selector)}).click()")
+    page.wait(f"{until} && {_READY}")
+
+
+def _keep_picture(page, name, folder):
+    """Keep a picture of the page for the manual, in few colours; the test shows that it is one."""
+    with Image.open(io.BytesIO(page.screenshot())) as shot:
+        assert shot.width == 1100
+        top = shot.convert("RGB").crop((0, 0, shot.width, min(shot.height, 1700)))
+        assert len(top.getcolors(1 << 24) or ()) > 20
+        top.quantize(64).save(folder / f"app_{name}.png", optimize=True)
+
+
+def _to_model(page, file):
+    page.choose("#files", [file])
+    _click(page, "form.drop button", "location.pathname != '/'")
+    _click(page, "button[name=next]", "location.pathname.endsWith('/model')")
+
+
+@IN_A_BROWSER
+def test_every_page_is_accessible(page, server, work, fitted, tmp_path):
+    pictures = Path(os.environ.get("DAHL_IDENT_PICTURES", tmp_path))
+    place = server.address.partition("/?")[0]
+    _check_access(page, "start")
+    for name, path in (("data", work), ("model", f"{work}/model"), ("result", fitted)):
+        page.open(place + path, 1100)
+        if name == "model":
+            page.wait(
+                "document.querySelector('#commands pre').textContent.includes('--element dahl')"
+            )
+        if name == "result":
+            images = "[...document.images].map(one => one.decode().then(() => one.naturalWidth))"
+            assert min(page.value(f"Promise.all({images})")) > 100
+        _keep_picture(page, name, pictures)
+        page.value("document.querySelectorAll('details').forEach(one => one.open = true)")
+        _check_access(page, name)
+
+
+@IN_A_BROWSER
+def test_waveforms_become_a_report(page, server, tmp_path):
+    truth = DAHL + di.Damper(0.3)
+    recorded(truth, "random", 500, 1e-3).to_frame().to_csv(tmp_path / "run.csv", index=False)
+    _to_model(page, tmp_path / "run.csv")
+    page.value("document.getElementById('damping').value = 'free'")
+    _click(page, "form > .buttons button", _RUN)
+    page.wait(_ENDED)
+    text = page.value("document.body.innerText")
+    assert "Trusted" in text
+    assert "dahl-ident fit data/run.csv --record" in text
+    assert server.page(f"{page.value('location.pathname')}/file/report.pdf").startswith("%PDF")
+
+
+@IN_A_BROWSER
+def test_a_technician_gets_to_the_report_with_the_keyboard(page):
+    def go_to(selector):
+        for _ in range(80):
+            if page.value(f"document.activeElement.matches({json.dumps(selector)})"):
+                return
+            page.press("Tab")
+        raise AssertionError(f"{selector} is not reached by the tab key")
+
+    page.choose("#files", [NOISY])  # the system's window, which is not of the page
+    go_to("form.drop button")
+    page.press("Enter", "\r")
+    page.wait(f"location.pathname != '/' && {_READY}")
+    go_to("button[name=next]")
+    page.press("Enter", "\r")
+    page.wait(f"location.pathname.endsWith('/model') && {_READY}")
+    go_to("input[name=law]")
+    page.press("ArrowDown")
+    assert page.value("document.querySelector('[name=law]:checked').value") == "bouc_wen"
+    go_to("form > .buttons button")
+    page.press("Enter", "\r")
+    page.wait(f"{_RUN} && {_READY}")
+    go_to(".buttons button")  # cancel
+    page.press("Enter", "\r")
+    page.wait("document.querySelector('.mark').innerText == 'Cancelled'")
+
+
+@IN_A_BROWSER
+def test_nothing_is_lost_by_reload_back_button_or_a_second_tab(page, server):
+    _to_model(page, NOISY)
+    page.value("document.getElementById('meta_specimen').value = 'Pivot 12'")
+    _click(page, "form > .buttons button", _RUN)
+    run = page.value("location.pathname")
+    page.call("Page.reload")
+    page.wait(f"{_RUN} && {_READY}")
+    assert "noisy.csv" in server.page(run)  # another tab
+    server.send(f"{run}/cancel")
+    page.wait(_ENDED)
+    page.value("history.back()")
+    page.wait(f"location.pathname.endsWith('/model') && {_READY}")
+    page.call("Page.reload")
+    page.wait(f"{_READY} && document.getElementById('meta_specimen').value == 'Pivot 12'")
+    assert page.value(f"[...document.links].some(one => one.pathname == {json.dumps(run)})")
+
+
+@IN_A_BROWSER
+def test_a_bad_file_is_explained_and_goes_no_further(page, tmp_path):
+    bad = tmp_path / "level 3.csv"
+    bad.write_text(
+        "frequency [Hz],amplitude [m],gain [N/m],phase [deg]\n1,1e-3,30,5\n1,2e-3,x9,6\n"
+    )
+    page.choose("#files", [bad])
+    _click(page, "form.drop button", "location.pathname != '/'")
+    alert = page.value("document.querySelector('[role=alert]').innerText")
+    assert "level 3.csv" in alert
+    assert "x9" in alert
+    assert page.value("document.querySelector('button[name=next]').disabled")
+    _check_access(page, "bad file")
