@@ -25,7 +25,7 @@ from dahl_ident.sensors import Sensors
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
-    from dahl_ident.problem.record_problem import Output
+    from dahl_ident.problem.record_waves import Output
 
 
 def kind_of(data: object) -> type[TableProblem] | type[RecordProblem]:

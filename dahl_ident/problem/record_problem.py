@@ -11,40 +11,30 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.record import at_even_times, cut, unbroken
-from dahl_ident.data.rows import one_run
-from dahl_ident.elements import Element, Friction, Model, Parameter
-from dahl_ident.elements.coefficients import Coefficients
-from dahl_ident.elements.equations import FirstState, plant_equations
-from dahl_ident.elements.model import as_model
-from dahl_ident.errors import DataError, FitError, ModelError, ValidationError
+from dahl_ident.data.record import cut
+from dahl_ident.elements import Model, Parameter
+from dahl_ident.errors import DataError, FitError
 from dahl_ident.noise import Rho
-from dahl_ident.problem.base import Problem, Quadratic
-from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
-from dahl_ident.problem.record_prediction import Predicted, bends, force_of, motion_of, nuisance
+from dahl_ident.problem.base import Quadratic
+from dahl_ident.problem.record_prediction import Predicted, force_of, motion_of
+from dahl_ident.problem.record_waves import SHORTEST, RecordWaves, bends
 from dahl_ident.problem.space import Space
 from dahl_ident.problem.table_problem import TableProblem
 
-if TYPE_CHECKING:
-    from dahl_ident.elements.equations import Excitation
-    from dahl_ident.engine import System
-
-Output = Literal["force", "motion"]
-_SHORTEST = 16  # fewest samples from which noise is estimated
 _PER_CYCLE = 100.0  # samples of a cycle that a record keeps where it is thinned
 _DELAY_STEP = 0.02  # step of the delay, in samples, for differences
 _LEAST = 1e-300  # stands for a positive value that is zero, which has no logarithm
 _VANISHED = 1e4  # gradient over curvature from which a value has vanished: its steps never end
 
 
-class RecordProblem(Problem):
+class RecordProblem(RecordWaves):
     """Records of one device and a model: residuals, Jacobian and cost.
 
     Residuals are measured minus predicted samples over the standard deviation of the output, so
@@ -79,100 +69,6 @@ class RecordProblem(Problem):
     around_optimum = True
     repetitions = 199  # each of which is searched alone: enough for the 95.45 % interval
 
-    def __init__(
-        self,
-        records: Sequence[Record],
-        model: Element,
-        *,
-        output: Output | None = None,
-        excitation: Excitation = "force",
-        calibration: Mapping[str, float] | None = None,
-    ) -> None:
-        self.calibration = dict(calibration or {})
-        self.records = tuple(records)
-        if not self.records:
-            raise DataError("there is no record; give one or more")
-        for record in self.records:
-            if not isinstance(record, Record):
-                raise ValidationError(
-                    f"data holds a {type(record).__name__}; expected a FrequencyResponse, a Record "
-                    "or several records (read_frequency_response and read_record read files, "
-                    "FrequencyResponse.concatenate joins tables)"
-                )
-        self.model = as_model(model)
-        self.excitation = excitation
-        self.output: Output = output or ("motion" if self.model.has_inertia else "force")
-        if self.output not in ("force", "motion"):
-            raise ValidationError(f"output is {output!r}; expected force or motion")
-        if self.output == "force" and not self.coefficients.are_values:
-            raise ModelError(
-                "a linear system with free parameters moves with a plant, but has no force over "
-                "time: fix it, fit the motion, or build it from Mass, Damper and Spring"
-            )
-        self.free = [p for p in self.model.parameters if p.free]
-        if not self.free:
-            raise ModelError(f"nothing is free in {self.model!r}; leave a parameter out")
-        self.with_memory = [e for e in self.model.elements if isinstance(e, Friction)]
-        if len({record.motion for record in self.records}) > 1:
-            raise DataError("some records are of translation and some of rotation; fit them apart")
-        integrated = self.output == "motion" or not self.model.rate_independent
-        runs = [0] * len(self.records) if one_run(self.records) else range(len(self.records))
-        self.runs: tuple[int, ...] = tuple(runs)
-        """The run of each record; sweeps of one level each, all different, are one run."""
-        if integrated or self.with_memory:
-            parts = [unbroken(record, _SHORTEST) for record in self.records]
-            self.runs = tuple(i for i, some in zip(runs, parts, strict=True) for _ in some)
-            self.records = tuple(record for some in parts for record in some)
-        if integrated:
-            self.records = tuple(at_even_times(record) for record in self.records)
-        for number, record in enumerate(self.records, 1):
-            self._check(record, f"record {number}" if len(self.records) > 1 else "the record")
-        self.motion = self.records[0].motion
-        self._check_scale()
-        parameters = (*self.free, *nuisance(self.model, self.records, self.output))
-        self.space = Space(parameters, bends(self.free, len(parameters), self.records), inside=True)
-        self.whitening = np.ones(1)
-        """Filter of the residuals; see :func:`~.record_noise.prediction_error_filter`."""
-        self.delay = 0.0
-        """Time by which the motion lags the force in the records, s; taken out."""
-        self.window = 1.0
-        """Factor on the window in which displacements are differentiated."""
-        self.displacement_noise = 0.0
-        """Standard deviation of the displacement, m, within which no movement counts."""
-        self.paths: tuple[FloatArray, ...] | None = None
-
-    def _check(self, record: Record, which: str) -> None:
-        if len(record) < _SHORTEST:
-            raise DataError(f"{which} has {len(record)} samples; expected at least {_SHORTEST}")
-        if self.output == "force" and record.displacement is None:
-            raise DataError(
-                f"{which} has {record.motion_channel} but no displacement, from which the force "
-                "would follow; integrate it, or add Mass() to fit the motion"
-            )
-        if self.output == "motion":
-            _ = record.force_samples
-
-    def _check_scale(self) -> None:
-        """Refuse a motion that masses and forces, all of them larger, would explain as well."""
-        elements = self.model.elements
-        if (
-            self.output == "force"
-            or any((not p.free and p.value and p.dimension[0]) for p in self.model.parameters)
-            or not all(any(p.free for p in e.parameters) for e in elements)
-        ):
-            return
-        if self.excitation == "base" or not any(r.force_samples.any() for r in self.records):
-            why = "the base moves" if self.excitation == "base" else "the force is zero"
-            raise DataError(
-                f"{why}, so that the motion determines only the ratios of masses, forces, dampers "
-                "and springs; give one of them, such as the mass: Mass(1.0), --mass 1.0"
-            )
-
-    @property
-    def data(self) -> tuple[Record, ...]:
-        """The records."""
-        return self.records
-
     @property
     def noise(self) -> str:
         """The model of the residuals: "white", or filtered by their "spectrum"."""
@@ -196,7 +92,7 @@ class RecordProblem(Problem):
                 x = np.asarray(record.displacement)
                 per_cycle = 2.0 * np.pi * np.std(x) / (np.std(np.diff(x)) or 1.0)
                 step = int(np.clip(per_cycle / _PER_CYCLE, 1.0, np.ceil(spare)))
-            n = max(_SHORTEST, int(samples * len(record) // self.n_residuals))
+            n = max(SHORTEST, int(samples * len(record) // self.n_residuals))
             thin, wave = cut(record, slice(None, None, step)), y[::step]
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
@@ -215,20 +111,6 @@ class RecordProblem(Problem):
         """Return the same problem with other values of parameters that are fixed."""
         model = self.model.with_values(values)  # equations are shorter where a value is 0 or 1
         return self.altered("system", "coefficients", "first", "latest", model=model)
-
-    def without_noise(self, noise: float, lead: float = LEADS[1]) -> RecordProblem:
-        """Return the same problem, the displacement's noise not counted as travel.
-
-        For the output "force"; see :func:`~.record_noise.travelled`.
-        """
-        x = self._displacements if noise else []
-        paths = tuple(travelled(wave, noise, lead) for wave in x) or None
-        return self.altered("latest", displacement_noise=noise, paths=paths)
-
-    def delayed(self, delay: float) -> RecordProblem:
-        """Return the same problem, the motion taken to lag the force by so many seconds."""
-        delayed = self.altered("motions", "drives", "latest", delay=delay)
-        return delayed.without_noise(self.displacement_noise)
 
     def delay_slopes(self, values: FloatArray) -> list[FloatArray]:
         """Return the derivatives of each record's output with respect to the delay, per s."""
@@ -274,17 +156,6 @@ class RecordProblem(Problem):
         changes = {"free": free, "space": space, "ranges": ranges, "latest": dict(self.latest)}
         return self.altered(*stale, model=model, **changes)
 
-    def differentiated_in(self, window: float) -> RecordProblem:
-        """Return the same problem, displacements differentiated in a window of other length."""
-        return self.altered("motions", "latest", window=window)
-
-    @property
-    def noise_travel(self) -> float:
-        """Travel that the displacement's noise would add, over the travel that counts."""
-        measured = [np.abs(np.diff(np.asarray(r.displacement))).sum() for r in self.records]
-        counted = [np.abs(np.diff(path)).sum() for path in self.paths or ()]
-        return float(sum(measured) / sum(counted) - 1.0) if counted else 0.0
-
     def filtered(self, waves: FloatArray) -> FloatArray:
         """Return residuals or derivatives, (n, ...), filtered; the first `order` are left out."""
         if self.whitening.size == 1:
@@ -294,168 +165,11 @@ class RecordProblem(Problem):
         return np.asarray(lfilter(self.whitening, [1.0], waves, axis=0)[self.whitening.size - 1 :])
 
     @property
-    def per_record(self) -> int:
-        """Unknowns that each record adds."""
-        return (len(self.parameters) - len(self.free)) // len(self.records)
-
-    @property
-    def n_reported(self) -> int:
-        """The number of the model's parameters; states, offsets and drifts follow."""
-        return len(self.free)
-
-    @property
-    def calibrations(self) -> Mapping[str, float]:
-        """Standard uncertainties of gains and delay of the channels, by the sensors' names."""
-        return self.calibration
-
-    @property
-    def every_parameter(self) -> tuple[Parameter, ...]:
-        """The model's parameters, fixed ones included, and what each record adds."""
-        return (*self.model.parameters, *self.parameters[self.n_reported :])
-
-    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
-        """Return the size of a unit in each record, by powers of force, displacement and time."""
-        sizes = []
-        for record, y in zip(self.records, self.measured, strict=True):
-            if self.output == "force":
-                x = np.asarray(record.displacement)
-                v = np.gradient(x, record.time)
-            else:
-                x, v, _ = in_band(record, y)
-            push, time = record.force_samples, np.std(x) / np.std(v)
-            force = np.std(push if push.any() else v / time)  # a free decay: of unit mass
-            sizes.append(np.prod(np.power([force, np.std(x), time], dimension)))
-        return np.array(sizes)
-
-    @property
-    def extent(self) -> str:
-        """The amount of data, in words."""
-        n = len(self.records)
-        return f"{n} record{'s' if n > 1 else ''}, {self.n_samples} samples"
-
-    @property
-    def output_in_words(self) -> str:
-        """The output of which a misfit is a share."""
-        return f"the {self.output}"
-
-    @property
-    def provenances(self) -> tuple[Mapping[str, Any] | None, ...]:
-        """Where each record comes from."""
-        return tuple(record.provenance for record in self.records)
-
-    @property
-    def level(self) -> float:
-        """Size of the input of all records: of the displacement, or of the drive."""
-        force = self.output == "force"
-        waves = [np.asarray(r.displacement if force else r.force_samples) for r in self.records]
-        return float(np.sqrt(np.mean(np.concatenate([w - w.mean() for w in waves]) ** 2)))
-
-    @property
-    def n_samples(self) -> int:
-        """Samples of all records."""
-        return sum(len(record) for record in self.records)
-
-    @property
     def n_residuals(self) -> int:  # type: ignore[override]
         """Number of residuals: all samples except those with which the filter begins."""
         return self.n_samples - len(self.records) * (self.whitening.size - 1)
 
     n_numbers = n_residuals
-
-    @cached_property
-    def measured(self) -> tuple[FloatArray, ...]:
-        """The output of each record."""
-        if self.output == "force":
-            return tuple(record.force_samples for record in self.records)
-        return tuple(record.motion_samples for record in self.records)
-
-    @cached_property
-    def motions(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
-        """Displacement, velocity and acceleration of each record, for the output "force"."""
-        return self._motions_of(self._displacements)
-
-    @property
-    def _displacements(self) -> list[FloatArray]:
-        """Measured displacements, freed of the delay."""
-        x = [np.asarray(record.displacement) for record in self.records]
-        if not self.delay:
-            return x
-        from scipy.interpolate import CubicSpline
-
-        times = [record.time for record in self.records]
-        return [
-            np.asarray(CubicSpline(t, wave)(t + self.delay))
-            for t, wave in zip(times, x, strict=True)
-        ]
-
-    def _motions_of(
-        self, displacements: Sequence[FloatArray]
-    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
-        if all(e.rate_independent for e in self.model.elements):
-            return tuple((x, np.zeros(0), np.zeros(0)) for x in displacements)
-        from dahl_ident.engine import differentiated
-
-        return tuple(
-            (x, *differentiated(x, 1.0 / record.sample_rate, self.window))
-            for x, record in zip(displacements, self.records, strict=True)
-        )
-
-    @cached_property
-    def estimated_noise(self) -> float:
-        """Standard deviation of the displacements' white noise, m; see `displacement_noise`."""
-        return float(np.median([noise_of(x) for x, _, _ in self.motions]))
-
-    def with_more_noise(self, noise: float, draw: int = 0) -> RecordProblem:
-        """Return the same problem, white noise added to the displacements."""
-        rng = np.random.default_rng(draw)
-        noisy = [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
-        return self.altered("latest", motions=self._motions_of(noisy))
-
-    def with_noisier_drive(self, stds: Sequence[float], draw: int) -> RecordProblem:
-        """Return the same problem, white noise added to the drive of each record."""
-        rng = np.random.default_rng(draw)
-        waves = [
-            std * rng.standard_normal(len(record))
-            for record, std in zip(self.records, stds, strict=True)
-        ]
-        return self.driven_more(dict(enumerate(waves)))
-
-    def driven_more(self, waves: Mapping[int, FloatArray]) -> RecordProblem:
-        """Return the same problem, waves added to the drives of the records with these numbers."""
-        from dahl_ident.engine import band_limited
-
-        drives = list(self.drives)
-        for number, wave in waves.items():
-            time, drive = drives[number]
-            more = band_limited(wave, 1.0 / self.records[number].sample_rate)
-            drives[number] = time, drive + more
-        return self.altered("latest", drives=tuple(drives))
-
-    @cached_property
-    def system(self) -> System:
-        """The plant's equations of motion, compiled."""
-        from dahl_ident.engine import translate
-
-        channel = self.records[0].motion_channel
-        return translate(plant_equations(self.coefficients.model, self.excitation, channel))
-
-    @cached_property
-    def drives(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Times of the samples, and the drive's polynomials between them, of each record."""
-        from dahl_ident.engine import band_limited
-
-        waves = []
-        for record in self.records:
-            time, interval = record.time - record.time[0], 1.0 / record.sample_rate
-            drive = band_limited(record.force_samples, interval)
-            if self.delay:  # the motion is compared with that of a drive as much later
-                place = np.arange(time.size) - self.delay / interval
-                place = np.clip(place, 0.0, time.size - 1.0)
-                step = np.clip(np.floor(place).astype(int), 0, time.size - 2)
-                late = np.polynomial.polynomial.polyval(place - step, drive[:, step], tensor=False)
-                drive = band_limited(late, interval)
-            waves.append((time, drive))
-        return tuple(waves)
 
     def to_search(self, values: ArrayLike) -> FloatArray:
         """Return search coordinates; values that have vanished are as small as numbers can be."""
@@ -486,16 +200,6 @@ class RecordProblem(Problem):
                         low[i], high[i] = ends
         return low, high
 
-    def full_values(self, values: FloatArray) -> list[float]:
-        """Return the value of every parameter of the model, fixed ones included."""
-        by_name = dict(zip(self.names, values.tolist(), strict=True))
-        return [float(by_name.get(p.name, p.value or 0.0)) for p in self.model.parameters]
-
-    def own(self, values: FloatArray, number: int) -> FloatArray:
-        """Return the values that belong to one record alone."""
-        start = len(self.free) + number * self.per_record
-        return values[start : start + self.per_record]
-
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
         """Return the predicted samples of record `number`."""
         predicted = force_of if self.output == "force" else motion_of
@@ -517,16 +221,6 @@ class RecordProblem(Problem):
         It is asked for more than once, also by problems in which other parameters are free.
         """
         return {}
-
-    @cached_property
-    def coefficients(self) -> Coefficients:
-        """The map from the parameters to the equations' numbers."""
-        return Coefficients(self.model)
-
-    @cached_property
-    def first(self) -> FirstState:
-        """The map from a record's unknowns to the first states."""
-        return FirstState(self.coefficients.model)
 
     def outputs(self, values: FloatArray) -> list[FloatArray]:
         """Return the predicted output of each record."""

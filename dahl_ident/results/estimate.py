@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
     from dahl_ident.elements.equations import Excitation
     from dahl_ident.fitting.ipopt import Constraints
-    from dahl_ident.problem.record_problem import Output
+    from dahl_ident.problem.record_waves import Output
 
 METHODS = ("mcmc", "grid")
 UNCERTAINTIES = ("combined", "noise")
