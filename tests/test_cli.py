@@ -584,7 +584,9 @@ def test_a_report_goes_to_standard_output(run):
 
 def test_sensors_are_fixed_free_or_have_a_prior(run):
     Path("noisy.csv").write_text(run("datasets", "noisy", "-o", "-").out, encoding="utf-8")
-    Path("lab.toml").write_text('force_gain = "norm(1, 0.05)"\ndelay = 1e-4\n', encoding="utf-8")
+    Path("lab.toml").write_text(
+        'force_gain = "scipy.stats.norm(1, 0.05)"\ndelay = 1e-4\n', encoding="utf-8"
+    )
     params = json.loads(run("fit", "noisy.csv", "--json", "--config", "lab.toml").out)["params"]
     sensors = di.Sensors(force_gain=stats.norm(1, 0.05), delay=1e-4)
     fit = di.fit(di.read_frequency_response("noisy.csv"), di.Dahl(), sensors=sensors)
