@@ -1,5 +1,6 @@
 """Two measured joints that no Dahl model describes: what the verdicts say of them."""
 
+import functools
 import os
 import re
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 import dahl_ident as di
 from benchmarks.measured import BEAM
-from dahl_ident import compare_models, extract, fit, read_frequency_response, read_record
+from dahl_ident import extract, fit, read_frequency_response, read_record
 from dahl_ident.diagnostics import Verdict
 from dahl_ident.diagnostics.slip_density import slip_density
 
@@ -69,6 +70,7 @@ class TestDamper:
         (trend,) = (t for t in linear.trends if t.covariate == "frequency")
         assert np.expm1(trend.stiffness.value) == pytest.approx(-0.26, abs=0.04)
 
+    @pytest.mark.long
     def test_runs_deviate_within_the_bounds_of_parameters(self):
         """A power damper that does not improve the fit, its exponent at zero."""
         files = sorted((FOLDER / "brfd").glob("band30lb_*.csv"))
@@ -83,14 +85,6 @@ class TestDamper:
             di.FrequencyResponse.concatenate(every), di.Dahl() + di.PowerDamper(), throw=False
         )
         assert str(found.status) == "not determined"
-
-    def test_other_models_are_compared_as_well(self, damper):
-        found = fit(damper.select(rows=np.arange(damper.n) % 3 == 0), di.Dahl())
-        report = found.fit_report()
-        assert "Other models, for comparison" in report
-        names = [model.name for model in compare_models(found).models]
-        assert names[:3] == ["as fitted", "two Dahl elements", "gap"]
-        assert all(name in report for name in names)
 
 
 class TestStill:
@@ -119,15 +113,17 @@ class TestStill:
             assert both.params[name].value == pytest.approx(fundamentals.params[name].value, abs=u)
 
     def test_laws_are_compared_where_harmonics_are_rows(self, tests):
-        compared = compare_models(self.of(tests[::3], 3))
-        assert not compared.failed
-        assert {"gap", "Bouc-Wen", "mass added"} <= {model.name for model in compared.models}
+        text = self.of(tests[::3], 3).fit_report().partition("Other models, for comparison")[2]
+        assert "could not be fitted" not in text
+        for name in ("as fitted", "two Dahl elements", "gap", "Bouc-Wen", "mass added"):
+            assert name in text
 
 
 class TestBeam:
     """One mode and one joint: microslip, and more in the joint than a Dahl element."""
 
     @staticmethod
+    @functools.cache
     def fitted(beam, controlled):
         data = beam.select(level=[label for label in beam.levels if controlled in label])
         if controlled == "Force":  # exact motions, row by row
