@@ -10,10 +10,20 @@ from hypothesis import strategies as st
 from mpmath import mp
 from scipy import stats
 
-from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Sensors, Spring, response
+from dahl_ident import (
+    BoucWen,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    Record,
+    Sensors,
+    Spring,
+    response,
+)
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import DataError, ModelError, ValidationError
-from dahl_ident.problem import ProblemBatch, TableProblem
+from dahl_ident.problem import ProblemBatch, RecordProblem, TableProblem
 
 n = 6
 A = np.geomspace(3e-4, 3e-2, n)
@@ -253,6 +263,26 @@ def test_residuals_do_not_depend_on_units(force, motion, x):
 def test_search_coordinates_round_trip(values):
     problem = TableProblem(FrequencyResponse(np.ones(n), NOISE, A), Dahl())
     np.testing.assert_allclose(problem.to_values(problem.to_search(values)), values, rtol=1e-13)
+
+
+@pytest.mark.parametrize("channel", ["displacement", "velocity", "acceleration"])
+@pytest.mark.parametrize("size", [2e-3, 40.0])
+def test_rates_of_either_sign_are_numbers_near_zero_and_logarithms_far_off(channel, size):
+    """The bend is a tenth of the inverse rms displacement, whichever channel was recorded."""
+    t, omega = np.arange(4000) / 1000.0, 2.0 * np.pi
+    wave = (
+        size
+        * np.sin(omega * t)
+        * omega ** ("displacement", "velocity", "acceleration").index(channel)
+    )
+    record = Record(t, **{channel: wave}, force=np.cos(omega * t))
+    problem = RecordProblem([record], BoucWen() + Mass(1.0))
+    bend = 0.1 / (size / 2.0**0.5)
+    for rate in (1e-6 * bend, -0.3 * bend, bend, 1e4 * bend):
+        values = np.where(np.array(problem.names) == "q", rate, 1.0)
+        coordinate = problem.to_search(values)[problem.names.index("q")]
+        assert coordinate == pytest.approx(np.arcsinh(rate / bend), rel=1e-2)
+        assert problem.to_values(problem.to_search(values)) == pytest.approx(values)
 
 
 def test_profiled_likelihood_is_its_maximum_over_the_scale():
