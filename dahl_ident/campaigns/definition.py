@@ -12,12 +12,12 @@
     [fit]                          # options of fit
     [posterior]                    # options of posterior; left out: no posterior
 
-    [[model]]                      # one table an element
+    [[model]]                      # one table for each element
     kind = "dahl"
 
     [output]
     folder = "results"
-    per = "device"                 # one fit a device; "run": one fit a file
+    per = "device"                 # one fit for each device; "run": one for each file
     reports = false                # a report for each fit
 
 Paths are relative to the file.
@@ -54,7 +54,7 @@ _COLUMNS = {
     "version", "report", "retry", "refused", "key",
 }  # fmt: skip
 _PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
-"""Columns of the table of results, which covariates cannot be called."""
+"""Columns of the table of results, whose names covariates cannot have."""
 _BLANK = ("", "na", "n/a", "nan")
 
 
@@ -64,7 +64,7 @@ class Task:
 
     device: str  # labels; `run` is empty where the fit takes all runs of the device
     run: str
-    files: tuple[Path, ...]  # what is read, in the order of their names
+    files: tuple[Path, ...]  # in the order of the runs
     runs: tuple[str, ...]  # label of each file
     covariates: Mapping[str, float | str]  # from the path and from the table of covariates
 
@@ -78,12 +78,12 @@ class Task:
 class Definition:
     """A checked campaign: files, options and the folder of the results."""
 
-    source: str  # where it was read from, for messages
-    # all settings that a result depends on: kind, read, extract, fit, posterior, model and per;
-    # digests of files that define laws of the model
+    source: str  # its file, for messages
+    # all settings that a result depends on: kind, read, extract, fit, posterior, model, per, and
+    # the digests of files that define laws of the model
     options: Mapping[str, Any]
-    tasks: tuple[Task, ...]  # In the order of their names
-    folder: Path  # where results go
+    tasks: tuple[Task, ...]  # in the order of their names
+    folder: Path  # of the results
     reports: bool  # whether each fit gets a report
 
     def key(self, digests: Collection[str], version: str) -> str:
@@ -117,9 +117,9 @@ def _checked(name: str, folder: Path, content: Mapping[str, Any]) -> Definition:
     _refuse_unknown("options in [output]", output, _OUTPUT)
     kind = one_of(files.get("kind", "record"), "[files] kind", _KINDS)
     per = one_of(output.get("per", "device"), "[output] per", _UNITS)
-    place, reports = output.get("folder", "results"), output.get("reports", False)
-    if not isinstance(place, str) or not place:
-        raise ValidationError(f"[output] folder is {place!r}; expected the path of a folder")
+    results, reports = output.get("folder", "results"), output.get("reports", False)
+    if not isinstance(results, str) or not results:
+        raise ValidationError(f"[output] folder is {results!r}; expected the path of a folder")
     if not isinstance(reports, bool):
         raise ValidationError(f"[output] reports is {reports!r}; expected true or false")
     _run_laws(folder, content.get("laws", []))
@@ -136,7 +136,7 @@ def _checked(name: str, folder: Path, content: Mapping[str, Any]) -> Definition:
     _check_options(options)
     tasks = _tasks(folder, files, per)
     _check_names(tasks, parameters)
-    return Definition(name, options, tasks, folder / place, reports)
+    return Definition(name, options, tasks, folder / results, reports)
 
 
 def _table(content: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def _run_laws(folder: Path, laws: Any) -> None:
 
 
 def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
-    """Return the model as plain data, names of its parameters, and digests of files of laws."""
+    """Return the model as plain data, the names of its parameters, and digests of its law files."""
     from dahl_ident.elements.law_files import file_of, own_laws
     from dahl_ident.elements.model import describe_model, model_from_description
 
@@ -186,7 +186,7 @@ def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[st
 
 
 def _check_options(options: Mapping[str, Any]) -> None:
-    """Refuse options that the functions do not have, before any file is read."""
+    """Refuse unknown options before any file is read."""
     import dahl_ident as di
 
     record = options["kind"] == "record"
@@ -213,10 +213,10 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 
 def _check_names(tasks: Sequence[Task], parameters: Collection[str]) -> None:
-    """Refuse covariates that are called as a column of results, and fits of the same name."""
-    taken = _COLUMNS | set(parameters)
+    """Refuse covariates named like a column of the results, and two fits of the same name."""
+    reserved = _COLUMNS | set(parameters)
     for column in {column for task in tasks for column in task.covariates}:
-        if column in taken or column.startswith(_PREFIXES):
+        if column in reserved or column.startswith(_PREFIXES):
             raise ValidationError(
                 f"a covariate is called {column!r}, as a column of the results; give it "
                 "another name"
@@ -263,7 +263,7 @@ def _tasks(folder: Path, files: Mapping[str, Any], per: str) -> tuple[Task, ...]
 
 
 def _joined(device: str, runs: list[Task]) -> Task:
-    """Return one fit of several runs, with the covariates that all of them share."""
+    """Return one fit of several runs, with the covariates that they have in common."""
     shared = {
         name: value
         for name, value in runs[0].covariates.items()
@@ -274,7 +274,7 @@ def _joined(device: str, runs: list[Task]) -> Task:
 
 
 def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
-    """Return the files of the pattern with the fields that their paths hold."""
+    """Return the files that match the pattern, with the fields read from their paths."""
     fields = _FIELD.findall(pattern)
     if "device" not in fields:
         raise ValidationError(
@@ -305,7 +305,7 @@ def _matches(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
 def _covariates(
     folder: Path, table: Any
 ) -> dict[tuple[str, str | None], dict[str, float | str]] | None:
-    """Return the rows of the table by device and run, None where there is no table."""
+    """Return the rows of the table by device and run; None without a table."""
     if table is None:
         return None
     if not isinstance(table, str):

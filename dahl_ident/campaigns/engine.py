@@ -1,8 +1,7 @@
-"""Runs jobs in one of three places, a few at a time, and ends whatever becomes of the place.
+"""Runs jobs, a few at a time: in processes of this machine, in an executor, or with Dask.
 
-Processes of this machine, an executor that was given, or a Dask scheduler. Each fit has a limit of
-time and of memory (:mod:`dahl_ident.campaigns.worker`). A place that does not answer is waited
-for, but not for ever.
+Each fit has a limit of time and of memory (:mod:`dahl_ident.campaigns.worker`). If an executor or a
+scheduler does not answer, the run waits for it for a limited time, and then ends.
 """
 
 from __future__ import annotations
@@ -33,18 +32,16 @@ from dahl_ident.version import __version__
 _Tag = TypeVar("_Tag")
 PATIENCE = 120.0  # s without an answer after which a worker counts as lost
 _WAITING = 2  # jobs submitted for each worker: one in progress, one waiting
-_LOOK = 1.0  # s between looks at a worker that sent no row
-_ANSWER = 5.0  # s in which a scheduler answers
-_TIMES_MEDIAN, _LEAST = 10.0, 60.0
-_LEAST_MEMORY = 2.0
-"""GB that a fit may always have where no limit was given; what is loaded takes some tenths."""
-_FIRST, _KNOWN = 600.0, 3
-"""Limit of time, s, until this number of fits says how long a fit takes."""
+_POLL = 1.0  # s between checks while no row arrives
+_RESPONSE_TIME = 5.0  # s within which a scheduler must answer
+_TIMES_MEDIAN, _LEAST_TIMEOUT = 10.0, 60.0  # default limit of time over the median; its least, s
+_FIRST_TIMEOUT, _FEWEST_TIMED = 600.0, 3  # limit, s, until so many fits have ended
 _RECENT = 1001  # fits whose median time is taken
+_LEAST_MEMORY = 2.0  # least default limit, GB; the imported libraries take some tenths
 
 
 class LostError(DataError):
-    """The place where jobs are done is gone; rows that came before are good."""
+    """The executor or scheduler is lost; the rows received before are valid."""
 
 
 class Limits:
@@ -57,28 +54,28 @@ class Limits:
         earlier: Iterable[float] = (),
     ) -> None:
         self._timeout, self.memory = timeout, memory
-        self._took = deque(earlier, _RECENT)
+        self._times = deque(earlier, _RECENT)
 
     @property
     def seconds(self) -> float:
-        """The time that was given, or ten times the median of the fits so far."""
+        """The stated timeout, or ten times the median of the fits so far."""
         if self._timeout is not None:
             return self._timeout
-        if len(self._took) < _KNOWN:
-            return _FIRST
-        return max(_LEAST, _TIMES_MEDIAN * median(self._took))
+        if len(self._times) < _FEWEST_TIMED:
+            return _FIRST_TIMEOUT
+        return max(_LEAST_TIMEOUT, _TIMES_MEDIAN * median(self._times))
 
     def note(self, row: Row) -> None:
         """Count a fit that has ended; one that failed says nothing about the time of others."""
         if row["status"] != "failed":
-            self._took.append(row["seconds"])
+            self._times.append(row["seconds"])
 
 
 class Place:
-    """An executor that somebody else made and ends; of its state only rows are known."""
+    """An executor that the caller made and ends; its state is known from the rows alone."""
 
-    connections = 1  # how often it was connected to; what was under way on an earlier one is lost
-    answers_in_between = False  # whether it may be asked while jobs are under way
+    connections = 1  # number of connections made; jobs submitted on an earlier one are lost
+    can_be_polled = False  # whether `answers` says more than False while jobs are running
 
     def __init__(self, workers: int, executor: Executor) -> None:
         self.workers, self._executor = workers, executor
@@ -87,15 +84,15 @@ class Place:
         """Begin a job."""
         try:
             return self._executor.submit(worker.do_within, job, seconds, memory)
-        except RuntimeError as exc:  # among them BrokenExecutor
+        except RuntimeError as exc:  # including BrokenExecutor
             raise LostError(f"{self} takes no jobs any more: {exc}") from exc
 
     def answers(self) -> bool:
-        """Return whether the place is known to work; asked when no row came for a while."""
+        """Return whether the place is known to work; called when no row arrives for a while."""
         return False
 
     def close(self) -> None:
-        """Give back what the place holds."""
+        """Release the resources that the place holds."""
 
     def __str__(self) -> str:
         return "the executor"
@@ -113,11 +110,11 @@ class Local(Place):
         return super().submit(job, seconds, share)
 
     def answers(self) -> bool:
-        """Return that it works."""
+        """Return True: these threads always work."""
         return True
 
     def close(self) -> None:
-        """End processes, but for one that the next campaign may use."""
+        """End all processes except one, which the next campaign can use."""
         self._executor.shutdown(wait=False, cancel_futures=True)
         worker.end_busy()
         self._executor.shutdown(wait=True)
@@ -125,9 +122,9 @@ class Local(Place):
 
 
 class Scheduler(Place):
-    """A Dask scheduler; a lost connection is made again."""
+    """A Dask scheduler; a lost connection is restored."""
 
-    answers_in_between = True
+    can_be_polled = True
 
     def __init__(self, address: str, workers: int | None = None) -> None:
         self._address = address
@@ -140,7 +137,7 @@ class Scheduler(Place):
         self._refuse_other_versions()
 
     def _connected(self) -> Any:
-        return library("distributed", "dask").Client(self._address, timeout=2.0 * _ANSWER)
+        return library("distributed", "dask").Client(self._address, timeout=2.0 * _RESPONSE_TIME)
 
     def _refuse_other_versions(self) -> None:
         def installed() -> str:  # inside a function, so that its code goes to the workers
@@ -161,26 +158,28 @@ class Scheduler(Place):
             )
 
     def submit(self, job: Job, seconds: float, memory: float | None) -> Future[Row]:
-        """Begin a job on a worker; what a broken connection says is not the end of the place."""
+        """Begin a job on a worker; errors of a broken connection are not converted to LostError."""
         return self._executor.submit(worker.do_within, job, seconds, memory)
 
     def answers(self) -> bool:
-        """Return whether the scheduler has workers; connect again where the connection is lost."""
+        """Return whether the scheduler has workers; reconnect if the connection is lost."""
         try:
             if self._client.status != "running":
                 client = self._connected()
                 self.close()
                 self._client, self._executor = client, client.get_executor(pure=False)
                 self.connections += 1
-            cores = self._client.sync(self._client.scheduler.ncores, callback_timeout=_ANSWER)
-        except Exception:  # whatever a library says about a connection that is broken
+            cores = self._client.sync(
+                self._client.scheduler.ncores, callback_timeout=_RESPONSE_TIME
+            )
+        except Exception:  # any error of a broken connection
             return False
         return bool(cores)
 
     def close(self) -> None:
         """End the connection."""
         with contextlib.suppress(Exception):
-            self._client.close(timeout=_ANSWER)
+            self._client.close(timeout=_RESPONSE_TIME)
 
     def __str__(self) -> str:
         return f"the scheduler {self._address}, or all of its workers,"
@@ -191,58 +190,57 @@ def run_jobs(
 ) -> Iterator[tuple[_Tag, Row]]:
     """Yield the row of each job as it is completed; jobs are read as they are needed.
 
-    Raises LostError where the place does not answer for `patience` seconds.
+    Raises LostError if the place does not answer for `patience` seconds.
     """
-    waiting, again = iter(jobs), list[tuple[_Tag, Job]]()
-    under_way: dict[Future[Row], tuple[tuple[_Tag, Job], float]] = {}
-    heard, connections, exhausted = time.monotonic(), place.connections, False
+    waiting, repeated = iter(jobs), list[tuple[_Tag, Job]]()
+    running: dict[Future[Row], tuple[tuple[_Tag, Job], float]] = {}
+    last_answer, connections, exhausted = time.monotonic(), place.connections, False
     while True:
-        while len(under_way) < _WAITING * place.workers and not (exhausted and not again):
-            one = again.pop() if again else next(waiting, None)
-            if one is None:
+        while len(running) < _WAITING * place.workers and not (exhausted and not repeated):
+            tagged = repeated.pop() if repeated else next(waiting, None)
+            if tagged is None:
                 exhausted = True
                 break
             try:
                 seconds = limits.seconds
-                under_way[place.submit(one[1], seconds, limits.memory)] = one, seconds
+                running[place.submit(tagged[1], seconds, limits.memory)] = tagged, seconds
             except LostError:
                 raise
-            except Exception:  # a connection that broke between two looks at it
-                again.append(one)
+            except Exception:  # the connection broke since the last check
+                repeated.append(tagged)
                 break
-        if exhausted and not under_way and not again:
+        if exhausted and not running and not repeated:
             return
-        if not under_way:
-            time.sleep(_LOOK)
-        came = False
-        for future in wait(under_way, timeout=_LOOK, return_when=FIRST_COMPLETED).done:
-            one, _ = under_way.pop(future)
+        if not running:
+            time.sleep(_POLL)
+        received = False
+        for future in wait(running, timeout=_POLL, return_when=FIRST_COMPLETED).done:
+            tagged, _ = running.pop(future)
             try:
                 row = future.result()
-            except (CancelledError, BrokenExecutor):  # the place broke, whatever the job
-                again.append(one)
+            except (CancelledError, BrokenExecutor):  # not the fault of the job
+                repeated.append(tagged)
                 continue
-            except Exception as exc:  # raised by the executor, which gave the job up
+            except Exception as exc:  # the executor gave up the job
                 text = " ".join(str(exc).split())
                 row = failed(f"the worker was lost, and the job given up: {text}", retry=True)
-            came = True
+            received = True
             limits.note(row)
-            yield one[0], row
-        most = patience
-        if not place.answers_in_between:
-            most += max((seconds for _, seconds in under_way.values()), default=0.0)
-        if came or place.answers():
-            heard = time.monotonic()
-        elif time.monotonic() - heard > most:
-            raise LostError(f"{place} has not answered for {most:.3g} s")
+            yield tagged[0], row
+        timeout = patience
+        if not place.can_be_polled:
+            timeout += max((seconds for _, seconds in running.values()), default=0.0)
+        if received or place.answers():
+            last_answer = time.monotonic()
+        elif time.monotonic() - last_answer > timeout:
+            raise LostError(f"{place} has not answered for {timeout:.3g} s")
         if place.connections != connections:
             connections = place.connections
-            again += [one for one, _ in under_way.values()]
-            under_way.clear()
+            repeated += [tagged for tagged, _ in running.values()]
+            running.clear()
 
 
 def default_workers() -> int:
     """Return the number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    affinity = getattr(os, "sched_getaffinity", None)  # on Linux
+    return len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -9,8 +9,8 @@ between runs of one device (only where some device has several fits). tau and om
 priors, and all results are averaged over their posterior on a grid, so that few devices give wide
 intervals; b is integrated in closed form. The REML estimate is the posterior's mode.
 
-Outlying devices are found first, and take no part in mean, scatter and coefficients. Control charts
-compare a fit with the other fits of its device where there are several, because scatter between
+Outlying devices are identified first, and excluded from mean, scatter and coefficients. A control
+chart compares a fit with the other fits of its device if there are several, because scatter between
 devices is not a change in time.
 """
 
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 USABLE = ("trusted", "approximate")
 """Statuses whose numbers and uncertainties can be used."""
 _NODES = 31  # grid points in tau and in omega; twice as many change no interval by 1 %
-_GONE = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
-_MOST = 20.0  # largest tau that REML tries, in standard deviations of the estimates
+_NEGLIGIBLE = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
+_LARGEST_TAU = 20.0  # in REML, in standard deviations of the estimates
 _FALSE_ALARMS = 0.01  # probability that any device is called outlying if none is
 # Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations
 EWMA_WEIGHT, EWMA_WIDTH = 0.2, 2.86
@@ -59,16 +59,16 @@ class _Fits:
         labels, numbers = np.unique(device, return_inverse=True)
         return cls(y, u2, X, numbers, labels.size)
 
-    def only(self, kept: NDArray[np.bool_]) -> _Fits:
-        return _Fits.of(self.y[kept], self.u2[kept], self.X[kept], self.device[kept])
+    def select(self, mask: NDArray[np.bool_]) -> _Fits:
+        return _Fits.of(self.y[mask], self.u2[mask], self.X[mask], self.device[mask])
 
     def sums(self, values: FloatArray) -> FloatArray:
-        """Return the sums of values, (n,) or (n, c), of each device's fits."""
-        each = [np.bincount(self.device, v, self.devices) for v in np.atleast_2d(values.T)]
-        return np.asarray(each[0] if values.ndim == 1 else np.stack(each, axis=-1))
+        """Return the sums of values, (n,) or (n, c), over the fits of each device."""
+        sums = [np.bincount(self.device, v, self.devices) for v in np.atleast_2d(values.T)]
+        return np.asarray(sums[0] if values.ndim == 1 else np.stack(sums, axis=-1))
 
-    def at(self, tau: float, omega: float) -> _Solution:
-        """Return the generalised least squares solution at given scatters."""
+    def solve(self, tau: float, omega: float) -> _Solution:
+        """Return the generalised least squares solution for given tau and omega."""
         w = 1.0 / (omega**2 + self.u2)
         total = self.sums(w)
         shrink = tau**2 / (1.0 + tau**2 * total)
@@ -80,26 +80,26 @@ class _Fits:
         log_det = -np.log(w).sum() + np.log1p(tau**2 * total).sum()
         squares = G[-1, -1] - G[:-1, -1] @ b
         log_likelihood = -0.5 * (log_det - np.linalg.slogdet(C)[1] + squares)
-        away = self.sums(w * (self.y - self.X @ b)) / total
-        return _Solution(tau, b, C, float(log_likelihood), away, 1.0 / total)
+        residual = self.sums(w * (self.y - self.X @ b)) / total
+        return _Solution(tau, b, C, float(log_likelihood), residual, 1.0 / total)
 
 
 class _Solution(NamedTuple):
-    """Coefficients b with covariance C, mean residuals of devices and their variance by fits."""
+    """Coefficients b with covariance C; for each device its mean residual and its variance."""
 
     tau: float
     b: FloatArray
     C: FloatArray
     log_likelihood: float
-    away: FloatArray
+    residual: FloatArray
     variance: FloatArray
 
     def shrunken(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return estimates of the devices, of mean covariates x, and their variances."""
-        pull = self.tau**2 / (self.tau**2 + self.variance)
-        left = (1.0 - pull)[:, None] * x
-        variance = pull * self.variance + np.einsum("ij,jk,ik->i", left, self.C, left)
-        return x @ self.b + pull * self.away, variance
+        """Return shrunk estimates of the devices, with mean covariates x, and their variances."""
+        weight = self.tau**2 / (self.tau**2 + self.variance)
+        remaining = (1.0 - weight)[:, None] * x
+        variance = weight * self.variance + np.einsum("ij,jk,ik->i", remaining, self.C, remaining)
+        return x @ self.b + weight * self.residual, variance
 
 
 @dataclass(frozen=True)
@@ -109,24 +109,24 @@ class PopulationParameter:
     Attributes
     ----------
     name, unit : str
-        Of the parameter.
+        Name and unit of the parameter.
     logarithmic : bool
-        Whether the model is that of its logarithm; scatter is relative then.
+        Whether the model describes its logarithm; scatter is then relative.
     coefficients : mapping of str to (float, float)
         Value and standard uncertainty of the mean (at the mean of the covariates) and of the
         change per unit of each covariate.
     between_devices, between_runs : (float, float, float)
-        Posterior median and limits (95.45 %) of tau and omega; omega is zero where every device
-        has one fit.
+        Posterior median and limits (95.45 %) of tau and omega; omega is zero if every device has
+        one fit.
     devices : DataFrame
-        Each device: own mean, estimate shrunk towards the population (`shrunken`) with its standard
-        uncertainty, and `p`, the probability of a device this distant if it belongs to the
-        population.
+        One row per device: the mean of its own fits (`own`), the estimate shrunk towards the
+        population (`shrunken`) with its standard uncertainty, and `p`, the probability of a device
+        this distant if it belongs to the population.
     ordered : bool
         Whether an order in time was stated.
     fits : DataFrame
-        Control charts, a row a fit: individuals (`value`, `centre`, `limit`) and, where an order in
-        time is stated, EWMA (`ewma`, `ewma_limit`). Where devices have several fits, a value is the
+        Control charts, one row per fit: individuals (`value`, `centre`, `limit`) and, if an order
+        in time is stated, EWMA (`ewma`, `ewma_limit`). If devices have several fits, a value is the
         deviation from the others of its device, and NaN for a device with one.
 
     Examples
@@ -161,29 +161,29 @@ class PopulationParameter:
     def __str__(self) -> str:
         value, u = self.mean
         lines = [f"{self.name}: mean {with_unit(value, u, self.unit)}"]
-        what = f"ln {self.name}" if self.logarithmic else self.name
+        quantity = f"ln {self.name}" if self.logarithmic else self.name
         lines += [
-            f"change of {what} per unit of {name}: {with_unit(b, error, '')}"
+            f"change of {quantity} per unit of {name}: {with_unit(b, error, '')}"
             for name, (b, error) in self.coefficients.items()
             if name != "mean"
         ]
         unit = "" if self.logarithmic else self.unit
-        for where, (median, low, high) in (
+        for groups, (median, low, high) in (
             ("devices", self.between_devices), ("runs", self.between_runs)
         ):  # fmt: skip
             if high > 0.0:
                 limits = interval(low, high, unit)
-                lines.append(f"scatter of {what} between {where}: {median:.2g} ({limits})")
+                lines.append(f"scatter of {quantity} between {groups}: {median:.2g} ({limits})")
         if self.out_of_control:
             lines.append(f"fits outside the control limits: {len(self.out_of_control)}")
-        outlying = ", ".join(self.outlying)
-        told = f"{outlying}, not in these numbers" if outlying else "no device"
-        lines.append(f"outside the population: {told}")
+        names = ", ".join(self.outlying)
+        outlying = f"{names}, not in these numbers" if names else "no device"
+        lines.append(f"outside the population: {outlying}")
         return "\n".join(lines)
 
     @property
     def outlying(self) -> tuple[str, ...]:
-        """Devices outside the population; false-alarm rate 1 % for all together."""
+        """Devices outside the population; the false-alarm rate is 1 % for all devices together."""
         return tuple(self.devices.index[self.devices["outlying"]])
 
     @property
@@ -204,11 +204,11 @@ class Population:
     Attributes
     ----------
     parameters : mapping of str to PopulationParameter
-        By name; the population itself is indexed by name as well.
+        Parameters by name; the population itself can be indexed by name as well.
     used : int
-        Fits that were used.
+        Number of fits used.
     left_out : mapping of str to int
-        Fits that were not used, by status.
+        Number of fits not used, by status.
 
     Examples
     --------
@@ -231,7 +231,7 @@ class Population:
         return self.parameters[name]
 
     def summary(self) -> pd.DataFrame:
-        """Return one row a parameter: mean, u, scatter between devices and runs, covariates."""
+        """Return one row per parameter: mean, u, scatter between devices and runs, covariates."""
         import pandas as pd
 
         rows = {}
@@ -246,8 +246,8 @@ class Population:
         return pd.DataFrame.from_dict(rows, orient="index")
 
     def __str__(self) -> str:
-        left = ", ".join(f"{count} {status}" for status, count in self.left_out.items())
-        head = f"{self.used} fits used" + (f"; left out: {left}" if left else "")
+        unused = ", ".join(f"{count} {status}" for status, count in self.left_out.items())
+        head = f"{self.used} fits used" + (f"; left out: {unused}" if unused else "")
         return f"{head}\n{self.summary()}"
 
 
@@ -263,12 +263,12 @@ def population(
     Parameters
     ----------
     table : DataFrame
-        That of a campaign: a row a fit, with `device`, `status`, and for each parameter ``p``
+        Table of a campaign: one row per fit, with `device`, `status`, and for each parameter ``p``
         its value ``p`` and its combined standard uncertainty ``u_p``.
     parameters : sequence of str, optional
-        By default every column that has an uncertainty.
+        Parameters to evaluate; by default every column that has an uncertainty.
     covariates : sequence of str, optional
-        Columns on which the parameters may depend, linearly.
+        Columns on which the parameters may depend linearly.
     order : str, optional
         Column that orders the fits in time. Without it the control charts show no drift: there is
         a chart of individuals in the order of the table, and no EWMA chart.
@@ -285,13 +285,13 @@ def population(
     DataError
         If a column is missing or not numeric, or fewer than three devices are usable.
     ValidationError
-        If a covariate is the same in every fit, or follows from others.
+        If a covariate is the same in every fit, or a linear combination of others.
 
     Notes
     -----
     Fits whose status is neither trusted nor approximate, or that have no finite uncertainty, are
-    left out, and counted. Devices outside the population are named, and take no part in its mean,
-    scatter and coefficients, nor in the limits of control charts.
+    left out and counted. Devices outside the population are named, and excluded from its mean,
+    scatter and coefficients, and from the limits of control charts.
 
     Examples
     --------
@@ -307,7 +307,7 @@ def population(
     """
     names = _parameters(table, parameters)
     _require(table, ["device", "status", *covariates, *([order] if order else [])])
-    table = marked(table, names)
+    table = with_final_status(table, names)
     usable = table["status"].isin(USABLE).to_numpy()
     left_out = table.loc[~usable, "status"].value_counts().to_dict()
     chosen = table.loc[usable]
@@ -318,12 +318,15 @@ def population(
             f"{chosen['device'].nunique()} devices have usable results; a population needs at "
             "least three"
         )
-    evaluated = {name: _one(chosen, name, list(covariates), order is not None) for name in names}
+    evaluated = {
+        name: _parameter_statistics(chosen, name, list(covariates), order is not None)
+        for name in names
+    }
     return Population(evaluated, len(chosen), {str(k): int(v) for k, v in left_out.items()})
 
 
-def marked(table: pd.DataFrame, parameters: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return the table with a status that says so where a usable fit has no finite uncertainty."""
+def with_final_status(table: pd.DataFrame, parameters: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return the table; the status of a usable fit without a finite uncertainty says so."""
     names = _estimated(table) if parameters is None else parameters
     u = table[[f"u_{name}" for name in names]].replace(np.inf, np.nan)
     without = table["status"].isin(USABLE) & (u.isna().any(axis=1) | u.empty)
@@ -353,7 +356,7 @@ def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:
         )
 
 
-def _one(
+def _parameter_statistics(
     table: pd.DataFrame, name: str, covariates: list[str], ordered: bool
 ) -> PopulationParameter:
     import pandas as pd
@@ -371,20 +374,18 @@ def _one(
             f"the covariates {', '.join(covariates)} are constant or follow from each other in "
             "these fits; leave one out"
         )
-    whole = _Fits(y, u**2, X, device, len(labels))
-    p, outlying = _outlying(whole)
+    fits = _Fits(y, u**2, X, device, len(labels))
+    p, outlying = _outlying(fits)
     inside = ~outlying[device]
     X[:, 1:] -= X[inside, 1:].mean(axis=0)
-    posterior = _Averages.of(whole.only(inside))
+    posterior = _Averages.of(fits.select(inside))
     tau, omega = posterior.scatters
-    separate = whole.sums(y / u**2) / whole.sums(u**-2)
+    own = fits.sums(y / u**2) / fits.sums(u**-2)
     w = 1.0 / (omega[0] ** 2 + u**2)
-    alone = whole.sums(w)
-    shrunken, variance = whole.sums(w * y) / alone, 1.0 / alone
+    weight = fits.sums(w)
+    shrunken, variance = fits.sums(w * y) / weight, 1.0 / weight  # of outlying devices: not shrunk
     shrunken[~outlying], variance[~outlying] = posterior.devices, posterior.variance
-    devices = pd.DataFrame(
-        {"own": separate, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels
-    )
+    devices = pd.DataFrame({"own": own, "shrunken": shrunken, "u": np.sqrt(variance)}, index=labels)
     devices["p"], devices["outlying"] = p, outlying
     if logarithmic:
         devices["u"] *= np.exp(devices["shrunken"])
@@ -395,14 +396,15 @@ def _one(
         name=name,
         unit=str(table[f"unit_{name}"].iloc[0]) if f"unit_{name}" in table else "",
         logarithmic=logarithmic,
-        coefficients={n: (float(v), float(e)) for n, v, e in zip(["mean", *covariates], b, u_b,
-                                                                 strict=True)},
+        coefficients=dict(
+            zip(["mean", *covariates], zip(b.tolist(), u_b.tolist(), strict=True), strict=True)
+        ),
         between_devices=tau,
         between_runs=omega,
         devices=devices,
         ordered=ordered,
         fits=pd.DataFrame({"device": table["device"].to_numpy(), **charts}),
-    )  # fmt: skip
+    )
 
 
 def _numbers(table: pd.DataFrame, column: str) -> FloatArray:
@@ -433,23 +435,23 @@ class _Averages(NamedTuple):
         mode = _reml(data)
         repeated = len(data.y) > data.devices
         nodes = [_nodes(data, mode, 0), _nodes(data, mode, 1) if repeated else np.zeros(1)]
-        every = [data.at(tau, omega) for tau in nodes[0] for omega in nodes[1]]
-        values = np.array([solution.log_likelihood for solution in every])
+        solutions = [data.solve(tau, omega) for tau in nodes[0] for omega in nodes[1]]
+        values = np.array([s.log_likelihood for s in solutions])
         widths = [np.gradient(n) if n.size > 1 else np.ones(1) for n in nodes]
         weights = np.exp(values - values.max()) * np.outer(*widths).ravel()
         weights /= weights.sum()
-        b, C = (np.array([getattr(one, name) for one in every]) for name in ("b", "C"))
+        b, C = np.array([s.b for s in solutions]), np.array([s.C for s in solutions])
         mean = weights @ b
         covariance = np.tensordot(weights, C, 1) + (weights[:, None] * (b - mean)).T @ (b - mean)
         x = data.sums(data.X) / data.sums(np.ones(len(data.y)))[:, None]
-        each = [one.shrunken(x) for one in every]
-        devices, variances = (np.array(part) for part in zip(*each, strict=True))
+        estimates = [s.shrunken(x) for s in solutions]
+        devices, variances = (np.array(part) for part in zip(*estimates, strict=True))
         shrunken = weights @ devices
         variance = weights @ (variances + (devices - shrunken) ** 2)
         grid, scatters = weights.reshape(len(nodes[0]), -1), []
-        for places, marginal in zip(nodes, (grid.sum(1), grid.sum(0)), strict=True):
+        for axis, marginal in zip(nodes, (grid.sum(1), grid.sum(0)), strict=True):
             cumulative = np.cumsum(marginal) - 0.5 * marginal
-            low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, places)
+            low, middle, high = np.interp([0.02275, 0.5, 0.97725], cumulative, axis)
             scatters.append((float(middle), float(low), float(high)))
         return cls(mean, covariance, shrunken, variance, scatters)
 
@@ -460,11 +462,11 @@ def _reml(data: _Fits) -> tuple[float, float]:
 
     def objective(x: FloatArray) -> float:
         tau, omega = np.abs(x) * spread  # even in both, so that zero is an ordinary point
-        return -data.at(tau, omega).log_likelihood
+        return -data.solve(tau, omega).log_likelihood
 
     if len(data.y) == data.devices:
         best = optimize.minimize_scalar(
-            lambda t: objective(np.array([t, 0.0])), bounds=(0.0, _MOST), method="bounded"
+            lambda t: objective(np.array([t, 0.0])), bounds=(0.0, _LARGEST_TAU), method="bounded"
         )
         return float(best.x) * spread, 0.0
     starts = [np.array([a, b]) for a in (0.7, 0.05) for b in (0.7, 0.05)]
@@ -476,9 +478,9 @@ def _reml(data: _Fits) -> tuple[float, float]:
 def _nodes(data: _Fits, mode: tuple[float, float], axis: int) -> FloatArray:
     """Return nodes from zero to where the likelihood is negligible, finer near zero."""
     point = list(mode)
-    top = data.at(*point).log_likelihood
+    top = data.solve(*point).log_likelihood
     step = 0.1 * float(np.sqrt(np.median(data.u2)))
-    while top - data.at(*point).log_likelihood < _GONE:
+    while top - data.solve(*point).log_likelihood < _NEGLIGIBLE:
         point[axis] = 1.3 * point[axis] + step
     return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
 
@@ -487,28 +489,28 @@ def _outlying(data: _Fits) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return each device's p value against all others, and which are outlying.
 
     Outlying devices are removed one by one, the most distant first, so that they do not mask one
-    another; at most half of the devices are removed, and two freedoms of the scatter stay, without
-    which its posterior has no end.
+    another; at most half of the devices are removed, and two degrees of freedom of the scatter
+    remain, without which its posterior is not integrable.
     """
     p, outlying = np.ones(data.devices), np.zeros(data.devices, dtype=bool)
     kept, numbers = data, np.arange(data.devices)
     for _ in range(data.devices // 2):
-        solution = kept.at(*_reml(kept))
-        worst = int(np.argmax(solution.away**2 / (solution.tau**2 + solution.variance)))
+        solution = kept.solve(*_reml(kept))
+        worst = int(np.argmax(solution.residual**2 / (solution.tau**2 + solution.variance)))
         fits = kept.device == worst
-        others = kept.only(~fits)
+        others = kept.select(~fits)
         freedom = others.devices - others.X.shape[1]
         if freedom < 2 or np.linalg.matrix_rank(others.X) < others.X.shape[1]:
             break
         tau, omega = _reml(others)
-        solution = others.at(tau, omega)
+        solution = others.solve(tau, omega)
         w = 1.0 / (omega**2 + kept.u2[fits])
         x = (w[:, None] * kept.X[fits]).sum(axis=0) / w.sum()
         deviation = float((w * kept.y[fits]).sum() / w.sum() - x @ solution.b)
         distance = deviation / np.sqrt(tau**2 + 1.0 / w.sum() + x @ solution.C @ x)
         # the most distant of all: Sidak's correction for the number of devices
-        alone = 2.0 * stats.t.sf(abs(distance), freedom)
-        p[numbers[worst]] = -np.expm1(kept.devices * np.log1p(-min(alone, 1.0 - 1e-16)))
+        single = 2.0 * stats.t.sf(abs(distance), freedom)
+        p[numbers[worst]] = -np.expm1(kept.devices * np.log1p(-min(single, 1.0 - 1e-16)))
         if p[numbers[worst]] >= _FALSE_ALARMS:
             break
         outlying[numbers[worst]] = True
@@ -519,10 +521,10 @@ def _outlying(data: _Fits) -> tuple[FloatArray, NDArray[np.bool_]]:
 def _charts(
     y: FloatArray, device: NDArray[np.intp], inside: NDArray[np.bool_], ordered: bool
 ) -> dict[str, Any]:
-    """Return control charts of fits; `inside` are those that set centre and limits.
+    """Return control charts of fits; those `inside` the population set centre and limits.
 
-    Where devices have several fits, a value is the deviation from the mean of its device, enlarged
-    to the variance of a single fit; the scatter is that of successive fits of one device.
+    If devices have several fits, a value is the deviation from the mean of its device, enlarged to
+    the variance of a single fit; the scatter is that of successive fits of one device.
     """
     import pandas as pd
 
@@ -535,8 +537,8 @@ def _charts(
     sigma = float(ranges.mean()) / _MOVING_RANGE if ranges.size else np.nan
     centre = float(y[inside].mean())
     if repeated:
-        away = y - (np.bincount(device, y) / np.bincount(device))[device]
-        y = centre + np.where(fits > 1, away * np.sqrt(fits / np.maximum(fits - 1, 1)), np.nan)
+        deviation = y - np.bincount(device, y)[device] / fits
+        y = centre + np.where(fits > 1, deviation * np.sqrt(fits / np.maximum(fits - 1, 1)), np.nan)
     charts: dict[str, Any] = {"value": y, "centre": centre, "limit": 3.0 * sigma}
     if not ordered:
         return charts
@@ -544,6 +546,6 @@ def _charts(
     ewma, width = np.full((2, y.size), np.nan)
     from_centre = pd.Series([centre, *y[charted]]).ewm(alpha=EWMA_WEIGHT, adjust=False)
     ewma[charted] = from_centre.mean()[1:]
-    grown = 1.0 - (1.0 - EWMA_WEIGHT) ** (2.0 * np.arange(1, charted.size + 1))
-    width[charted] = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * grown)
+    settled = 1.0 - (1.0 - EWMA_WEIGHT) ** (2.0 * np.arange(1, charted.size + 1))
+    width[charted] = EWMA_WIDTH * sigma * np.sqrt(EWMA_WEIGHT / (2.0 - EWMA_WEIGHT) * settled)
     return {**charts, "ewma": ewma, "ewma_limit": width}

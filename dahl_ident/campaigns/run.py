@@ -90,7 +90,7 @@ class Campaign:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The results, one row a fit."""
+        """The results, one row per fit."""
         import pandas as pd
 
         path = self.folder / "results.csv"
@@ -134,11 +134,11 @@ class Campaign:
             not set.
         """
         from dahl_ident.campaigns.campaign_report import FORMATS, campaign_document
-        from dahl_ident.campaigns.population import USABLE, marked, population
+        from dahl_ident.campaigns.population import USABLE, population, with_final_status
         from dahl_ident.reporting.publish import content_of
 
         place = place_of(path, "a campaign's report", FORMATS)
-        table = marked(self.table)
+        table = with_final_status(self.table)
         enough = table.loc[table["status"].isin(USABLE), "device"].nunique() >= 3
         evaluated = population(table, covariates=covariates, order=order) if enough else None
         reports = Path(os.path.relpath(self.folder / "reports", place.parent)).as_posix()

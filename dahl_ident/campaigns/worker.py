@@ -1,10 +1,10 @@
 """One fit of a campaign in a separate process: from files to a row, with limits.
 
-Each fit runs in a separate process, wherever it runs: on this machine, in a thread of an executor,
-on a worker of a cluster. So a fit that hangs, needs too much memory or kills its process ends as a
-row, and nothing else is lost. Jobs go through standard input and rows come back through standard
-output, as pickles; nothing of the calling script is imported but the files of its laws. Numerical
-libraries are imported only inside functions, so that this module loads at once.
+Each fit has a separate process, whether it runs on this machine, in a thread of an executor or on
+a worker of a cluster. A fit that hangs, needs too much memory or kills its process therefore ends
+as a row, and nothing else is lost. Jobs go through standard input and rows come back through
+standard output, as pickles; of the calling script, only the files of its laws are imported.
+Numerical libraries are imported inside functions, so that this module loads quickly.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_DEATHS = 3  # of worker processes on one job, after which the job is taken as the cause
+_DEATHS = 3  # worker processes that may die on one job before the job is taken as the cause
 _START = "import sys; sys.path[:] = {!r}; from dahl_ident.campaigns.worker import serve; serve()"
 
 
@@ -50,33 +51,33 @@ class Job:
     files: tuple[tuple[str, bytes | None], ...]
     runs: tuple[str, ...]  # label of each file
     options: Mapping[str, Any]  # of :class:`dahl_ident.campaigns.definition.Definition`
-    report: str | None  # where the report goes
+    report: str | None  # path of its report
     # modules, or files with their contents, that define laws of the model
     laws: tuple[str | LawFile, ...] = ()
     version: str = __version__  # that of the package that made the job
 
 
 class UnseenError(DataError):
-    """A file that cannot be read where the fit is made; perhaps it can elsewhere."""
+    """A file that cannot be read on the machine that does the fit; perhaps it can on another."""
 
 
 def failed(error: str, *, retry: bool = False, refused: bool = False, seconds: float = 0.0) -> Row:
     """Return the row of a fit that failed.
 
-    With `retry`, the same command tries it again; `refused` says that options or model are wrong.
+    With `retry`, the same command tries it again; `refused`: the options or the model are wrong.
     """
     row: Row = {"status": "failed", "error": error, "digests": [], "seconds": seconds}
-    return row | {name: True for name, is_so in (("retry", retry), ("refused", refused)) if is_so}
+    return row | {name: True for name, is_set in (("retry", retry), ("refused", refused)) if is_set}
 
 
 def do(job: Job) -> Row:
     """Return the row of one fit; a failure is a row with the reason."""
-    began = time.perf_counter()
+    start = time.perf_counter()
     digests: list[str] = []
     try:
         for law in job.laws:
             _load(law)
-        row = _done(job, digests)
+        row = _fitted(job, digests)
     except UnseenError as exc:
         row = failed(
             f"{exc}; where workers do not have the files, send them with send_files=True (on the "
@@ -89,10 +90,10 @@ def do(job: Job) -> Row:
             "give it more with memory= (on the command line --memory)",
             retry=True,
         )
-    except Exception as exc:  # one device that fails, however, must not end the campaign
-        wrong = isinstance(exc, (ValidationError, ModelError))
-        row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}", refused=wrong)
-    return {**row, "digests": digests, "seconds": time.perf_counter() - began}
+    except Exception as exc:  # no failure of one device may end the campaign
+        refused = isinstance(exc, (ValidationError, ModelError))
+        row = failed(f"{type(exc).__name__}: {' '.join(str(exc).split())}", refused=refused)
+    return {**row, "digests": digests, "seconds": time.perf_counter() - start}
 
 
 def _load(law: str | LawFile) -> None:
@@ -105,7 +106,7 @@ def _load(law: str | LawFile) -> None:
     run(law)
 
 
-def _done(job: Job, digests: list[str]) -> Row:
+def _fitted(job: Job, digests: list[str]) -> Row:
     import dahl_ident as di
     from dahl_ident.elements.model import model_from_description
 
@@ -123,10 +124,10 @@ def _done(job: Job, digests: list[str]) -> Row:
             row[f"posterior_{name}"] = estimate.value
             row[f"u_posterior_{name}"] = estimate.stderr
     if job.report is not None:
-        place = Path(job.report)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        di.report(results, place, title=job.name, overwrite=True)
-        row["report"] = place.name
+        path = Path(job.report)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        di.report(results, path, title=job.name, overwrite=True)
+        row["report"] = path.name
     return row
 
 
@@ -146,9 +147,9 @@ def _response(
 
 @contextmanager
 def _on_disk(job: Job, digests: list[str]) -> Iterator[list[Path]]:
-    """Give the paths of the files while they are read, and record their digests.
+    """Yield the paths of the files, and append their digests to a list.
 
-    Files that came with the job are in a folder that is removed afterwards.
+    Files that were sent with the job are in a folder that is removed afterwards.
     """
     with TemporaryDirectory(prefix="campaign_") as folder:
         paths = []
@@ -164,11 +165,11 @@ def _on_disk(job: Job, digests: list[str]) -> Iterator[list[Path]]:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 digest of a regular file, or why there is none."""
+    """Return the SHA-256 digest of a regular file."""
     from dahl_ident.data.storage import regular
 
     try:
-        path.stat()  # what is not there may be elsewhere; what is not a file is not one anywhere
+        path.stat()  # a missing file may exist on another machine
         with regular(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as exc:
@@ -189,7 +190,7 @@ def _row(result: FitResult) -> Row:
         row[f"unit_{name}"] = estimate.unit
     try:
         budget = result.budget()
-    except FitError:  # there is no finite uncertainty; the statements say why
+    except FitError:  # no finite uncertainty; the statements say why
         return row
     for name, part in budget.items():
         row |= {f"u_{name}": part.u, f"U_{name}": part.U, f"dof_{name}": part.dof}
@@ -207,22 +208,22 @@ class _Process:
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(self.path)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            start_new_session=True,  # an interrupt from the keyboard is for whoever asks
+            start_new_session=True,  # an interrupt from the keyboard is for the parent process
             env={**os.environ, **dict.fromkeys(THREADS, "1")},
         )  # fmt: skip
 
     def do(self, job: Job, seconds: float, memory: float | None) -> Row | None:
-        """Return the row of a job, None if the process died; it is killed after some seconds."""
+        """Return the row of a job, None if the process died; it is killed after so many seconds."""
         content = pickle.dumps((job, memory))
-        late = threading.Event()
+        timed_out = threading.Event()
 
         def stop() -> None:
-            late.set()
+            timed_out.set()
             self._process.kill()
 
-        clock = threading.Timer(seconds, stop)
-        clock.daemon = True
-        clock.start()
+        timer = threading.Timer(seconds, stop)
+        timer.daemon = True
+        timer.start()
         try:
             assert self._process.stdin is not None
             assert self._process.stdout is not None
@@ -233,7 +234,7 @@ class _Process:
             if self._ended:
                 return failed("the campaign was ended", retry=True)
             self.end()
-            if not late.is_set():
+            if not timed_out.is_set():
                 return None
             return failed(
                 f"stopped after {seconds:.3g} s, the limit of time for a device; give it more with "
@@ -241,7 +242,7 @@ class _Process:
                 retry=True, seconds=seconds,
             )  # fmt: skip
         finally:
-            clock.cancel()
+            timer.cancel()
         return row
 
     @property
@@ -249,12 +250,12 @@ class _Process:
         return self._process.poll() is None
 
     def end(self) -> int:
-        """End the process, and return how it ended."""
+        """End the process, and return its exit status."""
         self._ended = True
         self._process.kill()
         for stream in (self._process.stdin, self._process.stdout):
             assert stream is not None
-            with contextlib.suppress(OSError):  # what it has not read
+            with contextlib.suppress(OSError):  # from flushing what it has not read
                 stream.close()
         return self._process.wait()
 
@@ -264,7 +265,7 @@ _busy: set[_Process] = set()
 
 
 def do_within(job: Job, seconds: float, memory: float | None) -> Row:
-    """Return the row of a job that may take some seconds and GB, done in a separate process."""
+    """Return the row of a job, done in a separate process with limits of time and memory (GB)."""
     if job.version != __version__:
         return failed(
             f"ValidationError: this worker has dahl_ident {__version__}, and the campaign was "
@@ -279,15 +280,12 @@ def do_within(job: Job, seconds: float, memory: float | None) -> Row:
     return failed(f"the process that worked on it died {_DEATHS} times", retry=True)
 
 
-@contextlib.contextmanager
+@contextmanager
 def _borrowed() -> Iterator[_Process]:
-    process = None
-    while process is None and _idle:
-        process = _idle.pop()
-        if process.path != sys.path:  # it may not find the modules of laws
-            process.end()
-            process = None
-    process = process or _Process()
+    process = _idle.pop() if _idle else _Process()
+    if process.path != sys.path:  # it may not find the modules of laws
+        process.end()
+        process = _Process()
     _busy.add(process)
     try:
         yield process
@@ -298,13 +296,13 @@ def _borrowed() -> Iterator[_Process]:
 
 
 def end_busy() -> None:
-    """End processes that are in the middle of a job."""
+    """End the processes that are working on a job."""
     for process in tuple(_busy):
         process.end()
 
 
 def end_idle(keep: int = 0) -> None:
-    """End processes that have nothing to do; `keep` stay for the next campaign."""
+    """End idle processes, except for `keep` of them, which the next campaign can use."""
     while len(_idle) > keep:
         _idle.pop().end()
 
@@ -314,44 +312,40 @@ atexit.register(end_idle)
 
 def serve() -> None:
     """Do the jobs that come through standard input, until it is closed."""
-    jobs: list[tuple[Job, float | None]] = []
-    there = threading.Semaphore(0)
-    source, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    jobs: SimpleQueue[tuple[Job, float | None]] = SimpleQueue()
+    source, rows = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries print to standard error, not between the rows
 
     def read() -> None:
         with contextlib.suppress(Exception):
             while True:
-                jobs.append(pickle.load(source))
-                there.release()
-        os._exit(1)  # whoever asked is gone, perhaps in the middle of a job
+                jobs.put(pickle.load(source))
+        os._exit(1)  # the parent process is gone, perhaps in the middle of a job
 
     threading.Thread(target=read, daemon=True).start()
     while True:
-        there.acquire()
-        job, memory = jobs.pop()
+        job, memory = jobs.get()
         _limit_memory(memory)
-        row = do(job)
-        pickle.dump(row, answers)
-        answers.flush()
+        pickle.dump(do(job), rows)
+        rows.flush()
 
 
 def _limit_memory(gigabytes: float | None) -> None:
-    """Limit the memory of this process; without a number, to that of the machine."""
+    """Limit the memory of this process; by default to that of the machine."""
     try:
         import resource
     except ImportError:  # Windows has no such limits
         return
-    wanted = gigabytes or machine_memory()
-    size = resource.RLIM_INFINITY if math.isinf(wanted) else int(1e9 * wanted)
-    _, most = resource.getrlimit(resource.RLIMIT_DATA)
-    if most != resource.RLIM_INFINITY:
-        size = most if size == resource.RLIM_INFINITY else min(size, most)
-    resource.setrlimit(resource.RLIMIT_DATA, (size, most))
+    limit = gigabytes or machine_memory()
+    soft = resource.RLIM_INFINITY if math.isinf(limit) else int(1e9 * limit)
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard != resource.RLIM_INFINITY:
+        soft = hard if soft == resource.RLIM_INFINITY else min(soft, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def machine_memory() -> float:
-    """Return the memory of this machine in GB; infinite where the system does not say."""
+    """Return the memory of this machine in GB; infinity if the system does not report it."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     except (AttributeError, ValueError, OSError):
