@@ -1,15 +1,15 @@
 """Cycles of a waveform, and the spans of a record that hold one level or a sweep.
 
-A record of unknown frequency is cut at its rising crossings: from below ``-h`` to above ``+h``,
-``h`` being a part of the amplitude, so noise makes none. Where the motion stays within ``±h`` for
-long the search goes on with that part's own amplitude. A record of known frequency is cut into its
-periods, in any noise. The phase of each cycle's own sine then puts its beginning right.
+A record of unknown frequency is cut at its rising crossings, from below ``-h`` to above ``+h`` with
+``h`` a fraction of the amplitude, so that noise causes none. Parts in which the motion stays within
+``±h`` for long are searched again with their own amplitude. A record of known frequency is cut into
+its periods, whatever the noise. A sine fitted to each cycle then corrects its phase.
 
-Cycle by cycle a piece grows while amplitude and frequency stay what they were on average. One that
-is long enough and has no trend is a plateau, and becomes a point; the others are ramps. Where there
-is more ramp than plateau the record is a sweep, cut into windows of little change. A drive such as
-a crank may be steady for no two cycles: where plateaus hold less than half of the cycles that
-neither sweep nor ramp, these are grouped with a wider tolerance.
+A piece grows cycle by cycle as long as amplitude and frequency stay near its mean. A piece that is
+long enough and has no trend is a plateau, and becomes a point; the others are ramps. If ramps
+outweigh plateaus, the record is a sweep, and is cut into windows of little change. A drive such as
+a crank may never be steady for two cycles: if plateaus hold less than half of the cycles outside
+sweeps and ramps, these cycles are grouped with wider tolerances.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 
-_THRESHOLD = 0.3  # fraction of the amplitude that a lobe exceeds; noise may be a tenth of it
-_QUANTILES = (0.995, 0.9, 0.7)  # for the amplitude; the next where large lobes mislead the first
-_QUIET = 1.5  # half cycles: a longer time within the threshold may hold another level
-_FEWEST_SAMPLES = 16  # a shorter quiet part is not searched for cycles of its own
-_ALIKE = 0.1  # of one sine: relative difference of periods, and part of a cycle off at most
+_THRESHOLD = 0.3  # fraction of the amplitude that half a cycle exceeds; noise may be a tenth
+_QUANTILES = (0.995, 0.9, 0.7)  # that give the amplitude, tried in turn: a few peaks may be large
+_QUIET = 1.5  # half cycles; a longer time within the threshold may hold another level
+_FEWEST_SAMPLES = 16  # a shorter quiet part is not searched for cycles
+_ALIKE = 0.1  # of one sine: largest relative difference of periods, and phase error in cycles
 _MOST_BRIDGED = 10.0  # cycles; a longer pause ends a sine
-_DEEPEST = 12  # quiet parts within quiet parts: each below _THRESHOLD of the last, in all 5e-7
-_SAMPLED = 50_000  # samples at most from which the quantiles are computed
-_FEWEST_A_CYCLE = 3  # samples in a cycle: its mean and phasor are three numbers
+_MOST_NESTED = 12  # quiet parts within quiet parts, each below _THRESHOLD of the last: 5e-7 in all
+_QUANTILE_SAMPLES = 50_000  # samples at most from which the quantiles are computed
+_FEWEST_PER_CYCLE = 3  # samples; mean and phasor of a cycle are three numbers
 _NOISIEST_CUT = 0.05  # largest noise of the log amplitude of a cycle whose frequency is known
-_FEWEST_CUTS = 3  # averages that must be left: fewer do not show whether a level is held
+_FEWEST_CUTS = 3  # cycles that must remain; fewer do not show whether the level is constant
 _NOISIEST_CROSSING = 0.1  # largest noise of the log amplitude of a cycle between two crossings
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)  # its multiples are spread most evenly
 _TOGETHER = 100_000  # samples computed at once, so that intermediate arrays stay in the cache
-_HOLE = 1.0 / 3.0  # fraction of a cycle without samples that makes its amplitude unknown
+_GAP = 1.0 / 3.0  # fraction of a cycle without samples that makes its amplitude unknown
 Mode = Literal["auto", "steps", "sweep"]
 MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
 AMPLITUDE_TOLERANCE = 0.02  # of log amplitude within a plateau; steps of level are larger
 FREQUENCY_TOLERANCE = 0.01  # of log frequency within a plateau
 _UNSTEADY = 5.0  # factor by which tolerances widen for groups of cycles whose drive varies
-_NOISE_FACTOR = 6.0  # tolerance in standard deviations of a cycle: noise alone splits no plateau
+_NOISE_FACTOR = 6.0  # least tolerance in standard deviations, so that noise splits no plateau
 _WIDEST = 0.3  # largest tolerance, however large the noise
 _LEAST_NOISE = 1e-12  # least noise of a log amplitude: its inverse square, a weight, stays finite
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is not a cycle
 _EDGE_TOLERANCE = 0.005  # relative; cycles at the ends of a plateau that differ more are left out
 _MOSTLY_HELD = 0.5  # least share of the cycles in plateaus; with less, the record is a sweep
-_CLEARLY_MORE = 1.5  # groups replace plateaus where they hold this many times as many cycles
-_SLOW = 0.005  # largest change of log amplitude in a cycle that friction follows without a lag
-_SCATTERED = 4.0  # standard deviations about a straight line within which a trend is scatter
+_CLEARLY_MORE = 1.5  # groups replace plateaus if they hold this many times as many cycles
+_SLOW = 0.005  # largest change of log amplitude per cycle that friction follows without lag
+_SCATTERED = 4.0  # largest trend, in standard deviations about a line, that may be scatter
 _SWEEP_RANGE = 0.2  # least change of log amplitude or frequency over a whole sweep
 _SWEEP_STEP = 0.2  # largest change of log amplitude or frequency from cycle to cycle of a sweep
 _SWEEP_CHANGE = 0.1  # largest change of log amplitude or frequency in one window of a sweep
@@ -61,7 +61,7 @@ _SWEEP_CYCLES = (4, 20)  # least and most cycles in one window of a sweep
 
 @dataclass(frozen=True)
 class Span:
-    """Start and stop, s, frequency in the middle, Hz, and where the spans next to it are."""
+    """Start and stop, s, frequency in the middle, Hz, and the bounds set by the adjacent spans."""
 
     start: float
     stop: float
@@ -73,10 +73,10 @@ class Span:
 
 @dataclass(frozen=True)
 class Cycles:
-    """Consecutive cycles of a sine; those with a hole in the sampling are left out.
+    """Consecutive cycles of a sine; those with a gap in the sampling are left out.
 
     `noise` is the standard deviation of `log_amplitude`, and of the phase in rad. `log_frequency`
-    is from the middle of one cycle to that of the next.
+    is the mean from the middle of one cycle to that of the next.
     """
 
     start: FloatArray
@@ -89,7 +89,7 @@ class Cycles:
         return self.start.size
 
     def part(self, first: int, last: int) -> Cycles:
-        """Return the cycles from `first` on, `last` not among them."""
+        """Return the cycles from `first` to `last`, excluding `last`."""
         names = ("start", "stop", "log_amplitude", "noise")
         of_cycles = {name: getattr(self, name)[first:last] for name in names}
         return Cycles(**of_cycles, log_frequency=self.log_frequency[first : max(last - 1, first)])
@@ -110,7 +110,7 @@ class Cycles:
 
     @property
     def ramping(self) -> bool:
-        """Whether the amplitude goes one way, faster than friction follows."""
+        """Whether the amplitude rises or falls throughout, faster than friction follows."""
         a = self.log_amplitude
         n = len(self)
         line = np.polyfit(np.arange(n), a, 1)
@@ -118,7 +118,7 @@ class Cycles:
         return self.trending and abs(_change(a)) > max(_SLOW * n, _SCATTERED * scatter)
 
     def span(self, *, sweep: bool = False) -> Span:
-        """Return the time that they take, and their mean frequency."""
+        """Return the time span of the cycles, and their mean frequency."""
         frequency = float(np.exp(np.mean(self.log_frequency)))
         return Span(float(self.start[0]), float(self.stop[-1]), frequency, sweep)
 
@@ -126,152 +126,149 @@ class Cycles:
 def find_cycles(
     time: FloatArray, motion: FloatArray, frequency_hz: float | None = None
 ) -> list[Cycles]:
-    """Cut a record into runs of consecutive cycles, or where their frequency is known into those.
+    """Cut a record into runs of consecutive cycles; of known frequency, into one run.
 
-    Where noise hides the amplitude of a period, several make one cycle.
+    If noise hides the amplitude of single periods of known frequency, several make one cycle.
     """
     if frequency_hz is None:
         runs = _crossing_runs(time, motion, 0)
         runs.sort(key=lambda edges: float(edges[0]))
-        cycles = [_measured(time, motion, edges) for edges in _joined(runs)]
-        return [  # noise alone may have made some of them: theirs is infinite
+        measured = [_measured(time, motion, edges) for edges in _joined(runs)]
+        return [  # cycles that may be noise alone have infinite noise
             replace(c, noise=np.where(c.noise > _NOISIEST_CROSSING, np.inf, c.noise))
-            for c in cycles
+            for c in measured
         ]
-    periods = _cut(time, motion, frequency_hz, 1)
-    if len(periods):
-        turns = min(
-            int(np.ceil((periods.usual_noise / _NOISIEST_CUT) ** 2)), len(periods) // _FEWEST_CUTS
-        )
-        if turns > 1:
-            periods = _cut(time, motion, frequency_hz, turns)
-    return [periods]
+    cycles = _cut(time, motion, frequency_hz, 1)
+    if len(cycles):
+        periods = int(np.ceil((cycles.usual_noise / _NOISIEST_CUT) ** 2))
+        periods = min(periods, len(cycles) // _FEWEST_CUTS)
+        if periods > 1:
+            cycles = _cut(time, motion, frequency_hz, periods)
+    return [cycles]
 
 
-def _cut(time: FloatArray, motion: FloatArray, frequency_hz: float, turns: int) -> Cycles:
+def _cut(time: FloatArray, motion: FloatArray, frequency_hz: float, periods: int) -> Cycles:
     interval = float(np.median(np.diff(time)))
-    count = int((time[-1] - time[0] + 1.5 * interval) * frequency_hz / turns)
-    edges = time[0] - 0.5 * interval + np.arange(count + 1) * turns / frequency_hz
-    return _measured(time, motion, edges, turns)
+    count = int((time[-1] - time[0] + 1.5 * interval) * frequency_hz / periods)
+    edges = time[0] - 0.5 * interval + np.arange(count + 1) * periods / frequency_hz
+    return _measured(time, motion, edges, periods)
 
 
 def _joined(runs: list[FloatArray]) -> list[FloatArray]:
-    """Join runs that are a few cycles of the same period apart; what lies between is measured."""
+    """Join runs that are a few cycles of the same period apart, and cut the pause into cycles."""
     joined: list[FloatArray] = []
     for edges in runs:
         if joined:
             last = joined[-1]
             period, next_period = last[-1] - last[-2], edges[1] - edges[0]
-            apart = (edges[0] - last[-1]) / period
+            pause = (edges[0] - last[-1]) / period
+            whole = round(pause)
             alike = abs(next_period / period - 1.0) < _ALIKE
-            if alike and apart < _MOST_BRIDGED and abs(apart - round(apart)) < _ALIKE:
-                bridge = np.linspace(last[-1], edges[0], round(apart) + 1)[1:-1]
-                joined[-1] = np.concatenate([last, bridge, edges[0 if round(apart) else 1 :]])
+            if alike and pause < _MOST_BRIDGED and abs(pause - whole) < _ALIKE:
+                bridge = np.linspace(last[-1], edges[0], whole + 1)[1:-1]
+                joined[-1] = np.concatenate([last, bridge, edges[0 if whole else 1 :]])
                 continue
         joined.append(edges)
     return joined
 
 
 def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[FloatArray]:
-    """Return the rising crossings, split where the motion is quiet, and those found there."""
-    if time.size < _FEWEST_SAMPLES or depth > _DEEPEST:
+    """Return the rising crossings, split at quiet parts, and those within these parts."""
+    if time.size < _FEWEST_SAMPLES or depth > _MOST_NESTED:
         return []
-    tried = (_runs_at(time, motion, quantile, depth) for quantile in _QUANTILES)
-    return next(filter(None, tried), [])
+    trials = (_runs_at(time, motion, quantile, depth) for quantile in _QUANTILES)
+    return next(filter(None, trials), [])
 
 
 def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) -> list[FloatArray]:
-    """Return the rising crossings of the amplitude that a quantile gives."""
-    seen = scattered(motion, _SAMPLED)
-    low, high = np.quantile(seen, [1.0 - quantile, quantile])
+    """Return the rising crossings for the amplitude given by a quantile."""
+    low, high = np.quantile(scattered(motion, _QUANTILE_SAMPLES), [1.0 - quantile, quantile])
     middle, threshold = 0.5 * (low + high), 0.5 * _THRESHOLD * (high - low)
     if not threshold > 1e-12 * max(abs(low), abs(high)):
         return []
-    moved = motion - middle
-    beyond = np.flatnonzero(np.abs(moved) > threshold)
-    above = moved[beyond] > 0.0
+    motion = motion - middle
+    beyond = np.flatnonzero(np.abs(motion) > threshold)
+    above = motion[beyond] > 0.0
     pause = np.diff(beyond) - 1
     long = np.flatnonzero(pause >= _FEWEST_SAMPLES)
     quiet = long[pause[long] > _QUIET * _lobe_spacing(beyond, above, long)]
     breaks = np.concatenate([[0], quiet + 1, [beyond.size]])
     runs: list[FloatArray] = []
-    done = 0
+    searched = 0
     for first, last in pairwise(breaks.tolist()):
         rising = first + np.flatnonzero(~above[first : last - 1] & above[first + 1 : last])
         if rising.size < 2:
             continue
-        runs.append(_crossings(time, moved, beyond[rising], beyond[rising + 1]))
-        # a cycle before and after, the motion may have been on its way to or from these
+        runs.append(_crossings(time, motion, beyond[rising], beyond[rising + 1]))
+        # the cycle before and the cycle after may be transitions, and are not searched
         at = beyond[rising]
         start = max(int(2 * at[0] - at[1]), 0)
-        runs += _crossing_runs(time[done:start], motion[done:start], depth + 1)
-        done = int(2 * at[-1] - at[-2])
-    if done:
-        runs += _crossing_runs(time[done:], motion[done:], depth + 1)
+        runs += _crossing_runs(time[searched:start], motion[searched:start], depth + 1)
+        searched = int(2 * at[-1] - at[-2])
+    if searched:
+        runs += _crossing_runs(time[searched:], motion[searched:], depth + 1)
     return runs
 
 
 def scattered(samples: FloatArray, count: int) -> FloatArray:
-    """Return so many samples, spread over the record and over the phases of any period."""
+    """Return `count` samples, spread over the record and over the phases of any period."""
     size = samples.shape[-1]
     if size <= count:
         return samples
-    places = np.arange(count) * _GOLDEN % 1.0  # a plain stride may fit the period of the motion
-    return np.asarray(samples[..., np.sort((places * size).astype(np.intp))])
+    fractions = np.arange(count) * _GOLDEN % 1.0  # equal steps could match the motion's period
+    return np.asarray(samples[..., np.sort((fractions * size).astype(np.intp))])
 
 
 def _lobe_spacing(
     beyond: NDArray[np.intp], above: NDArray[np.bool_], pairs: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """Return, for pairs of samples beyond the threshold, how far lobes near each are apart."""
-    turns = np.flatnonzero(above[1:] != above[:-1]) + 1
-    lobe = np.searchsorted(turns, pairs, side="right")
-    starts = beyond[np.concatenate([[0], turns])]
-    far = np.full(1, beyond[-1] + 1)
-    spacing = np.concatenate([far, np.diff(starts), far, far])
-    before, after = spacing[lobe], spacing[lobe + 2]
-    return np.asarray(np.minimum(before, after))
+    """Return the half period, in samples, near pairs of samples beyond the threshold."""
+    changes = np.flatnonzero(above[1:] != above[:-1]) + 1
+    lobe = np.searchsorted(changes, pairs, side="right")
+    starts = beyond[np.concatenate([[0], changes])]
+    unknown = np.full(1, beyond[-1] + 1)
+    spacing = np.concatenate([unknown, np.diff(starts), unknown, unknown])
+    return np.asarray(np.minimum(spacing[lobe], spacing[lobe + 2]))
 
 
 def _crossings(
-    time: FloatArray, moved: FloatArray, before: NDArray[np.intp], after: NDArray[np.intp]
+    time: FloatArray, motion: FloatArray, before: NDArray[np.intp], after: NDArray[np.intp]
 ) -> FloatArray:
-    """Return where zero is crossed between samples before and after."""
-    upward = np.flatnonzero((moved[:-1] < 0.0) & (moved[1:] >= 0.0))
+    """Return the times of upward zero crossings between samples `before` and `after`."""
+    upward = np.flatnonzero((motion[:-1] < 0.0) & (motion[1:] >= 0.0))
     first = upward[np.searchsorted(upward, before)]
     last = upward[np.searchsorted(upward, after) - 1]
-    at = np.array([first, last])
-    share = moved[at] / (moved[at] - moved[at + 1])
-    return np.asarray(np.mean(time[at] + share * (time[at + 1] - time[at]), axis=0))
+    at = np.array([first, last])  # noise may cause several
+    fraction = motion[at] / (motion[at] - motion[at + 1])
+    return np.asarray(np.mean(time[at] + fraction * (time[at + 1] - time[at]), axis=0))
 
 
-def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, turns: int = 1) -> Cycles:
-    """Return the amplitude of each cycle, of so many turns, and the frequency to the next."""
+def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, periods: int = 1) -> Cycles:
+    """Return amplitudes and frequencies of cycles of one or more periods between `edges`."""
     cuts = np.searchsorted(time, edges)
     counts = np.diff(cuts)
-    known = np.flatnonzero((counts >= _FEWEST_A_CYCLE) & ~_with_hole(time, edges))
-    start, stop, n = edges[known], edges[known + 1], counts[known]
+    sampled = np.flatnonzero((counts >= _FEWEST_PER_CYCLE) & ~_with_gap(time, edges))
+    start, stop, n = edges[sampled], edges[sampled + 1], counts[sampled]
     fits = []
     for first, last in groups_of_cycles(cuts):
         inside = slice(int(cuts[first]), int(cuts[last]))
         per_cycle = counts[first:last]
-        turn = np.repeat(2.0 * np.pi * turns / np.diff(edges[first : last + 1]), per_cycle)
-        theta = (time[inside] - np.repeat(edges[first:last], per_cycle)) * turn
-        those = known[(known >= first) & (known < last)]
-        bounds = np.column_stack([cuts[those], cuts[those + 1]]).ravel() - cuts[first]
-        fits.append(sine_in_each(theta, motion[inside], bounds, counts[those]))
+        omega = np.repeat(2.0 * np.pi * periods / np.diff(edges[first : last + 1]), per_cycle)
+        theta = (time[inside] - np.repeat(edges[first:last], per_cycle)) * omega
+        group = sampled[(sampled >= first) & (sampled < last)]
+        bounds = np.column_stack([cuts[group], cuts[group + 1]]).ravel() - cuts[first]
+        fits.append(sine_in_each(theta, motion[inside], bounds, counts[group]))
     if not fits:
-        fits = [sine_in_each(time[:0], motion[:0], known, n)]
-    phasor, left = (np.concatenate(column) for column in zip(*fits, strict=True))
-    amplitude = np.maximum(np.abs(phasor), np.finfo(np.float64).tiny)
-    noise = np.sqrt(2.0 * left / n) / amplitude
-    return Cycles(
-        start, stop, np.log(amplitude), noise, _log_frequency(start, stop, np.angle(phasor), turns)
-    )
+        fits = [sine_in_each(time[:0], motion[:0], sampled, n)]
+    phasor, variance = (np.concatenate(column) for column in zip(*fits, strict=True))
+    amplitude = np.maximum(np.abs(phasor), TINY)
+    noise = np.sqrt(2.0 * variance / n) / amplitude
+    frequency = _log_frequency(start, stop, np.angle(phasor), periods)
+    return Cycles(start, stop, np.log(amplitude), noise, frequency)
 
 
 def groups_of_cycles(cuts: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
-    """Yield first and last cycle of groups whose samples, from cut to cut, stay in the cache."""
+    """Yield the first cycle, and that after the last, of groups whose samples fit in the cache."""
     groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
     yield from pairwise([*np.unique(groups).tolist(), cuts.size - 1])
 
@@ -279,7 +276,7 @@ def groups_of_cycles(cuts: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
 def sine_in_each(
     theta: FloatArray, y: FloatArray, bounds: NDArray[np.intp], n: NDArray[np.intp]
 ) -> tuple[ComplexArray, FloatArray]:
-    """Return the phasor of each cycle, offset fitted as well, and the variance it leaves."""
+    """Return the phasor of each cycle, fitted with an offset, and the residual variance."""
     middle = 0.5 * float(y.min() + y.max()) if y.size else 0.0
     y = y - middle
     rotor = np.exp(-1j * theta)
@@ -289,11 +286,10 @@ def sine_in_each(
     cc, ss, cs = 0.5 * (n + two.real), 0.5 * (n - two.real), -0.5 * two.imag
     normal = np.array([[n, c, s], [c, cc, cs], [s, cs, ss]]).transpose(2, 0, 1)
     right = np.array([total, with_y.real, -with_y.imag]).T
-    fitted = np.linalg.solve(normal + 1e-9 * n[:, None, None] * np.eye(3), right[:, :, None])[
-        ..., 0
-    ]
-    left = np.maximum(power - np.sum(fitted * right, axis=1), 0.0) / n
-    return fitted[:, 1] - 1j * fitted[:, 2], left
+    normal += 1e-9 * n[:, None, None] * np.eye(3)
+    fitted = np.linalg.solve(normal, right[:, :, None])[..., 0]
+    variance = np.maximum(power - np.sum(fitted * right, axis=1), 0.0) / n
+    return fitted[:, 1] - 1j * fitted[:, 2], variance
 
 
 def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:
@@ -302,34 +298,34 @@ def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:
 
 
 def _log_frequency(
-    start: FloatArray, stop: FloatArray, phase: FloatArray, turns: int
+    start: FloatArray, stop: FloatArray, phase: FloatArray, periods: int
 ) -> FloatArray:
     """Return the mean frequency from the middle of each cycle to that of the next."""
     middle, period = 0.5 * (start + stop), stop - start
     missing = (start[1:] - stop[:-1]) / (0.5 * (period[1:] + period[:-1]))
     fraction = np.diff(phase) / (2.0 * np.pi)
-    whole = np.round(turns * (1.0 + missing) - fraction)
+    whole = np.round(periods * (1.0 + missing) - fraction)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.log((whole + fraction) / np.diff(middle)))
 
 
-def _with_hole(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
-    """Return which cycles have a part of them without samples."""
+def _with_gap(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
+    """Return which cycles lack samples over a part of their time."""
     periods = np.diff(edges)
     broken = np.zeros(periods.size, dtype=bool)
     steps = np.diff(time)
-    for i in np.flatnonzero(steps > _HOLE * periods.min(initial=np.inf)):
+    for i in np.flatnonzero(steps > _GAP * periods.min(initial=np.inf)):
         first = max(int(np.searchsorted(edges, time[i], side="right")) - 1, 0)
         last = int(np.searchsorted(edges, time[i + 1]))
-        broken[first:last] |= steps[i] > _HOLE * periods[first:last]
+        broken[first:last] |= steps[i] > _GAP * periods[first:last]
     return broken
 
 
 def find_spans(runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | None) -> list[Span]:
     """Return the spans of runs of consecutive cycles, in order of time.
 
-    Plateaus of `fewest` cycles at least, windows of sweeps (of `window` cycles, or as many as
-    change little), or whichever there is more of.
+    The spans are plateaus of at least `fewest` cycles or windows of sweeps (of `window` cycles, or
+    as many as change little), whichever there is more of.
     """
     pieces = [piece for cycles in runs for piece in _pieces(cycles) if len(piece) >= fewest]
     plateaus = [piece for piece in pieces if not piece.trending]
@@ -355,25 +351,25 @@ def _change(values: FloatArray) -> float:
     """Return the change from end to end of the straight line through the values."""
     if values.size < 2:
         return 0.0
-    place = np.linspace(-0.5, 0.5, values.size)
-    return float(place @ values / (place @ place))
+    x = np.linspace(-0.5, 0.5, values.size)
+    return float(x @ values / (x @ x))
 
 
-def _pieces(cycles: Cycles, unsteady: float = 1.0) -> Iterator[Cycles]:
-    """Grow pieces cycle by cycle against the mean of what they have."""
+def _pieces(cycles: Cycles, widening: float = 1.0) -> Iterator[Cycles]:
+    """Yield pieces, each grown by the next cycle as long as that is near the mean so far."""
     amplitude, frequency = cycles.log_amplitude.tolist(), cycles.log_frequency.tolist()
     noise = np.clip(cycles.noise, _LEAST_NOISE, 1.0).tolist()
     first, a_sum, f_sum, inverse = 0, 0.0, 0.0, 0.0
     for j in range(len(cycles)):
-        held = j - first
-        if held:
-            usual = min(noise[j], held / inverse)  # a transition is noisier than its neighbours
+        n = j - first
+        if n:
+            usual = min(noise[j], n / inverse)  # a transition is noisier than its neighbours
             a_tolerance, f_tolerance = _tolerances(usual)
-            f_mean = f_sum / (held - 1) if held > 1 else frequency[j - 1]
+            f_mean = f_sum / (n - 1) if n > 1 else frequency[j - 1]
             if (
                 max(noise[j], noise[first]) < _NOISIEST
-                and abs(amplitude[j] - a_sum / held) <= unsteady * a_tolerance
-                and abs(frequency[j - 1] - f_mean) <= unsteady * f_tolerance
+                and abs(amplitude[j] - a_sum / n) <= widening * a_tolerance
+                and abs(frequency[j - 1] - f_mean) <= widening * f_tolerance
             ):
                 f_sum += frequency[j - 1]
             else:
@@ -386,30 +382,30 @@ def _pieces(cycles: Cycles, unsteady: float = 1.0) -> Iterator[Cycles]:
 
 
 def _groups(cycles: Cycles, fewest: int) -> Iterator[Cycles]:
-    """Group the cycles of a drive that is not steady; ramps are none of them."""
-    waiting = [p for p in _pieces(cycles, _UNSTEADY) if len(p) >= fewest]
-    while waiting:
-        piece = waiting.pop(0)
+    """Yield groups of cycles of a drive that is not steady, without ramps."""
+    pieces = [p for p in _pieces(cycles, _UNSTEADY) if len(p) >= fewest]
+    while pieces:
+        piece = pieces.pop(0)
         n = len(piece)
         if piece.trending and n >= 2 * fewest:
-            waiting[:0] = piece.part(0, n // 2), piece.part(n // 2, n)
+            pieces[:0] = piece.part(0, n // 2), piece.part(n // 2, n)
         elif not piece.ramping:
             yield piece
 
 
 def _trimmed(piece: Cycles, fewest: int) -> Cycles:
-    """Leave out cycles at the ends that stray from the plateau's level, the rest of a ramp."""
-    stray = np.abs(piece.log_amplitude - np.median(piece.log_amplitude))
-    scatter = 1.5 * float(np.median(stray))
+    """Return a plateau without cycles at its ends that belong to a ramp."""
+    deviation = np.abs(piece.log_amplitude - np.median(piece.log_amplitude))
+    scatter = 1.5 * float(np.median(deviation))
     noise = _NOISE_FACTOR * max(piece.usual_noise, scatter)
-    kept = np.flatnonzero(stray <= max(_EDGE_TOLERANCE, noise))
+    kept = np.flatnonzero(deviation <= max(_EDGE_TOLERANCE, noise))
     if kept.size == 0 or kept[-1] + 1 - kept[0] < fewest:
         return piece
     return piece.part(int(kept[0]), int(kept[-1]) + 1)
 
 
 def _sweeps(cycles: Cycles) -> Iterator[Cycles]:
-    """Return the parts of a run in which nothing jumps, yet something changes much."""
+    """Return the parts of a run without jumps in which amplitude or frequency changes greatly."""
     if len(cycles) < 2:
         return
     jump = np.abs(np.diff(cycles.log_amplitude)) > _SWEEP_STEP

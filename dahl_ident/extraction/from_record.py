@@ -1,15 +1,15 @@
 """From a record to a frequency response: segments, sine fits, verdicts, one table.
 
-Pieces of a record may end within a level. Each part then has a point of its own, and with n_i
-cycles they give, by weights w_i = n_i / sum n,
+Pieces of a record may end within a level. Each part of the level, with n_i cycles, then gives a
+point, and these are combined with weights w_i = n_i / sum n:
 
     N = sum w_i N_i,      C = sum w_i^2 (C_i - R_i) + sum w_i R_i
 
-R being what rounding and aliasing leave alike in every cycle. A part that has not settled belongs
-to the settling periods of the one that has.
+R is the part due to rounding and aliasing, which repeats in every cycle. A part that has not
+settled counts as settling periods of the part that has.
 
-A record that is not a sine measurement is refused: in a sine test almost every cycle is like the
-one before it, by energy; in random motion a few are so by chance.
+A record that is not a sine measurement is refused. In a sine test almost every cycle, weighted by
+energy, is like the one before it; in random motion a few are, by chance.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ from dahl_ident.units import percent
 _NEGLIGIBLE = 0.2  # bias over standard error down to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
-_WELL_COVERED = 0.8  # share of the moving time; points that cover more are not there by chance
-_APART = 3.0  # cycles that may be missing between two parts of one level
+_WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are no coincidence
+_MISSING_CYCLES = 3.0  # largest number between two parts of one level
 _MEANS = (
     "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
     "force_distortion", "asymmetry", "displacement_steps", "force_steps", "displacement_clipped",
@@ -60,22 +60,23 @@ _MEANS = (
 )  # fmt: skip
 _PERIOD_CHANGE = 0.03  # largest relative change from cycle to cycle of a sine (median by energy)
 _AMPLITUDE_CHANGE = 0.1  # largest change likewise; at a resonance, amplitudes change faster
-_SWEEP_RANGE = 0.2  # least change of log period over a sweep: less may be chance
-_FEWEST_OF_SWEEP = 6  # cycles: they give four second differences of the period
-_FEWEST_PAIRS = 2  # pairs of cycles that are needed to tell how alike cycles are
+_SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be chance
+_SWEEP_CYCLES = 6  # least number; they give four second differences of the period
+_FEWEST_PAIRS = 2  # neighbouring cycles needed to judge how similar cycles are
 _NOISY = 0.03  # noise of the log amplitude from which cycles cannot be compared
-_SINE_IN_NOISE = 0.3  # share of power near the strongest line of a sine, if noise spoils the cycles
-_ONE_LINE = 0.8  # share of power near the strongest line of a sine, if its cycles look unlike
-_LEAK = 2  # lines on either side into which the strongest line leaks
-_SPECTRUM_OF = 2**20  # samples at most, from the middle of the record, whose spectrum is computed
+# Least fraction of the power near the strongest line of a sine whose cycles differ:
+_SINE_IN_NOISE = 0.3  # because of noise
+_ONE_LINE = 0.8  # for another reason
+_LEAKAGE = 2  # lines on either side into which the strongest line leaks
+_SPECTRUM_SAMPLES = 2**20  # at most, from the middle of the record
 
 
 @dataclass(frozen=True)
 class Point:
     """One amplitude and frequency: responses of the fundamental and the harmonics.
 
-    `joint` is the covariance of what was held with each response, (rows, 3, 3); `repeating` is the
-    part of it that is alike in every cycle.
+    `joint` is the covariance of (controlled amplitude, real part, imaginary part) of each response,
+    (rows, 3, 3); `repeating` is the part of it that is the same in every cycle.
     """
 
     frequency_hz: float
@@ -93,7 +94,7 @@ class Point:
 def measure(
     segment: Segment, settings: Settings, samples: Samples, *, sweep: bool = False
 ) -> Point:
-    """Turn a segment of known phase, and the record's samples, into a point."""
+    """Return the point of a segment of known phase; `samples` are those of the whole record."""
     if settings.of_displacement and settings.integrations and 0 in settings.harmonics:
         raise ExtractionError(
             f"the mean of a displacement is not known from its {settings.motion_channel}; leave 0 "
@@ -130,21 +131,18 @@ def measure(
     channel = settings.transient_channel
     transient = estimate_transient(rough, channel, float(np.angle(X)), response)
     steady = without(transient, first, settings)
-    _check_share(rough, steady, settings, samples.within_blocks(first))
-    dropped = settings.settling_periods or 0
-    if sweep:
-        dropped = 0
-    elif settings.settling_periods is None and transient.significant and cycles > FEWEST_CYCLES:
-        looked_at = min(cycles, MOST_CYCLES)
-        fundamental = replace(settings, harmonics=(1,))
-        dropped = _settling_periods(
-            Phasors.of(rough.segment, transient, looked_at, fundamental, steps, recorded), cycles
-        )
+    _check_share(rough, steady, settings, samples.lost_variance(first))
+    dropped = 0 if sweep else settings.settling_periods or 0
+    find_settling = settings.settling_periods is None and not sweep
+    if find_settling and transient.significant and cycles > FEWEST_CYCLES:
+        n, fundamental = min(cycles, MOST_CYCLES), replace(settings, harmonics=(1,))
+        phasors = Phasors.of(rough.segment, transient, n, fundamental, steps, recorded)
+        dropped = _settling_periods(phasors, cycles)
     used = whole.last_cycles(cycles - dropped)
     phasors = Phasors.of(
         used, transient, cycles - dropped, settings, steps, samples.of(used), sweep=sweep
     )
-    _check_share(phasors.fit, phasors.fit.segment, settings, samples.within_blocks(used))
+    _check_share(phasors.fit, phasors.fit.segment, settings, samples.lost_variance(used))
     return _point(phasors, cycles, dropped)
 
 
@@ -152,9 +150,9 @@ def _where(segment: Segment) -> str:
     return f"around t = {segment.centre:.6g} s, {segment.omega / (2.0 * np.pi):.6g} Hz"
 
 
-def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: FloatArray) -> None:
-    """Refuse what is not one sine."""
-    shares = fundamental_share(fit, segment, within)
+def _check_share(fit: SineFit, segment: Segment, settings: Settings, lost: FloatArray) -> None:
+    """Refuse a segment that is not one sine."""
+    shares = fundamental_share(fit, segment, lost)
     for name, share in zip((settings.motion_channel, "force"), shares, strict=True):
         if share < settings.min_share:
             raise ExtractionError(
@@ -166,32 +164,32 @@ def _check_share(fit: SineFit, segment: Segment, settings: Settings, within: Flo
 
 
 def _settling_periods(phasors: Phasors, cycles: int) -> int:
-    """Return how many leading cycles to leave out, judged by the fundamental of the first ones."""
+    """Return how many leading cycles to leave out, from the fundamental of the first cycles."""
     q = np.arange(cycles - FEWEST_CYCLES + 1)
-    kept = phasors.cycles / (cycles - q)
-    bias = abs(phasors.bias[0]) * np.exp(-phasors.transient.rate * q) * kept
-    error = np.sqrt(phasors.fundamental[1][0, 0] * kept)
-    good = bias <= _NEGLIGIBLE * error  # or else the least mean squared error
-    return int(np.argmax(good) if good.any() else np.argmin(bias**2 + 2.0 * error**2))
+    ratio = phasors.cycles / (cycles - q)
+    bias = abs(phasors.bias[0]) * np.exp(-phasors.transient.rate * q) * ratio
+    error = np.sqrt(phasors.fundamental[1][0, 0] * ratio)
+    negligible = bias <= _NEGLIGIBLE * error  # if it never is: the least mean square error
+    return int(np.argmax(negligible) if negligible.any() else np.argmin(bias**2 + 2.0 * error**2))
 
 
 def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
-    """Return the rows of a segment, and what speaks for and against them."""
+    """Return the rows of a segment with their quality and verdicts."""
     distorted = phasors.distorted
     response, joint, dof = phasors.rows(distorted)
-    silent = {k: LineNoise(np.zeros_like(n.lines), n.dof) for k, n in phasors.noise.items()}
+    no_noise = {k: LineNoise(np.zeros_like(n.lines), n.dof) for k, n in phasors.noise.items()}
     segment, recorded = phasors.fit.segment, phasors.samples.time
     transient, bias, lag = phasors.transient, phasors.bias, phasors.lag
-    only_mean = np.where(np.equal(phasors.harmonics, 0), 2.0, 1.0)  # whose variance is one number
-    variance = 0.5 * only_mean * np.trace(joint[:, 1:, 1:], axis1=1, axis2=2)
+    components = np.where(np.equal(phasors.harmonics, 0), 1.0, 2.0)  # a mean is a real number
+    variance = np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) / components
     error = np.maximum(np.sqrt(variance), TINY)
     excess = np.abs(bias) / (_TOLERATED * error)
-    forgotten = (excess <= 1.0) | (not transient.significant)
-    missing = np.where(forgotten, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / transient.rate))
+    faded = (excess <= 1.0) | (not transient.significant)
+    missing = np.where(faded, 0.0, np.ceil(np.log(np.maximum(excess, 1.0)) / transient.rate))
     if phasors.mean_moves:
-        forgotten = np.zeros_like(forgotten)
+        faded = np.zeros_like(faded)
         missing = np.maximum(missing, cycles)
-    settled = forgotten & (np.abs(lag) <= _TOLERATED * error)
+    settled = faded & (np.abs(lag) <= _TOLERATED * error)
     quality = {
         "settled": settled,
         "bias_real": (bias + lag).real,
@@ -219,7 +217,7 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
         harmonic=phasors.harmonics,
         response=response,
         joint=joint,
-        repeating=replace(phasors, noise=silent).rows(distorted)[1],
+        repeating=replace(phasors, noise=no_noise).rows(distorted)[1],
         dof=dof,
         sweep=bool(phasors.fit.trending),
         quality=quality | {"verdict": verdicts},
@@ -229,19 +227,19 @@ def _point(phasors: Phasors, cycles: int, dropped: int) -> Point:
 def record_response(
     pieces: Iterable[Record], settings: Settings, level: ArrayLike | None, run: str | None
 ) -> FrequencyResponse:
-    """Return the points of a record in pieces; a level across a cut is one point."""
+    """Return the points of a record in pieces; a level that continues in the next is one point."""
     points: list[Point] = []
     refused: list[str] = []
-    doubts: dict[str, None] = {}
+    noted: dict[str, None] = {}  # warnings of the reader
     for record in pieces:
-        doubts |= dict.fromkeys((record.provenance or {}).get("warnings", ()))
+        noted |= dict.fromkeys((record.provenance or {}).get("warnings", ()))
         settings = replace(settings, motion_channel=record.motion_channel)
         try:
-            further, unusable = _points(record, settings)
+            next_points, reasons = _points(record, settings)
         except ExtractionError as exc:
-            further, unusable = [], [str(exc)]
-        points = joined(points, further)
-        refused += unusable
+            next_points, reasons = [], [str(exc)]
+        points = joined(points, next_points)
+        refused += reasons
     provenance = dict(record.provenance or {})
     file = f"{provenance['file']}: " if "file" in provenance else ""
     if not points:
@@ -251,12 +249,12 @@ def record_response(
     names = ("frequency", "mode", "num_periods", "settling_periods", "harmonics", "min_share")
     options = {name: getattr(settings, name) for name in names}
     options |= {"harmonics": list(settings.harmonics), "refused": refused}
-    provenance |= {"extraction": options} | ({"warnings": list(doubts)} if doubts else {})
+    provenance |= {"extraction": options} | ({"warnings": list(noted)} if noted else {})
     return _table(points, record, settings, {"level": level, "run": run}, provenance)
 
 
 def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]:
-    """Return the points, and why other segments give none; at least one does."""
+    """Return the points, at least one, and the reasons why other segments give none."""
     frequency, mode = settings.frequency, settings.mode
     time = record.time if record.time[0] == 0.0 else record.time - record.time[0]
     samples = Samples(time, np.stack([record.motion_samples, record.force_samples]))
@@ -289,7 +287,7 @@ def _points(record: Record, settings: Settings) -> tuple[list[Point], list[str]]
 def _refuse_other_motion(
     record: Record, motion: FloatArray, runs: Sequence[Cycles], points: Sequence[Point]
 ) -> None:
-    """Refuse a record that is not a sine measurement, even if some points occur by chance."""
+    """Refuse a record that is not a sine measurement, even if chance gives some points."""
     moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
     measured = sum(p.quality["end_time"] - p.quality["start_time"] for p in points)
     if measured > _WELL_COVERED * moving:
@@ -310,21 +308,21 @@ def _refuse_other_motion(
 
 
 def _not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float) -> str:
-    """Return why the motion is not a sine measurement; empty where it may be one.
+    """Return why the motion is not a sine measurement; empty if it may be one.
 
-    `covered` is the share of the moving time that points cover; chance makes some of any motion.
+    `covered` is the fraction of the moving time that points cover.
     """
-    noise, period, amplitude, pairs = _neighbours(runs)
-    unlike = period > _PERIOD_CHANGE or amplitude > _AMPLITUDE_CHANGE
-    if pairs >= _FEWEST_PAIRS and not unlike:
+    noise, period, amplitude, pairs = _neighbour_changes(runs)
+    similar = period <= _PERIOD_CHANGE and amplitude <= _AMPLITUDE_CHANGE
+    if pairs >= _FEWEST_PAIRS and similar:
         return ""
-    line, turns = _strongest_line(motion)
+    line, periods = _strongest_line(motion)
     in_noise = pairs >= _FEWEST_PAIRS and (covered > 0.0 or noise > _NOISY)
-    if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE) and turns > 1:
+    if line > (_SINE_IN_NOISE if in_noise else _ONE_LINE) and periods > 1:
         return ""
     power = f"its strongest line has {percent(line)} of the power"
     if pairs < _FEWEST_PAIRS:
-        short = ", or a record too short for one" if turns < _FEWEST_PAIRS else ""
+        short = ", or a record too short for one" if periods < _FEWEST_PAIRS else ""
         return f"not a sine test{short}: the motion has no two consecutive cycles, and {power}"
     return (
         f"not a sine test: neighbouring cycles of the motion differ by {percent(period)} in "
@@ -333,21 +331,24 @@ def _not_a_sine_test(motion: FloatArray, runs: Sequence[Cycles], covered: float)
 
 
 def _is_sweep(runs: Sequence[Cycles]) -> bool:
-    """Return whether a drive is one sine whose period changes evenly from cycle to cycle."""
+    """Return whether the drive is one sine whose period changes smoothly from cycle to cycle."""
     if not runs:
         return False
     run = max(runs, key=len)
     period = np.log(run.stop - run.start)
-    if len(run) < _FEWEST_OF_SWEEP or np.ptp(period) < _SWEEP_RANGE:
+    if len(run) < _SWEEP_CYCLES or np.ptp(period) < _SWEEP_RANGE:
         return False
     energy = np.exp(2.0 * (run.log_amplitude - run.log_amplitude.max()) + period)[1:-1]
-    bend = _median(np.abs(np.diff(period, 2)), energy)
-    steps = _median(np.abs(np.diff(run.log_amplitude))[1:], energy)
-    return bend <= _PERIOD_CHANGE and steps <= _AMPLITUDE_CHANGE
+    period_change = _median(np.abs(np.diff(period, 2)), energy)
+    amplitude_change = _median(np.abs(np.diff(run.log_amplitude))[1:], energy)
+    return period_change <= _PERIOD_CHANGE and amplitude_change <= _AMPLITUDE_CHANGE
 
 
-def _neighbours(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:
-    """Return medians by energy: noise of cycles, change of period and amplitude; and pairs."""
+def _neighbour_changes(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:
+    """Return medians, weighted by energy, over pairs of neighbouring cycles, and their number.
+
+    The medians are those of the noise, and of the changes of log period and log amplitude.
+    """
     pairs = [
         (
             np.maximum(run.noise[1:], run.noise[:-1]),
@@ -370,23 +371,23 @@ def _neighbours(runs: Sequence[Cycles]) -> tuple[float, float, float, int]:
 
 def _median(values: FloatArray, weights: FloatArray) -> float:
     order = np.argsort(values)
-    below = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
 
 
 def _strongest_line(motion: FloatArray) -> tuple[float, int]:
-    """Return the share of the power near the strongest line, and its periods in what is seen."""
-    start = max(0, (motion.size - _SPECTRUM_OF) // 2)
-    part = motion[start : start + _SPECTRUM_OF]
+    """Return the fraction of the power near the strongest spectral line, and its periods."""
+    start = max(0, (motion.size - _SPECTRUM_SAMPLES) // 2)
+    part = motion[start : start + _SPECTRUM_SAMPLES]
     power = np.abs(np.fft.rfft(part - part.mean())[1:]) ** 2
     total = float(power.sum())
     strongest = int(np.argmax(power))
-    near = power[max(strongest - _LEAK, 0) : strongest + _LEAK + 1]
+    near = power[max(strongest - _LEAKAGE, 0) : strongest + _LEAKAGE + 1]
     return (float(near.sum()) / total, strongest + 1) if total else (1.0, motion.size)
 
 
 def _summary(refused: Sequence[str]) -> str:
-    """Return the first reason, and how many segments have one."""
+    """Return the first reason, and the number of unusable segments."""
     more = "" if len(refused) == 1 else f" ({len(refused)} segments in all are not usable)"
     return f"{refused[0]}{more}"
 
@@ -402,18 +403,21 @@ def _table(
     rows = [len(point.harmonic) for point in points]
 
     def per_row(name: str) -> Any:
-        """Return a field or a verdict of the points, one for each row."""
+        """Return a field or a quality of the points, one value per row."""
         values = [getattr(p, name) if hasattr(p, name) else p.quality[name] for p in points]
         pairs = zip(values, rows, strict=True)
         return np.concatenate([v if np.ndim(v) else np.full(n, v) for v, n in pairs])
 
     names = ("frequency_hz", "response", "amplitude", "drive", "dof", "harmonic")
-    joint, held = per_row("joint"), "drive" if settings.of_displacement else "amplitude"
+    joint, controlled = per_row("joint"), "drive" if settings.of_displacement else "amplitude"
     uncertainty = 0.0 if record.force is not None else record.drive_factor_uncertainty
     return FrequencyResponse(
         **{name: per_row(name) for name in names},
         covariance=joint[:, 1:, 1:],
-        **{f"{held}_std": np.sqrt(joint[:, 0, 0]), f"{held}_covariance": joint[:, 0, 1:]},
+        **{
+            f"{controlled}_std": np.sqrt(joint[:, 0, 0]),
+            f"{controlled}_covariance": joint[:, 0, 1:],
+        },
         **labels,
         controlled=settings.controlled,
         quantity="receptance" if settings.of_displacement else "dynamic_stiffness",
@@ -424,29 +428,31 @@ def _table(
     )
 
 
-def joined(points: list[Point], further: list[Point]) -> list[Point]:
-    """Return the points of one piece and of the next, a level across the cut as one point."""
-    if not points or not further:
-        return [*points, *further]
-    a, b = points[-1], further[0]
-    apart = (b.quality["start_time"] - a.quality["end_time"]) * a.frequency_hz
+def joined(points: list[Point], next_points: list[Point]) -> list[Point]:
+    """Return the points of one piece and of the next; a level in both becomes one point."""
+    if not points or not next_points:
+        return [*points, *next_points]
+    a, b = points[-1], next_points[0]
+    missing = (b.quality["start_time"] - a.quality["end_time"]) * a.frequency_hz
     one_level = (
         not (a.sweep or b.sweep)
         and a.harmonic == b.harmonic
-        and apart < _APART + b.quality["settling_periods"]
+        and missing < _MISSING_CYCLES + b.quality["settling_periods"]
         and abs(np.log(b.amplitude / a.amplitude)) < AMPLITUDE_TOLERANCE
         and abs(np.log(b.frequency_hz / a.frequency_hz)) < FREQUENCY_TOLERANCE
     )
-    return [*points[:-1], _both(a, b), *further[1:]] if one_level else [*points, *further]
+    if not one_level:
+        return [*points, *next_points]
+    return [*points[:-1], _combined(a, b), *next_points[1:]]
 
 
-def _both(a: Point, b: Point) -> Point:
+def _combined(a: Point, b: Point) -> Point:
     """Return one point for two parts of a level."""
     periods = a.quality["num_periods"] + b.quality["num_periods"]
     settling = a.quality["settling_periods"] + b.quality["settling_periods"]
     if b.quality["settled"].all() and not a.quality["settled"].all():
-        left_out = a.quality["num_periods"] + b.quality["settling_periods"]
-        counts = {"num_periods": periods, "settling_periods": left_out}
+        settling = a.quality["num_periods"] + b.quality["settling_periods"]
+        counts = {"num_periods": periods, "settling_periods": settling}
         return replace(b, quality=b.quality | counts)
     used = [p.quality["num_periods"] - p.quality["settling_periods"] for p in (a, b)]
     weights = np.array(used, dtype=np.float64) / sum(used)
@@ -456,9 +462,9 @@ def _both(a: Point, b: Point) -> Point:
 
     repeating = mean(a.repeating, b.repeating)
     separate = [w**2 * (p.joint - p.repeating) for w, p in zip(weights, (a, b), strict=True)]
-    # the degrees of freedom of a sum of variances, as Welch and Satterthwaite have them
+    # degrees of freedom by the Welch-Satterthwaite formula
     traces = [np.trace(joint[:, 1:, 1:], axis1=1, axis2=2) + TINY for joint in separate]
-    spread = sum((s / sum(traces)) ** 2 / p.dof for s, p in zip(traces, (a, b), strict=True))
+    inverse_dof = sum((t / sum(traces)) ** 2 / p.dof for t, p in zip(traces, (a, b), strict=True))
     verdicts = zip(a.quality["verdict"], b.quality["verdict"], strict=True)
     quality = {
         **a.quality,
@@ -476,7 +482,7 @@ def _both(a: Point, b: Point) -> Point:
         **{name: mean(getattr(a, name), getattr(b, name)) for name in means},
         joint=separate[0] + separate[1] + repeating,
         repeating=repeating,
-        dof=np.asarray(1.0 / spread),
+        dof=np.asarray(1.0 / inverse_dof),
         quality=quality,
     )
 

@@ -30,12 +30,12 @@ from dahl_ident.extraction.segment_quality import (
     BY_CHANCE,
     EVEN,
     alias_error,
-    aliases_unseen,
     asymmetry,
     clipped_share,
     crest_samples,
     distortion,
     fundamental_share,
+    has_unmeasured_aliases,
     quantisation_errors,
 )
 from dahl_ident.extraction.sine_fit import (
@@ -353,7 +353,7 @@ class Phasors:
     def channel_quality(self) -> dict[str, Any]:
         """Return the columns that judge the two waveforms."""
         fit, steps = self.fit, self.steps
-        shares = fundamental_share(fit, fit.segment, self.samples.within_blocks(fit.segment))
+        shares = fundamental_share(fit, fit.segment, self.samples.lost_variance(fit.segment))
         amplitudes, block = np.abs(fit.phasors(1)), fit.segment.block
         noise = np.sqrt(np.diagonal(self.noise[1].matrix).real * block)
         crest = crest_samples(amplitudes[0], steps[0], fit.segment.sample_phase / block)
@@ -383,7 +383,7 @@ class Phasors:
             objections.append("creates energy: a sign is reversed")
         fit = self.fit
         aliased = alias_error(fit, 1, self.cycles) > _ALIASED * np.abs(fit.phasors(1))
-        if aliased.any() or aliases_unseen(fit, self.cycles):
+        if aliased.any() or has_unmeasured_aliases(fit, self.cycles):
             samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
             objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
         held = ("displacement", "force")[self.held]  # assumed to be a sine
@@ -404,6 +404,6 @@ def without(transient: Transient, segment: Segment, settings: Settings) -> Segme
     if not transient.significant:
         return segment
     channels = segment.channels.copy()
-    part = transient.lasting(segment.theta)
+    part = transient.unfaded(segment.theta)
     channels[settings.transient_channel, part] -= transient.waveform(segment.part(part))
     return replace(segment, channels=channels)

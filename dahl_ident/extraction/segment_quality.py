@@ -1,15 +1,15 @@
 """Quality of a segment of samples: sensor steps, clipping, share of the sine, asymmetry, aliases.
 
-A loop that is alike in both directions has odd harmonics alone. Even ones appear where friction,
-clearance or a spring differ between the directions, and where the displacement has even harmonics
-itself: a mass turns X_k/X_1 into k^2 X_k/X_1 of the force, and a symmetric nonlinear element
+A loop that is the same in both directions has only odd harmonics. Even ones appear if friction,
+clearance or a spring differ between the directions, and if the displacement itself has even
+harmonics: a mass turns X_k/X_1 into k^2 X_k/X_1 of the force, and a symmetric nonlinear element
 spreads X_2 over all even orders. Without asymmetry abs(F_k)^2 over its variance follows F(2,
 dof_k).
 
-With r samples a cycle the harmonics r - k and r + k alias onto harmonic k, alike in every cycle.
-The harmonics of a waveform with kinks fall as a power of their order, between 1/k (steps) and 1/k^3
-(reversals of Dahl friction). The power is taken from those that stand out of the noise. Where r is
-not a whole number, the alias drops out of the harmonic the more cycles there are.
+With r samples per cycle the harmonics r - k and r + k alias onto harmonic k, equally in every
+cycle. The harmonics of a waveform with kinks decrease as a power of their order, between 1/k
+(steps) and 1/k^3 (reversals of Dahl friction). The power is estimated from those above the noise.
+If r is not a whole number, the alias separates from the harmonic as the number of cycles grows.
 """
 
 from __future__ import annotations
@@ -24,47 +24,47 @@ from dahl_ident.extraction.sine_fit import HARMONICS, Segment, SineFit
 
 _UNROUNDED = 0.05  # residual in steps of the sensor; with less, nothing was rounded
 _DITHERED = np.sqrt(0.25 + 1.0 / 12.0)  # residual, in steps, of half a step of noise
-_LOOKED_AT = 20_000  # samples at most from which the sensor's step is found
-_FAR = 30.5  # steps: a longer gap between values is not tested for whole steps
-_ON_GRID = 0.1  # largest distance of such a gap from whole steps
-_MOSTLY = 0.9  # least share of gaps that short; with less, the step is too fine to matter
-_SAME = 1e-9  # fraction of the range: values nearer than this differ by rounding alone
+_STEP_SAMPLES = 20_000  # samples at most from which the sensor's step is estimated
+_LONG_GAP = 30.5  # steps; a longer gap between values is not tested for whole steps
+_ON_GRID = 0.1  # largest deviation of the other gaps from whole steps
+_MOSTLY = 0.9  # least fraction of such gaps; with less, the step is too fine to matter
+_SAME = 1e-9  # fraction of the range; values closer together differ only by rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value that may be clipped
-_CORNER = 3  # samples from a rail within which a clipped waveform has left it
-_AWAY = 1e-4  # fraction of the span by which it has then left the rail
+_CORNER = 3  # samples within which a clipped waveform leaves the rail
+_DEPARTURE = 1e-4  # fraction of the span by which it is then away from the rail
 EVEN = (2, 4, 6, 8)  # the lowest harmonics, which are the largest
-BY_CHANCE = 1e-4  # share of symmetric points that are called asymmetric at most
+BY_CHANCE = 1e-4  # largest fraction of symmetric points that are called asymmetric
 _LEAST = 1e-3  # fraction of the fundamental; smaller even harmonics do not matter
-_CLEAR = 9.0  # power of a harmonic over the noise's from which it is seen
-_SEEN_FROM = 1.0 / 3.0  # fraction of the fitted orders; powers of lower ones differ too much
-_FLATTEST, _STEEPEST = 1.0, 3.0  # powers of the order: jumps of the force, and of its curvature
+_CLEAR = 9.0  # least ratio of power to noise of a harmonic used to extrapolate
+_LOWEST_USED = 1.0 / 3.0  # fraction of the fitted orders; lower ones follow other powers
+_FLATTEST, _STEEPEST = 1.0, 3.0  # powers of the order for jumps of the force and its curvature
 _FIRST = 3  # order of the first harmonic of friction after the fundamental
-_STAYS = 0.01  # least part of an alias that matters if it is left in the fundamental
-_FITTED = 5  # numbers that a fit estimates: offset, drift, a sine (two) and its frequency
+_LEAST_LEAKAGE = 0.01  # least fraction of an alias in the fundamental that matters
+_FITTED = 5  # fitted parameters: offset, drift, a sine (two) and its frequency
 
 
 def sensor_step(samples: FloatArray) -> float:
-    """Return the sensor's step, 0 where the values lie on no grid."""
-    values = np.sort(scattered(samples, _LOOKED_AT))
+    """Return the sensor's step; 0 if the values do not lie on a grid."""
+    values = np.sort(scattered(samples, _STEP_SAMPLES))
     gaps = np.diff(values)
     gaps = gaps[gaps > _SAME * (values[-1] - values[0])]
     if gaps.size == 0:
         return 0.0
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
     in_steps = gaps / step
-    near = in_steps < _FAR
+    short = in_steps < _LONG_GAP
     on_grid = np.abs(in_steps - np.round(in_steps)) < _ON_GRID
-    return step if near.mean() > _MOSTLY and on_grid[near].all() else 0.0
+    return step if short.mean() > _MOSTLY and on_grid[short].all() else 0.0
 
 
 def quantisation_errors(
     amplitude: FloatArray, step: FloatArray, residual: FloatArray, samples_a_cycle: float
 ) -> FloatArray:
-    """Return the root mean square error that rounding leaves in a phasor, for each channel.
+    """Return the root mean square error of a phasor due to rounding, for each channel.
 
-    Noise of more than half a step dithers. Without it every cycle may be rounded alike: only the
-    samples of one cycle, step/sqrt(12) each, average out; and rounding itself adds up to (2
-    step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A).
+    Noise of more than half a step acts as dither. Without it every cycle may be rounded in the same
+    way: only the samples of one cycle, step/sqrt(12) each, average out; and rounding itself adds up
+    to (2 step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A).
     """
     sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
     largest = np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
@@ -74,10 +74,10 @@ def quantisation_errors(
 
 
 def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) -> float:
-    """Return the share of samples that stand still at an extreme, in runs with a corner.
+    """Return the fraction of samples in runs of constant extreme values that end in a corner.
 
-    Where the noise does not reach the sensor's step, a crest of `crest` samples stands still as
-    well.
+    If the noise is less than the sensor's step, the `crest` of a sine, so many samples, is constant
+    as well.
     """
     highest, lowest = float(samples.max()), float(samples.min())
     span = highest - lowest
@@ -92,7 +92,7 @@ def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) 
         starts, stops = edges[::2], edges[1::2]
         before = samples[np.maximum(starts - _CORNER, 0)]
         after = samples[np.minimum(stops + _CORNER - 1, samples.size - 1)]
-        corner = np.minimum(np.abs(before - rail), np.abs(after - rail)) > _AWAY * span
+        corner = np.minimum(np.abs(before - rail), np.abs(after - rail)) > _DEPARTURE * span
         runs = (stops - starts)[corner]
         stuck += int(runs[runs > longest].sum())
     return stuck / samples.size
@@ -104,21 +104,21 @@ def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
     return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
 
 
-def fundamental_share(fit: SineFit, segment: Segment, within: FloatArray) -> FloatArray:
-    """Return the fundamental's share of the power of each channel, offset and drift apart.
+def fundamental_share(fit: SineFit, segment: Segment, lost: FloatArray) -> FloatArray:
+    """Return the fundamental's share of the power of each channel without offset and drift.
 
-    `fit` may be one of block means; `within` is the power that the segment's means do not show.
+    `fit` may be one of block means; `lost` is the variance that the segment's block means lack.
     """
     sine = 0.5 * np.abs(fit.phasors(1)) ** 2
     drift = fit.coefficients[1] ** 2 / 3.0
-    left = np.maximum(np.var(segment.channels, axis=1) + within - drift - sine, 0.0)
+    others = np.maximum(np.var(segment.channels, axis=1) + lost - drift - sine, 0.0)
     n = segment.time.size * segment.block
-    left *= n / max(n - _FITTED, 1)
-    return np.asarray(sine / (sine + left))
+    others *= n / max(n - _FITTED, 1)
+    return np.asarray(sine / (sine + others))
 
 
 def distortion(fit: SineFit, channel: int, integrations: int = 0) -> float:
-    """Return a channel's harmonics 2 to 9 over its fundamental, without what noise adds."""
+    """Return a channel's harmonics 2 to 9 over its fundamental, corrected for noise."""
     orders = np.arange(1, min(HARMONICS, fit.orders) + 1)
     noise = float(fit.residual_variance[channel])
     sizes = np.array([abs(fit.phasors(k)[channel]) for k in orders.tolist()])
@@ -134,9 +134,10 @@ def asymmetry(
     dof: FloatArray,
     displacement: FloatArray,
 ) -> float:
-    """Return the force's even harmonics over its fundamental, 0 where they are not significant.
+    """Return the force's even harmonics over its fundamental; 0 if they are not significant.
 
-    Both phasors are over those of the fundamental; `variance` is E abs(error)^2 of the force's.
+    Force and displacement are relative to their fundamentals; `variance` is E abs(error)^2 of the
+    former.
     """
     if orders.size == 0:
         return 0.0
@@ -154,35 +155,38 @@ def alias_error(fit: SineFit, harmonic: int, cycles: int) -> FloatArray:
     whole = round(per_cycle)
     if fit.trending or whole - harmonic <= fit.orders:
         return np.zeros(2)
-    seen = np.arange(1, fit.orders + 1)
-    seen = seen[(seen >= _SEEN_FROM * fit.orders) & ((whole - harmonic - seen) % 2 == 0)]
-    size = np.array([np.abs(fit.phasors(k)) for k in seen.tolist()]).reshape(-1, 2)
-    variance = np.array([fit.phasor_variance(k) for k in seen.tolist()])
+    fitted = np.arange(1, fit.orders + 1)
+    fitted = fitted[(fitted >= _LOWEST_USED * fit.orders) & ((whole - harmonic - fitted) % 2 == 0)]
+    size = np.array([np.abs(fit.phasors(k)) for k in fitted.tolist()]).reshape(-1, 2)
+    variance = np.array([fit.phasor_variance(k) for k in fitted.tolist()])
     clear = size**2 > _CLEAR * np.outer(variance, fit.residual_variance)
     aliased = np.array([whole - harmonic, whole + harmonic])
-    both = [_extended(seen[c], s[c], aliased) for c, s in zip(clear.T, size.T, strict=True)]
-    passed = fit.segment.passed(int(aliased[1]))
-    if passed is not None:  # block means pass little of them
-        both = [size * np.abs(passed[aliased - 1]) for size in both]
-    return np.asarray(_kept(per_cycle, cycles) * np.hypot.reduce(both, axis=1))
+    both = [_extrapolated(fitted[c], s[c], aliased) for c, s in zip(clear.T, size.T, strict=True)]
+    factors = fit.segment.attenuation(int(aliased[1]))
+    if factors is not None:
+        both = [size * np.abs(factors[aliased - 1]) for size in both]
+    return np.asarray(_leakage(per_cycle, cycles) * np.hypot.reduce(both, axis=1))
 
 
-def aliases_unseen(fit: SineFit, cycles: int) -> bool:
-    """Return whether harmonics alias onto the fundamental of which not even the first is seen."""
+def has_unmeasured_aliases(fit: SineFit, cycles: int) -> bool:
+    """Return whether harmonics alias onto the fundamental while no higher one is fitted."""
     per_cycle = 2.0 * np.pi / fit.segment.sample_phase
-    return not fit.trending and fit.orders < _FIRST and _kept(per_cycle, cycles) > _STAYS
+    leakage = _leakage(per_cycle, cycles)
+    return not fit.trending and fit.orders < _FIRST and leakage > _LEAST_LEAKAGE
 
 
-def _kept(per_cycle: float, cycles: int) -> float:
-    """Return the share of an alias that stays on the harmonic next to it."""
+def _leakage(per_cycle: float, cycles: int) -> float:
+    """Return the fraction of an alias that falls on the harmonic next to it."""
     return float(abs(np.sinc(cycles * (per_cycle - round(per_cycle)))))
 
 
-def _extended(seen: NDArray[np.intp], size: FloatArray, orders: NDArray[np.intp]) -> FloatArray:
-    """Return sizes at other orders by the power law through those seen; 0 for a pure sine."""
-    if not (seen > 1).any():
+def _extrapolated(
+    known: NDArray[np.intp], size: FloatArray, orders: NDArray[np.intp]
+) -> FloatArray:
+    """Return sizes at other orders by a power law through the known ones; 0 for a pure sine."""
+    if not (known > 1).any():
         return np.zeros(orders.size)
-    place, level = np.log(seen), np.log(size)
-    fall = -np.polyfit(place, level, 1)[0] if seen.size > 1 else _FLATTEST
-    fall = np.clip(fall, _FLATTEST, _STEEPEST)
-    return np.asarray(np.exp(level[-1] + fall * (place[-1] - np.log(orders))))
+    log_order, log_size = np.log(known), np.log(size)
+    power = -np.polyfit(log_order, log_size, 1)[0] if known.size > 1 else _FLATTEST
+    power = np.clip(power, _FLATTEST, _STEEPEST)
+    return np.asarray(np.exp(log_size[-1] + power * (log_order[-1] - np.log(orders))))

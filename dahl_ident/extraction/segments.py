@@ -32,10 +32,11 @@ from dahl_ident.extraction.cycles import (
 from dahl_ident.extraction.sine_fit import (
     FEWEST_CYCLES,
     Segment,
+    checked_inverse,
+    column_blocks,
     columns,
     estimate_frequency,
     normal_equations,
-    solvable_inverse,
     steady_segment,
     track_phase,
 )
@@ -259,9 +260,8 @@ def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
         return None
     cuts = np.searchsorted(segment.time, edges[unjudged:-unjudged])
     within = slice(int(cuts[0]), int(cuts[-1]))
-    normal, right = normal_equations(
-        segment.theta[within], segment.tau[within], segment.channels[:1, within], 1, 1
-    )
+    blocks = column_blocks(segment.theta[within], segment.tau[within], 1, 1)
+    normal, right = normal_equations(segment.channels[:1, within], 6, blocks)
     if not np.linalg.cond(normal) < _SOLVABLE:
         return None
     inverse = np.asarray(np.linalg.inv(normal), np.float64)
@@ -297,7 +297,7 @@ def _extended(
     """Return the slice with the cycles before and after it that the segment's sine fits as well."""
     thinned = segment.thinned()
     basis = columns(thinned.theta, thinned.tau, 1)
-    fitted = solvable_inverse(basis @ basis.T, thinned) @ (basis @ thinned.channels[0])
+    fitted = checked_inverse(basis @ basis.T, thinned) @ (basis @ thinned.channels[0])
     cycle = 2.0 * np.pi / segment.omega
 
     def misfit(where: slice) -> float:

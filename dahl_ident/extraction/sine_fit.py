@@ -1,28 +1,28 @@
-"""Sine fit: the phasors of motion and force in one segment of steady sine excitation.
+"""Sine fit: the phasors of motion and force in one segment of sine excitation.
 
 Both channels are fitted with the same columns by linear least squares,
 
     y(t) = offset + drift tau + sum_k c_k cos(k theta) + s_k sin(k theta),   k = 1 ... K
 
-so that nothing fitted leaks into the fundamental, and jitter, gaps and missing samples need no
+so that no fitted component leaks into the fundamental, and jitter and missing samples need no
 resampling. A phasor is ``Y_k = c_k - j s_k``. The phase ``theta`` is a polynomial of ``tau``, time
 from -1 to 1 over the segment, known or estimated jointly from both channels, the four-parameter fit
-of IEEE Std 1057. In a sweep each harmonic may change linearly.
+of IEEE Std 1057. In a sweep each harmonic may change linearly with time.
 
-A record with many samples a cycle needs no more than 256 block means of them. The mean of m samples
-spaced evenly by the phase p is, of harmonic k in the middle of the block, D_k = sin(m k p/2) / (m
-sin(k p/2)) times as large; the fit takes its columns smaller by the same factor.
+Where there are many samples per cycle, means of blocks, 256 per cycle, replace them. The mean of m
+samples, spaced by the phase p, has harmonic k reduced by D_k = sin(m k p/2) / (m sin(k p/2)); the
+fit reduces its columns by the same factor.
 
-Noise of the phasors: over P whole cycles whatever repeats falls on the harmonics. What lies on the
-lines between them, at ``f = (k + m/P) f_0``, is noise, seen at the frequency where it counts. With
-Z_i the two channels' content of the lines, the cross-spectral matrix at the harmonic is
+Noise of the phasors: over P whole cycles, whatever repeats lies on the harmonics. The content of
+the lines between them, at ``f = (k + m/P) f_0``, is noise near the frequency of interest. With Z_i
+the content of line i in both channels, the cross-spectral matrix at the harmonic is
 
     C = sum_i f_i Z_i Z_i^H / sum_i f_i
 
-The lines lie evenly about the harmonic, so the expectation is right for every noise spectrum
-``a + b/f``. With P >= 4, lines within half a harmonic are taken, else all up to the next harmonics.
-The noise is taken as circular: n lines of equal weight give 2 n degrees of freedom. The noise of
-the mean (k = 0) is that of the lowest lines, white from there down.
+The lines are symmetric about the harmonic, so the expectation is right for every noise spectrum
+``a + b/f``. With P >= 4, lines within half a harmonic are used, otherwise all up to the next
+harmonics. The noise is taken as circular: n lines of equal weight give 2 n degrees of freedom. The
+noise of the mean (k = 0) is that of the lowest lines, and white below them.
 """
 
 from __future__ import annotations
@@ -33,40 +33,41 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray
 from dahl_ident.errors import ExtractionError, argument
 
-FEWEST_CYCLES = 2  # needed to fit offset and drift as well
-HARMONICS = 9  # least number of fitted harmonics, where the sampling can separate them
-_MOST_HARMONICS = 40  # fitted at most, against leakage where cycles are not whole samples
-_AFFORDABLE = 4e5  # samples times harmonics; leakage falls as samples grow, so fewer harmonics do
+FEWEST_CYCLES = 2  # needed to fit offset and drift in addition
+HARMONICS = 9  # least number of fitted harmonics, if the sampling can separate them
+_MOST_HARMONICS = 40  # fitted at most, against leakage if a cycle is not a whole number of samples
+_AFFORDABLE = 4e5  # samples times harmonics; with more samples leakage is less, so fewer suffice
 _NYQUIST_MARGIN = 0.45  # frequency of the highest harmonic over the sampling rate
 _BLOCK = 16384  # samples computed at once, so that their columns stay in the cache
-_KEPT = 2_000_000  # entries of the columns up to which they are kept, not computed twice
+_KEPT = 2_000_000  # entries of the columns up to which they are stored, not computed twice
 _BLOCKS_PER_CYCLE = 64  # averages over such blocks lose 4e-4 of the fundamental
 _MEANS_PER_CYCLE = 256  # averages lose 3e-5 of the fundamental and 0.2 % of the ninth harmonic
-_EVEN = 0.05  # fraction of a step by which samples may be off an even grid
+_EVEN = 0.05  # fraction of a step by which samples may deviate from an even grid
 _FEWEST_SAMPLES = 2  # a phase difference needs two samples
 _LEAST_WEIGHT = 1e-6  # least weight of a cycle, as a fraction of the largest
 _MAX_STEPS = 20  # iterations; without convergence by then the start was wrong
 _TRACKED = 0.1  # rad of phase error, which the four-parameter fit then removes
-_STEP_TOLERANCE = 1e-4  # rad of phase at the ends of the segment; the error left is its square
-CYCLES_FOR_SCATTER = 4  # with fewer, lines next to the harmonic are few and far
-_MOST_LINES = 10  # on either side: 40 degrees of freedom, more of which hardly narrow a region
+_STEP_TOLERANCE = 1e-4  # rad of phase at the ends of the segment; the remaining error is its square
+CYCLES_FOR_SCATTER = 4  # with fewer, lines next to the harmonic are few and distant
+_MOST_LINES = 10  # on either side: 40 degrees of freedom; more hardly narrow an interval
 _MEAN_LINES = 4  # lowest spectral lines, from which the noise of the mean is estimated
-_INDEPENDENT = 0.05  # fraction of the largest eigenvalue; lines that gaps make alike lie below it
+_INDEPENDENT = 0.05  # fraction of the largest eigenvalue; lines that gaps make dependent are below
 _NOISE_BLOCKS_PER_CYCLE = 128  # averages lose 1 % of slow noise at the ninth harmonic
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples of motion (row 0) and force (row 1), or means of a `block`, and their phase."""
+    """Samples of motion (row 0) and force (row 1), or means of blocks of them, and their phase."""
 
     time: FloatArray
     channels: FloatArray
-    phase: Polynomial
-    block: int = 1
+    phase: Polynomial  # of tau, rad
+    block: int = 1  # samples per block
 
     @property
     def centre(self) -> float:
@@ -80,7 +81,7 @@ class Segment:
 
     @cached_property
     def tau(self) -> FloatArray:
-        """Time from -1 to 1."""
+        """Time scaled to -1 ... 1."""
         return (self.time - self.centre) / self.half_width
 
     @cached_property
@@ -98,15 +99,15 @@ class Segment:
         """Phase from one sample to the next, rad."""
         return self.omega * float(np.median(np.diff(self.time)))
 
-    def passed(self, orders: int) -> FloatArray | None:
-        """Return how much of harmonics 1, 2, ... passes into block means; None: all."""
+    def attenuation(self, orders: int) -> FloatArray | None:
+        """Return the factors D_k of harmonics 1, 2, ... in block means; None for single samples."""
         if self.block == 1:
             return None
         half = 0.5 * np.arange(1, orders + 1) * self.sample_phase
         return np.asarray(np.sin(half) / (self.block * np.sin(half / self.block)))
 
     def with_samples(self, time: FloatArray, channels: FloatArray, block: int = 1) -> Segment:
-        """Return other samples with the same phase as a function of time."""
+        """Return a segment of other samples with the same phase as a function of time."""
         if time.size < _FEWEST_SAMPLES:
             raise ExtractionError(
                 f"{time.size} samples near t = {self.centre:.6g} s for cycles of "
@@ -120,28 +121,28 @@ class Segment:
         return replace(new, phase=self.phase(inner))
 
     def part(self, keep: slice) -> Segment:
-        """Return some of the samples, each with the phase it had."""
+        """Return some of the samples with their phase."""
         return self.with_samples(self.time[keep], self.channels[:, keep], self.block)
 
     def first_cycles(self, cycles: int) -> Segment:
-        """Return the first so many cycles, or all where there are fewer."""
+        """Return the first `cycles`, or all if there are fewer."""
         end = self.theta[0] - 0.5 * self.sample_phase + 2.0 * np.pi * cycles
         return self.part(slice(0, int(np.searchsorted(self.theta, end))))
 
     def last_cycles(self, cycles: int) -> Segment:
-        """Return the last so many cycles; a partial one at the start is left out."""
+        """Return the last `cycles`; a partial one at the start is left out."""
         first = self.theta[-1] + 0.5 * self.sample_phase - 2.0 * np.pi * cycles
         return self.part(slice(int(np.searchsorted(self.theta, first)), None))
 
     @property
     def whole_cycles(self) -> int:
-        """Number of whole cycles, to within half a sample, or one block at the ends."""
+        """Number of whole cycles, of which half a sample, or one block, may be missing."""
         missing = 0.5 if self.block == 1 else 1.0
         turned = float(self.theta[-1] - self.theta[0]) + (1.0 + missing) * self.sample_phase
         return int(turned / (2.0 * np.pi))
 
     def thinned(self) -> Segment:
-        """Return block means, about 64 a cycle, where there are twice as many samples."""
+        """Return block means, about 64 per cycle, if there are at least twice as many samples."""
         if self.sample_phase > np.pi / _BLOCKS_PER_CYCLE:
             return self
         block = np.floor((self.theta - self.theta[0]) * (_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
@@ -164,7 +165,7 @@ class Samples:
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 
     def block_size(self, highest_hz: float) -> int:
-        """Return how many samples make a block; 1 where they are few a cycle, or uneven."""
+        """Return the number of samples per block; 1 if they are few per cycle, or uneven."""
         size = int(1.0 / (highest_hz * self.step * _MEANS_PER_CYCLE))
         for start in range(0, self.time.size if size > 1 else 0, _BLOCK):
             part = self.time[start : start + _BLOCK]
@@ -174,7 +175,7 @@ class Samples:
         return max(size, 1)
 
     def means(self, size: int) -> Samples:
-        """Return means of blocks; samples behind the last whole block are left out."""
+        """Return means of blocks; samples after the last whole block are left out."""
         if size == 1:
             return self
         whole = self.time.size // size * size
@@ -182,22 +183,22 @@ class Samples:
         return Samples(self.time[:whole].reshape(-1, size).mean(axis=1), blocks.mean(axis=2))
 
     def of(self, segment: Segment) -> Samples:
-        """Return the samples that a segment's block means are made of."""
-        reach = (0.5 * segment.block - 0.25) * self.step if segment.block > 1 else 0.0
-        first = int(np.searchsorted(self.time, segment.time[0] - reach))
-        last = int(np.searchsorted(self.time, segment.time[-1] + reach, side="right"))
+        """Return the samples from which the block means of a segment are formed."""
+        half_block = (0.5 * segment.block - 0.25) * self.step if segment.block > 1 else 0.0
+        first = int(np.searchsorted(self.time, segment.time[0] - half_block))
+        last = int(np.searchsorted(self.time, segment.time[-1] + half_block, side="right"))
         return Samples(self.time[first:last], self.channels[:, first:last])
 
-    def within_blocks(self, segment: Segment) -> FloatArray:
-        """Return the variance of both channels that the means of a segment do not show."""
+    def lost_variance(self, segment: Segment) -> FloatArray:
+        """Return the variance of both channels that the block means of a segment lack."""
         if segment.block == 1:
             return np.zeros(2)
-        whole = np.var(self.of(segment).channels, axis=1)
-        return np.asarray(whole - np.var(segment.channels, axis=1))
+        recorded = np.var(self.of(segment).channels, axis=1)
+        return np.asarray(recorded - np.var(segment.channels, axis=1))
 
 
 def steady_segment(time: FloatArray, channels: FloatArray, omega: float, block: int = 1) -> Segment:
-    """Return a segment of one angular frequency, rad/s."""
+    """Return a segment of constant angular frequency, rad/s."""
     half_width = 0.5 * float(time[-1] - time[0])
     return Segment(time, channels, Polynomial([0.0, omega * half_width]), block)
 
@@ -210,12 +211,12 @@ class SineFit:
     orders: int
     trending: int  # harmonics 1 to this one may change linearly
     coefficients: FloatArray  # (columns, 2)
-    inverse: FloatArray  # of the normal matrix
+    inverse: FloatArray  # inverse of the normal matrix
     residual: FloatArray  # (2, n)
 
     @cached_property
     def residual_variance(self) -> FloatArray:
-        """Mean square of what the fit leaves of motion and force, shape (2,)."""
+        """Mean square residual of motion and force, shape (2,)."""
         power = np.einsum("ij,ij->i", self.residual, self.residual)
         return np.asarray(power / self.residual.shape[1], dtype=np.float64)
 
@@ -224,7 +225,7 @@ class SineFit:
         return self._pair(2 * harmonic, harmonic)
 
     def slopes(self, harmonic: int) -> ComplexArray:
-        """Return the change of the phasors with tau, shape (2,), of a fit with trend."""
+        """Return the derivatives of the phasors with respect to tau, shape (2,), with a trend."""
         return self._pair(2 * (self.orders + harmonic) if harmonic else 1, harmonic)
 
     def _pair(self, i: int, harmonic: int) -> ComplexArray:
@@ -232,11 +233,11 @@ class SineFit:
         return np.asarray(cos - 1j * self.coefficients[i + 1] if harmonic else cos)
 
     def phasors_of(self, waveform: FloatArray) -> ComplexArray:
-        """Return phasors 0, 1, ... that the fit would give a waveform; 0 after its last sample."""
+        """Return phasors 0, 1, ... of a waveform by the same fit; it is 0 after its last sample."""
         theta, tau = self.segment.theta[: waveform.size], self.segment.tau[: waveform.size]
         right = np.zeros(self.inverse.shape[0])
-        passed = self.segment.passed(self.orders)
-        for part, block in _column_blocks(theta, tau, self.orders, self.trending, passed):
+        factors = self.segment.attenuation(self.orders)
+        for part, block in column_blocks(theta, tau, self.orders, self.trending, factors):
             right += block @ waveform[part]
         fitted = (self.inverse @ right)[: 2 * self.orders + 2]
         return np.asarray(fitted[::2] - 1j * fitted[1::2])
@@ -250,7 +251,7 @@ class SineFit:
 
 
 def resolvable_orders(segment: Segment) -> int:
-    """Return how many harmonics are fitted: at most those that the sampling can separate."""
+    """Return how many harmonics are fitted: not more than the sampling can separate."""
     per_cycle = 2.0 * np.pi / segment.sample_phase
     affordable = np.clip(_AFFORDABLE / segment.time.size, HARMONICS, _MOST_HARMONICS)
     orders = int(min(affordable, _NYQUIST_MARGIN * per_cycle))
@@ -267,20 +268,18 @@ def sine_fit(segment: Segment, *, trend: bool = False, most: int = _MOST_HARMONI
     """Fit harmonics, offset and drift to both channels; with `trend` harmonics change linearly."""
     orders = min(resolvable_orders(segment), most)
     trending = orders if trend else 0
-    theta, tau, passed = segment.theta, segment.tau, segment.passed(orders)
+    theta, tau, factors = segment.theta, segment.tau, segment.attenuation(orders)
 
     def blocks() -> Iterable[tuple[slice, FloatArray]]:
-        return _column_blocks(theta, tau, orders, trending, passed)
+        return column_blocks(theta, tau, orders, trending, factors)
 
     width = 2 * (orders + trending) + 2
-    kept = tuple(blocks()) if width * theta.size <= _KEPT else ()
-    normal, right = normal_equations(
-        theta, tau, segment.channels, orders, trending, kept or blocks()
-    )
-    inverse = solvable_inverse(normal, segment)
+    stored = tuple(blocks()) if width * theta.size <= _KEPT else ()
+    normal, right = normal_equations(segment.channels, width, stored or blocks())
+    inverse = checked_inverse(normal, segment)
     coefficients = inverse @ right
     residual = segment.channels.copy()
-    for part, block in kept or blocks():
+    for part, block in stored or blocks():
         residual[:, part] -= coefficients.T @ block
     return SineFit(segment, orders, trending, coefficients, inverse, residual)
 
@@ -288,19 +287,20 @@ def sine_fit(segment: Segment, *, trend: bool = False, most: int = _MOST_HARMONI
 def estimate_frequency(segment: Segment) -> Segment:
     """Return the segment with the frequency that fits both channels best.
 
-    Gauss-Newton from within half a cycle; the channels are weighted by their residuals.
+    Gauss-Newton method; the phase at the ends moves by at most half a cycle. The channels are
+    weighted by their residuals.
     """
-    few = segment.thinned()
-    moved = 0.0
+    thinned = segment.thinned()
+    change = 0.0
     for _ in range(_MAX_STEPS):
-        step = _frequency_step(few)
-        moved += step
-        if abs(moved) > np.pi:
+        step = _frequency_step(thinned)
+        change += step
+        if abs(change) > np.pi:
             break
-        few = replace(few, phase=few.phase + Polynomial([0.0, step]))
+        thinned = replace(thinned, phase=thinned.phase + Polynomial([0.0, step]))
         if abs(step) < _STEP_TOLERANCE:
-            turned = moved * segment.half_width / few.half_width
-            return replace(segment, phase=segment.phase + Polynomial([0.0, turned]))
+            change *= segment.half_width / thinned.half_width
+            return replace(segment, phase=segment.phase + Polynomial([0.0, change]))
     raise ExtractionError(
         f"no steady frequency near {segment.omega / (2.0 * np.pi):.6g} Hz around t = "
         f"{segment.centre:.6g} s: the fit diverges; expected one sine of constant frequency: "
@@ -309,17 +309,17 @@ def estimate_frequency(segment: Segment) -> Segment:
 
 
 def track_phase(segment: Segment, degree: int) -> Segment:
-    """Return the segment with its phase following the motion's, cycle by cycle."""
+    """Return the segment with its phase fitted to that of the motion, cycle by cycle."""
     for _ in range(_MAX_STEPS):
-        bend = _phase_error(segment.thinned(), degree)
-        segment = replace(segment, phase=segment.phase + bend)
-        if np.abs(bend.coef).sum() < _TRACKED:
+        error = _phase_error(segment.thinned(), degree)
+        segment = replace(segment, phase=segment.phase + error)
+        if np.abs(error.coef).sum() < _TRACKED:
             break
     return segment
 
 
 def _phase_error(segment: Segment, degree: int) -> Polynomial:
-    """Return by how much the motion's phase departs, a polynomial of tau that is 0 at 0."""
+    """Return the deviation of the motion's phase as a polynomial of tau that is 0 at tau = 0."""
     theta = segment.theta
     motion = segment.channels[0] - segment.channels[0].mean()
     turns = (theta - theta[0]) / (2.0 * np.pi)
@@ -329,36 +329,34 @@ def _phase_error(segment: Segment, degree: int) -> Polynomial:
         return Polynomial([0.0])
     counts = np.diff(starts, append=theta.size)
     sums = np.add.reduceat(motion * np.exp(-1j * theta), starts)
-    at = np.add.reduceat(segment.tau, starts) / counts
+    tau = np.add.reduceat(segment.tau, starts) / counts
     weights = np.abs(sums) + _LEAST_WEIGHT * np.abs(sums).max() + TINY
-    bend = Polynomial.fit(at, np.unwrap(np.angle(sums)), degree, w=weights).convert()
-    return bend - bend(0.0)
+    error = Polynomial.fit(tau, np.unwrap(np.angle(sums)), degree, w=weights).convert()
+    return error - error(0.0)
 
 
 def _frequency_step(segment: Segment) -> float:
     """Return one Gauss-Newton step of the phase at tau = 1, rad."""
     orders = min(HARMONICS, resolvable_orders(segment))
-    theta, tau, y = segment.theta, segment.tau, segment.channels
-    normal, right = normal_equations(theta, tau, y, orders, 1)
-    n = 2 * orders + 2
-    inverse = solvable_inverse(normal[:n, :n], segment)
-    slope = step = 0.0
+    y, n = segment.channels, 2 * orders + 2
+    blocks = column_blocks(segment.theta, segment.tau, orders, 1)
+    normal, right = normal_equations(y, n + 2, blocks)
+    inverse = checked_inverse(normal[:n, :n], segment)
+    curvature = gradient = 0.0
     for channel in range(len(y)):
         coefficients = inverse @ right[:n, channel]
         total = float(y[channel] @ y[channel])
         if total == 0.0:
             continue
         cos, sin = coefficients[2:4]
-        change = np.zeros(normal.shape[0])  # tau (-cos sin(theta) + sin cos(theta))
-        change[n : n + 2] = sin, -cos
-        across = normal[:n] @ change
-        misfit = change @ right[:, channel] - across @ coefficients
-        power = change @ normal @ change - across @ inverse @ across
-        left = total - float(right[:n, channel] @ coefficients)
-        weight = 1.0 / max(left, 1e-24 * total)
-        slope += weight * float(power)
-        step += weight * float(misfit)
-    return step / slope if slope else 0.0
+        derivative = np.zeros(n + 2)  # tau (-cos sin(theta) + sin cos(theta))
+        derivative[n:] = sin, -cos
+        cross = normal[:n] @ derivative
+        residual_power = total - float(right[:n, channel] @ coefficients)
+        weight = 1.0 / max(residual_power, 1e-24 * total)
+        curvature += weight * float(derivative @ normal @ derivative - cross @ inverse @ cross)
+        gradient += weight * float(derivative @ right[:, channel] - cross @ coefficients)
+    return gradient / curvature if curvature else 0.0
 
 
 def columns(
@@ -366,9 +364,9 @@ def columns(
     tau: FloatArray,
     orders: int,
     trending: int = 0,
-    passed: FloatArray | None = None,
+    factors: FloatArray | None = None,
 ) -> FloatArray:
-    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then the first ones times tau."""
+    """Return 1, tau, cos theta, sin theta, cos 2 theta, ...; then `trending` pairs times tau."""
     width = 2 * orders + 2
     out = np.empty((width + 2 * trending, theta.size))
     out[0] = 1.0
@@ -376,45 +374,43 @@ def columns(
     np.cos(theta, out=out[2])
     np.sin(theta, out=out[3])
     twice = 2.0 * out[2]
-    for i in range(4, width):  # cos k = 2 cos 1 cos(k - 1) - cos(k - 2), and so for sin
+    for i in range(4, width):  # cos k = 2 cos 1 cos(k - 1) - cos(k - 2), likewise for sin
         np.multiply(twice, out[i - 2], out=out[i])
         if i != 5:
             out[i] -= out[i - 4] if i > 5 else 1.0
-    if passed is not None:
-        out[2:width] *= np.repeat(passed, 2)[:, None]
+    if factors is not None:
+        out[2:width] *= np.repeat(factors, 2)[:, None]
     np.multiply(out[2 : 2 + 2 * trending], tau, out=out[width:])
     return out
 
 
-def _column_blocks(
-    theta: FloatArray, tau: FloatArray, orders: int, trending: int, passed: FloatArray | None = None
+def column_blocks(
+    theta: FloatArray,
+    tau: FloatArray,
+    orders: int,
+    trending: int,
+    factors: FloatArray | None = None,
 ) -> Iterator[tuple[slice, FloatArray]]:
     """Yield slices of the samples with their columns."""
     for start in range(0, theta.size, _BLOCK):
         part = slice(start, start + _BLOCK)
-        yield part, columns(theta[part], tau[part], orders, trending, passed)
+        yield part, columns(theta[part], tau[part], orders, trending, factors)
 
 
 def normal_equations(
-    theta: FloatArray,
-    tau: FloatArray,
-    channels: FloatArray,
-    orders: int,
-    trending: int,
-    blocks: Iterable[tuple[slice, FloatArray]] = (),
+    channels: FloatArray, width: int, blocks: Iterable[tuple[slice, FloatArray]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the normal matrix and the right-hand sides of a fit with these columns."""
-    width = 2 * orders + 2 + 2 * trending
+    """Return the normal matrix and the right-hand sides of a fit with `width` columns."""
     normal = np.zeros((width, width))
     right = np.zeros((width, len(channels)))
-    for part, block in blocks or _column_blocks(theta, tau, orders, trending):
+    for part, block in blocks:
         normal += block @ block.T
         right += block @ channels[:, part].T
     return normal, right
 
 
-def solvable_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
-    """Return the inverse of normal equations, or say that the samples do not determine it."""
+def checked_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
+    """Return the inverse of a normal matrix, or raise an error if it is ill-conditioned."""
     if np.linalg.cond(normal) > 1e8:
         raise ExtractionError(
             f"the samples around t = {segment.centre:.6g} s do not separate the harmonics of "
@@ -426,26 +422,26 @@ def solvable_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True)
 class LineNoise:
-    """Noise next to one harmonic: `lines`, (2, lines), whose products sum to a sample's errors."""
+    """Noise near one harmonic: scaled `lines`, (2, lines), whose products sum to `matrix`."""
 
     lines: ComplexArray
     dof: float
 
     @property
     def matrix(self) -> ComplexArray:
-        """``E[e e^H]`` of a sample's errors (motion, force), Hermitian."""
+        """``E[e e^H]`` of the errors e of one sample (motion, force), Hermitian."""
         return self.lines @ self.lines.conj().T
 
 
 def line_noise(
     fit: SineFit, harmonics: Sequence[int], cycles: int, residual: FloatArray
 ) -> list[LineNoise]:
-    """Return the noise next to each harmonic of a fit over two or more whole cycles."""
+    """Return the noise near each harmonic of a fit over two or more whole cycles."""
     reach = cycles // 2 if cycles >= CYCLES_FOR_SCATTER else cycles - 1
     side = min(reach, _MOST_LINES)
     content, window = _line_content(fit, harmonics, cycles, side, residual)
     lines = np.concatenate([np.arange(-side, 0), np.arange(1, side + 1)])
-    half, free = _orthogonal(window, lines)
+    whitening, freedom = _whitening(window, lines)
     noise = []
     for harmonic, sums in zip(harmonics, content, strict=True):
         frequency = harmonic + lines / cycles
@@ -454,19 +450,19 @@ def line_noise(
         else:
             weights = (np.abs(lines) <= _MEAN_LINES).astype(np.float64)
             sides = 2
-        weights = weights / (weights @ free)
-        # a straight line, which the fit removes, holds 6/(pi p)^2 of the sine with p periods in the
-        # record and nothing of the cosine; its part in the harmonics, about 1/P^2, is theirs
+        weights = weights / (weights @ freedom)
+        # the fitted straight line takes 6/(pi p)^2 of the power of a sine with p periods in the
+        # record and none of the cosine, except for the part in the harmonics, about 1/P^2
         drift = 3.0 / (np.pi * frequency * cycles) ** 2 / (1.0 - 1.0 / cycles**2)
-        weighted = np.sqrt(weights / (1.0 - drift)) * (sums @ half.T)
-        noise.append(LineNoise(weighted, 2.0 / sides / float(weights**2 @ free)))
+        weighted = np.sqrt(weights / (1.0 - drift)) * (sums @ whitening.T)
+        noise.append(LineNoise(weighted, 2.0 / sides / float(weights**2 @ freedom)))
     return noise
 
 
 def _line_content(
     fit: SineFit, harmonics: Sequence[int], cycles: int, side: int, residual: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``sum r exp(-j (k + m/P) theta)`` and the window's own ``sum exp(-j q theta/P)``."""
+    """Return ``sum r exp(-j (k + m/P) theta)`` and the window's ``sum exp(-j q theta/P)``."""
     theta, residual, counts = _block_sums(fit.segment.theta, residual)
     products = np.zeros((2, len(harmonics), 2, 2, side))
     window = np.zeros(2 * side + 1, dtype=np.complex128)
@@ -489,7 +485,7 @@ def _line_content(
 def _block_sums(
     theta: FloatArray, residual: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return phases, sums of the residual and numbers of samples, about 128 blocks a cycle."""
+    """Return phases, sums of the residual and numbers of samples of about 128 blocks per cycle."""
     block = np.floor((theta - theta[0]) * (_NOISE_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
     starts = np.flatnonzero(np.diff(block, prepend=-1.0))
     if 2 * starts.size > theta.size:
@@ -500,20 +496,22 @@ def _block_sums(
 
 
 def powers(rotor: ComplexArray, highest: int) -> ComplexArray:
-    """Return the powers 0 to `highest`, one a row."""
+    """Return the powers 0 to `highest`, one per row."""
     powers = np.ones((highest + 1, rotor.size), dtype=np.complex128)
     for k in range(1, highest + 1):
         np.multiply(powers[k - 1], rotor, out=powers[k])
     return powers
 
 
-def _orthogonal(window: ComplexArray, lines: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Return the matrix that gives each line the variance of a sample, and how free each is."""
-    apart = lines[:, None] - lines
-    gram = np.where(apart >= 0, window[np.abs(apart)], window[np.abs(apart)].conj())
-    onto = np.where(lines >= 0, window[np.abs(lines)], window[np.abs(lines)].conj())
-    gram -= np.outer(onto, onto.conj()) / window[0]
+def _whitening(window: ComplexArray, lines: NDArray[np.intp]) -> tuple[ComplexArray, FloatArray]:
+    """Return the matrix that makes lines of white noise independent, and the freedom of each."""
+
+    def spectrum(line: NDArray[np.intp]) -> ComplexArray:
+        return np.where(line >= 0, window[np.abs(line)], window[np.abs(line)].conj())
+
+    at_lines = spectrum(lines)
+    gram = spectrum(lines[:, None] - lines) - np.outer(at_lines, at_lines.conj()) / window[0]
     values, vectors = np.linalg.eigh(gram)
     kept = vectors[:, values > _INDEPENDENT * values[-1]]
-    half = (kept / np.sqrt(values[-kept.shape[1] :])) @ kept.conj().T
-    return half, np.sum(np.abs(kept) ** 2, axis=1)
+    whitening = (kept / np.sqrt(values[-kept.shape[1] :])) @ kept.conj().T
+    return whitening, np.sum(np.abs(kept) ** 2, axis=1)

@@ -57,62 +57,61 @@ def extract(
     Parameters
     ----------
     records : Record, path, sequence or mapping
-        Waveforms of motion and force, sampled anyhow. Velocity and acceleration are integrated
-        at the fitted frequency. A path is a file, or a pattern such as ``"day1/*.csv"``; of
-        several records, in a list or a mapping of names to them, each becomes a `run`, called
-        by its name in the mapping or by that of its file. A long file is read and extracted in
-        pieces of 10,000,000 samples (of HDF5, TDMS, Parquet and npy the rest stays on the
-        disk); a level across a cut is one point, less the cycle that the cut goes through.
+        Waveforms of motion and force, sampled at any times. Velocity and acceleration are
+        integrated at the fitted frequency. A path is a file, or a pattern such as
+        ``"day1/*.csv"``. Several records, in a list or a mapping from names, each become a `run`,
+        named as in the mapping or after the file. A long file is read and extracted in pieces of
+        10,000,000 samples (HDF5, TDMS, Parquet and npy files stay on the disk); a level in two
+        pieces is one point, without the cycle at the cut.
     columns : mapping or path of a TOML file, optional
-        Column map for files, as :func:`dahl_ident.read_record` takes it.
+        Column map for files, as for :func:`dahl_ident.read_record`.
     frequency : float, optional
-        Excitation frequency, Hz, where it is known; the whole record is then read at it. Left
-        out: found, and estimated for each segment together with the phasors.
+        Excitation frequency, Hz, if it is known; the whole record is then evaluated at it. By
+        default it is estimated for each segment together with the phasors.
     mode : {"auto", "steps", "sweep"}, default "auto"
-        What the record holds: levels one after another, or a continuous sweep of amplitude or
+        Whether the record holds successive levels, or a continuous sweep of amplitude or
         frequency. "auto" takes whichever there is more of.
     num_periods : int, optional
-        Periods of each segment that are used, settling ones among them: the last ones. In a
-        sweep, those of a window. Default: all of a segment.
+        Number of periods of each segment that are used, including settling periods: the last
+        ones. In a sweep, periods of a window. Default: all of a segment.
     settling_periods : int, optional
         Leading periods of `num_periods` that are left out. Default: as many as the transient of
         friction needs, judged from the decaying mean of the force.
     harmonics : sequence of int, optional
-        Which harmonics become rows, 0 (the mean force) to 9; fewer where the sampling cannot
-        separate them. Default: 1, 3, 5, 7, 9, and 0, 2, 4, 6, 8 as well where the force is
-        asymmetric, which a warning says. 1 alone where the force was controlled, since the
-        displacement then has harmonics of its own; if others are given, those are the rows:
-        X_k/F_1, in a table of receptance.
+        Harmonics that become rows, from 0 (the mean force) to 9; fewer if the sampling cannot
+        separate them. Default: 1, 3, 5, 7, 9, and also 0, 2, 4, 6, 8 if the force is asymmetric,
+        with a warning. If the force was controlled, only 1, since the displacement then has
+        harmonics itself; other harmonics, if given, are rows of receptance, X_k/F_1.
     controlled : {"displacement", "force"}, default "displacement"
-        What the laboratory held constant. Where it is the force, the transient is looked for in the
-        displacement's mean.
+        The amplitude that the laboratory kept constant. If it is the force, the transient is
+        looked for in the mean of the displacement.
     level : str or float, optional
         Nominal label of the records.
     min_share : float, default 0.6
-        Share of the power, offset and drift apart, that the fundamental has at least, in motion
-        and in force. Lower it for a sine buried in noise.
+        Least share of the power, without offset and drift, that the fundamental must have in
+        motion and in force. Lower it for a sine buried in noise.
     jobs : int, default 1
-        Processes among which several records are divided.
+        Number of processes among which several records are divided.
 
     Returns
     -------
     FrequencyResponse
-        Dynamic stiffness with `covariance`, `dof`, `amplitude_std` and `amplitude_covariance`; of
-        harmonics of the displacement receptance, with `drive_std` and `drive_covariance`.
+        Dynamic stiffness with `covariance`, `dof`, `amplitude_std` and `amplitude_covariance`;
+        for harmonics of the displacement, receptance with `drive_std` and `drive_covariance`.
         The covariance is such that ``d' C^-1 d / 2`` follows F(2, dof). Its `quality` columns:
 
         ``settled``
-            Whether the bias left by the transient is within a standard error.
+            Whether the remaining bias due to the transient is within a standard error.
         ``bias_real``, ``bias_imag``
-            That bias as estimated, in the response's unit; it is not subtracted. In a sweep
-            with half of what the response changes in a cycle, a bound of how far it lags.
+            Estimate of that bias, in the response's unit; it is not subtracted. In a sweep it
+            includes half the change of the response in a cycle, a bound of the lag.
         ``more_periods``
-            Settling periods that are missing at least; 0 in a sweep that is too fast.
+            Least number of settling periods that are missing; 0 in a sweep that is too fast.
         ``num_periods``, ``settling_periods``
             Periods of the segment, and how many leading ones were left out.
         ``covariance_from``
-            "cycles", or "spectrum" with fewer than four: an estimate from farther from the
-            harmonics.
+            "cycles", or "spectrum" with fewer than four cycles: an estimate from spectral lines
+            farther from the harmonics.
         ``start_time``, ``end_time``
             First and last sample used, s.
         ``displacement_share``, ``force_share``
@@ -123,19 +122,19 @@ def extract(
             Even harmonics 2 to 8 of the force over its fundamental; 0 where noise or the
             displacement's own even harmonics explain them, and in a sweep.
         ``displacement_steps``, ``force_steps``
-            Amplitude in steps of the sensor; infinite where no steps show.
+            Amplitude in steps of the sensor; infinite if no steps are visible.
         ``displacement_clipped``, ``force_clipped``
-            Share of samples that stand still at the highest or lowest value.
+            Share of samples that are constant at the highest or lowest value.
         ``verdict``
-            "good", or what speaks against the point; a loss below zero among it.
+            "good", or the reasons against the point, such as a negative loss.
 
     Raises
     ------
     ExtractionError
-        If the motion is not a sine; or no segment is usable: too short, motion or force not
+        If the motion is not a sine, or no segment is usable: too short, motion or force not
         dominated by one sine, less motion than the sensor's step, or `frequency` not that of the
-        motion, so that its phase drifts. If only some are usable, a warning lists the others and
-        why.
+        motion, so that its phase drifts. If only some segments are usable, a warning gives the
+        reasons for the others.
     ValidationError
         If an argument is out of range, or the record has only a drive without a factor.
     DataError
@@ -143,15 +142,15 @@ def extract(
 
     Notes
     -----
-    The sine fit is that of IEEE Std 1057 with harmonics. Its covariance is taken from what does
-    not repeat between the harmonics, plus errors that do: rounding to sensor steps where no
-    noise dithers it, and harmonics above half the sampling rate, which alias onto lower ones (the
-    size of the measured ones is extrapolated to them; with a hundred samples per cycle this is
+    The sine fit is that of IEEE Std 1057 with harmonics. Its covariance is estimated from the
+    spectrum between the harmonics, plus errors that repeat in every cycle: rounding to sensor steps
+    without noise as dither, and harmonics above half the sampling rate, which alias onto lower ones
+    (their size is extrapolated from the measured ones; with a hundred samples per cycle this is
     negligible, and if the sampling is too slow to measure any the verdict says so). Rows of other
-    harmonics, which belong to a sine, add what the displacement's own harmonics change in them:
-    about the stiffness times their size. The covariance holds for white and for 1/f noise. The
-    uncertainty of a record's `drive_factor` is common to all points and not part of it. A hum
-    during rests that is a clean sine in both channels is taken for a level; give `frequency` then.
+    harmonics, which assume a sine, include the effect of the displacement's own harmonics: about
+    the stiffness times their size. The covariance is valid for white and for 1/f noise. The
+    uncertainty of a record's `drive_factor` is common to all points and not included. Hum at rest
+    that is a clean sine in both channels is taken for a level; give `frequency` in this case.
 
     Examples
     --------
@@ -166,20 +165,20 @@ def extract(
     >>> f"{N:.2f}", f"{exact:.2f}", str(data.quality["verdict"][0])
     ('19.74+9.72j', '19.74+9.72j', 'good')
     """
-    how = locals().copy()
+    options = locals().copy()
     for name in ("records", "columns", "level", "jobs"):
-        del how[name]
+        del options[name]
     reading = {} if columns is None else {"columns": columns}
     named = _named(records)
     if isinstance(records, Mapping):
-        return extract_all([FileTask(r, name, level, reading) for name, r in named], how, jobs)
+        return extract_all([FileTask(r, name, level, reading) for name, r in named], options, jobs)
     tasks = [FileTask(source, None, level, reading) for _, source in named]
-    return extract_all(tasks, how, jobs, [str(name) for name, _ in named])
+    return extract_all(tasks, options, jobs, [str(name) for name, _ in named])
 
 
 @dataclass(frozen=True)
 class FileTask:
-    """One record or file, the labels of its points, and the words with which it is read."""
+    """One record or file, the labels of its points, and the keywords for reading it."""
 
     source: Record | PathLike
     run: str | None
@@ -188,11 +187,11 @@ class FileTask:
 
 
 def extract_all(
-    tasks: Sequence[FileTask], how: Mapping[str, Any], jobs: int = 1, names: Sequence[str] = ()
+    tasks: Sequence[FileTask], options: Mapping[str, Any], jobs: int = 1, names: Sequence[str] = ()
 ) -> FrequencyResponse:
-    """Return the points of all tasks in one table; `how` holds the other words of `extract`."""
-    stated = {name: value for name, value in how.items() if value is not None}
-    if how.get("controlled") == "force":
+    """Return the points of all tasks in one table; `options` are other keywords of `extract`."""
+    stated = {name: value for name, value in options.items() if value is not None}
+    if options.get("controlled") == "force":
         stated.setdefault("harmonics", (1,))
     settings = Settings(**stated)
     refuse_repeated([task.source for task in tasks])
@@ -200,26 +199,28 @@ def extract_all(
     if jobs == 1:
         parts = [_extracted(task, settings) for task in tasks]
     else:
-        # a forked copy of a process with threads may hang: the workers start afresh
+        # a fork of a process with threads may hang, so the workers are new processes
         with ProcessPoolExecutor(
             jobs, get_context("spawn"), initializer=name_options, initargs=(names_options(),)
         ) as pool:
             parts = []
-            for part, messages in pool.map(_extracted_apart, tasks, repeat(settings)):
+            for part, messages in pool.map(_extracted_with_warnings, tasks, repeat(settings)):
                 parts.append(part)
                 for message in messages:
                     warnings.warn(message, stacklevel=3)
     parts = labelled(parts, names) if names and len(parts) > 1 else parts
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
-    return data if how.get("harmonics") is not None else _without_needless_rows(data)
+    return data if options.get("harmonics") is not None else _needed_harmonics(data)
 
 
-def _extracted_apart(task: FileTask, settings: Settings) -> tuple[FrequencyResponse, list[str]]:
-    """Return the points of a task and its warnings, which another process cannot show."""
-    with warnings.catch_warnings(record=True) as shown:
+def _extracted_with_warnings(
+    task: FileTask, settings: Settings
+) -> tuple[FrequencyResponse, list[str]]:
+    """Return the points of a task and its warnings, for the main process to show."""
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         data = _extracted(task, settings)
-    return data, [str(warning.message) for warning in shown]
+    return data, [str(warning.message) for warning in caught]
 
 
 def _extracted(task: FileTask, settings: Settings) -> FrequencyResponse:
@@ -231,7 +232,7 @@ def _extracted(task: FileTask, settings: Settings) -> FrequencyResponse:
 
 
 def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
-    """Return each record or file with its run; one alone has none."""
+    """Return each record or file with the name of its run; a single one has none."""
     if isinstance(records, Record):
         return [(None, records)]
     if isinstance(records, Mapping):
@@ -245,10 +246,9 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
                 )
             named.append((str(name), files[0]))
     else:
-        alone = isinstance(records, str | Path)
         sources = [records] if isinstance(records, str | Path) else records
         files = [file for source in sources for file in _files(source)]
-        if alone and files == [str(records)]:
+        if files == [str(records)]:  # a path that is not a pattern
             return [(None, files[0])]
         named = list(zip(_labels(files), files, strict=True))
     if not named:
@@ -257,7 +257,7 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
 
 
 def _files(source: Record | PathLike) -> list[Record | PathLike]:
-    """Return a record by itself, or the files that a path or pattern names."""
+    """Return a list of the record itself, or of the files that a path or pattern names."""
     if isinstance(source, Record):
         return [source]
     if not isinstance(source, str | Path):
@@ -268,7 +268,7 @@ def _files(source: Record | PathLike) -> list[Record | PathLike]:
 
 
 def matching(pattern: str) -> list[str]:
-    """Return the files that a pattern matches, in order; a path without one by itself."""
+    """Return the files that a pattern matches, in order; a path that is not a pattern as it is."""
     if not _PATTERN.search(pattern) or Path(pattern).exists():
         return [pattern]
     files = sorted(glob(pattern, recursive=True))  # noqa: PTH207 # may be absolute
@@ -278,7 +278,7 @@ def matching(pattern: str) -> list[str]:
 
 
 def _labels(sources: Sequence[Record | PathLike]) -> list[str]:
-    """Return a run for each: the name of its file, or its number."""
+    """Return the name of each run: that of its file, or its number."""
     files = [(s.provenance or {}).get("file") if isinstance(s, Record) else s for s in sources]
     numbers = [f"record {i + 1}" for i in range(len(files))]
     labels = [str(file or number) for file, number in zip(files, numbers, strict=True)]
@@ -286,8 +286,8 @@ def _labels(sources: Sequence[Record | PathLike]) -> list[str]:
     return labels if len(set(labels)) == len(labels) else numbers
 
 
-def _without_needless_rows(data: FrequencyResponse) -> FrequencyResponse:
-    """Return the odd harmonics alone where the force is symmetric, and say so where it is not."""
+def _needed_harmonics(data: FrequencyResponse) -> FrequencyResponse:
+    """Return only the odd harmonics if the force is symmetric; warn if it is not."""
     even = data.harmonic % 2 == 0
     if not even.any():
         return data

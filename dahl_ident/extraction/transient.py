@@ -1,14 +1,14 @@
 """The transient of friction: whether a segment has settled, and the remaining bias if not.
 
-For Dahl friction the departure from the steady loop fades along the path s travelled,
+For Dahl friction the departure from the steady loop decays with the path s travelled,
 
-    D(s) = D_0 exp(-beta s/A),     beta = sigma A/f_max;     exp(-4 beta) a cycle
+    D(s) = D_0 exp(-beta s/A),     beta = sigma A/f_max;     exp(-4 beta) per cycle
 
-so settling takes cycles, not seconds. D has one sign, so the force's mean shows it, or the
-displacement's where the force is controlled: least squares on harmonics, offset and exp(-beta s/A).
-What D then adds to each harmonic is the remaining bias. Where the decay does not show its rate, it
-leans on the beta at which Dahl friction has the measured phase. The noise of D_0 is taken from the
-lines below the fundamental, as 1/f noise.
+so settling takes cycles, not seconds. D has one sign, so it appears in the mean of the force, or of
+the displacement if the force is controlled. It is estimated by least squares together with
+harmonics and offset, and its part in each harmonic is the remaining bias. If the decay does not
+determine its rate, the rate is drawn to the beta at which Dahl friction has the measured phase. The
+noise of D_0 is taken from the lines below the fundamental, as 1/f noise.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from dahl_ident.extraction.sine_fit import (
 )
 
 SIGNIFICANT = 3.0  # standard deviations at which D_0 differs from zero
-_RATES = np.geomspace(1e-3, 64.0, 29)  # tried values of the rate, 4 beta
+_RATES = np.geomspace(1e-3, 64.0, 29)  # first grid of the rate, 4 beta
 _REFINEMENTS = 5  # times that the grid of rates is refined, each time five times finer
-_RATE_SPREAD = 1.0  # standard deviation of ln(rate) about the value that the phase suggests
+_RATE_SPREAD = 1.0  # standard deviation of ln(rate) about the value derived from the phase
 _FADED = 28.0  # decay constants after which a departure of 1 is 1e-12
 _SLOW_LINES = 24  # spectral lines below the fundamental that give the noise of D_0
 MOST_CYCLES = 256  # cycles at most from which D_0 and the rate are estimated
@@ -40,9 +40,9 @@ MOST_CYCLES = 256  # cycles at most from which D_0 and the rate are estimated
 
 @dataclass(frozen=True)
 class Transient:
-    """Departure D_0 of one channel from its steady loop, and 4 beta as `rate`.
+    """Departure D_0 of one channel from its steady loop, and its `rate`, 4 beta.
 
-    D_0 is taken where the path of ``cos(theta + displacement_phase)`` is `start` amplitudes.
+    D_0 is that where the path of ``cos(theta + displacement_phase)`` is `start` amplitudes.
     """
 
     departure: float
@@ -62,11 +62,11 @@ class Transient:
         return self.departure * np.exp(-0.25 * self.rate * path)
 
     def phasors(self, fit: SineFit) -> ComplexArray:
-        """Return what D adds to the fitted phasors 0, 1, ... of its channel."""
-        part = self.lasting(fit.segment.theta)
+        """Return the contribution of D to the fitted phasors 0, 1, ... of its channel."""
+        part = self.unfaded(fit.segment.theta)
         return fit.phasors_of(self.waveform(fit.segment.part(part)))
 
-    def lasting(self, theta: FloatArray) -> slice:
+    def unfaded(self, theta: FloatArray) -> slice:
         """Return the samples before it has faded to 1e-12 of its size."""
         faded = theta[0] + 2.0 * np.pi * _FADED / self.rate
         return slice(0, max(2, int(np.searchsorted(theta, faded))))
@@ -75,30 +75,31 @@ class Transient:
 def estimate_transient(
     fit: SineFit, channel: int, displacement_phase: float, response: complex
 ) -> Transient:
-    """Return the departure that a segment starts with, at its first sample, and its rate.
+    """Return the departure at the first sample of a segment, and its rate.
 
     The phase of the response, a dynamic stiffness, determines the rate if the decay does not.
     """
     drifting = fit.residual[channel] + fit.coefficients[1, channel] * fit.segment.tau
-    few = replace(fit.segment, channels=drifting[None]).thinned()
-    # the harmonics that a departure is distinguished from
-    basis = columns(few.theta, few.tau, min(HARMONICS, resolvable_orders(few)))
+    thinned = replace(fit.segment, channels=drifting[None]).thinned()
+    y = thinned.channels[0]
+    # the harmonics from which a departure is distinguished
+    basis = columns(thinned.theta, thinned.tau, min(HARMONICS, resolvable_orders(thinned)))
     steady = np.delete(basis, 1, axis=0)
     steady = np.linalg.solve(np.linalg.cholesky(steady @ steady.T), steady)  # orthonormal
-    path = _path(few.theta + displacement_phase)
+    path = _path(thinned.theta + displacement_phase)
     start = float(_path(fit.segment.theta[:1] + displacement_phase)[0])
 
-    angle = few.theta - few.theta[0]
+    angle = thinned.theta - thinned.theta[0]
     cycles = max(2, round(float(angle[-1]) / (2.0 * np.pi)))
     p = np.arange(1.0, min(cycles, _SLOW_LINES + 1))  # the lines p/T below the fundamental
     tones = powers(np.exp(-1j / cycles * angle), p.size)[1:]
-    seen = tones @ (few.channels[0] - steady.T @ (steady @ few.channels[0]))
+    content = tones @ (y - steady.T @ (steady @ y))
 
     def variance_of(departure: float, decay: FloatArray) -> float:
-        """Return the variance of white noise that moves D_0 as much as the slow noise does."""
+        """Return the variance of white noise with the same effect on D_0 as the slow noise."""
         decaying = tones @ decay
         power = np.abs(decaying) ** 2
-        level = float(np.mean(p * np.abs(seen - departure * decaying) ** 2)) / decay.size
+        level = float(np.mean(p * np.abs(content - departure * decaying) ** 2)) / decay.size
         return max(level * float(np.sum(power / p) / np.sum(power)), TINY)
 
     rates = _RATES
@@ -108,7 +109,7 @@ def estimate_transient(
         decays = np.exp(-0.25 * rates[:, None] * (path - start))
         decays -= decays @ steady.T @ steady
         power = np.einsum("ij,ij->i", decays, decays)
-        sizes = decays @ few.channels[0] / power
+        sizes = decays @ y / power
         gain = sizes**2 * power
         best = int(np.argmax(gain))
         variance = variance_of(sizes[best], decays[best])
@@ -119,7 +120,7 @@ def estimate_transient(
 
 
 def _path(theta: FloatArray) -> FloatArray:
-    """Return the path of cos(theta) from theta = 0 on, in amplitudes: 4 a cycle."""
+    """Return the path of cos(theta) from theta = 0, in amplitudes: 4 per cycle."""
     strokes = np.floor(theta / np.pi)
     return 2.0 * strokes + 1.0 - np.cos(theta - np.pi * strokes)
 
