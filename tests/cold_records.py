@@ -202,7 +202,7 @@ def joint(f_max: float, sigma: float, chi: float, ratio: float) -> tuple[FloatAr
 
 def sliding(
     k: FloatArray, d: FloatArray, first: float, drive: Callable[[float], float],
-    samples: int, rate: float, substeps: int = 100,
+    samples: int, rate: float, substeps: int = 40,
 ) -> FloatArray:  # fmt: skip
     """Return displacements of m = 0.3, c = 0.5, k = 50 with Jenkins elements, by small steps.
 
@@ -288,9 +288,9 @@ DECAYS: dict[str, Decay] = {
 }  # fmt: skip
 
 
-def decay(name: str, known: str, seed: int) -> Case:
+def decay(name: str, known: str, seed: int, samples: int = 600) -> Case:
     """Return a free decay of m = 0.3, k = 50 from 20 mm; either the mass or the spring is known."""
-    law, samples, rate = DECAYS[name], 600, 250.0
+    law, rate = DECAYS[name], 250.0
     damping = 0.0 if law.force else 0.5
 
     def rates(t: float, y: FloatArray, u: float) -> list[float]:

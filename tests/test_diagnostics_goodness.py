@@ -64,15 +64,15 @@ class TestSilence:
         """Covariances as rough as a few cycles give: chi-square keeps its distribution."""
         rng = np.random.default_rng(5)
         values = []
-        for seed in range(60):
+        for seed in range(30):
             data = table(seed=seed, noise=0.01)
             s2 = (0.01 * np.abs(data.response)) ** 2
             factors = rng.standard_normal((30, int(dof), 2))
             C = np.einsum("nki,nkj->nij", factors, factors) / dof * s2[:, None, None]
             found = judge(replace(data, covariance=C, dof=np.full(30, dof)))
             values.append(found.chi_square.p_value)
-        assert np.mean(np.array(values) < 0.05) < 0.17  # of 60: more come once in 3,000 times
-        assert np.mean(values) == pytest.approx(0.5, abs=0.12)
+        assert np.sum(np.array(values) < 0.05) <= 5  # of 30: more come once in 300 times
+        assert np.mean(values) == pytest.approx(0.5, abs=0.15)
 
     def test_a_driven_plant(self):
         result = fit(plant_table(), Dahl() + Mass() + Damper() + Spring())
@@ -238,9 +238,9 @@ class TestPhysics:
 
     def test_a_nearly_linear_plant_moves_in_a_sine(self):
         plant = FRICTION + Mass(0.3) + Damper(20.0) + Spring(300.0)
-        f = np.tile(np.geomspace(0.1, 20.0, 12), 3)
-        u = np.repeat([0.05, 0.1, 0.3], 12)
-        R = response(plant, f, u).receptance * relative_noise(36, 0.001, 3)
+        f = np.tile(np.geomspace(0.1, 20.0, 6), 2)
+        u = np.repeat([0.05, 0.3], 6)
+        R = response(plant, f, u).receptance * relative_noise(12, 0.001, 3)
         data = FrequencyResponse(f, R, drive=u, controlled="force", quantity="receptance")
         assert not fit(data, Dahl() + Mass() + Damper() + Spring()).goodness.warnings
 
@@ -300,7 +300,7 @@ class TestComparison:
             return
         pytest.fail("no data set makes an element vanish")
 
-    @pytest.mark.parametrize("loss", ["huber", "soft_l1", "student_t"])
+    @pytest.mark.parametrize("loss", ["huber", "student_t"])
     def test_a_robust_loss_is_that_of_every_model(self, loss):
         """Two rows of thrice the response would make a free exponent look clearly better."""
         clean = table()

@@ -153,7 +153,7 @@ class TestTestsThatScatter:
     def test_far_beyond_an_uneven_covariance(self):
         """Bands hold, though the stated covariances say neither how much nor where."""
         inside: list[bool] = []
-        for seed in range(8):
+        for seed in range(4):
             data = scattering(seed)
             found, widths = left_out(data, Dahl())
             misfit = fit(data, Dahl()).goodness.rms_misfit
@@ -177,11 +177,12 @@ class TestAtInfinity:
     def test_what_is_determined_has_budget_and_bands(self):
         truth = 30.0**2 / 0.1
         covered, inside = [], []
-        for seed in range(20):
-            data = microslip(seed)
+        for data in map(microslip, range(20)):
             found = fit(data, self.MODEL, throw=False)
             if found.success:
                 continue
+            if len(covered) == 3:
+                break
             kappa = found.budget()["sigma^2/f_max"]
             covered.append(abs(kappa.value - truth) < kappa.U)
             mass = found.budget()["mass"]

@@ -44,7 +44,7 @@ def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says():
     model = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
     truth = {p.name: float(p.value or 0.0) for p in plant.parameters if p.name != "alpha"}
     errors = []
-    for seed in range(5):
+    for seed in range(3):
         noise = np.random.default_rng(seed).standard_normal((2, len(clean)))
         x = np.asarray(clean.displacement) + 1e-5 * noise[0]
         force = clean.force_samples + 3e-4 * noise[1]
@@ -177,7 +177,7 @@ def test_a_negative_damper_is_said_in_the_verdict_with_what_to_do():
 
 
 def test_a_mass_that_rests_on_less_than_the_misfit_is_doubted():
-    x: FloatArray = trajectory("multisine", 3000)
+    x: FloatArray = trajectory("multisine", 1500)
     law = di.MaxwellSlip(slips=[5e-4, 2e-3, 4e-3], stiffnesses=[20.0, 10.0, 5.0])
     noise = 1e-3 * np.random.default_rng(1).standard_normal(x.size)
     force = law.force(x) + noise
