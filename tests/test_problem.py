@@ -156,6 +156,40 @@ def test_jacobian_is_the_residuals_derivative(quantity, controlled, noise, stead
     np.testing.assert_allclose(problem.information(theta), J.T @ J, rtol=same)
 
 
+@pytest.mark.parametrize("harmonics", [(1,), (1, 3)])
+def test_near_a_point_exact_motions_cost_no_more_than_sines(harmonics):
+    """The same there, wrong by the square of the distance, and with its own derivatives."""
+    frequency, drive = (
+        np.repeat([0.3, 0.7, 1.5], len(harmonics)),
+        np.repeat([0.09, 0.3, 0.6], len(harmonics)),
+    )
+    table = FrequencyResponse(
+        frequency, np.full(frequency.shape, 1.0 - 0.5j), drive=drive, controlled="force",
+        quantity="receptance", harmonic=np.tile(harmonics, 3),
+        covariance=np.tile(np.diag([4e-4, 9e-4]), (frequency.size, 1, 1)),
+        drive_std=0.01 * drive,
+    )  # fmt: skip
+    problem = TableProblem(table, FREE)
+    centre = problem.to_search(TRUE)
+    near = problem.near(centre)
+    np.testing.assert_allclose(near.predict(centre), problem.predict(centre), rtol=1e-9)
+    direction = np.array([1.0, -1.0, 0.02, 0.03, 0.1])
+    errors = []
+    for size in (0.02, 0.04):
+        there = centre + size * direction
+        exact = problem.predict(there)
+        errors.append(np.abs(near.predict(there) / exact - 1.0).max())
+    assert 0.0 < errors[0] < 0.01
+    assert errors[1] < 5.0 * errors[0]
+    there = centre + 0.04 * direction
+    r, J = near.residuals_and_jacobian(there)
+    step = 1e-4 * np.eye(5)[:, None] * np.array([-2.0, -1.0, 1.0, 2.0])[:, None]
+    values = near.residuals((there + step).reshape(-1, 5)).reshape(5, 4, -1)
+    slopes = np.array([1.0, -8.0, 8.0, -1.0]) @ values / 12e-4
+    gradient = slopes @ r  # residuals of noisy drives are defined up to a rotation
+    np.testing.assert_allclose(J.T @ r, gradient, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
+
+
 def test_with_a_free_exponent_and_two_friction_elements():
     plant = Dahl(name="a", alpha=None) + Dahl(name="b") + Mass() + Damper()
     table = FrequencyResponse(
