@@ -34,6 +34,7 @@ def test_the_damper_shows_its_misfit():
         assert np.median(posterior.values[:, i]) == pytest.approx(middle, abs=0.1 * grid.std()[i])
 
 
+@pytest.mark.long
 def test_the_bolted_joint_leaves_f_max_to_its_prior(tmp_path):
     columns = tmp_path / "columns.toml"
     columns.write_text(BEAM)

@@ -189,13 +189,13 @@ def test_a_robust_estimate_does_not_depend_on_how_far_off_a_row_is(loss, factor,
 )
 def test_robust_intervals_and_scale_hold_for_gaussian_noise(loss):
     rng, z, scales = np.random.default_rng(1), [], []
-    for _ in range(80):
+    for _ in range(30):
         error = rng.normal(size=n) + 1j * rng.normal(size=n)
         found = solve(TableProblem(table(TRUE * np.exp(0.05 * error)), Dahl()), loss=loss)
         z.append((found.theta - np.log([0.1, 30.0])) / np.sqrt(np.diagonal(found.covariance)))
         scales.append(found.scale)
-    assert np.abs(np.std(z, axis=0) - 1.0).max() < 0.22
-    assert np.mean(scales) == pytest.approx(0.05, rel=0.03)
+    assert np.abs(np.std(z, axis=0) - 1.0).max() < 0.36  # of 30: more come once in 200 times
+    assert np.mean(scales) == pytest.approx(0.05, rel=0.05)
 
 
 @pytest.mark.versions
@@ -329,7 +329,15 @@ ODD_RESPONSES: dict[str, ComplexArray] = {
 @pytest.mark.parametrize(
     "model", [Dahl(), pytest.param(Dahl() + Spring(), marks=pytest.mark.long)], ids=repr
 )
-@pytest.mark.parametrize("name", ODD_RESPONSES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long)
+        if name in ("mostly nothing", "noise alone")
+        else name
+        for name in ODD_RESPONSES
+    ],
+)
 def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name, model):
     data = FrequencyResponse(np.ones(n), ODD_RESPONSES[name], A)
     found = fit(data, model, noise="absolute", throw=False)

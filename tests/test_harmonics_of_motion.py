@@ -1,5 +1,7 @@
 """Harmonics of the displacement of driven plants, as rows of a table: X_k over the force."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ def table(harmonics=(1, 3)):
 def asymmetric():
     """Return rows of the mean, the fundamental and the second harmonic, with a covariance."""
     plant = di.Dahl(0.1, 30.0, asymmetry=0.2) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(3.0)
-    f, u = (g.ravel() for g in np.meshgrid(np.geomspace(0.4, 2.5, 5), [0.08, 0.2, 0.6]))
+    f, u = (g.ravel() for g in np.meshgrid(np.geomspace(0.4, 2.5, 3), [0.08, 0.2, 0.6]))
     X = di.response(plant, f, u).harmonics
     k = np.tile([0, 1, 2], f.size)
     row = np.repeat(np.arange(f.size), 3)
@@ -39,9 +41,13 @@ def asymmetric():
     )  # fmt: skip
 
 
+@functools.cache
+def fitted():
+    return di.fit(table(), di.Dahl(alpha=1.0) + FREE)
+
+
 def test_they_are_fitted_with_the_fundamental():
-    data = table()
-    fit = di.fit(data, di.Dahl(alpha=1.0) + FREE)
+    fit = fitted()
     assert fit.status.usable, fit.verdict
     for name, truth in (("f_max", 0.1), ("sigma", 30.0), ("damping", 0.24), ("stiffness", 0.3)):
         found = fit.params[name]
@@ -82,7 +88,7 @@ def test_files_keep_them(tmp_path):
     again = di.read_frequency_response(tmp_path / "rows.csv")
     assert (again.quantity, again.harmonic.tolist()) == ("receptance", data.harmonic.tolist())
     np.testing.assert_allclose(again.response, data.response, rtol=1e-12)
-    fit = di.fit(data, di.Dahl(alpha=1.0) + FREE)
+    fit = fitted()
     fit.save(tmp_path / "fit.json")
     stored = di.FitResult.load(tmp_path / "fit.json")
     np.testing.assert_allclose(stored.best_fit, fit.best_fit, rtol=1e-9)

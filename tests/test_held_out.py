@@ -176,7 +176,8 @@ class TestAtInfinity:
 
     def test_what_is_determined_has_budget_and_bands(self):
         truth = 30.0**2 / 0.1
-        covered, inside = [], []
+        covered: list[bool] = []
+        inside: list[float] = []
         for data in map(microslip, range(20)):
             found = fit(data, self.MODEL, throw=False)
             if found.success:

@@ -145,13 +145,13 @@ class TestProfile:
         assert tied.lower == pytest.approx(free.lower, rel=1e-3)
 
     @pytest.mark.parametrize(
-        "seed", [4, 8, *(pytest.param(s, marks=pytest.mark.long) for s in (53, 204))]
+        "seed", [8, *(pytest.param(s, marks=pytest.mark.long) for s in (4, 53, 204))]
     )
     def test_with_a_hidden_spring_the_limits_are_those_of_a_global_search(self, seed):
         """The profile's valley is bent and long; fits with the value fixed find it from scratch.
 
-        But for the first table, the optimum lies in microslip with the spring at minus infinity,
-        and a second valley, gross slip, holds the limits.
+        But for the table of seed 4, the optimum lies in microslip with the spring at minus
+        infinity, and a second valley, gross slip, holds the limits.
         """
         hidden = table(model=Dahl(0.1, 30.0) + Spring(30.0), beta=(100.0, 1000.0), seed=seed)
         model = Dahl(alpha=1.0) + Spring()
@@ -204,7 +204,7 @@ class TestProfile:
 
 class TestBootstrap:
     def test_agrees_with_the_profile_where_all_is_well(self):
-        result = fit(table(), Dahl())
+        result = fit(table(n=12), Dahl(alpha=1.0))
         profile, bootstrap = result.conf_interval("profile"), result.conf_interval("bootstrap")
         width = profile.upper[1] - profile.lower[1]
         assert (np.abs(bootstrap.lower[1] - profile.lower[1]) < 0.05 * width).all()

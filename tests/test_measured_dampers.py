@@ -66,7 +66,11 @@ def cranked(pattern, step=2):
 
 @pytest.mark.parametrize(
     ("pattern", "most"),
-    [("ensaio[0-9]*.1.mat", 0.14), ("ensaio.A.*.mat", 0.12), ("ensaio.vali.*", 0.07)],
+    [
+        pytest.param("ensaio[0-9]*.1.mat", 0.14, marks=pytest.mark.long),
+        pytest.param("ensaio.A.*.mat", 0.12, marks=pytest.mark.long),
+        ("ensaio.vali.*", 0.07),
+    ],
 )
 def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     model = Dahl() + PowerDamper() + Spring() + Mass()
@@ -80,7 +84,9 @@ def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
     [
         # two minima of the exponent, 1.1 and 2.5: the likelier counts, its distance is in u
         ("ensaio[0-9]*.1.mat", False, ("f_max", "sigma", "alpha", "damping")),
-        ("ensaio.A.*.mat", False, ("f_max", "sigma", "alpha", "damping")),
+        pytest.param(
+            "ensaio.A.*.mat", False, ("f_max", "sigma", "alpha", "damping"), marks=pytest.mark.long
+        ),
         # the test of two rows holds most of what tells friction from damping
         ("ensaio.vali.*.mat", True, ("f_max", "sigma", "damping")),
     ],

@@ -378,7 +378,7 @@ class TestPlan:
         # 2 % between runs leaves 1 % only with more than four
         plan = di.plan(
             LINEAR, ranges=NEAR, limits={**KNEE, "time": 3000}, noise=0.01, scatter=0.02,
-            between_runs=60.0, target={"f_max": 0.01}, draws=20, candidates=60,
+            between_runs=60.0, target={"f_max": 0.01}, draws=10, candidates=30,
         )  # fmt: skip
         assert (plan.reached, plan.runs) == (True, 5)
         assert plan.seconds < 320.0
@@ -408,9 +408,10 @@ class TestPlan:
             plant, ranges=NEAR, controlled="force", noise=0.01, draws=30, candidates=100,
             limits={"force": (0.02, 2.0), "frequency_hz": (0.1, 3.0), "time": 400},
         )  # fmt: skip
-        errors = _errors(plan, plant.with_values(TRUTH), 0.01, 100)
+        errors = _errors(plan, plant.with_values(TRUTH), 0.01, 40)
         predicted = [plan.expected[name].after for name in ("f_max", "sigma")]
-        assert errors.std(axis=0) == pytest.approx(predicted, rel=0.22)
+        # of 40 tables the error of a standard deviation is 11 %
+        assert errors.std(axis=0) == pytest.approx(predicted, rel=0.33)
         assert all(0.02 <= step.level <= 2.0 for step in plan.steps)
 
     def test_points_with_several_amplitudes_are_avoided(self):
