@@ -15,7 +15,10 @@ from dahl_ident import (
     Dahl,
     Damper,
     FrequencyResponse,
+    Iwan,
+    LuGre,
     Mass,
+    MaxwellSlip,
     Record,
     Sensors,
     Spring,
@@ -154,6 +157,28 @@ def test_jacobian_is_the_residuals_derivative(quantity, controlled, noise, stead
     assert np.all(np.abs(quadratic.gradient - J.T @ r) <= same * np.abs(J.T) @ np.abs(r))
     np.testing.assert_allclose(quadratic.hessian, J.T @ J, rtol=same)
     np.testing.assert_allclose(problem.information(theta), J.T @ J, rtol=same)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        BoucWen(1e12, 1e13, 0.0),
+        BoucWen(1e12, 1e13, 0.0) + MaxwellSlip([1e-15], [1.0]),
+        MaxwellSlip([1e-13], [1e12]),
+        Iwan(0.1, 1e12, chi=0.0, ratio=1.0),
+        LuGre(0.1, 1e12, static_ratio=1.0, stribeck_speed=1.0),
+    ],
+)
+def test_a_law_that_slips_at_once_is_dry_friction(law):
+    """A driven plant moves as with Dahl friction of the same force, however high the stiffness."""
+    rest = Mass() + Damper(0.24) + Spring(0.3)
+    table = FrequencyResponse(
+        [0.3, 0.7, 1.5], np.full(3, 1.0 - 0.5j), drive=[0.3, 0.5, 0.6], controlled="force",
+        quantity="receptance",
+    )  # fmt: skip
+    expected = TableProblem(table, Dahl(0.1, 1e6, 1.0) + rest, noise="absolute").predict([0.3])
+    found = TableProblem(table, law + rest, noise="absolute").predict([0.3])
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
 @pytest.mark.parametrize("harmonics", [(1,), (1, 3)])

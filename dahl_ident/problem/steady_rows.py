@@ -25,8 +25,7 @@ _LEVEL = 0.1  # difference of ln of the drive between two levels; a held one var
 # knee over the largest displacement from which friction is a spring: its third harmonic is 1e-3,
 # and a sine errs by the square
 _MICROSLIP = 1e3
-_SLIP = 1e-9  # knee over the smallest displacement, below which the stiffness has no effect
-_STIFFNESS = (1, -1, 0)  # powers of force, displacement and time
+_SLIP = 1e-9  # knee over the smallest displacement, below which its size has no effect
 _ELSEWHERE = 0.2  # relative distance from the measurement that may mean another branch
 
 
@@ -134,18 +133,21 @@ class SteadyRows:
         return np.asarray(far.all(axis=-1))
 
     def _within_reach(self, values: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return values with a lower stiffness where friction slips at far smaller amplitudes."""
+        """Return values with a higher knee where friction slips at far smaller displacements.
+
+        All lengths of the law grow in proportion, and so its forces stay.
+        """
         smallest = np.nanmin(np.abs(self._measured), axis=-1, keepdims=True)
         reachable = []
         for element, law_values in self._model.of(values):
-            kept = list(law_values)
+            longer = np.ones(())
             if not element.is_linear:
                 with np.errstate(all="ignore"):
-                    share = element.knee(law_values)[1] / (_SLIP * smallest)
-                for i, parameter in enumerate(element.parameters):
-                    if parameter.dimension == _STIFFNESS and (share < 1.0).any():
-                        kept[i] = law_values[i] * np.where(share < 1.0, share, 1.0)
-            reachable += kept
+                    longer = np.fmax(_SLIP * smallest / element.knee(law_values)[1], 1.0)
+            for parameter, value in zip(element.parameters, law_values, strict=True):
+                _, length, time = parameter.dimension
+                scaled = length != 0 and time == 0 and (longer > 1.0).any()
+                reachable.append(value * longer**length if scaled else value)
         return reachable
 
     def _is_unique(self, values: Sequence[FloatArray], shape: tuple[int, ...]) -> NDArray[np.bool_]:
