@@ -63,7 +63,7 @@ SI_UNITS: dict[str, tuple[str, str]] = {
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
 _ROTATION = {"N/m^2": "N m/rad^2", "N/s": "N m/s"} | dict(SI_UNITS.values())
 QUANTITIES: tuple[Quantity, ...] = tuple(q for q in get_args(Quantity) if q != "backbone")
-"""The six standard quantities, each a quotient of force and motion; a backbone is none."""
+"""The six standard quantities, each a quotient of force and motion; a backbone is not."""
 MOTION_KINDS = ("displacement", "velocity", "acceleration")
 DRIVE_KINDS = ("force", "voltage", "current")
 MECHANICAL_KINDS = (*MOTION_KINDS, "force", *QUANTITIES, "force_per_voltage", "force_per_current")
@@ -78,7 +78,7 @@ _MARKER = re.compile(
     "(?:^|[\\s_,(]|(?<=\\w))(?:" + "|".join(f"({p})" for _, p in _MARKERS) + r")\)?\s*$", re.I
 )
 _DECIBEL = re.compile(r"^\s*dB\b(?:\s*re\.?\s*(?:1(?![\d./]))?)?\s*", re.I)
-# What laboratories write and pint does not know, or takes for something else.
+# Spellings of laboratories that pint does not know, or interprets differently.
 _SPELLINGS = {
     "sec": "s",
     "Sec": "s",
@@ -99,8 +99,9 @@ _SPELLINGS = {
     "VDC": "V",
     "VAC": "V",
 }
+_PREFIXES = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 _AMBIGUOUS = {"grad": "a degree in German and a gon elsewhere; write deg or gon"}
-# Units of nearly every file, read without pint, whose definitions take most of a second to load.
+# Units of nearly every file, read without pint, which takes most of a second to load.
 _FORCE = (("kilogram", 1.0), ("meter", 1.0), ("second", -2.0))
 _VOLT = (("ampere", -1.0), ("kilogram", 1.0), ("meter", 2.0), ("second", -3.0))
 _COMMON: dict[str, tuple[float, Dimension]] = {
@@ -127,14 +128,14 @@ _COMMON_PART = re.compile(
     r"(\s*[*/]\s*|\s+|)(?:\(([^()]+)\)|([A-Za-z]+|\N{DEGREE SIGN}|1\b))(?:\^(-?\d))?"
 )
 _TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
-_LONGEST = 60  # characters; longer text in brackets is a remark
+_LONGEST = 60  # characters; longer text in brackets is not a unit
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit as it was written, and its value in SI units without the marker of an amplitude.
+    """A unit as written, and its value in SI units without the marker of an amplitude.
 
-    `dimension` has the exponents of the SI base units, the radian among them, sorted by name.
+    `dimension` has the exponents of the SI base units and the radian, sorted by name.
     """
 
     text: str
@@ -145,7 +146,7 @@ class Unit:
 
     @property
     def to_peak(self) -> float:
-        """Factor from amplitudes in this unit to zero-to-peak; 1 where the text does not say."""
+        """Factor from amplitudes in this unit to zero-to-peak; 1 if the text does not say."""
         return _TO_PEAK[self.marker or "zero to peak"]
 
 
@@ -154,8 +155,8 @@ def parse_unit(text: str) -> Unit:
 
     Products are written with a space, ``*``, a dot or a hyphen; powers as ``m/s^2``, ``m/s2`` or
     ``m/s²``; amplitudes are marked ``rms``, ``pp`` or ``pk`` at the end; decibels are ``dB`` with
-    the reference unit. ``g`` is the gram; the acceleration is ``g_n``, and ``g`` is read so only
-    where :func:`kind_of` needs an acceleration.
+    the reference unit. ``g`` is the gram and ``g_n`` the acceleration; ``g`` is read as ``g_n``
+    only if :func:`kind_of` expects an acceleration.
 
     Examples
     --------
@@ -187,7 +188,7 @@ def parse_unit(text: str) -> Unit:
 def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion, float]:
     """Return which of `kinds`, keys of `SI_UNITS`, a unit belongs to, its motion and its SI value.
 
-    `what` has the unit, for the message.
+    `what` names the object that has the unit, for the message.
 
     Examples
     --------
@@ -196,7 +197,7 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
     >>> kind_of(parse_unit("lbf-in"), ("force",), "force")[:2]
     ('force', 'rotation')
     """
-    for candidate in _readings(unit):
+    for candidate in _meanings(unit):
         for kind in kinds:
             for motion, si in zip(MOTIONS, SI_UNITS[kind], strict=True):
                 if _same(candidate.dimension, parse_unit(si).dimension, kind):
@@ -209,24 +210,21 @@ def kind_of(unit: Unit, kinds: tuple[str, ...], what: str) -> tuple[str, Motion,
 
 
 def factor_to(unit: Unit, si: str, what: str) -> float:
-    """Return the value of one `unit` in the SI unit `si`, angles counting as pure numbers."""
-    wanted = _without_angle(parse_unit(si).dimension)
-    for candidate in _readings(unit):
-        if _without_angle(candidate.dimension) == wanted:
+    """Return the value of one `unit` in the SI unit `si`, with angles as pure numbers."""
+    dimension = _without_angle(parse_unit(si).dimension)
+    for candidate in _meanings(unit):
+        if _without_angle(candidate.dimension) == dimension:
             return candidate.factor
     raise UnitError(f"{what} has the unit [{unit.text}]; expected one of the dimension of {si}")
 
 
 def si_unit(kind: str, motion: Motion = "translation") -> str:
-    """Return the SI unit of a kind, as printed after its numbers."""
+    """Return the SI unit of a kind as printed after numbers."""
     return SI_UNITS[kind][motion == "rotation"]
 
 
-_PREFIXES = {-9: "n", -6: "\u00b5", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-
-
 def engineering(value: float, unit: str) -> str:
-    """Return a number with an SI prefix, such as ``3.33 mm``; with none for N/m and the like."""
+    """Return a number with an SI prefix, such as ``3.33 mm``; compound units have no prefix."""
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g} {unit}".strip()
     power, unit = prefix([value], unit)
@@ -234,7 +232,7 @@ def engineering(value: float, unit: str) -> str:
 
 
 def prefix(values: Iterable[float], unit: str) -> tuple[float, str]:
-    """Return the power of ten of a prefix that suits most of some numbers, and the unit with it."""
+    """Return the power of ten of the prefix that suits the median number, and the prefixed unit."""
     sizes = sorted(abs(v) for v in values if v != 0.0 and math.isfinite(v))
     if not sizes or unit not in ("N", "m", "s", "Hz", "J", "rad"):
         return 1.0, unit
@@ -245,14 +243,14 @@ def prefix(values: Iterable[float], unit: str) -> tuple[float, str]:
 
 
 def shown_unit(unit: str, motion: Motion) -> str:
-    """Return a model's unit, declared for translation, as it is written for `motion`."""
+    """Return the unit of a parameter, declared for translation, as written for `motion`."""
     return _ROTATION.get(unit, unit) if motion == "rotation" else unit
 
 
 def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float, str, Motion]:
     """Read a number with its unit, such as ``"0.2 N"`` or ``"5 um rms"``.
 
-    Returns its SI value, zero to peak where it is an amplitude, its kind and its motion.
+    Returns its SI value (zero to peak for an amplitude), its kind and its motion.
 
     Examples
     --------
@@ -270,7 +268,7 @@ def parse_quantity(text: str, kinds: tuple[str, ...], what: str) -> tuple[float,
 
 
 def _normalised(text: str, written: str) -> str:
-    """Translate units as laboratories write them into a form that pint can read safely."""
+    """Return a unit as written by a laboratory in a form that pint can read safely."""
     superscripts = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
     text = text.replace("º", "°")
     out = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(superscripts), text.strip())
@@ -290,7 +288,7 @@ def _normalised(text: str, written: str) -> str:
 
 
 def percent(share: float, digits: int = 2, *, sign: bool = False) -> str:
-    """Return a share as text, such as ``"9.2 %"``; with `sign` also that."""
+    """Return a ratio as text, such as ``"9.2 %"``, with a plus sign if `sign` is set."""
     rounded = float(f"{100.0 * share:.{digits}g}")
     return f"{rounded:{'+' if sign else ''}g} %" if math.isfinite(share) else "-"
 
@@ -325,7 +323,7 @@ def _registry() -> pint.UnitRegistry[Any]:
 
 @cache
 def _root(text: str, written: str) -> tuple[float, Dimension]:
-    """Factor to SI base units and their exponents."""
+    """Return the factor to SI base units and their exponents."""
     common = _common(text)
     if common is not None:
         return common
@@ -337,8 +335,8 @@ def _root(text: str, written: str) -> tuple[float, Dimension]:
     return float(base.magnitude), tuple(sorted((k, float(v)) for k, v in base.unit_items()))
 
 
-def _readings(unit: Unit) -> list[Unit]:
-    """Return the unit, and with g as the standard acceleration, which laboratories write so."""
+def _meanings(unit: Unit) -> list[Unit]:
+    """Return the unit, and that with g as the acceleration of gravity if it contains g."""
     if not re.search(r"\bg\b", unit.text):
         return [unit]
     return [unit, parse_unit(re.sub(r"\bg\b", "g_n", unit.text))]
@@ -350,7 +348,7 @@ def _without_angle(dimension: Dimension) -> Dimension:
 
 def _same(first: Dimension, second: Dimension, kind: str) -> bool:
     if kind in MECHANICAL_KINDS and kind not in MOTION_KINDS:
-        # N m and N m/rad are both written for a rotary stiffness
+        # a rotary stiffness may be in N m or N m/rad
         return _without_angle(first) == _without_angle(second)
     return first == second
 
@@ -375,13 +373,13 @@ DEFINITIONS: dict[Quantity, QuantityForm] = {
     "mechanical_impedance": QuantityForm(-1, 1),
     "apparent_mass": QuantityForm(-2, 1),
 }
-COMPLIANCES = tuple(name for name, of in DEFINITIONS.items() if of.exponent < 0)
+COMPLIANCES = tuple(name for name, form in DEFINITIONS.items() if form.exponent < 0)
 """Motion over force."""
-_POWERS_OF_J = (1.0 + 0.0j, 1.0j, -1.0 + 0.0j, -1.0j)  # exact, where (1j)**n rounds
+_POWERS_OF_J = (1.0 + 0.0j, 1.0j, -1.0 + 0.0j, -1.0j)  # exact; (1j)**n is rounded
 
 
 def power_of_s(omega: FloatArray, power: int) -> ComplexArray:
-    """Return (j omega)^power, without rounding of the direction."""
+    """Return (j omega)^power, with an exact phase."""
     return np.asarray(_POWERS_OF_J[power % 4] * omega ** float(power))
 
 
@@ -390,9 +388,9 @@ def converted(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return the response as `target`, and its complex derivative with respect to the source."""
     old, new = DEFINITIONS[source], DEFINITIONS[target]
-    turn = old.exponent * new.exponent
-    factor = power_of_s(omega, new.power - turn * old.power)
-    if turn == 1:
+    sign = old.exponent * new.exponent  # -1 inverts the response
+    factor = power_of_s(omega, new.power - sign * old.power)
+    if sign == 1:
         return response * factor, factor
     zero = np.flatnonzero(response == 0.0)
     if zero.size:
@@ -404,18 +402,18 @@ def converted(
 
 
 def jacobian(derivative: ComplexArray) -> FloatArray:
-    """Return the (n, 2, 2) real Jacobian of a complex derivative on (Re, Im)."""
+    """Return the (n, 2, 2) real Jacobian, with respect to (Re, Im), of a complex derivative."""
     re, im = derivative.real, derivative.imag
     return np.stack([np.stack([re, -im], -1), np.stack([im, re], -1)], -2)
 
 
 def polar_std(response: ComplexArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations of gain and of phase (rad), to first order."""
-    along = np.stack([response.real, response.imag], -1) / np.abs(response)[:, None]
-    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    radial = np.stack([response.real, response.imag], -1) / np.abs(response)[:, None]
+    tangential = np.stack([-radial[:, 1], radial[:, 0]], -1)
 
     def std(direction: FloatArray) -> FloatArray:
         variance = np.einsum("ni,nij,nj->n", direction, covariance, direction)
         return np.asarray(np.sqrt(variance.clip(0.0)))
 
-    return std(along), std(across) / np.abs(response)
+    return std(radial), std(tangential) / np.abs(response)

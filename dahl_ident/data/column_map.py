@@ -1,7 +1,7 @@
 """Column maps: the columns of time, displacement, force and drive in a laboratory's files.
 
-A laboratory describes its files once, in a small TOML file. Each role is the name of a column, or a
-table with the name, its unit if the header does not give it, a sign and a constant factor::
+A laboratory describes its files once, in a small TOML file. Each role is given by the name of a
+column, or by a table with the name, the unit if the header lacks it, a sign and a constant factor::
 
     drive_factor = "12.5 N/V"
     drive_factor_uncertainty = 0.01
@@ -15,8 +15,8 @@ table with the name, its unit if the header does not give it, a sign and a const
     column = "amplifier"
     unit = "V"
 
-In files with paths (MATLAB, HDF5) a ``*`` stands for any name or index, and every match becomes
-one level: ``column = "FRdata.*[*].frequency"``. Indices count from 0.
+In files with paths (MATLAB, HDF5) a ``*`` matches any name or index, and every match becomes one
+level: ``column = "FRdata.*[*].frequency"``. Indices start at 0.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ from dahl_ident.units import (
     si_unit,
 )
 
-_SHOWN = 10  # rows that a warning names
+_SHOWN = 10  # most rows named in a warning
 
 
 @dataclass(frozen=True)
 class MappedColumn:
-    """The column of a role, by its usual name where there is no other; `unit` is for the file's."""
+    """The column of a role, by default with its usual name; `unit` replaces that of the file."""
 
     column: str | None = None
     unit: str | None = None
@@ -74,7 +74,7 @@ class MappedColumn:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Roles and other information that a file does not contain; see `read_frequency_response`."""
+    """Roles, and information that a file does not contain; see `read_frequency_response`."""
 
     roles: Mapping[str, MappedColumn] = field(default_factory=dict)
     quantity: Quantity | None = None
@@ -86,7 +86,7 @@ class ColumnMap:
 
 
 def column_map_of(entries: Mapping[str, Any]) -> str:
-    """Return how a column map with these entries is given, for messages."""
+    """Return, for messages, how the user gives a column map with these entries."""
 
     def toml(entry: Any) -> str:
         if isinstance(entry, Mapping):
@@ -100,7 +100,7 @@ def column_map_of(entries: Mapping[str, Any]) -> str:
 
 
 def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -> ColumnMap:
-    """Read a column map from a mapping or a TOML file; `overrides` replace what it says."""
+    """Read a column map from a mapping or a TOML file; `overrides` replace its entries."""
     name, entries = "columns", value or {}
     if not isinstance(entries, Mapping):
         name, entries = str(entries), read_toml(entries, "the column map")
@@ -120,7 +120,7 @@ def column_map(value: Mapping[str, Any] | str | Path | None, **overrides: Any) -
 
 
 def _mapped(entry: Any, role: str) -> MappedColumn:
-    """Return what an entry of a column map says of a role, a name or a table."""
+    """Return the column of a role from its entry in a column map, a name or a table."""
     if role not in FILE_COLUMNS:
         known = choices((*FILE_COLUMNS, *SETTINGS), role)
         raise ValidationError(f"unknown entry {role!r}; expected one of {known}")
@@ -142,7 +142,7 @@ def _controlled(entry: Any, key: str) -> str | dict[str, str]:
     if isinstance(entry, str):
         return one_of(entry, key, CONTROLLED)
     if isinstance(entry, Mapping) and all(isinstance(v, str) for v in entry.values()):
-        return {one_of(held, key, CONTROLLED): entry[held] for held in entry}
+        return {one_of(word, key, CONTROLLED): pattern for word, pattern in entry.items()}
     raise ValidationError(
         f"{key} is {entry!r}; expected 'displacement' or 'force', or a pattern of level labels "
         "for each of them"
@@ -174,19 +174,19 @@ SETTINGS: Checks = {
     "drive_factor": _text,
     "drive_factor_uncertainty": non_negative_number,
 }
-"""Entries of a column map that are not columns, and what checks each."""
+"""Entries of a column map that are not columns, with their checks."""
 
 
 @dataclass
 class Binding:
-    """Roles looked up in one source, with the assumptions (`notes`) and warnings (`doubts`)."""
+    """Roles looked up in one source, with the assumptions made (`notes`) and the warnings."""
 
     source: RawFile
     map: ColumnMap
     columns: Mapping[str, Column]
     motions: dict[str, Motion] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -198,37 +198,37 @@ class Binding:
             )
 
     def naming(self, role: str, entry: Any = ANY) -> str:
-        """Return how the column of a role is named, for messages."""
+        """Return, for messages, how the user names the column of a role."""
         if self.columns is not RECORD_COLUMNS:
             return column_map_of({role: entry})
         typed = f"{entry['column']} [{entry['unit']}]" if isinstance(entry, Mapping) else entry
-        named = {role: entry}
-        return spelled(f"columns={named!r}", argument(role, typed))
+        columns = {role: entry}
+        return spelled(f"{columns=}", argument(role, typed))
 
     def mapped(self, role: str) -> MappedColumn:
-        """Return what the column map says of a role."""
+        """Return the entry of a role in the column map."""
         return self.map.roles.get(role, MappedColumn())
 
     def called(self, role: str) -> list[RawChannel]:
-        """Return the columns that are called what the role is, or said to be it by the format."""
+        """Return the columns of a role according to their names or to the file format."""
         return [c for c in self.source.channels if c.is_called(self.columns[role])]
 
     def channel(self, role: str) -> RawChannel | None:
-        """Return the channel of a role, or None where the file has none."""
+        """Return the channel of a role, or None if the file has none."""
         column = self.mapped(role).column
-        channel = self._called(role) if column is None else self.source.find(column)
+        channel = self._named(role) if column is None else self.source.find(column)
         if channel is not None:
             self.used.add(channel.name)
         return channel
 
-    def _called(self, role: str) -> RawChannel | None:
-        """Return the one column that is called what the role is."""
+    def _named(self, role: str) -> RawChannel | None:
+        """Return the only column with a name of the role, None if there is none."""
         matches = self.called(role)
         names = self.columns[role].names
-        if role not in self.map.roles:  # a column that the map gives another role has no second one
-            named = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
-            taken = [self.source.find(column).content for column in named]
-            matches = [c for c in matches if not any(c.content is channel for channel in taken)]
+        if role not in self.map.roles:  # a column to which the map gives a role has no other role
+            mapped = [c.column for c in self.map.roles.values() if c.column and "*" not in c.column]
+            used = [self.source.find(column).content for column in mapped]
+            matches = [c for c in matches if not any(c.content is content for content in used)]
         elif not matches:
             raise DataError(
                 f"{self.source.name}: no column is called {' or '.join(names)}; name "
@@ -238,11 +238,11 @@ class Binding:
             matches = sorted(matches, key=lambda c: names.index(plain(c.short or c.name)))[:1]
         if len(matches) > 1:
             distinct = len({c.name for c in matches}) == len(matches)
-            way = f"say which one with {self.naming(role, matches[0].name)}"
+            choice = f"say which one with {self.naming(role, matches[0].name)}"
             raise DataError(
                 f"{self.source.name}: {len(matches)} columns may be the {role}: "
                 f"{listed([c.header for c in matches])}; "
-                + (way if distinct else "rename them in the file")
+                + (choice if distinct else "rename them in the file")
             )
         return matches[0] if matches else None
 
@@ -262,15 +262,15 @@ class Binding:
         return channel
 
     def numbers(self, role: str, channel: RawChannel) -> FloatArray:
-        """Return finite numbers with the map's sign and factor, in the file's unit."""
+        """Return finite numbers in the file's unit, with the map's sign and factor."""
         mapped = self.mapped(role)
         return scaled(self.source.numbers(channel), mapped.sign * mapped.factor)
 
     def si(self, role: str, quantity: str = "dynamic_stiffness", *, least: bool = True) -> Any:
-        """Return a column in SI units, amplitudes zero to peak; None where there is none.
+        """Return a column in SI units, amplitudes zero to peak; None if there is none.
 
-        `quantity` is the table's, for units that do not say their kind; `least` refuses smaller
-        numbers.
+        `quantity` is that of the table, for columns whose unit follows from it; with `least`,
+        numbers below the column's `least` are refused.
         """
         channel, declared = self.channel(role), self.columns[role]
         if channel is None:
@@ -293,8 +293,8 @@ class Binding:
         text = self.mapped(role).unit or channel.unit
         if text is None and channel.is_called(declared):
             text = channel.unit_in_name
-        if not text and (alike := next(filter(self.has, declared.like), None)) is not None:
-            inherited = self.unit(alike, self.required(alike))
+        if not text and (other := next(filter(self.has, declared.like), None)) is not None:
+            inherited = self.unit(other, self.required(other))
             text = None if inherited.decibel else inherited.text
         elif not text and declared.unit == "1":
             text = "1"
@@ -311,7 +311,7 @@ class Binding:
             raise UnitError(f"{self.source.name}: column {channel.name!r}: {exc}") from exc
 
     def kind(self, role: str, unit: Unit) -> tuple[str, float]:
-        """Return which kind a role's unit is, and its factor, for angular frequency to Hz."""
+        """Return the kind of a role's unit, and the factor to SI units (Hz for frequencies)."""
         kind, motion, factor = kind_of(
             unit, self.columns[role].kinds, f"{self.source.name}: the {role}"
         )
@@ -334,24 +334,27 @@ class Binding:
         return positive_number(value, "drive_factor"), self.map.drive_factor_uncertainty
 
     def refuse_idle_factor(self, kind: str | None) -> None:
-        """Refuse keywords on the factor of a drive of this kind if they have no effect."""
+        """Refuse options for the factor of a drive of this kind if they have no effect."""
         names = ("drive_factor", "drive_factor_uncertainty")
-        what = " and ".join(n for n in names if self.source.options.get(n) is not None)
-        if not what:  # a column map may serve other files too, and is not refused
+        options = " and ".join(n for n in names if self.source.options.get(n) is not None)
+        if not options:  # in a column map, which may serve other files too, they are allowed
             return
         if kind in (None, "force"):
             channel = self.channel("drive")
             why = f"the drive ({channel.name}) is a force already" if channel else ""
+            why = why or "no column holds the drive"
             raise DataError(
-                f"{self.source.name}: {what} is given, but {why or 'no column holds the drive'}; "
-                "expected a drive in V or A: leave the factor out, or name the column with "
+                f"{self.source.name}: {options} is given, but {why}; expected a drive in V or A: "
+                "leave the factor out, or name the column with "
                 f"{self.naming('drive')}"
             )
         if self.map.drive_factor is None and "drive_factor" not in self.source.metadata:
-            raise DataError(f"{self.source.name}: {what} is given without drive_factor; give both")
+            raise DataError(
+                f"{self.source.name}: {options} is given without drive_factor; give both"
+            )
 
     def motion(self) -> Motion:
-        """Return translation or rotation, on which all units must agree."""
+        """Return translation or rotation; all units must agree."""
         kinds = set(self.motions.values())
         if len(kinds) > 1:
             stated = ", ".join(f"{role} is {motion}" for role, motion in self.motions.items())
@@ -359,7 +362,7 @@ class Binding:
         return kinds.pop() if kinds else "translation"
 
     def provenance(self) -> dict[str, Any]:
-        """Return where the data come from, and the assumptions made on the way."""
+        """Return the source of the data, the assumptions made and the warnings."""
         unused = [c.name for c in self.source.channels if c.name not in self.used]
         notes = list(dict.fromkeys([*self.source.notes, *self.notes]))
         if unused:
@@ -370,23 +373,23 @@ class Binding:
             "sha256": self.source.sha256,
             "options": dict(self.source.options),
             "notes": notes,
-            "warnings": list(dict.fromkeys([*self.source.doubts, *self.doubts])),
+            "warnings": list(dict.fromkeys([*self.source.warnings, *self.warnings])),
             "origin": self.source.metadata.get("provenance"),
         }
         return {key: value for key, value in facts.items() if value}
 
-    def doubt(self, message: str) -> None:
-        """Warn, and keep the warning with the data: verdict and report repeat it."""
+    def warn(self, message: str) -> None:
+        """Warn, and store the warning with the data, because verdict and report repeat it."""
         warnings.warn(f"{self.source.name}: {message}", DataWarning, stacklevel=3)
-        self.doubts.append(message)
+        self.warnings.append(message)
 
-    def doubt_rows(self, rows: NDArray[np.bool_], message: str) -> None:
-        """Warn of the rows that are marked, if there are any."""
+    def warn_rows(self, rows: NDArray[np.bool_], message: str) -> None:
+        """Warn about the marked rows, if there are any."""
         marked = np.flatnonzero(rows)
         if marked.size:
             names = ", ".join(self.source.row_name(int(i)) for i in marked[:_SHOWN])
             more = f" and {marked.size - _SHOWN} more" if marked.size > _SHOWN else ""
-            self.doubt(f"{message}: {names}{more}")
+            self.warn(f"{message}: {names}{more}")
 
     def same_length(self, channels: Mapping[str, RawChannel]) -> None:
         """Refuse columns of different lengths."""
@@ -396,7 +399,7 @@ class Binding:
 
 
 def scaled(values: FloatArray, factor: float) -> FloatArray:
-    """Return values times factor; long records are not copied for a factor of 1."""
+    """Return values times factor; without a copy if the factor is 1."""
     return values if factor == 1.0 else values * factor
 
 

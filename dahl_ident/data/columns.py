@@ -1,4 +1,4 @@
-"""The columns of tables, each declared once, and the checks of what they may hold."""
+"""The columns of tables, each declared once, and the checks of their values."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CONTROLLED = ("displacement", "force")
 
 
 def frozen_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a contiguous copy of `array` that cannot be written to; one of these, as it is."""
+    """Return a contiguous read-only copy of `array`, or `array` itself if it is one."""
     flags = array.flags
     if flags.owndata and flags.c_contiguous and not flags.writeable and type(array) is np.ndarray:
         return array
@@ -51,12 +51,12 @@ def frozen_mapping(value: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
 
 
 def plain_mappings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return constructor arguments with plain dicts, which pickle where proxies do not."""
+    """Return constructor arguments with plain dicts, because mapping proxies cannot be pickled."""
     return {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in pairs}
 
 
 def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
-    """Return `value` if it is among `allowed`, else name them."""
+    """Return `value` if it is among `allowed`, otherwise raise an error that lists them."""
     if value not in allowed:
         raise ValidationError(
             f"{name} is {value!r}; expected one of {choices(allowed, str(value))}"
@@ -65,7 +65,7 @@ def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
 
 
 def set_checked(instance: Any, check: Callable[[Any, str], Any], *names: str) -> None:
-    """Replace fields of a frozen dataclass by what a check returns; a default of None stays."""
+    """Replace fields of a frozen dataclass by checked values; a default of None remains."""
     optional = {one.name for one in fields(instance) if one.default is None}
     for name in names:
         value = getattr(instance, name)
@@ -84,7 +84,7 @@ def complex_values(value: ArrayLike, name: str) -> NDArray[np.complex128]:
 
 
 def degrees_of_freedom(value: ArrayLike, name: str) -> FloatArray:
-    """Return numbers above zero, infinity among them."""
+    """Return numbers above zero; infinity is allowed."""
     array = real_array(value, name)
     for i in np.flatnonzero(~(array > 0.0))[:1]:
         raise ValidationError(
@@ -100,7 +100,7 @@ def labels(value: ArrayLike, name: str) -> NDArray[Any]:
 
 
 def run_labels(value: ArrayLike, name: str) -> NDArray[np.str_]:
-    """Return text labels; numbers become text, 3.0 the same as 3."""
+    """Return text labels; numbers become text, with 3.0 equal to 3."""
     array = labels(value, name)
     if array.dtype.kind == "U":
         return array
@@ -108,7 +108,7 @@ def run_labels(value: ArrayLike, name: str) -> NDArray[np.str_]:
 
 
 def controlled_words(value: ArrayLike, name: str) -> NDArray[np.str_]:
-    """Return words out of ``CONTROLLED``."""
+    """Return an array of the words in ``CONTROLLED``."""
     array = np.asarray(value, dtype=np.str_)
     for word in np.unique(array):
         one_of(str(word), name, CONTROLLED)
@@ -116,7 +116,7 @@ def controlled_words(value: ArrayLike, name: str) -> NDArray[np.str_]:
 
 
 def harmonic_numbers(value: ArrayLike, name: str) -> NDArray[np.int64]:
-    """Return whole numbers of 0 and above."""
+    """Return whole numbers >= 0."""
     array = non_negative_array(value, name)
     for number in array[array != np.round(array)][:1]:
         raise ValidationError(f"{name}: expected whole numbers, got {float(number)!r}")
@@ -124,7 +124,7 @@ def harmonic_numbers(value: ArrayLike, name: str) -> NDArray[np.int64]:
 
 
 def plain_values(value: ArrayLike, name: str) -> NDArray[Any]:
-    """Return numbers (NaN and infinity among them), truth values or text."""
+    """Return numbers (including NaN and infinity), truth values or text."""
     array = np.asarray(value)
     if array.dtype.kind in "OT":
         return array.astype(str)
@@ -156,23 +156,23 @@ def check_covariance(
 
 
 Table = Any
-"""A frequency response, whose own module uses this one."""
+"""A FrequencyResponse; its module imports this one."""
 Source = str | Callable[[Table], NDArray[Any] | None]
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of tables: what it may hold, its name and unit in files, and how it is saved.
+    """A column of tables: its allowed values, its name and unit in files, and how it is saved.
 
-    In files it has the first of its `names`, and is found under the others without a map. `unit` is
-    that in which it is saved; where a header has none, the first column of `like` gives it. `kinds`
-    are those that a file's unit may be of. `least` is the smallest number allowed, as `expected`
-    says.
+    It is saved under the first of its `names` (or `header`) in `unit`, and only in tables of the
+    `form`, if given; it is read under all of its names. A unit in a file may be of one of `kinds`;
+    if the header has none, that of the first existing column in `like` is taken. `least` is the
+    smallest number allowed, described by `expected`.
 
-    Its values are those of the attribute `source` of a table, the `part` of each row's, or what a
-    function makes of the table. `form` is the only form of table in which it is saved, `header`
-    what it is saved under. In memory it has a `check`; `shape` is that of one row's value; where it
-    `repeats`, one value may be given for all rows; without what it `needs` it means nothing.
+    `source` gives the values: an attribute of the table, of which `part` may select an entry of
+    each row, or a function of the table. In memory the column has a `check`; `shape` is that of the
+    value in one row; if it `repeats`, one value may be given for all rows; it requires the columns
+    in `needs`.
     """
 
     names: tuple[str, ...] = ()
@@ -206,19 +206,19 @@ class Column:
         return frozen_copy(array)
 
     def saved(self, data: Table) -> NDArray[Any] | None:
-        """Return its values in a table, None where that has none."""
+        """Return the values in a table, None if the table does not have the column."""
         if not isinstance(self.source, str):
             return self.source(data)
         values = getattr(data, self.source, None)
         return None if values is None else np.asarray(values[(slice(None), *self.part)])
 
     def unit_of(self, motion: Motion, quantity: str) -> str:
-        """Return the SI unit in tables of a quantity, of translation or rotation."""
+        """Return the SI unit in tables of a quantity for translation or rotation."""
         kinds = {kind: si_unit(kind, motion) for kind in ("displacement", "force")}
         return self.unit.format(**kinds, response=si_unit(quantity, motion))
 
-    def measures(self, unit: str | None, what: str) -> bool:
-        """Return whether a unit, that `what` has, is of one of the kinds."""
+    def accepts(self, unit: str | None, what: str) -> bool:
+        """Return whether the unit of `what` is of one of the kinds."""
         if unit is None or not self.kinds:
             return False
         try:
@@ -229,7 +229,7 @@ class Column:
 
 
 def _polar(axis: int) -> Source:
-    """Return a function that gives the standard deviation of gain (0) or phase, in degrees (1)."""
+    """Return a function for the standard deviation of gain (axis 0) or phase in degrees (1)."""
 
     def saved(data: Table) -> NDArray[Any] | None:
         if data.covariance is None:
@@ -240,7 +240,7 @@ def _polar(axis: int) -> Source:
 
 
 def backbone_std(data: Table, axis: int) -> FloatArray:
-    """Return the standard deviation of a backbone's frequencies, Hz (0), or damping ratios (1)."""
+    """Return the standard deviation of a backbone's frequencies, Hz, or damping ratios (axis 1)."""
     assert data.covariance is not None  # a backbone has one
     std = np.sqrt(data.covariance[:, axis, axis])
     return np.asarray(std if axis else data.frequency_hz * std)
@@ -269,7 +269,7 @@ def check_table(data: Table) -> None:
                 f"controlled {data.controlled[row]!r}; expected a ratio >= 0, and "
                 "'displacement', at whose amplitude the frequency was found"
             )
-    if data.quantity != "dynamic_stiffness":  # extraction judges those
+    if data.quantity != "dynamic_stiffness":
         forced = (data.quantity == "receptance") & (data.controlled == "force")
         for row in np.flatnonzero((data.harmonic != 1) & ~forced)[:1]:
             raise ValidationError(
@@ -411,7 +411,7 @@ FILE_COLUMNS = RECORD_COLUMNS | RESPONSE_COLUMNS
 def combined(
     parts: Sequence[Table], combine: Callable[[list[NDArray[Any]]], NDArray[Any]]
 ) -> dict[str, Any]:
-    """Apply `combine` to each column of all parts; returns constructor arguments."""
+    """Return constructor arguments: `combine` applied to each column of all parts."""
     columns: dict[str, Any] = {
         name: combine([getattr(part, name) for part in parts])
         for name in COLUMNS
@@ -426,7 +426,7 @@ def combined(
 
 
 def shared_properties(data: Table) -> set[str]:
-    """Return the properties that two tables must share to be concatenated."""
+    """Return the properties in which two tables must agree to be concatenated."""
     columns = {name for name in COLUMNS if getattr(data, name) is not None}
     columns.add(f"a drive factor uncertain by {data.drive_factor_uncertainty:.3g}")
     if data.level is not None:

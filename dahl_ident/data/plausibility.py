@@ -1,7 +1,7 @@
-"""Plausibility of a table: warnings that list the rows, an error where a table must be wrong.
+"""Plausibility of tables and records: warnings that list the rows, and errors.
 
-A passive structure dissipates ``pi A^2 Im Z`` a cycle. Single negative rows may be noise; a sum
-that is negative by more than its noise means a wrong sign of the phase, or wrong columns.
+A passive structure dissipates ``pi A^2 Im Z`` per cycle. Single negative rows may be due to noise;
+a sum that is negative by more than its noise means a wrong sign of the phase, or wrong columns.
 """
 
 from __future__ import annotations
@@ -18,55 +18,55 @@ from dahl_ident.data.rows import sizes
 from dahl_ident.errors import DataError
 from dahl_ident.units import percent
 
-Doubt = Callable[[NDArray[np.bool_], str], None]
-"""A function that warns of the marked rows, if any, with a message."""
+Warn = Callable[[NDArray[np.bool_], str], None]
+"""A function that warns about the marked rows, if any, with a message."""
 _SIGNIFICANT = 0.00135  # one-sided probability of three standard deviations
-_ASSUMED_ERROR = 0.1  # relative error of the gain, where no covariance is known
-_MISMATCH = 0.1  # of a logarithm: rms instead of zero to peak makes 0.35; also the fall of a gain
-_FEWEST_ROWS, _FEW_ROWS = 3, 0.26  # rows to compare, and the share of them that may be wrong
-_STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value, and share of the motion's range
-_SELDOM, _MOSTLY = 0.01, 0.5  # shares of a signal that repeats no value, and of one that holds it
+_ASSUMED_ERROR = 0.1  # relative error of the gain if no covariance is known
+_MISMATCH = 0.1  # of a logarithm (rms for zero to peak causes 0.35); also of a change of gain
+_FEWEST_ROWS, _FEW_ROWS = 3, 0.26  # rows to compare, and fraction of them that may be wrong
+_STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value; change of the other signal
+_SELDOM, _MOSTLY = 0.01, 0.5  # fractions of repeated values: hardly any, and most of the signal
 _SWITCH = 8  # samples before and after a change of unit that are compared
-_DECADES = 1.0  # by which a change of unit may seem to differ from a factor of 1000
-_NEAR = 4.0  # steps within which a smooth signal continues, and beyond which it is far from zero
-_FURTHER = 5.0  # mean steps that a signal may move from one sample to the next
-_MOST_CHANGES = 2  # of the unit, there and back; more are a signal of many scales
-_PART = 1 << 20  # samples that are compared at once, to limit memory
-_SMALL_PHASE = 0.1  # rad, at most, of a gain that falls towards zero
+_DECADES = 1.0  # by which an apparent change of unit may differ from a factor of 1000
+_NEAR = 4.0  # steps; a smooth signal continues within so many, and is far from zero beyond twice
+_LARGEST_STEP = 5.0  # mean steps that a signal may move from one sample to the next
+_MOST_CHANGES = 2  # of the unit, there and back; more mean a signal of many scales
+_PART = 1 << 20  # samples compared at once, to limit memory
+_SMALL_PHASE = 0.1  # rad, over the relative change of the gain
 
 
-def check_phase_unit(phase: FloatArray, degrees: bool, name: str, doubt: Doubt) -> None:
-    """Warn where a phase in degrees looks like radians, or the reverse."""
+def check_phase_unit(phase: FloatArray, degrees: bool, name: str, warn: Warn) -> None:
+    """Warn if a phase in degrees looks like radians, or the reverse."""
     size = np.abs(phase)
     if degrees and 0.5 <= size.max() <= 2.0 * np.pi and phase.size > 1:
-        doubt(
+        warn(
             np.ones(phase.shape, dtype=bool),
             f"column {name!r} is in degrees, yet no phase is above 2 pi; are they radians?",
         )
     if not degrees:
-        doubt(
+        warn(
             size > 4.0 * np.pi,
             f"column {name!r} is in radians, yet these phases are above 4 pi; are they degrees?",
         )
 
 
-def check_drive(data: FrequencyResponse, doubt: Doubt) -> None:
-    """Warn where the drive is not the response times the amplitude."""
+def check_drive(data: FrequencyResponse, warn: Warn) -> None:
+    """Warn about rows whose drive is not the response times the amplitude."""
     amplitude, drive, fundamental = data.amplitude, data.drive, data.harmonic == 1
     if amplitude is None or drive is None or not fundamental.any():
         return
     gain = data.select(harmonic=1).to("dynamic_stiffness").gain
     mismatch = np.zeros(data.n)
     mismatch[fundamental] = np.log(gain) + np.log(amplitude / drive)[fundamental]
-    doubt(
+    warn(
         np.abs(mismatch) > _MISMATCH,
         "drive and amplitude do not agree with the response by more than "
         f"{percent(_MISMATCH)} (rms against zero to peak?)",
     )
 
 
-def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
-    """Warn of single rows that create energy, refuse a table that does as a whole."""
+def check_energy(file: str, data: FrequencyResponse, warn: Warn) -> None:
+    """Warn about single rows that create energy; refuse a table that does so as a whole."""
     fundamental = data.harmonic == 1
     if not fundamental.any():
         return
@@ -80,10 +80,10 @@ def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
     else:
         std = weight * np.sqrt(part.covariance[:, 1, 1]) / stiffness
     dof = np.full(part.n, np.inf) if part.dof is None else part.dof
-    share = (std / std.max()) ** 2 if std.any() else std
-    total, total_std = loss.sum(), std.max() * np.sqrt(share.sum())
-    spread = np.sum(share**2 / dof)
-    total_dof = np.inf if spread == 0.0 else share.sum() ** 2 / spread  # Welch and Satterthwaite
+    variance = (std / std.max()) ** 2 if std.any() else std  # relative to the largest
+    total, total_std = loss.sum(), std.max() * np.sqrt(variance.sum())
+    denominator = np.sum(variance**2 / dof)  # of the Welch-Satterthwaite formula
+    total_dof = np.inf if denominator == 0.0 else variance.sum() ** 2 / denominator
     if total < -_limit(total_dof) * total_std:
         raise DataError(
             f"{file}: the table as a whole creates energy: the sum of A^2 Im(F/X) is negative, "
@@ -94,42 +94,43 @@ def check_energy(file: str, data: FrequencyResponse, doubt: Doubt) -> None:
     creating = np.zeros(data.n, dtype=bool)
     creating[fundamental] = creates_energy(loss, std, dof)
     if part.covariance is None:
-        creating[fundamental] |= _against_the_others(part)
-    doubt(creating, "the phase's sign creates energy")
+        creating[fundamental] |= _opposite_phase(part)
+    warn(creating, "the phase's sign creates energy")
 
 
-def _against_the_others(part: FrequencyResponse) -> NDArray[np.bool_]:
-    """Return the rows whose phase is as large as that of nearly all others, with opposite sign."""
+def _opposite_phase(part: FrequencyResponse) -> NDArray[np.bool_]:
+    """Return the few rows whose phase is about as large as that of the others but negative."""
     sine = part.response.imag / part.gain
-    against = sine < 0.0
-    if part.n < _FEWEST_ROWS or against.sum() > max(1.0, _FEW_ROWS * part.n):
+    negative = sine < 0.0
+    if part.n < _FEWEST_ROWS or negative.sum() > max(1.0, _FEW_ROWS * part.n):
         return np.zeros(part.n, dtype=bool)
-    return np.asarray(sine < -0.5 * np.median(sine[~against]))
+    return np.asarray(sine < -0.5 * np.median(sine[~negative]))
 
 
-def check_phase_size(data: FrequencyResponse, doubt: Doubt) -> None:
-    """Warn where the gain falls with the amplitude and the phase is far too small for it.
+def check_phase_size(data: FrequencyResponse, warn: Warn) -> None:
+    """Warn if the gain changes with the amplitude and the phase is far too small for that.
 
-    Friction that takes a share d off the gain turns the phase by about d rad.
+    Friction that reduces the gain by a fraction d changes the phase by about d rad.
     """
     fundamental = data.harmonic == 1
     for frequency in np.unique(data.frequency_hz[fundamental]):
         rows = fundamental & (data.frequency_hz == frequency)
         response, gain = data.response[rows], data.gain[rows]
-        fall = 1.0 - gain.min() / gain.max()
+        change = 1.0 - gain.min() / gain.max()
         angle = np.abs(np.arcsin(np.clip(response.imag / gain, -1.0, 1.0))).max()
-        if gain.size >= _FEWEST_ROWS and fall > _MISMATCH and 0.0 < angle < _SMALL_PHASE * fall:
-            doubt(
+        small = 0.0 < angle < _SMALL_PHASE * change
+        if gain.size >= _FEWEST_ROWS and change > _MISMATCH and small:
+            warn(
                 rows,
-                f"the gain varies by {percent(fall)} at {frequency:g} Hz, yet no phase is above "
+                f"the gain varies by {percent(change)} at {frequency:g} Hz, yet no phase is above "
                 f"{np.degrees(angle):.2g} degrees; are the phases in radians?",
             )
 
 
-def record_doubts(
+def record_warnings(
     time: FloatArray, motion: FloatArray, force: FloatArray
 ) -> Iterator[tuple[NDArray[np.intp], str]]:
-    """Yield places where a sensor sticks, samples are lost or the unit changes, and what to say."""
+    """Yield samples where a sensor sticks, samples are lost or the unit changes; and a message."""
     if not 2 < force.size == motion.size == time.size:
         return
     yield (
@@ -141,11 +142,11 @@ def record_doubts(
         "the motion repeats one value while the force goes on, from {}: does a sensor stick?",
     )
     starts, stops = _runs((motion == 0.0) & (force == 0.0))
-    least = np.where((starts > 0) & (stops < time.size - 1), 0.2, 3.0)  # a rest may end it
-    torn = np.zeros(starts.shape, dtype=bool)
+    least = np.where((starts > 0) & (stops < time.size - 1), 0.2, 3.0)  # at an end it may be a rest
+    lost = np.zeros(starts.shape, dtype=bool)
     for values in (motion, force) if starts.size else ():
-        torn |= _edges(values, starts, stops) > least * _usual(np.abs(np.diff(values)))
-    yield starts[torn], "motion and force are 0 for a while, from {}: are samples missing?"
+        lost |= _edges(values, starts, stops) > least * _usual(np.abs(np.diff(values)))
+    yield starts[lost], "motion and force are 0 for a while, from {}: are samples missing?"
     for name, values, partner in (("motion", motion, force), ("force", force, motion)):
         yield (
             _few(np.union1d(_unit_changes(values, partner), _scaled_values(values))),
@@ -157,14 +158,14 @@ def record_doubts(
 
 
 def _stuck(held: FloatArray, partner: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
-    """Return where one signal stays at one value while the other continues."""
+    """Return the samples from which one signal is constant while the other changes."""
     steps = np.abs(np.diff(held))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
-    starts = starts - 1  # the value was there before it was repeated
+    starts = starts - 1  # the first sample of the repeated value
     travel = np.abs(partner[[(starts + stops) // 2, stops]] - partner[starts]).max(axis=0)
     moved = travel > _STUCK_TRAVEL * np.ptp(partner)
     starts, stops = starts[moved], stops[moved]
-    if not starts.size or not steps.any():  # a force of 0 throughout is a free decay
+    if not starts.size or not steps.any():  # a force that is always 0 is a free decay
         return np.asarray(starts[:1] if smooth else starts[:0])
     usual, count = _usual(steps), np.sum(steps == 0.0)
     jumps = np.append(steps, 0.0)[stops] > 5.0 * usual
@@ -173,14 +174,14 @@ def _stuck(held: FloatArray, partner: FloatArray, *, smooth: bool = False) -> ND
         jumps |= _edges(held, starts, stops) > _bend(held)
     held_samples = np.sum(stops - starts)
     if count - held_samples < _SELDOM * held.size and held_samples < _MOSTLY * held.size:
-        value, place, count = np.unique(held[starts], return_index=True, return_counts=True)
+        value, first, count = np.unique(held[starts], return_index=True, return_counts=True)
         once = (count == 1) & (value > held.min()) & (value < held.max())
-        jumps[place[once]] = True
+        jumps[first[once]] = True
     return np.asarray(starts[jumps])
 
 
 def _runs(marked: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first and the last place of each run of at least some marked samples."""
+    """Return the first and the last sample of each long run of marked samples."""
     change = np.diff(np.concatenate([[False], marked, [False]]).view(np.int8))
     starts, stops = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
     long = stops - starts + 1 >= _STUCK_SAMPLES
@@ -188,23 +189,23 @@ def _runs(marked: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]
 
 
 def _edges(values: FloatArray, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> FloatArray:
-    """Return the larger of the steps into and out of each run; none at the ends of the record."""
+    """Return the larger of the steps into and out of each run; 0 at the ends of the record."""
     steps = np.concatenate([[0.0], np.abs(np.diff(values)), [0.0]])
     return np.asarray(np.maximum(steps[starts], steps[stops + 1]))
 
 
 def _usual(steps: FloatArray) -> float:
-    """Return the size that hardly any step exceeds."""
+    """Return the 95 % quantile of the nonzero steps; 0 if there are none."""
     return float(np.quantile(steps[steps > 0.0], 0.95)) if steps.any() else 0.0
 
 
 def _bend(values: FloatArray) -> float:
-    """Return a step that a smooth signal does not begin or end with."""
+    """Return a limit for the first or last step of a run in a smooth signal."""
     return 5.0 * float(np.quantile(np.abs(np.diff(values, 2)), 0.98))
 
 
 def _unit_changes(values: FloatArray, partner: FloatArray) -> NDArray[np.intp]:
-    """Return where values are 1000 times, or a thousandth of, what they were just before."""
+    """Return the samples from which values are 1000 times larger or smaller than before."""
     if values.size > 2 * _PART:
         parts = [slice(i, i + _PART + 2 * _SWITCH) for i in range(0, values.size, _PART)]
         return np.unique(
@@ -216,16 +217,16 @@ def _unit_changes(values: FloatArray, partner: FloatArray) -> NDArray[np.intp]:
         change = np.log10(after / before)
         bend = np.log10(np.divide(*_sizes(values, at, 2)))
         later = np.minimum(at + _SWITCH, values.size - 4)
-        still = [np.log10(np.divide(*_sizes(partner, place, 1))) for place in (at, later)]
-        going_on = np.abs(values[at] * 10.0 ** (-3.0 * np.sign(change)) - values[at - 1])
-    marked = (going_on < _FURTHER * before) & ~(np.abs(still) > 1.5 * _DECADES).any(axis=0)
+        others = [np.log10(np.divide(*_sizes(partner, i, 1))) for i in (at, later)]
+        step = np.abs(values[at] * 10.0 ** (-3.0 * np.sign(change)) - values[at - 1])
+    changed = (step < _LARGEST_STEP * before) & ~(np.abs(others) > 1.5 * _DECADES).any(axis=0)
     for ratio in (change, bend):
-        marked &= np.abs(np.abs(ratio) - 3.0) < _DECADES
-    return np.asarray(at[marked])
+        changed &= np.abs(np.abs(ratio) - 3.0) < _DECADES
+    return np.asarray(at[changed])
 
 
 def _scaled_values(values: FloatArray) -> NDArray[np.intp]:
-    """Return where a smooth signal, far from zero, goes on 1000 times larger or smaller."""
+    """Return the samples from which a smooth signal, far from zero, is scaled by 1000 or 1/1000."""
     if values.size < _SWITCH:
         return np.zeros(0, dtype=np.intp)
     steps = np.abs(np.diff(values))
@@ -234,13 +235,13 @@ def _scaled_values(values: FloatArray) -> NDArray[np.intp]:
     far = (np.abs(before) > 2.0 * least) & (least > 0.0)
     scaled = np.zeros(before.shape, dtype=bool)
     for factor in (1e3, 1e-3):
-        going_on = np.abs(factor * first - before) < least
-        scaled |= going_on & (np.abs(factor * (second - first)) < least)
+        continues = np.abs(factor * first - before) < least
+        scaled |= continues & (np.abs(factor * (second - first)) < least)
     return np.asarray(3 + np.flatnonzero(far & scaled))
 
 
 def _sizes(values: FloatArray, at: NDArray[np.intp], order: int) -> tuple[FloatArray, FloatArray]:
-    """Return the mean difference of some samples before each place, and of some from it on."""
+    """Return mean differences of the given order before and after some samples."""
     size = np.abs(np.diff(values, order))
     total = np.concatenate([[0.0], np.cumsum(size)])
     low, high = np.maximum(at - order - _SWITCH, 0), np.minimum(at + _SWITCH, size.size)
@@ -248,17 +249,17 @@ def _sizes(values: FloatArray, at: NDArray[np.intp], order: int) -> tuple[FloatA
     return before, (total[high] - total[at]) / (high - at)
 
 
-def _few(places: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the first of neighbouring places; none where there are many, as in random numbers."""
-    first = places[np.diff(places, prepend=-2 * _SWITCH) > _SWITCH]
+def _few(samples: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the first of neighbouring samples; none if there are many, as in random numbers."""
+    first = samples[np.diff(samples, prepend=-2 * _SWITCH) > _SWITCH]
     return first if first.size <= _MOST_CHANGES else first[:0]
 
 
 def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArray[np.bool_]:
-    """Return which losses are below zero by more than their noise."""
+    """Return which losses are negative by more than their noise."""
     return np.asarray(loss < -_limit(dof) * std)
 
 
 def _limit(dof: ArrayLike) -> FloatArray:
-    """Student's t at the level of significance; the normal distribution for infinite dof."""
+    """Return the critical value of Student's t; of the normal distribution for infinite dof."""
     return -np.asarray(stdtrit(np.minimum(dof, 1e9), _SIGNIFICANT))

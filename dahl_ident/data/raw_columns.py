@@ -29,32 +29,32 @@ CELL = {
     )
     for mark in (".", ",", ".,", ",.")
 }
-"""A number in a cell of text, by its decimal mark and, behind it, that of thousands if any."""
+"""Patterns of a number in a cell, by decimal mark and, after it, thousands separator if any."""
 _COUNTED = re.compile(r"column ([0-9]{1,4})")
 _SUFFIXES = {"hz": "Hz", "deg": "deg", "rad": "rad", "s": "s"}
 _SYMBOL = "(?:[numkM]?(?:Nm|N|m|rad|V|A|Hz|s)|s2|kg|lbf|(?i:hz|deg|rad|s))"
-# of names of one letter, which are many things, no unit is split off
+# no unit is split off a name of one letter
 _UNIT_AT_END = re.compile(rf"(.*?[^\W_]{{2}})[\s._-]+({_SYMBOL}(?:_per_{_SYMBOL})*)")
 _CODES = (
     999.0, 9999.0, 99999.0, 999999.0, 999.9, 9999.9, 999.99, 9999.99,
-    32767.0, 32768.0, 2147483647.0, 2147483648.0,  # ends of whole numbers
+    32767.0, 32768.0, 2147483647.0, 2147483648.0,  # limits of integers
 )  # fmt: skip
-"""Marks of missing values in files of loggers, with either sign."""
+"""Marks of missing values in files of data loggers, with either sign."""
 
 _SMALLEST_OVERFLOW = 1e30  # instruments write 1e30, 9.9e37 and the like
 _CODE_RATIO = 5.0  # a code for a missing value exceeds every measured number by this factor
-_FEW = 4  # with fewer values, one that lies far from the others may be measured
-_LONGEST_WORD = 200  # letters; no label, time stamp or number in a cell has more
-_LONGEST_HEADER = 400  # letters; a longer cell holds no name and unit
+_FEWEST_VALUES = 4  # with fewer, a value far from the others may be measured
+_LONGEST_WORD = 200  # letters of a label, time stamp or number
+_LONGEST_HEADER = 400  # letters of a cell with name and unit
 _INDEX = re.compile(r"[\d:, ]+")
-_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # as ISO 80000 has it: F / N
+_UNBRACKETED = re.compile(r"\s*(.*\S)\s+(?:/|in)\s+(\S.*)")  # F / N, according to ISO 80000
 _CURVED = re.compile(r"\s*(.*?\S)\s*\((.*)\)\s*")
-_PADDING = (1 << 26, 16)  # most memory of a column of text: bytes, and bytes for each letter
+_PADDING = (1 << 26, 16)  # most memory of a column of text: bytes, or bytes per letter
 
 
 @dataclass(frozen=True)
 class Stored:
-    """An array that is read from its file when it is used; `what` names it in messages."""
+    """An array that is read from its file when needed; `what` names it in messages."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -63,7 +63,7 @@ class Stored:
 
     @cached_property
     def array(self) -> NDArray[Any]:
-        """All of it, read once."""
+        """The whole array, read once."""
         return self[slice(None)]
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
@@ -79,8 +79,8 @@ class Stored:
 class RawChannel:
     """One named array of a file.
 
-    `role` is set where the format says what the channel is, in the words of a column map; `short`
-    is the last part of a path, by which a role is found without a map.
+    `role` is that of a column map, if the format defines it; `short` is the last part of a path, by
+    which a role is found without a map.
     """
 
     name: str
@@ -91,7 +91,7 @@ class RawChannel:
 
     @property
     def values(self) -> NDArray[Any]:
-        """The array, read from the file where it is still there."""
+        """The array, read from the file if necessary."""
         return self.content.array if isinstance(self.content, Stored) else self.content
 
     @property
@@ -105,46 +105,46 @@ class RawChannel:
         return self.content.dtype.kind
 
     def part(self, rows: slice) -> RawChannel:
-        """Return some of the values, and read no others."""
+        """Return a channel of some of the values; no others are read."""
         return replace(self, content=self.content[rows])
 
     @property
     def unit_in_name(self) -> str | None:
-        """Unit that a name such as ``frequency_hz``, ``drive_N`` or ``re_m_per_N`` ends in."""
+        """Unit at the end of a name such as ``frequency_hz``, ``drive_N`` or ``re_m_per_N``."""
         match = _UNIT_AT_END.fullmatch(self.short or self.name)
         if match is None:
             return None
         return _SUFFIXES.get(match[2].casefold(), match[2].replace("_per_", "/"))
 
     def is_called(self, declared: Column) -> bool:
-        """Return whether the format says that it is this column, or else its name does."""
+        """Return whether this is the declared column, by its role or else by its name."""
         name = self.short or self.name
         if self.role is not None:
             return self.role == declared.names[0]
         match = _UNIT_AT_END.fullmatch(name)
         stem = match is not None and plain(match[1]) in declared.names
         return plain(name) in declared.names or (
-            stem and declared.measures(self.unit_in_name, self.name)
+            stem and declared.accepts(self.unit_in_name, self.name)
         )
 
     @property
     def header(self) -> str:
-        """Name and unit as a table would print them."""
+        """Name and unit as in the header of a table."""
         return self.name if self.unit is None else f"{self.name} [{self.unit}]"
 
 
 TRACE = "analyser's trace"
-"""The format of pairs of numbers without a header, below their count."""
+"""The format of pairs of numbers without a header, preceded by their count."""
 
 
 @dataclass(frozen=True)
 class RawFile:
     """All channels of one file.
 
-    `row_name` turns the index of a value into words that find it in the file. `decimal` is the
-    decimal mark in columns of text. `metadata` is what an earlier save left in the file, `options`
-    what the user said, `stated` the drive and amplitude in the header. At `runs` a repeated header
-    begins another run. `doubts` are the warnings shown.
+    `row_name` describes the position of a value in the file, given its index. `decimal` is the
+    decimal mark in columns of text. `metadata` is that of an earlier save, `options` are those of
+    the user, `stated` holds drive and amplitude from the header. A repeated header starts another
+    run at each row in `runs`. `notes` are the assumptions made.
     """
 
     name: str
@@ -156,13 +156,13 @@ class RawFile:
     row_name: Callable[[int], str] = field(default=lambda i: f"row {i + 1}")
     metadata: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     runs: tuple[int, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     stated: Mapping[str, str] = field(default_factory=dict)
 
     def rows(self, keep: NDArray[np.bool_]) -> RawFile:
-        """Return the rows to `keep` of every channel that has this length."""
+        """Return the file with only the rows to `keep` of channels of this length."""
         kept = np.flatnonzero(keep)
         channels = tuple(
             replace(c, content=c.values[keep]) if c.content.shape == keep.shape else c
@@ -171,11 +171,11 @@ class RawFile:
         return replace(self, channels=channels, row_name=lambda i: self.row_name(int(kept[i])))
 
     def where(self, channel: RawChannel, index: int) -> str:
-        """Return file, row and column of a value."""
+        """Return file, row and column of a value, for messages."""
         return f"{self.name}, {self.row_name(index)}, column {channel.name!r}"
 
     def find(self, text: str) -> RawChannel:
-        """Return the one channel of this name, header, last part of a path, or number."""
+        """Return the only channel with this name, header, last part of a path, or number."""
         exact = [c for c in self.channels if text in (c.name, c.header)]
         matches = exact or [c for c in self.channels if plain(c.name) == plain(text)]
         if len(matches) > 1:
@@ -203,12 +203,11 @@ class RawFile:
 
     def matching(self, pattern: str) -> dict[str, RawChannel]:
         """Return the channels that a path with ``*`` matches, by the part that varies."""
-        start = re.search(r"[^./]*\*", pattern)
-        end = re.search(r"\*[^.*/]*(?=[./][^*]*$|$)", pattern)
-        assert start is not None  # callers pass patterns with a star in them
-        assert end is not None
-        parts = (pattern[: start.start()], pattern[start.start() : end.end()], pattern[end.end() :])
-        before, varying, after = (re.escape(part).replace(r"\*", r"[^.\[\]/]*") for part in parts)
+        parts = re.fullmatch(r"(|.*?[./])([^./]*\*(?:.*\*)?[^.*/]*)([./][^*]*|)", pattern)
+        assert parts is not None  # callers pass patterns with a star
+        before, varying, after = (
+            re.escape(p).replace(r"\*", r"[^.\[\]/]*") for p in parts.groups()
+        )
         expression = re.compile(f"{before}({varying}){after}")
         channels = {m[1]: c for c in self.channels if (m := expression.fullmatch(c.name))}
         if not channels:
@@ -217,7 +216,7 @@ class RawFile:
         return channels
 
     def numbers(self, channel: RawChannel, *, infinite: bool = False) -> FloatArray:
-        """Return a channel's numbers, finite unless said, or name the cell that holds another."""
+        """Return a channel's numbers; refuse other cells, and infinite ones unless allowed."""
         values = channel.values
         if values.dtype.kind == "c":
             raise DataError(
@@ -276,34 +275,34 @@ class RawFile:
             )
 
     def from_text(self, channel: RawChannel) -> FloatArray:
-        """Return the numbers in cells of text, NaN for empty ones, or name the cell without one."""
+        """Return the numbers in cells of text, NaN for empty ones; refuse other text."""
         numbers = np.empty(channel.values.size)
         mark, thousands = self.decimal[0], self.decimal[1:]
-        swapped = str.maketrans(mark, ".", thousands)
+        to_python = str.maketrans(mark, ".", thousands)
         for i, cell in enumerate(map(str, channel.values.flat)):
             if cell.strip() and not CELL[self.decimal].fullmatch(cell):
                 comma = " with a decimal comma" if mark == "," else ""
                 raise DataError(f"{self.where(channel, i)}: {cell[:40]!r} is not a number{comma}")
-            numbers[i] = float(cell.translate(swapped)) if cell.strip() else np.nan
+            numbers[i] = float(cell.translate(to_python)) if cell.strip() else np.nan
         return numbers
 
 
 def cell_text(cell: Any) -> str:
-    """Return a cell as text; an empty one, or NaN, has none."""
+    """Return a cell as text; empty for an empty cell or NaN."""
     return "" if cell is None or cell != cell else str(cell)
 
 
 def column_of(cells: Sequence[Any]) -> NDArray[Any]:
-    """Return numbers where every filled cell is one, else text."""
+    """Return numbers if every filled cell is one, otherwise text."""
     filled = [cell for cell in cells if cell_text(cell)]
     if all(isinstance(cell, (int, float)) and not isinstance(cell, bool) for cell in filled):
-        with contextlib.suppress(OverflowError):  # whole numbers beyond all floats stay text
+        with contextlib.suppress(OverflowError):  # integers too large for a float remain text
             return np.array([c if cell_text(c) else np.nan for c in cells], dtype=np.float64)
     return words(cells)
 
 
 def words(cells: Iterable[Any]) -> NDArray[np.str_]:
-    """Return cells as text; of a longer one the first letters, and a mark that no number has."""
+    """Return cells as text; long ones are cut and marked, so that they cannot become numbers."""
     texts = map(cell_text, cells)
     short = [t if len(t) <= _LONGEST_WORD else f"{t[:_LONGEST_WORD]}..." for t in texts]
     lengths = [len(cell) for cell in short]
@@ -315,7 +314,7 @@ def words(cells: Iterable[Any]) -> NDArray[np.str_]:
 def missing_marks(values: FloatArray) -> dict[float, float]:
     """Return marks of a missing value such as -9999, with the size of the largest other number."""
     marks = {}
-    for code in {float(values.min()), float(values.max())} if values.size >= _FEW else ():
+    for code in {float(values.min()), float(values.max())} if values.size >= _FEWEST_VALUES else ():
         if abs(code) in _CODES or abs(code) >= _SMALLEST_OVERFLOW:
             others = np.abs(values[values != code])
             if others.size and others.max() < abs(code) / _CODE_RATIO:
@@ -324,14 +323,14 @@ def missing_marks(values: FloatArray) -> dict[float, float]:
 
 
 def plain(name: str) -> str:
-    """Return a name without case, and with any run of blanks, dots and hyphens as one _."""
+    """Return a name in lower case, with each run of blanks, dots and hyphens as one _."""
     return re.sub(r"[\s._-]+", "_", name.strip().casefold())
 
 
 def split_header(text: str) -> tuple[str, str | None]:
     """Split ``"force [kN]"``, ``"force (kN)"``, ``"F / kN"`` or ``"force in kN"``.
 
-    What stands in square brackets is the unit, unless it is an index.
+    Text in square brackets is the unit, unless it is an index.
     """
     if len(text) > _LONGEST_HEADER:
         return text.strip(), None
@@ -342,7 +341,7 @@ def split_header(text: str) -> tuple[str, str | None]:
         return square[1], unit
     for match in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
         if match[2].strip() == "dB":
-            return match[1], "dB"  # of what, the reader of the gain asks
+            return match[1], "dB"  # the reader of the gain asks for the reference
         with contextlib.suppress(UnitError):
             return match[1], parse_unit(match[2]).text
     return text.strip(), None

@@ -1,4 +1,4 @@
-"""Sampled waveforms of motion and force, as a laboratory stored them, in SI units."""
+"""Recorded waveforms of motion and force in SI units."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 DriveUnit = Literal["N", "N m", "V", "A"]
 _GAP = 1.5  # median steps; a longer step misses a sample
-_SMALLEST = SMALLEST**0.5  # stiffness, or force over it, whose square is representable
-_LONG_GAP = 5.0  # median steps; over a longer gap nothing is interpolated
-_MOST_GAPS = 0.02  # share of the samples; with more gaps, the steps themselves are uneven
+_SMALLEST = SMALLEST**0.5  # products and ratios of such numbers have representable squares
+_LONG_GAP = 5.0  # median steps; a longer gap is not interpolated
+_MOST_GAPS = 0.02  # fraction of the samples; with more gaps the record has uneven steps
 _SHOWN_GAPS = 3
-_EVEN = 0.01  # fraction of a step by which samples of an even grid may be off
+_EVEN = 0.01  # fraction of a step by which samples may deviate from an even grid
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -53,13 +53,13 @@ class Record(Tabular):
     drive_unit : {"V", "A", "N", "N m"}
         Unit of `drive`.
     drive_factor : float, optional
-        Force for one unit of drive, N/V or N/A; 1 where the drive is a force already.
+        Force per unit of drive, N/V or N/A; 1 if the drive is a force already.
     drive_factor_uncertainty : float
         Relative standard uncertainty of `drive_factor`.
     motion : {"translation", "rotation"}
-        Whether displacement is m or rad.
+        Whether displacement is in m or rad.
     provenance : mapping, optional
-        Where the samples come from: file, hash, options.
+        Source of the samples: file, hash, options.
 
     Raises
     ------
@@ -145,7 +145,7 @@ class Record(Tabular):
 
     @property
     def motion_channel(self) -> Literal["displacement", "velocity", "acceleration"]:
-        """Which kind of motion was recorded."""
+        """The kind of motion that was recorded."""
         if self.displacement is not None:
             return "displacement"
         return "velocity" if self.velocity is not None else "acceleration"
@@ -157,7 +157,7 @@ class Record(Tabular):
 
     @property
     def force_samples(self) -> FloatArray:
-        """Measured force; where there is none, drive times its factor. N or N m.
+        """Measured force, or otherwise drive times its factor, N or N m.
 
         Raises
         ------
@@ -199,9 +199,9 @@ class Record(Tabular):
         Parameters
         ----------
         kind : {"waveforms", "loops"}, default "waveforms"
-            One panel a channel over time, or force (drive where there is none) over motion.
+            One panel per channel over time, or force (otherwise drive) over motion.
         ax : matplotlib Axes, optional
-            One for loops, a sequence of one a channel for waveforms; new where left out.
+            One for loops, a sequence of one per channel for waveforms; new by default.
 
         Returns
         -------
@@ -240,7 +240,7 @@ class Record(Tabular):
 
     @property
     def _units(self) -> dict[str, str]:
-        """The units of the channels that there are."""
+        """The units of the channels of this record."""
         units = {kind: si_unit(kind, self.motion) for kind in (*MOTION_KINDS, "force")}
         units = {"time": "s", **units, "drive": self.drive_unit}
         return {name: unit for name, unit in units.items() if getattr(self, name) is not None}
@@ -251,9 +251,8 @@ class Record(Tabular):
         Returns
         -------
         list of dict
-            ``name``, ``data``, ``unit_str`` and ``time`` of each channel, and ``fs`` where the
-            samples are evenly spaced and begin at zero. :func:`~dahl_ident.read_record` reads
-            the list again.
+            ``name``, ``data``, ``unit_str`` and ``time`` of each channel, and ``fs`` if the samples
+            are evenly spaced and begin at zero. :func:`~dahl_ident.read_record` reads the list.
 
         Examples
         --------
@@ -296,11 +295,10 @@ class Record(Tabular):
 
 
 def unbroken(record: Record, shortest: int) -> list[Record]:
-    """Return the parts of a record between long gaps, and warn where there are several.
+    """Return the parts of a record between long gaps, and warn if there are several.
 
-    Nothing with a memory can be followed through a gap. Parts of fewer than `shortest` samples are
-    left out; a record without a part so long, or whose steps differ everywhere, has uneven times,
-    not gaps.
+    The state of hysteresis is unknown after a gap. Parts of fewer than `shortest` samples are left
+    out. A record without a longer part, or with many gaps, has uneven steps rather than gaps.
     """
     steps = np.diff(record.time)
     after = np.flatnonzero(steps > _LONG_GAP * np.median(steps)) + 1
@@ -316,39 +314,38 @@ def unbroken(record: Record, shortest: int) -> list[Record]:
         f"nothing is known from {', '.join(shown)}; {parts}, each from a first state of its own"
         + (f"; {lost} samples in shorter parts are left out" if lost else "")
     )
-    known = _doubted(record, message)
-    return [replace(cut(record, part), provenance=known) for part in kept]
+    provenance = _with_warning(record, message)
+    return [replace(cut(record, part), provenance=provenance) for part in kept]
 
 
 def at_even_times(record: Record) -> Record:
-    """Return a record at even times, and warn where it is resampled, by cubic splines."""
+    """Return a record at even times, and warn if it is resampled, by cubic splines."""
     time = record.time
     if time.size <= 3 or record.uniform:
         return record
     from scipy.interpolate import make_interp_spline
 
-    usual = float(np.median(np.diff(time)))
-    grid = np.linspace(time[0], time[-1], 1 + round((time[-1] - time[0]) / usual))
+    step = float(np.median(np.diff(time)))
+    grid = np.linspace(time[0], time[-1], 1 + round((time[-1] - time[0]) / step))
     message = (
         f"the samples from {time[0]:.6g} to {time[-1]:.6g} s are not evenly spaced; resampled at "
-        f"{1.0 / usual:.6g} Hz"
+        f"{1.0 / step:.6g} Hz"
     )
     columns: dict[str, Any] = {
         name: make_interp_spline(time, getattr(record, name))(grid) for name in record._units
     }
-    return replace(record, **columns | {"time": grid}, provenance=_doubted(record, message))
+    return replace(record, **columns | {"time": grid}, provenance=_with_warning(record, message))
 
 
-def _doubted(record: Record, message: str) -> dict[str, Any]:
+def _with_warning(record: Record, message: str) -> dict[str, Any]:
     """Warn, and return a record's provenance with the warning."""
-    known = dict(record.provenance or {})
-    warnings.warn(f"{known.get('file', 'the record')}: {message}", DataWarning, stacklevel=3)
-    known["warnings"] = [*known.get("warnings", ()), message]
-    return known
+    provenance = dict(record.provenance or {})
+    warnings.warn(f"{provenance.get('file', 'the record')}: {message}", DataWarning, stacklevel=3)
+    return provenance | {"warnings": [*provenance.get("warnings", ()), message]}
 
 
 def cut(record: Record, part: slice) -> Record:
-    """Return some of a record's samples."""
+    """Return a record of some of the samples."""
     return replace(record, **{name: getattr(record, name)[part] for name in record._units})
 
 
@@ -381,7 +378,7 @@ def is_even(time: FloatArray) -> bool:
 
 
 def gaps(time: FloatArray) -> FloatArray:
-    """Return start and end of every step above 1.5 times the median step, (m, 2)."""
+    """Return start and end of every step longer than 1.5 times the median step, (m, 2)."""
     steps = np.diff(time)
     before = np.flatnonzero(steps > _GAP * np.median(steps))
     return np.column_stack([time[before], time[before + 1]])

@@ -1,4 +1,4 @@
-"""From the columns of a table to a record of waveforms."""
+"""Conversion of the columns of a table to a record of waveforms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data.column_map import Binding, ColumnMap, scaled
 from dahl_ident.data.columns import RECORD_COLUMNS
-from dahl_ident.data.plausibility import record_doubts
+from dahl_ident.data.plausibility import record_warnings
 from dahl_ident.data.raw_columns import RawChannel, RawFile, missing_marks
 from dahl_ident.data.record import Record, is_even
 from dahl_ident.data.tabular import listed
@@ -27,7 +27,7 @@ _STAMP = re.compile(
 def record_from(
     source: RawFile, columns: ColumnMap, missing: Literal["error", "drop"] = "error"
 ) -> Record:
-    """Return the record that a source holds."""
+    """Return the record in a source."""
     bound = Binding(source, columns, RECORD_COLUMNS)
     channels = _channels(bound)
     bound.same_length(channels)
@@ -44,7 +44,7 @@ def record_from(
             numbers = _numeric(channel)
             complete &= np.isfinite(numbers)
             for mark in missing_marks(numbers[np.isfinite(numbers)]):
-                bound.doubt(
+                bound.warn(
                     f"{np.sum(numbers == mark)} samples left out: column {channel.name!r} is "
                     f"{mark:g} in them, a mark of a missing value"
                 )
@@ -62,32 +62,32 @@ def record_from(
         bound.refuse_idle_factor(None)
     if "time" not in values:
         rate = bound.map.sample_rate
-        assert rate is not None  # _channels has asked for a time column otherwise
+        assert rate is not None  # otherwise _channels requires a time column
         bound.notes.append(f"time counted from the sample rate of {rate:g} Hz")
         values["time"] = (np.arange(size) / rate)[complete]
     force: FloatArray = values["force"] if "force" in values else values["drive"]
     motion = next(values[kind] for kind in MOTION_KINDS if kind in values)
-    for places, doubt in record_doubts(values["time"], motion, force):
-        if places.size:
-            first = bound.source.row_name(int(places[0]))
-            bound.doubt(doubt.format(f"{first} ({places.size} such places)"))
+    for samples, message in record_warnings(values["time"], motion, force):
+        if samples.size:
+            first = bound.source.row_name(int(samples[0]))
+            bound.warn(message.format(f"{first} ({samples.size} such places)"))
     try:
         return Record(**values, motion=bound.motion(), provenance=bound.provenance())
     except ValidationError as exc:
         raise DataError(f"{source.name}: {exc}") from exc
 
 
-_FEWEST_STAMPS = 16  # with fewer, times with some missing look like rounded ones
-_PLANNED = {"step", "measured"}  # columns of a waveform that a plan wrote
+_FEWEST_STAMPS = 16  # with fewer, times with gaps cannot be told from rounded ones
+_PLANNED = {"step", "measured"}  # columns of a waveform written by a plan
 
 
 def record_size(source: RawFile, columns: ColumnMap) -> int:
-    """Return how many samples the record of a source has; nothing is read."""
+    """Return the number of samples of the record in a source; nothing is read."""
     return next(iter(_channels(Binding(source, columns, RECORD_COLUMNS)).values())).size
 
 
 def _channels(bound: Binding) -> dict[str, RawChannel]:
-    """Return the channels of the roles that the record has, exactly one motion among them."""
+    """Return the channels by role, with exactly one of motion."""
     source = bound.source
     motions = [kind for kind in MOTION_KINDS if kind in bound.map.roles]
     if not motions:
@@ -118,7 +118,7 @@ def _channels(bound: Binding) -> dict[str, RawChannel]:
 
 
 def _numeric(channel: RawChannel) -> FloatArray:
-    """Return the numbers of a channel for finding gaps; text counts as present."""
+    """Return the numbers of a channel, with NaN for missing ones; text counts as present."""
     if channel.values.dtype.kind in "fiu":
         return channel.values.astype(np.float64)
     return np.array([np.nan if not str(v).strip() else 0.0 for v in channel.values])
@@ -127,7 +127,7 @@ def _numeric(channel: RawChannel) -> FloatArray:
 def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:
     """Return SI samples; for a drive in V or A, volts or amperes."""
     if role == "time" and is_stamped(channel):
-        seconds = _even(bound, channel, _seconds(bound, channel))
+        seconds = _increasing(bound, channel, _seconds(bound, channel))
         first = str(channel.values.flat[0]).strip()
         bound.notes.append(f"time counted from the stamp {first}")
         return seconds
@@ -135,7 +135,7 @@ def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:
     unit = bound.unit(role, channel)
     _, factor = bound.kind(role, unit)
     if role == "time":
-        values = _even(bound, channel, values)
+        values = _increasing(bound, channel, values)
     if unit.marker in ("rms", "peak to peak") or unit.decibel:
         raise UnitError(
             f"{bound.source.name}: column {channel.name!r} has the unit [{unit.text}]; expected "
@@ -143,7 +143,7 @@ def _samples(bound: Binding, role: str, channel: RawChannel) -> FloatArray:
         )
     samples = scaled(values, factor)
     if samples is not channel.content:
-        samples.setflags(write=False)  # nobody else's, so the record need not copy it
+        samples.setflags(write=False)  # a new array, which the record need not copy
     return samples
 
 
@@ -167,14 +167,14 @@ def _seconds(bound: Binding, channel: RawChannel) -> FloatArray:
                 "2024-03-31T12:00:00.5 or 12:00:00.5"
             )
         nanoseconds[i] = moment.astype(np.int64)
-        if match["sign"]:  # local time, ahead of UTC by so much
-            ahead = (60 * int(match["hours"]) + int(match["minutes"])) * 60_000_000_000
-            nanoseconds[i] -= -ahead if match["sign"] == "-" else ahead
+        if match["sign"]:  # of the offset of local time from UTC
+            offset = (60 * int(match["hours"]) + int(match["minutes"])) * 60_000_000_000
+            nanoseconds[i] -= -offset if match["sign"] == "-" else offset
     return np.asarray((nanoseconds - nanoseconds[0]) * 1e-9)
 
 
-def _even(bound: Binding, channel: RawChannel, time: FloatArray) -> FloatArray:
-    """Return increasing times, and evenly spaced ones where they are so but for their digits."""
+def _increasing(bound: Binding, channel: RawChannel, time: FloatArray) -> FloatArray:
+    """Return increasing times; evenly spaced ones if they differ from that only by rounding."""
     back = (np.flatnonzero(~(time[1:] > time[:-1])) + 1).tolist()
     if back:
         raise DataError(
@@ -191,7 +191,7 @@ def _even(bound: Binding, channel: RawChannel, time: FloatArray) -> FloatArray:
     middle = np.arange(time.size) - 0.5 * (time.size - 1)
     grid = time.mean() + middle * float(middle @ time / (middle @ middle))
     if step < 1.25 * resolution or np.abs(time - grid).max() > 0.6 * resolution:
-        return time  # of coarser stamps, one that is missing would not be seen
+        return time  # with a coarser resolution a missing sample would not be noticed
     bound.notes.append(f"times are rounded to {resolution:g}, and taken as even")
     return np.asarray(grid)
 

@@ -77,14 +77,14 @@ def response_from(
     source, options = _with_stated(source, columns, options)
     whole = Binding(source, columns, RESPONSE_COLUMNS)
     if source.runs:
-        whole.doubt(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
+        whole.warn(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
     if source.format == TRACE and not {"gain", "phase"} & columns.roles.keys():
         first, second = map(source.numbers, source.channels[:2])
         reach = np.abs(second).max()  # above zero, and degrees
         if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
             gain, phase = {"column": "real", "unit": ANY}, {"column": "imag", "unit": "deg"}
             polar = column_map_of({"gain": gain, "phase": phase})
-            whole.doubt(
+            whole.warn(
                 "the columns of the trace are taken as real and imaginary part, but look like "
                 f"magnitude and phase in degrees; if they are, give {polar}"
             )
@@ -102,7 +102,7 @@ def response_from(
             raise DataError(f"{named.name}: {exc}") from exc
         whole.used |= table.used
         whole.notes += table.notes
-        whole.doubts += [f"{prefix}{text}" for text in table.doubts]
+        whole.warnings += [f"{prefix}{text}" for text in table.warnings]
     data = parts[0] if len(parts) == 1 else FrequencyResponse.concatenate(parts)
     assumed = {"frequency": ASSUMED} if _UNKNOWN_FREQUENCY in whole.notes else {}
     return replace(data, provenance=whole.provenance() | assumed)
@@ -111,7 +111,7 @@ def response_from(
 def _as_gain(channel: RawChannel) -> RawChannel:
     """Return a channel called amplitude as a gain if its unit is that of a response."""
     named = plain(channel.short or channel.name) in RESPONSE_COLUMNS["amplitude"].names
-    if named and RESPONSE_COLUMNS["gain"].measures(channel.unit, channel.name):
+    if named and RESPONSE_COLUMNS["gain"].accepts(channel.unit, channel.name):
         return replace(channel, role="gain")
     return channel
 
@@ -219,10 +219,10 @@ class _TableBinding(Binding):
             **errors,
         )
         if quantity != "backbone":
-            check_drive(data, self.doubt_rows)
-            check_phase_size(data, self.doubt_rows)
+            check_drive(data, self.warn_rows)
+            check_phase_size(data, self.warn_rows)
             if options.passive:
-                check_energy(self.source.name, data, self.doubt_rows)
+                check_energy(self.source.name, data, self.warn_rows)
         return data
 
     def _add_stated(self) -> None:
@@ -405,7 +405,7 @@ class _TableBinding(Binding):
         channel = self.required("phase")
         values = self.numbers("phase", channel)
         _, factor = self.kind("phase", self.unit("phase", channel))
-        check_phase_unit(values, factor != 1.0, channel.name, self.doubt_rows)
+        check_phase_unit(values, factor != 1.0, channel.name, self.warn_rows)
         return values * factor
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
@@ -492,7 +492,7 @@ def _per_drive(text: str) -> tuple[str, str, int] | None:
     forms = [("", text, 0)]
     for kind, symbol in (("voltage", "V"), ("current", "A")):
         forms += [(kind, f"({text})*{symbol}/N", -1), (kind, f"({text})*N/{symbol}", 1)]
-    form = next((f for f in forms if RESPONSE_COLUMNS["gain"].measures(f[1], "the gain")), None)
+    form = next((f for f in forms if RESPONSE_COLUMNS["gain"].accepts(f[1], "the gain")), None)
     return form if form and form[2] else None  # None for a unit of the six quantities
 
 

@@ -70,12 +70,12 @@ def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     files = list(dict.fromkeys(str(part["file"]) for part in parts if "file" in part))
     notes = dict.fromkeys(note for part in parts for note in part.get("notes", []))
     lines = [("from", listed(files, shown=3))] if files else []
-    lines += [("warning", text) for text in doubts(provenance)]
+    lines += [("warning", text) for text in warnings_in(provenance)]
     return lines + [("note", note) for note in notes]
 
 
-def doubts(provenance: Mapping[str, Any] | None) -> list[str]:
-    """Return the warnings that were shown on reading the data, or their sources."""
+def warnings_in(provenance: Mapping[str, Any] | None) -> list[str]:
+    """Return the warnings shown when the data, or their sources, were read."""
     warnings: list[str] = []
     for part in _origins(provenance):
         file = f"{part['file']}: " if "file" in part else ""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.data.tabular import doubts
+from dahl_ident.data.tabular import warnings_in
 from dahl_ident.diagnostics.assessment import TableAssessment
 from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -370,7 +370,9 @@ def _notes(fit: RecordAssessment) -> Iterator[Finding]:
 
 def reading(fit: Any) -> Iterator[Finding]:
     """Yield the warnings that were shown when the data of a fit or posterior were read."""
-    texts = list(dict.fromkeys(text for one in fit.problem.provenances for text in doubts(one)))
+    texts = list(
+        dict.fromkeys(text for one in fit.problem.provenances for text in warnings_in(one))
+    )
     yield from (described("warning", text=text) for text in texts[:_DOUBTS_SHOWN])
     if len(texts) > _DOUBTS_SHOWN:
         yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)

@@ -322,8 +322,8 @@ def open_source(
             f"{file.name}: {argument('sheet', sheet)} is given, but the file is not a workbook"
         )
     source = _parsed(file, sheet)
-    for doubt in source.doubts:
-        warnings.warn(f"{file.name}: {doubt}", DataWarning, stacklevel=3)
+    for message in source.warnings:
+        warnings.warn(f"{file.name}: {message}", DataWarning, stacklevel=3)
     return replace(source, options=options or {})
 
 

@@ -1,7 +1,7 @@
-"""Universal files 58 and 58b, and the Standard Data Format of HP and Keysight.
+"""Universal files 58 and 58b, and the Standard Data Format (SDF) of HP and Keysight.
 
-The SDF has records of big-endian numbers without padding. (Standard Data Format Utilities User's
-Guide, Agilent 5963-1715)
+An SDF file consists of records of big-endian numbers without padding (Standard Data Format
+Utilities User's Guide, Agilent 5963-1715).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _DATA_TYPES: dict[int, tuple[str, str]] = {
     13: ("force", "load"),
 }
 _FILE, _MEASUREMENT, _DATA, _VECTOR, _CHANNEL, _X, _Y = 10, 11, 12, 13, 14, 16, 17  # records
-# The fields of the records that are read: type and place of each.
+# Fields read from the records: type and position.
 _FIELDS: dict[int, dict[str, tuple[str, int]]] = {
     _FILE: {
         "counts": ("(3,)>i2", 24), "places": ("(3,)>i4", 36), "x": (">i4", 56), "y": (">i4", 60),
@@ -67,10 +67,10 @@ _FIELDS: dict[int, dict[str, tuple[str, int]]] = {
 }  # fmt: skip
 _FREQUENCY, _TIME = 0, 1  # domains
 _RESPONSE, _COHERENCE = 4, 8  # types of data
-_LOGARITHMIC, _COMMON, _OF_RESULT, _OF_VECTOR = 1, 2, 3, 4  # axes; 0 is linear
+_LOGARITHMIC, _STORED = 1, (2, 3, 4)  # axes; 0 is linear
 _NUMBERS = {1: ">i2", 2: ">i4", 3: ">f4", 4: ">f8"}
-_POWER = 48  # stored exponent of a channel that occurs once in a result
-_UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # other than their labels
+_POWER = 48  # stored exponent of a channel that enters a result as a factor
+_UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # units by label
 
 
 def read_uff(file: File) -> RawFile:
@@ -98,12 +98,12 @@ def read_uff(file: File) -> RawFile:
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
-    """Return the data sets of a file, or name the damaged one."""
+    """Return the data sets of a file; an error names a damaged one."""
     sets: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        # pyuff reads by name only, and prints groups; standard input has no name
+        # pyuff reads only files with a name, which standard input lacks, and prints groups
         path = Path(folder) / "data.uff"
-        # binary data sets count bytes, so that only pure text can be brought to UTF-8
+        # binary data sets count bytes, so only pure text can be converted to UTF-8
         path.write_bytes(file.data if b"58b" in file.data else _uff_text(utf8(file.lines())))
         content = pyuff.UFF(str(path))
         types = content.get_set_types()
@@ -119,7 +119,7 @@ def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:
 
 
 def _uff_text(text: bytes) -> bytes:
-    """Return data sets 58 and 164, as the library expects them; others write them more freely."""
+    """Return data sets 58 and 164 in the strict form that the library expects."""
     kept: list[bytes] = []
     block: list[bytes] | None = None
     for line in [*text.splitlines(), b"-1"]:
@@ -142,19 +142,19 @@ def _uff_channels(
 ) -> Iterator[RawChannel]:
     """Yield the axis and the values of a data set 58, positive in its directions."""
     direction = {side: int(function[f"{side}_dir"]) for side in ("rsp", "ref")}
-    place = {}  # node and direction, such as 1:+Z or 3:-RX
+    point = {}  # node and direction, such as 1:+Z or 3:-RX
     for side, d in direction.items():
         axis = _AXES[abs(d)] if abs(d) < len(_AXES) else "?"
-        place[side] = f"{function[f'{side}_node']}:{'-' if d < 0 else '+'}{axis}"
+        point[side] = f"{function[f'{side}_node']}:{'-' if d < 0 else '+'}{axis}"
     values, count = np.asarray(function["data"]), int(function["num_pts"])
     if len(values) != count:
         raise DataError(
-            f"{file.name}: data set 58 ({place['rsp']}) holds {len(values)} values where its "
+            f"{file.name}: data set 58 ({point['rsp']}) holds {len(values)} values where its "
             f"header says {count}; the file looks cut off"
         )
 
     def unit_of(axis: str, side: str) -> str | None:
-        """Return the unit of the axis label, or that of the system of units for its type."""
+        """Return the unit in the axis label, or that of its data type in the system of units."""
         label = str(function.get(f"{axis}_axis_units_lab", "")).strip()
         if label and label.upper() != "NONE":
             return label
@@ -167,25 +167,26 @@ def _uff_channels(
         return _DATA_TYPES[kind][1].replace("motion", motion).replace("load", load)
 
     role, _ = _DATA_TYPES.get(int(function.get("ordinate_spec_data_type", 0)), (None, ""))
-    unit, turned = unit_of("ordinate", "rsp"), direction["rsp"] < 0
-    name, abscissa, step = f"{role or 'channel'} {place['rsp']}", "time", "s"
-    where = place["rsp"]
+    unit, inverted = unit_of("ordinate", "rsp"), direction["rsp"] < 0
+    points, abscissa, x_unit = point["rsp"], "time", "s"
+    name = f"{role or 'channel'} {points}"
     if function["func_type"] == _FRF:
-        where = f"{place['rsp']}/{place['ref']}"
-        name, abscissa, step, role = f"FRF {where}", "frequency", "Hz", "response"
-        denominator, turned = unit_of("orddenom", "ref"), turned != (direction["ref"] < 0)
+        points = f"{point['rsp']}/{point['ref']}"
+        name, abscissa, x_unit, role = f"FRF {points}", "frequency", "Hz", "response"
+        denominator, inverted = unit_of("orddenom", "ref"), inverted != (direction["ref"] < 0)
         unit = f"({unit})/({denominator})" if unit and denominator else unit
-    yield RawChannel(f"{abscissa} {where}", np.asarray(function["x"], dtype=float), step, abscissa)
-    if turned:
+    x = np.asarray(function["x"], dtype=float)
+    yield RawChannel(f"{abscissa} {points}", x, x_unit, abscissa)
+    if inverted:
         file.notes.append(f"{name}: sign turned, as its directions say")
-    yield RawChannel(name, -values if turned else values, unit, role)
+    yield RawChannel(name, -values if inverted else values, unit, role)
 
 
 def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | None:
-    """Return length and force units of data set 164, once its code and factors agree."""
-    system = None if units is None else _SYSTEMS.get(int(units["units_code"]))
-    for name, unit in zip(("length", "force"), system or (), strict=False):
-        assert units is not None  # it has told the system
+    """Return length and force units of data set 164; its code and factors must agree."""
+    if units is None or (system := _SYSTEMS.get(int(units["units_code"]))) is None:
+        return None
+    for name, unit in zip(("length", "force"), system, strict=True):
         stated, expected = float(units[name]), 1.0 / parse_unit(unit).factor
         if not 0.999 < stated / expected < 1.001:
             raise DataError(
@@ -197,7 +198,7 @@ def _uff_system(file: File, units: dict[str, Any] | None) -> tuple[str, str] | N
 
 
 def merged_axes(channels: list[RawChannel]) -> list[RawChannel]:
-    """Merge the axes of all functions into one where they are the same."""
+    """Merge the axes of all functions into one if they are equal."""
     axes = [c for c in channels if c.role in ("time", "frequency")]
     first = axes[0] if axes else None
     if first is None or any(
@@ -222,7 +223,7 @@ class _Sdf:
         self.averages = max(1, measurement.averages)
 
     def record(self, at: int, kind: int) -> bytes:
-        """Return a record, once its kind and size agree with the file."""
+        """Return a record; its kind and size must agree with the file."""
         stored, size = struct.unpack_from(">hi", self.data, at) if at >= 0 else (None, 0)
         if stored != kind or not 6 <= size <= len(self.data) - at:
             raise ValueError(
@@ -238,8 +239,8 @@ class _Sdf:
 
     def records(self, kind: int) -> Iterator[bytes]:
         """Yield all records of a kind: results, vectors or channels."""
-        which = (_DATA, _VECTOR, _CHANNEL).index(kind)
-        count, at = self.head.counts[which], self.head.places[which]
+        i = (_DATA, _VECTOR, _CHANNEL).index(kind)
+        count, at = self.head.counts[i], self.head.places[i]
         if not 0 <= count <= MOST_CHANNELS:
             raise ValueError(f"{count} records of type {kind}")
         for _ in range(count):
@@ -263,10 +264,10 @@ class _Sdf:
         for result, size in zip(results, expected, strict=True):
             axis = self.axis(result)
             if not result.valid:
-                self.file.doubts.append(f"the analyser says that {result.title!r} is not valid")
+                self.file.warnings.append(f"the analyser says that {result.title!r} is not valid")
             stored = np.frombuffer(numbers[at : at + size], _NUMBERS[result.y_number])
             at += size
-            with np.errstate(invalid="ignore"):  # of a NaN that signals
+            with np.errstate(invalid="ignore"):  # signalling NaN
                 parts = stored.astype(np.float64).reshape(result.count, result.size)
             for k, part in enumerate(parts):
                 values: NDArray[Any] = part[0::2] + 1j * part[1::2] if result.complex == 1 else part
@@ -282,9 +283,9 @@ class _Sdf:
         return self.file.source("SDF", merged_axes(read), row_name="sample {}".format)
 
     def result(self, record: bytes) -> SimpleNamespace:
-        """Read the header of a result, whose numbers are `count` vectors of `size`."""
+        """Return the header of a result, whose numbers are `count` vectors of `size`."""
         result = self.fields(record, _DATA)
-        if len(record) >= 130:  # from the second revision on, with more digits
+        if len(record) >= 130:  # since the second revision, with more digits
             result.start, result.step = struct.unpack_from(">2d", record, 114)
         if len(record) >= 150:
             result.points, passes = struct.unpack_from(">i6xh", record, 134)
@@ -307,7 +308,7 @@ class _Sdf:
         role = {_FREQUENCY: "frequency", _TIME: "time"}.get(result.domain)
         self.file.refuse_above_limit(8 * result.points, "one axis")
         n = np.arange(result.points)
-        if result.spacing in (_COMMON, _OF_RESULT, _OF_VECTOR):
+        if result.spacing in _STORED:
             stored = self.record(self.head.x, _X)[6:]
             if result.x_number not in _NUMBERS:
                 raise ValueError(f"an axis of numbers of type {result.x_number}")
@@ -336,7 +337,7 @@ class _Sdf:
                 continue
             channel = channels[number]
             if channel.overloaded == 1:
-                self.file.doubts.append(f"channel {number + 1} was overloaded")
+                self.file.warnings.append(f"channel {number + 1} was overloaded")
             sensitivity = channel.sensitivity
             if not 0.0 < abs(sensitivity) < np.inf or abs(power) not in (_POWER, 2 * _POWER):
                 raise ValueError(f"channel {number + 1} has the sensitivity {sensitivity:g}")
@@ -347,7 +348,7 @@ class _Sdf:
     def deviations(
         self, results: list[SimpleNamespace], channels: list[RawChannel]
     ) -> Iterator[RawChannel]:
-        """Yield the standard deviation that the coherence of averages gives a response."""
+        """Yield the standard deviation of a response from the coherence of averages."""
         responses = [c for c in channels if c.role == "response"]
         kinds = [r.kind for r in results for _ in range(r.count)]
         coherences = [
@@ -361,8 +362,8 @@ class _Sdf:
         self.file.notes.append(
             f"standard deviations from the coherence of {self.averages} averages"
         )
-        share = np.sqrt((1.0 - coherence) / (2.0 * self.averages * coherence))
-        std = np.maximum(share, np.finfo(np.float32).eps) * np.abs(responses[0].values)
+        relative = np.sqrt((1.0 - coherence) / (2.0 * self.averages * coherence))
+        std = np.maximum(relative, np.finfo(np.float32).eps) * np.abs(responses[0].values)
         yield RawChannel("std", std, responses[0].unit, "std")
 
 
@@ -371,6 +372,6 @@ def _text(letters: bytes) -> str:
 
 
 def _unit(letters: bytes) -> str | None:
-    """Return the label of a unit as others write it."""
+    """Return a unit from its label."""
     label = _text(letters)
     return _UNITS.get(label.casefold(), label) or None

@@ -106,7 +106,7 @@ _PACKED: tuple[tuple[bytes, Callable[[Any], Any], str], ...] = (
 class File:
     """A file to read; `content` holds its bytes if they are not on disk in this form.
 
-    Its reader adds its assumptions to `notes`, and its warnings to `doubts`.
+    Its reader adds its assumptions to `notes`, and its warnings to `warnings`.
     """
 
     path: Path | None
@@ -116,7 +116,7 @@ class File:
     format: str
     content: bytes | None = None
     notes: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def head(self) -> bytes:
@@ -170,8 +170,10 @@ class File:
         channels = tuple(channels)
         if not channels:
             raise DataError(f"{self.name}: the file holds no channels")
-        notes, doubts = tuple(self.notes), tuple(self.doubts)
-        return RawFile(self.name, kind, channels, self.sha256, notes=notes, doubts=doubts, **facts)
+        notes, warnings = tuple(self.notes), tuple(self.warnings)
+        return RawFile(
+            self.name, kind, channels, self.sha256, notes=notes, warnings=warnings, **facts
+        )
 
 
 def refuse_many(name: str, count: int, what: str, most: int = MOST_CHANNELS) -> None:

@@ -1,4 +1,4 @@
-"""The contents of a file: channels, sampling, gaps, and a column map to read it."""
+"""The contents of a file: channels, sampling, gaps, and a proposed column map."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from dahl_ident.units import MOTION_KINDS, parse_unit
 
 _INTERVALS = ("ts", "dt", "sampling_interval", "sample_interval")  # names of an interval in s
 _RATES = ("fs", "sample_rate", "sampling_rate", "sampling_frequency")  # names of a rate in Hz
-_FEW_GAPS = 5  # gaps that are listed one by one; of more: number, longest and first
-# The columns that are proposed; the units of some say nothing: any of them has the gain's.
+_FEW_GAPS = 5  # gaps that are listed singly; otherwise their number, the longest and the first
+# The proposed columns; those that all have the unit of the gain are not recognised by unit.
 _RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("voltage", "current"))}
 _RESPONSE = {
     role: RESPONSE_COLUMNS[role] if by_unit else replace(RESPONSE_COLUMNS[role], kinds=())
@@ -36,7 +36,7 @@ _F_TOO = replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))
 
 @dataclass(frozen=True)
 class ChannelSummary:
-    """One channel in a line: name or path, shape, type, unit and range."""
+    """One line for a channel: name or path, shape, type, unit and range."""
 
     name: str
     shape: tuple[int, ...]
@@ -49,8 +49,8 @@ class ChannelSummary:
 class FileContents:
     """The contents of a file, as returned by :func:`inspect`.
 
-    `sampling` and `gaps` are empty where the file has no time channel; `column_map` is TOML
-    text, to be checked and kept.
+    `sampling` and `gaps` are empty if the file has no time channel; `column_map` is TOML
+    text, to be checked and saved.
     """
 
     name: str
@@ -107,10 +107,10 @@ def _summary(channel: RawChannel) -> ChannelSummary:
 
 
 def _sampling(source: RawFile) -> tuple[str, tuple[str, ...]]:
-    """Describe the sampling of the first channel that is time, and its gaps; of many, some."""
+    """Describe the sampling of the first time channel, and its gaps or a summary of them."""
     column = RECORD_COLUMNS["time"]
     named = [c for c in source.channels if c.is_called(column)]
-    for channel in named or (c for c in source.channels if column.measures(c.unit, c.name)):
+    for channel in named or (c for c in source.channels if column.accepts(c.unit, c.name)):
         if channel.values.dtype.kind not in "fiu" or channel.size < 2:
             continue
         try:
@@ -138,7 +138,7 @@ def _sampling(source: RawFile) -> tuple[str, tuple[str, ...]]:
 
 
 def _proposal(source: RawFile) -> str:
-    """Return a column map in TOML: roles by name first, by unit where no name claims them."""
+    """Return a column map in TOML: roles by name, otherwise by unit."""
     groups = _patterns(source)
     if any(channel.size > 1 for channel in groups.values()):  # single numbers are settings
         groups = {path: channel for path, channel in groups.items() if channel.size > 1}
@@ -152,9 +152,9 @@ def _proposal(source: RawFile) -> str:
         by_unit = (
             p
             for p, c in free.items()
-            if column.measures(c.unit, c.name) and not any(map(c.is_called, every.values()))
+            if column.accepts(c.unit, c.name) and not any(map(c.is_called, every.values()))
         )
-        best = next(by_name, None) or min(by_unit, key=_likeness, default=None)
+        best = next(by_name, None) or min(by_unit, key=_force_rank, default=None)
         if best is not None and not (role in MOTION_KINDS and set(MOTION_KINDS) & roles.keys()):
             roles[role] = best
     lines = [line for role, path in roles.items() for line in _entry(role, path, groups[path])]
@@ -163,13 +163,13 @@ def _proposal(source: RawFile) -> str:
     for path, channel in groups.items():
         if path not in roles.values():
             others[any(map(channel.is_called, further))].append(path)
-    for what, paths in (("read by their names", others[True]), ("not used", others[False])):
-        lines += [f"# {what}: {listed(paths, 20)}"] if paths else []
+    for use, paths in (("read by their names", others[True]), ("not used", others[False])):
+        lines += [f"# {use}: {listed(paths, 20)}"] if paths else []
     required = [("frequency",)] if response else [("time",), MOTION_KINDS, ("force", "drive")]
-    missing = [several[0] for several in required if not set(several) & roles.keys()]
+    missing = [options[0] for options in required if not roles.keys() & options]
     if missing:
-        named = ", ".join(missing)
-        lines.append(f"# not found: {named}. Fill in, and remove the comment signs:")
+        names = ", ".join(missing)
+        lines.append(f"# not found: {names}. Fill in, and remove the comment signs:")
     lines += [f'# {role} = {{column = "", unit = ""}}' for role in missing]
     if "time" in missing:
         rate = _stated_rate(source)
@@ -177,15 +177,15 @@ def _proposal(source: RawFile) -> str:
     return "\n".join(lines)
 
 
-def _likeness(path: str) -> int:
-    """Order channels of force: a tribometer measures the friction, and the load across it too."""
+def _force_rank(path: str) -> int:
+    """Return -1 for a friction force and 1 for a normal force, which a tribometer measures too."""
     name = path.casefold()
-    across = any(word in name for word in ("normal", "load", "vertical"))
-    return across - any(word in name for word in ("friction", "tangential", "lateral"))
+    normal = any(word in name for word in ("normal", "load", "vertical"))
+    return normal - any(word in name for word in ("friction", "tangential", "lateral"))
 
 
 def _stated_rate(source: RawFile) -> str:
-    """Return a line with the sample rate that single numbers of the file state, if any do."""
+    """Return a line with the sample rate, from a single number in the file if there is one."""
     for channel in source.channels:
         if channel.size != 1 or channel.kind not in "fiu":
             continue
@@ -198,10 +198,10 @@ def _stated_rate(source: RawFile) -> str:
 
 
 def _is_response(channels: Collection[RawChannel]) -> bool:
-    """Return whether channels are a table of response; f is force only with time or motion."""
+    """Return whether channels form a table of responses; f is force only with time or motion."""
 
     def any_is(column: Column) -> bool:
-        return any(c.is_called(column) or column.measures(c.unit, c.name) for c in channels)
+        return any(c.is_called(column) or column.accepts(c.unit, c.name) for c in channels)
 
     sampled = any(any_is(_RECORD[role]) for role in ("time", *MOTION_KINDS))
     return any_is(_FREQUENCY) or (not sampled and any_is(_F_TOO))
@@ -220,7 +220,7 @@ def _entry(role: str, path: str, channel: RawChannel) -> Iterator[str]:
 
 
 def _patterns(source: RawFile) -> dict[str, RawChannel]:
-    """Return channels by path; those of one name in struct arrays by one path with ``*``."""
+    """Return channels by path; those of the same name in struct arrays by one path with ``*``."""
     by_short: dict[str, list[RawChannel]] = {}
     for channel in source.channels:
         by_short.setdefault(channel.short or channel.name, []).append(channel)

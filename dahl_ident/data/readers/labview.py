@@ -1,4 +1,4 @@
-"""Files of National Instruments: TDMS, and LabVIEW's measurement files (LVM)."""
+"""Files of National Instruments: TDMS and LabVIEW measurement files (LVM)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LONGEST_SEGMENT = 1 << 48  # bytes; more means that the segment was never close
 _END = "***End_of_Header***"
 _SPECIAL = ("***Start_Special***", "***End_Special***")
 _SEPARATORS = {"tab": "\t", "comma": ",", "semicolon": ";"}
-_SAME_STEP = 0.01  # relative difference of steps; rounding in times and in the header is less
+_SAME_STEP = 0.01  # relative difference of steps; rounding of times and header is less
 _MOST_SEGMENTS = 1000  # the time to read grows with their square
 Lines = list[tuple[int, str]]
 
@@ -40,23 +40,23 @@ def read_tdms(file: File) -> RawFile:
     stream: Any = file.stream()
     if isinstance(stream, Path):
         stream = _Bounded(io.FileIO(stream))
-    with _damage_named():
+    with _messages_as_errors():
         content = nptdms.TdmsFile.open(stream)
-        weakref.finalize(content, stream.close)  # open as long as a channel waits to be read
+        weakref.finalize(content, stream.close)  # channels are read later
         groups = content.groups()
         starts = [t for g in groups for c in g.channels() if (t := _start(c)) is not None]
         first = min(starts, default=None)
         channels = [c for group in groups for c in _tdms_channels(file, content, group, first)]
-        begun = _begun_again(file)
+        restarts = _restarts(file)
     if sum(c.role == "time" for c in channels) > 1 and len(set(starts)) > 1:
         late = (max(starts) - min(starts)) / np.timedelta64(1, "s")
-        file.doubts.append(
+        file.warnings.append(
             f"the channels start at different times, up to {late:.4g} s apart (wf_start_time); "
             "each has a time of its own"
         )
-    if begun:
-        file.doubts.append(
-            f"segments {listed([str(i) for i in begun], 5)} of the file state wf_increment again, "
+    if restarts:
+        file.warnings.append(
+            f"segments {listed(map(str, restarts), 5)} of the file state wf_increment again, "
             "as a file that was appended does; time goes on as if no pause were between them. "
             "Split the file where it holds several runs"
         )
@@ -64,16 +64,16 @@ def read_tdms(file: File) -> RawFile:
 
 
 class _Bounded(io.BufferedReader):
-    """A file of which no more is read than there is, for which memory would be set aside."""
+    """A file that is never read beyond its end, so that a damaged size allocates no memory."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        left = os.fstat(self.fileno()).st_size - self.tell()
-        return super().read(left if size is None or size < 0 else min(size, left))
+        remaining = os.fstat(self.fileno()).st_size - self.tell()
+        return super().read(remaining if size is None or size < 0 else min(size, remaining))
 
 
-def _begun_again(file: File) -> list[int]:
+def _restarts(file: File) -> list[int]:
     """Return the numbers of later segments that state the sampling of a waveform again."""
-    again, number = [], 0
+    restarts, number = [], 0
     with file.opened() as stream:
         while lead := stream.read(_LEAD_IN.size):
             if len(lead) < _LEAD_IN.size or not lead.startswith(b"TDSm"):
@@ -87,14 +87,14 @@ def _begun_again(file: File) -> list[int]:
                 break
             start = stream.tell()
             if number > 1 and b"wf_increment" in stream.read(min(metadata, _LONGEST_METADATA)):
-                again.append(number)
+                restarts.append(number)
             stream.seek(start + following)
-    return again
+    return restarts
 
 
 @contextlib.contextmanager
-def _damage_named() -> Iterator[None]:
-    """Raise what the library would print on the terminal as an error."""
+def _messages_as_errors() -> Iterator[None]:
+    """Raise messages that the library would print on the terminal as errors."""
     printer, printed = library("nptdms.log").log_manager.console_handler, io.StringIO()
     terminal = printer.setStream(printed)
     try:
@@ -106,7 +106,7 @@ def _damage_named() -> Iterator[None]:
 
 
 def _start(channel: Any) -> Any:
-    """Return when a waveform began; None where the file does not say."""
+    """Return the start time of a waveform; None if the file does not state it."""
     if float(channel.properties.get("wf_increment", 0.0)) <= 0.0:
         return None
     start = channel.properties.get("wf_start_time")
@@ -128,18 +128,18 @@ def _tdms_channels(file: File, content: Any, group: Any, first: Any) -> Iterator
         yield _labelled(f"{group.name}/", channel.name, values, unit)
         step = float(properties.get("wf_increment", 0.0))
         if step > 0.0:
-            start, begun = float(properties.get("wf_start_offset", 0.0)), _start(channel)
-            if begun is not None:  # to a hundredth of a step: clocks of modules differ by less
-                start += step * round(float((begun - first) / np.timedelta64(1, "s")) / step, 2)
+            start, clock = float(properties.get("wf_start_offset", 0.0)), _start(channel)
+            if clock is not None:  # to a hundredth of a step: clocks of modules differ by less
+                start += step * round(float((clock - first) / np.timedelta64(1, "s")) / step, 2)
             even = functools.partial(_even_times, start, step, count)
             times[start, step, count] = Stored((count,), np.dtype(np.float64), even, what)
     yield from _time_channels(list(times.values()), f"{group.name}/")
 
 
 def _tdms_values(content: Any, channel: Any, rows: slice) -> NDArray[Any]:
-    """Return some values of a channel, whose file is open as long as `content` lives."""
+    """Return some values of a channel, whose file is open as long as `content` exists."""
     assert content is not None
-    with _damage_named():
+    with _messages_as_errors():
         values = np.asarray(channel[rows])
     if values.size != len(range(*rows.indices(len(channel)))):
         raise ValueError("it ends before its last sample")
@@ -151,13 +151,13 @@ def _even_times(start: float, step: float, count: int, rows: slice) -> NDArray[A
 
 
 def _labelled(prefix: str, label: str, values: Any, unit: str | None) -> RawChannel:
-    """Return a channel; many loggers write its unit into the label, as in ``Force (N)``."""
+    """Return a channel; many data loggers write its unit into the label: ``Force (N)``."""
     name, in_label = (label, unit) if unit else split_header(label)
     return RawChannel(prefix + name, values, in_label, short=name)
 
 
 def _time_channels(axes: Sequence[Any], prefix: str) -> Iterator[RawChannel]:
-    """Yield the time axes of a group, all different."""
+    """Yield the different time axes of a group."""
     for i, time in enumerate(axes):
         name = "time" if len(axes) == 1 else f"time {i + 1}"
         yield RawChannel(prefix + name, time, "s", "time", name)
@@ -182,12 +182,12 @@ def read_lvm(file: File) -> RawFile:
     channels: list[RawChannel] = []
     for i, segment in enumerate(segments):
         channels += segment.channels(f"segment {i}/" if len(segments) > 1 else "")
-        file.doubts.extend(segment.contradictions())
+        file.warnings.extend(segment.contradictions())
     return file.source("LVM", channels, row_name="sample {}".format)
 
 
 class _Lvm:
-    """The lines of a file that are still to be read, and the settings in its header."""
+    """The unread lines of a file, and the settings in its header."""
 
     def __init__(self, file: File, lines: Lines) -> None:
         self.file, self.lines, self.separator = file, lines, "\t"
@@ -201,7 +201,7 @@ class _Lvm:
         self.single = (settings.get("Multi_Headings") or ["Yes"])[0].strip().casefold() == "no"
 
     def header(self) -> Lines:
-        """Take the lines of a header."""
+        """Remove and return the lines of a header."""
         for i, (_, line) in enumerate(self.lines):
             if line.strip() == _END:
                 head, self.lines = self.lines[:i], self.lines[i + 1 :]
@@ -214,7 +214,7 @@ class _Lvm:
         return {key.strip(): values for key, *values in cells}
 
     def segment(self) -> _LvmBlock:
-        """Take the lines of a segment: its header, labels and numbers; all of a single one."""
+        """Remove and return a segment: its header, labels and numbers."""
         header = self.entries(self.header())
         lines = list(itertools.dropwhile(lambda pair: not pair[1].strip(), self.lines))
         if not lines:
@@ -253,20 +253,20 @@ class _Lvm:
         return segment
 
     def check_samples(self, segment: _LvmBlock) -> None:
-        """Refuse a segment with fewer or more samples than its header says."""
+        """Refuse a segment with fewer or more samples than its header states."""
         rows = len(segment.data)
         stated = [value.strip() for value in segment.header.get("Samples", []) if value.strip()]
         for value in stated:
             if not re.fullmatch("[0-9]{1,18}", value):
                 raise ValueError(f"{value[:40]!r} is not a number of samples")
-        most = max(map(int, stated), default=rows)
-        # a single header is that of the first samples written, which more may follow
+        expected = max(map(int, stated), default=rows)
+        # a single header belongs to the first samples written, and more may follow
         timed = "X_Value" in segment.labels
-        goes_on = self.single and rows > most > 0 and (timed or rows % most == 0)
-        if most != rows and not goes_on:
+        appended = self.single and rows > expected > 0 and (timed or rows % expected == 0)
+        if expected != rows and not appended:
             raise DataError(
-                f"{self.file.name}: a segment has {rows} samples where its header says {most}; "
-                f"the file {'looks cut off' if rows < most else 'is damaged'}"
+                f"{self.file.name}: a segment has {rows} samples where its header says {expected}; "
+                f"the file {'looks cut off' if rows < expected else 'is damaged'}"
             )
 
 
@@ -279,7 +279,7 @@ class _LvmBlock(NamedTuple):
     multi: bool
 
     def channels(self, prefix: str) -> Iterator[RawChannel]:
-        """Yield the channels, and time: the x columns, or counted from their step."""
+        """Yield the channels, and time from the x columns or their stated step."""
         table = list(zip(self.labels, self.data.T, strict=True))
         named = [pair for pair in table if pair[0] != "X_Value"]
         units = self.header.get("Y_Unit_Label", [])
@@ -297,7 +297,7 @@ class _LvmBlock(NamedTuple):
         yield from _time_channels(list({time.tobytes(): time for time in times}.values()), prefix)
 
     def contradictions(self) -> Iterator[str]:
-        """Yield what the header says of the sampling, and the column of times does not."""
+        """Yield contradictions between the sampling in the header and the column of times."""
         times = self.data[:, [label == "X_Value" for label in self.labels]]
         if len(times) < 2:
             return
