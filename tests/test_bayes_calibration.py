@@ -17,7 +17,9 @@ def test_the_band_holds_uniform_ranks_and_sees_narrow_posteriors():
     assert extremity(np.sum(draws < truth, axis=0).astype(float)) < limit
 
 
-@pytest.mark.parametrize(("scenario", "tables"), [(friction(), 5), (plant(), 1)])
+@pytest.mark.parametrize(
+    ("scenario", "tables"), [(friction(), 5), pytest.param(plant(), 5, marks=pytest.mark.long)]
+)
 def test_ranks_of_the_truth_are_uniform(scenario, tables):
     found, failed = ranks(scenario, tables, seed=2)
     assert failed == 0

@@ -70,7 +70,7 @@ def test_every_move_alone_leaves_a_distribution_as_it_is(proposal):
     move = EnsembleMove(proposal, 4)
     sampler = emcee.EnsembleSampler(160, 2, log_density, moves=[(move, 1.0)], vectorize=True)
     seeded = np.random.RandomState(7).get_state()
-    sampler.run_mcmc(emcee.State(start, random_state=seeded), 2000)
+    sampler.run_mcmc(emcee.State(start, random_state=seeded), 1000)
     chain = sampler.get_chain()
     thin = int(np.ceil(4.0 * autocorrelation_time(chain).max()))  # the test wants independence
     draws = chain[::thin].reshape(-1, 2)

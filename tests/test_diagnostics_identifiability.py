@@ -149,6 +149,8 @@ class TestVerdicts:
         data = table(model=model, beta=(1e-2, 1e-1), noise=0.004, n=12)
         found = identifiability(fit(data, Dahl(alpha=None) + Spring(), throw=False))
         assert "alpha sigma^2/f_max" in found.determined
+        loss = found.combinations[0]
+        assert loss.value == pytest.approx(SIGMA**2 / F_MAX, abs=3.0 * loss.stderr)
         assert "alpha" in found.named(NOT)
 
     def test_an_unknown_force_gain_leaves_x_c(self):

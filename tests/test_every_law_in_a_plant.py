@@ -250,7 +250,7 @@ VARIANTS = ("user's law", "linear system", "Dahl, free exponent")  # of others
 )
 def test_a_law_in_a_driven_plant_is_found(name):
     case = CASES[name]
-    size = (3, 3) if name == "Iwan" else (3, 4)  # the slowest: thirty sliders
+    size = (2, 4) if name == "Iwan" else (3, 4)  # the slowest: thirty sliders
     model = case.law
     if "linear system" not in name:
         model = model + di.Mass(MASS)

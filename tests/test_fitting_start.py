@@ -14,9 +14,9 @@ from tests.random_problems import exponent_free, friction_alone, two_elements
 A = np.geomspace(1e-4, 1e-1, 20)
 
 
-def test_optimum_equals_that_of_a_dense_scan_in_hundreds_of_random_problems():
+def test_optimum_equals_that_of_a_dense_scan_in_random_problems():
     worst = 0.0
-    for problem, least_cost, at_edge in friction_alone(seed=1, count=400):
+    for problem, least_cost, at_edge in friction_alone(seed=1, count=100):
         found = solve(problem)
         assert found.success is not at_edge
         worst = max(worst, found.cost / least_cost - 1.0)

@@ -106,10 +106,10 @@ def test_the_force_along_a_sampled_motion_is_that_of_the_motion(uneven):
 
 
 def test_a_record_of_it_is_fitted():
-    t = np.arange(2000) / 200.0
+    t = np.arange(1000) / 100.0
     x = 0.01 * np.sin(2.0 * np.pi * 0.5 * t) * np.sin(2.0 * np.pi * 0.05 * t)
     law = LuGre(1.0, 300.0, 1.6, 0.02)
-    noise = 1e-3 * np.random.default_rng(0).standard_normal(2000)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(1000)
     force = law.force(x, velocity=np.gradient(x, t)) + noise
     found = fit(Record(t, displacement=x, force=force), LuGre())
     for name, truth in (("f_max", 1.0), ("sigma", 300.0), ("static_ratio", 1.6)):

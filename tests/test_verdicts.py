@@ -67,16 +67,6 @@ class TestStiffening:
         assert rise(table(n=4), Dahl(alpha=1.0)) is None
 
 
-def test_microslip_with_a_free_exponent_determines_the_loss_alone():
-    """Where exponent and limit grow together, their ratio stays, and with it the loss."""
-    data = table(model=FRICTION + Spring(20.0), beta=(3e-3, 3e-2), n=12, noise=1e-3)
-    found = fit(data, Dahl(alpha=1.0) + Spring(), free=["alpha"], throw=False).identifiability
-    assert found.determined == ("alpha sigma^2/f_max", "sigma + stiffness")
-    assert found.combinations[0].value == pytest.approx(
-        30.0**2 / 0.1, abs=3.0 * found.combinations[0].stderr
-    )
-
-
 class TestTrust:
     def test_two_points_leave_noise_and_model_alike(self):
         result = fit(table(n=2, noise=0.03), Dahl())
