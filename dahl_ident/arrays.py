@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 TINY = float(np.finfo(np.float64).tiny)
-"""Stands for 0 in quotients, so that they are finite."""
+"""Replaces 0 in denominators, so that quotients are finite."""
 
 SMALLEST, LARGEST = 1e-90, 1e90
 """Allowed magnitudes: squares, products and ratios of such numbers remain representable."""
@@ -37,13 +37,13 @@ def real_array(value: ArrayLike, name: str) -> FloatArray:
 
 
 def refuse_masked(value: ArrayLike, name: str) -> None:
-    """Refuse an array of which numpy masks some values."""
+    """Refuse a numpy array with masked values."""
     if np.ma.is_masked(value):
         raise ValidationError(f"{name}: some values are masked; leave these rows out")
 
 
 def finite_array(value: ArrayLike, name: str) -> FloatArray:
-    """Return `value` as a float array of at most 1e90 in size, or name the first bad index."""
+    """Return `value` as a float array of absolute values up to 1e90."""
     array = real_array(value, name)
     good = np.abs(array) <= LARGEST
     if not good.all():
@@ -85,12 +85,12 @@ def array_between(value: ArrayLike, name: str, low: float, high: float) -> Float
 
 
 def positive_number(value: Any, name: str) -> float:
-    """Return `value` as one finite float above zero."""
+    """Return `value` as one float above zero."""
     return _one(positive_array(value, name), name)
 
 
 def non_negative_number(value: Any, name: str) -> float:
-    """Return `value` as one finite float of at least zero."""
+    """Return `value` as one finite float >= 0."""
     return _one(non_negative_array(value, name), name)
 
 
@@ -106,7 +106,7 @@ def _one(array: FloatArray, name: str) -> float:
 
 
 def whole_number(value: Any, name: str, minimum: int) -> int:
-    """Return `value` as an int of at least `minimum`; a float or a bool is refused."""
+    """Return `value` as an int >= `minimum`; a float or a bool is refused."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise ValidationError(f"{name} is {value!r}; expected a whole number >= {minimum}")
     return int(value)

@@ -1,6 +1,6 @@
 """The errors and warnings of this package.
 
-All errors derive from :class:`DahlIdentError`, so one ``except`` catches the errors of this package
+All errors derive from :class:`DahlIdentError`, so one ``except`` catches all errors of the package
 and nothing else. A message says what was found, what was expected and what to do.
 """
 
@@ -31,7 +31,7 @@ __all__ = [
 
 
 class DahlIdentError(Exception):
-    """Base of every error that this package raises on purpose.
+    """Base class of the errors of this package.
 
     Examples
     --------
@@ -97,7 +97,7 @@ class DataError(DahlIdentError, ValueError):
 
 
 class DataWarning(UserWarning):
-    r"""Data that can be used but look wrong; the message lists the rows.
+    r"""Data that can be used but look wrong; the message names the rows.
 
     Examples
     --------
@@ -143,7 +143,7 @@ class FitError(DahlIdentError, RuntimeError):
     message : str
         What happened, and what to do.
     result : FitResult, optional
-        What was nevertheless found: status, and the combinations that are determined.
+        The result as far as it is determined: status, and identifiable combinations.
 
     Examples
     --------
@@ -168,7 +168,7 @@ class SamplingError(DahlIdentError, RuntimeError):
     message : str
         What happened, and what to do.
     posterior : Posterior, optional
-        The chain so far, where there is one.
+        The chain so far, if there is one.
 
     Examples
     --------
@@ -185,7 +185,7 @@ class SamplingError(DahlIdentError, RuntimeError):
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """A fit to records was stopped from the keyboard; what was found so far is kept.
+    """A fit to records was stopped from the keyboard; the best values so far are kept.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ class NoSteadyMotionWarning(UserWarning):
 
 
 def choices(known: Iterable[str], *words: str) -> str:
-    """Return the known names for a message, and those that unknown words may have meant.
+    """Return the known names for a message, and those similar to unknown words.
 
     Examples
     --------
@@ -277,17 +277,17 @@ def arguments_as_options() -> Iterator[None]:
 
 
 def names_options() -> bool:
-    """Return whether messages name options of the command line."""
+    """Return whether messages name command-line options instead of arguments."""
     return _OPTIONS.get()
 
 
 def name_options(on: bool) -> None:
-    """Name options, or arguments, from now on: for a process that works for another one."""
+    """Set whether messages name options, in a process that works for another one."""
     _OPTIONS.set(on)
 
 
 def spelled(python: str, options: str) -> str:
-    """Return how to say something to Python, or on the command line where that is used.
+    """Return the text for Python, or that for the command line if it is in use.
 
     Examples
     --------
@@ -298,7 +298,7 @@ def spelled(python: str, options: str) -> str:
 
 
 class Placeholder(str):
-    """The text of a message in place of a value that the user knows."""
+    """Text in a message that stands for a value of the user's choice."""
 
     __slots__ = ()
 
@@ -312,7 +312,7 @@ LOW, HIGH, ANY = Placeholder("low"), Placeholder("high"), Placeholder("...")
 def argument(name: str, value: Any = None, *, option: str | None = None) -> str:
     """Return an argument for a message, ``name=value`` or ``--name value``.
 
-    A mapping becomes one option for each of its names; `option` is that of another name.
+    A mapping becomes one option for each name; `option` is the option's name if it differs.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A line on the terminal that shows that a task goes on."""
+"""A line on the terminal that shows the progress of a task."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-PATIENCE = 2.0  # s without a display
+PATIENCE = 2.0  # s before the line appears
 
 
 class Show(Protocol):
-    """Shows how far a task is: words after its name, and where they are known the steps."""
+    """Shows the progress of a task: words after its name, and the number of steps if known."""
 
     def __call__(self, words: str, done: float = 0.0, total: float | None = None) -> None:
-        """Take the words, the number of steps done, and that of all."""
+        """Show the words, the number of steps done, and the total number."""
 
 
 @contextmanager
 def spinner(task: str) -> Iterator[Show]:
-    """Show on standard error, after two seconds, that a task goes on, and for how long.
+    """Show on standard error, after two seconds, that a task is running, and the time elapsed.
 
-    Standard output is for results. The function that is yielded says how far the task is; with the
-    number of steps the time left is shown as well.
+    Standard output is for results. The yielded function reports progress; with the number of steps,
+    the remaining time is shown as well.
     """
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -36,12 +36,12 @@ def spinner(task: str) -> Iterator[Show]:
     def show(words: str, done: float = 0.0, total: float | None = None) -> None:
         bar.update(number, description=f"{task}{words}", completed=done, total=total)
 
-    clock = threading.Timer(PATIENCE, bar.start)
-    clock.daemon = True
-    clock.start()
+    timer = threading.Timer(PATIENCE, bar.start)
+    timer.daemon = True
+    timer.start()
     try:
         yield show
     finally:
-        clock.cancel()
-        clock.join()
+        timer.cancel()
+        timer.join()
         bar.stop()

@@ -1,13 +1,13 @@
 """The exact free oscillation of a closed loop, by shooting from the describing function's estimate.
 
-Without a drive, a periodic motion returns to its state after a period that is not known either:
+Without a drive, a periodic motion returns to its state after a period that is unknown as well:
 
-    y(T; y_0) = y_0,    v(0) = 0,
+    y(T; y_0) = y_0,    v(0) = 0.
 
-solved for y_0 and T with the derivatives of the motion. Where the equations are the same
-in both directions, half a period leads to -y_0. Of Floquet's multipliers, the eigenvalues of the
-map's derivative, one is 1 (the motion may be shifted in time); the largest of the others says how a
-disturbance grows.
+These equations are solved for y_0 and T with the derivatives of the motion. If the system is the
+same in both directions, half a period leads to -y_0. Of Floquet's multipliers, the eigenvalues of
+the derivative of this map, one is 1 (the motion may be shifted in time); the largest of the others
+gives the growth of a disturbance.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from dahl_ident.elements.model import Model
 from dahl_ident.engine import System, march, settled, translate
 from dahl_ident.errors import FitError
 
-_STARTS = (1.0, 0.7, 1.4, 0.5, 0.35, 0.25)  # times the estimate, as long as nothing is found
-_EVALUATIONS = 60  # from each; ten are the rule
-_CLOSED = 1e-7  # of the states' sizes: what a motion may miss its beginning by
-_LOST = 1e3  # the same of a motion that grows beyond all bounds
-_FARTHEST = np.log(5.0)  # from the estimate, of amplitude and period: farther is another motion
-_SAMPLES = 256  # of a period, for its harmonics
-_HIGHEST = 9  # harmonic that counts
+_STARTS = (1.0, 0.7, 1.4, 0.5, 0.35, 0.25)  # starts over the estimate, tried until one converges
+_EVALUATIONS = 60  # at most from each start; usually ten are needed
+_CLOSED = 1e-7  # largest difference of first and last state, relative to the states' sizes
+_DIVERGED = 1e3  # the same for a motion that grows without bound
+_FARTHEST = np.log(5.0)  # log ratio of amplitude or period to the estimate; more: another motion
+_SAMPLES = 256  # per period, for the harmonics
+_HIGHEST = 9  # harmonic
 
 
 class FreeMotion(NamedTuple):
     """A periodic motion without a drive."""
 
-    amplitude: float  # of the displacement's fundamental
+    amplitude: float  # of the fundamental of the displacement
     omega: float
-    share: float  # root sum of squares of the mean and the harmonics 2 to 9 over it
-    growth_rate: float  # of the worst small disturbance, 1/s
+    share: float  # root sum of squares of mean and harmonics 2 to 9, over the fundamental
+    growth_rate: float  # of the least stable small disturbance, 1/s
 
 
 def free_motion(plant: Model, amplitude: float, omega: float) -> FreeMotion | None:
-    """Return the periodic motion near ``amplitude cos(omega t)``; None where there is none.
+    """Return the periodic motion near ``amplitude cos(omega t)``; None if there is none.
 
     The plant is the whole loop, friction included, with a mass and a value for every parameter.
     """
     loop = _Loop(plant)
     y = loop.start(amplitude, omega)
-    period = loop.turns * np.pi / omega
+    period = loop.half_periods * np.pi / omega
     for scale in _STARTS:
         orbit = loop.closed(y * scale, period)
         if orbit is not None:
@@ -59,14 +59,14 @@ def free_motion(plant: Model, amplitude: float, omega: float) -> FreeMotion | No
 
 
 class _Loop:
-    """The compiled equations of a loop, and its maps."""
+    """The compiled equations of a loop, and the map of its state over a period."""
 
     def __init__(self, plant: Model) -> None:
         import casadi as ca
 
         equations = plant_equations(plant)
         self.system: System = translate(equations)
-        self.turns = 1 if self.system.odd else 2  # half periods of the map
+        self.half_periods = 1 if self.system.odd else 2  # covered by the map
         self._sign = -1.0 if self.system.odd else 1.0
         self._plant = plant
         self._values = np.array([float(v) for v in plant.known_values()])
@@ -75,13 +75,12 @@ class _Loop:
         self._rates = ca.Function("rates", arguments, [equations.rates])
 
     def start(self, amplitude: float, omega: float) -> FloatArray:
-        """Return the state at the peak of a sine that every element has followed."""
-        inside = [e for e in self._plant.elements if e.n_states]
-        followed = [_followed(element, amplitude, omega) for element in inside]
-        return np.concatenate([[amplitude, 0.0], *followed])
+        """Return the state at the peak of a steady sinusoidal motion."""
+        states = [_steady_states(e, amplitude, omega) for e in self._plant.elements if e.n_states]
+        return np.concatenate([[amplitude, 0.0], *states])
 
     def closed(self, y: FloatArray, period: float) -> tuple[FloatArray, float, FloatArray] | None:
-        """Return the state, the period and the map of the periodic motion to which these lead."""
+        """Return state, period and map derivative of the periodic motion found from a start."""
         size = np.maximum(np.abs(y), 1e-3 * np.abs(y).max())
         at_rest = np.arange(y.size) == 1
         last: list[FloatArray] = []
@@ -89,32 +88,32 @@ class _Loop:
         def state(z: FloatArray) -> FloatArray:
             return np.asarray(np.insert(z[:-1], 1, 0.0) * size)
 
-        def missing(z: FloatArray) -> FloatArray:
+        def mismatch(z: FloatArray) -> FloatArray:
             try:
                 end, slope, rates = self._after(state(z), float(z[-1]) * period)
             except FitError:
                 last[:] = [np.zeros((y.size, y.size))]
-                return np.full(y.size, _LOST)
+                return np.full(y.size, _DIVERGED)
             columns = [((slope - np.eye(y.size)) * size)[:, ~at_rest], period * rates]
             last[:] = [np.column_stack(columns) / size[:, None], slope]
             return np.asarray((end - state(z)) / size)
 
-        def slopes(z: FloatArray) -> FloatArray:
-            missing(z)
+        def jacobian(z: FloatArray) -> FloatArray:
+            mismatch(z)
             return last[0]
 
-        begin = np.append((y / size)[~at_rest], 1.0)
+        start = np.append((y / size)[~at_rest], 1.0)
         solution = least_squares(
-            missing, begin, slopes, method="lm",
+            mismatch, start, jacobian, method="lm",
             xtol=1e-14, ftol=1e-14, max_nfev=_EVALUATIONS,
         )  # fmt: skip
         if not np.abs(solution.fun).max() < _CLOSED or solution.x[-1] <= 0.0:
             return None
-        missing(solution.x)
+        mismatch(solution.x)
         return state(solution.x), float(solution.x[-1]) * period, last[1]
 
     def _after(self, y: FloatArray, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return state, map and rates after a period, or after half of one with its sign."""
+        """Return state, map derivative and rates after a period; after half of one, negated."""
         motion = march(
             self.system, np.array([0.0, period]), np.zeros((1, 1)), np.array([0.0, period]), y,
             self._values, derivatives=True,
@@ -126,14 +125,14 @@ class _Loop:
     def described(
         self, y: FloatArray, period: float, slope: FloatArray, near: tuple[float, float]
     ) -> FreeMotion | None:
-        """Return size, frequency and stability of a motion; None where it is far from `near`."""
-        whole = period * 2 / self.turns
+        """Return size, frequency and stability of a motion; None if it is far from `near`."""
+        whole = period * 2 / self.half_periods
         times = np.linspace(0.0, whole, _SAMPLES + 1)
         x = march(self.system, times[[0, -1]], np.zeros((1, 1)), times, y, self._values).output
         X = 2.0 * np.fft.rfft(x[:-1])[: _HIGHEST + 1] / _SAMPLES
         amplitude, omega = abs(X[1]), 2.0 * np.pi / whole
-        apart = np.abs(np.log([max(amplitude, 1e-300) / near[0], omega / near[1]]))
-        if apart.max() > _FARTHEST:
+        distance = np.abs(np.log([max(amplitude, 1e-300) / near[0], omega / near[1]]))
+        if distance.max() > _FARTHEST:
             return None
         others = np.append(0.5 * X[0], X[2:])
         multipliers = np.linalg.eigvals(slope)
@@ -144,8 +143,8 @@ class _Loop:
         return FreeMotion(float(amplitude), float(omega), share, float(growth))
 
 
-def _followed(element: Element, amplitude: float, omega: float) -> FloatArray:
-    """Return an element's states at the peak of a sine that it has followed."""
+def _steady_states(element: Element, amplitude: float, omega: float) -> FloatArray:
+    """Return an element's states at the peak of a steady sinusoidal motion."""
     values = np.array([[float(v) for v in element.known_values()]])
     loop = settled(
         translate(law_equations(element)), np.array([amplitude]), np.array([omega]), values

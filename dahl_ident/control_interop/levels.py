@@ -1,8 +1,8 @@
-r"""Responses of a plant with friction: at several levels (Fig. 7), and all, with their stability.
+r"""Responses of a plant with friction at several levels (Fig. 7); all branches with stability.
 
-A disturbance of an exact steady motion grows by ln of the largest of Floquet's multipliers each
-cycle. Near a steady motion of the describing function, to first order in its rate of change, a
-disturbance xi of the displacement phasor, seen along X, obeys
+The logarithm of a disturbance of an exact steady motion grows by ln of the largest of Floquet's
+multipliers each cycle. Near a steady motion of the describing function, to first order in its rate
+of change, a disturbance xi of the displacement phasor, relative to the direction of X, obeys
 
     L'(s) dxi/dt = -(Z xi + A N'(A) Re xi),    Z = L + N,
 
@@ -35,7 +35,7 @@ Kind = Literal["bode", "nyquist", "nichols"]
 
 @dataclass(frozen=True)
 class LevelResponses:
-    """Complex responses over frequency, one row a level.
+    """Complex responses over frequency, one row per level.
 
     Attributes
     ----------
@@ -44,11 +44,11 @@ class LevelResponses:
     levels : ndarray, shape (m,)
         Drive, N, or displacement amplitude, m; zero-to-peak.
     controlled : {"force", "displacement"}
-        What is held along a row.
+        The amplitude that is constant along a row.
     quantity : str
-        What the response is.
+        The quantity of the response.
     response : ndarray of complex, shape (m, n)
-        NaN where a plant has no steady amplitude.
+        NaN where the plant has no steady amplitude.
     """
 
     frequency_hz: FloatArray
@@ -82,7 +82,7 @@ class LevelResponses:
         kind : {"bode", "nyquist", "nichols"}
             Gain and phase over frequency, imaginary over real part, or gain over phase.
         ax : Axes, or a sequence of two for "bode", optional
-            New where left out; they are returned.
+            New by default; they are returned.
         """
         from dahl_ident.plots import plot_frequency_response, plot_nichols, plot_nyquist
 
@@ -122,11 +122,11 @@ def level_responses(
     levels : array_like, shape (m,)
         Zero-to-peak drives, N, or displacement amplitudes, m; > 0.
     controlled : {"force", "displacement"}, default "force"
-        Which of the two a level holds constant over frequency.
+        Which of the two is constant over frequency at each level.
     quantity : str, default "receptance"
         One of the six standard quantities.
     steady : {"exact", "describing function"}, default "exact"
-        How the response to a force that is held is found, see :func:`dahl_ident.response`.
+        Method for the response to a force, see :func:`dahl_ident.response`.
 
     Returns
     -------
@@ -149,24 +149,23 @@ def level_responses(
     >>> fig_7 = level_responses(plant, f, u0, steady="describing function")  # as in the paper
     >>> top, bottom = fig_7.plot()
     """
-    f, held = (
-        np.atleast_1d(positive_array(value, name))
-        for value, name in ((frequency_hz, "frequency_hz"), (levels, "levels"))
-    )
-    if f.ndim != 1 or held.ndim != 1:
+    f = np.atleast_1d(positive_array(frequency_hz, "frequency_hz"))
+    sizes = np.atleast_1d(positive_array(levels, "levels"))
+    if f.ndim != 1 or sizes.ndim != 1:
         raise ValidationError(
-            f"frequency_hz has shape {f.shape} and levels {held.shape}; expected one dimension each"
+            f"frequency_hz has shape {f.shape} and levels {sizes.shape}; expected one dimension "
+            "each"
         )
     one_of(quantity, "quantity", QUANTITIES)
     one_of(controlled, "controlled", CONTROLLED)
     omega = 2.0 * np.pi * f
     if controlled == "force":
-        R = np.asarray(response(plant, f, held[:, None], steady=steady).receptance)
+        R = np.asarray(response(plant, f, sizes[:, None], steady=steady).receptance)
     else:
-        R = 1.0 / np.asarray(plant.dynamic_stiffness(held[:, None], omega))
-    with np.errstate(invalid="ignore"):  # where there is no steady amplitude
+        R = 1.0 / np.asarray(plant.dynamic_stiffness(sizes[:, None], omega))
+    with np.errstate(invalid="ignore"):  # NaN without a steady amplitude
         R, _ = converted(R, omega, "receptance", quantity)
-    return LevelResponses(f, held, controlled, quantity, R)
+    return LevelResponses(f, sizes, controlled, quantity, R)
 
 
 @dataclass(frozen=True)
@@ -176,9 +175,9 @@ class Branches:
     Attributes
     ----------
     steady : SteadyResponse
-        Amplitudes, phases, receptances; NaN where a point has fewer than the most.
+        Amplitudes, phases, receptances; NaN where a point has fewer than the largest number.
     growth_rate : ndarray
-        Rate at which the worst small disturbance grows, 1/s; negative on stable branches.
+        Growth rate of the least stable small disturbance, 1/s; negative on stable branches.
 
     Examples
     --------
@@ -194,7 +193,7 @@ class Branches:
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Whether a motion near each response approaches it; False where there is none."""
+        """Whether motions near each response approach it; False if there is none."""
         return np.asarray(self.growth_rate <= 0.0)
 
 
@@ -233,10 +232,10 @@ def response_branches(
 
     Notes
     -----
-    The describing function's stability is that of slow changes of one sine; another mode may still
-    start to oscillate, see :func:`limit_cycles`. Near the end of a branch the amplitude depends so
-    steeply on the drive that harmonics of a few per cent shift it by tens of per cent, which the
-    describing function does not see.
+    The stability found with the describing function is that of slow changes of one sine; another
+    mode may still start to oscillate, see :func:`limit_cycles`. Near the end of a branch the
+    amplitude depends so steeply on the drive that harmonics of a few per cent shift it by tens of
+    per cent, which the describing function does not include.
 
     Examples
     --------
@@ -255,14 +254,14 @@ def response_branches(
     if steady_motion.steady == "exact":
         with np.errstate(divide="ignore", invalid="ignore"):
             growth = np.log(steady_motion.multiplier) * steady_motion.frequency_hz
-        # a motion that may lie anywhere
+        # motions without a definite mean position
         neutral = np.abs(steady_motion.multiplier - 1.0) < NEUTRAL
         return Branches(steady_motion, np.where(neutral, 0.0, growth))
     return Branches(steady_motion, _slow_growth(friction, linear, steady_motion))
 
 
 def _slow_growth(friction: Model, linear: Model, steady: SteadyResponse) -> FloatArray:
-    """Return the rate at which slow changes of one sine grow, 1/s."""
+    """Return the growth rate of slow changes of one sine, 1/s."""
     omega = 2.0 * np.pi * np.asarray(steady.frequency_hz)
     exists = np.asarray(steady.found)
     N, slope = friction_and_slope(friction, np.where(exists, steady.amplitude, 1.0), omega)

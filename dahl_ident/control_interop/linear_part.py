@@ -1,6 +1,4 @@
-"""Friction and linear part of a plant, and the linear part as a rational function of s.
-
-Plants measured under feedback: from the response to the reference to that of the plant.
+"""Friction and linear part of a plant, and data of plants measured in closed loop.
 
 With F = C (r - x) the closed loop obeys (Z(A) + C) X = C R. It is therefore equivalent to the plant
 with the controller as an additional parallel element, ``LinearSystem(C,
@@ -34,23 +32,23 @@ from dahl_ident.units import jacobian
 
 
 def split(plant: Element) -> tuple[Model, Model]:
-    """Return the friction and the linear part of a plant that has both, values included."""
+    """Return the friction and the linear part of a plant that has both, with their values."""
     elements = as_model(plant).elements
     plant.known_values()
     friction = [element for element in elements if not element.is_linear]
     linear = [element for element in elements if element.is_linear]
-    for part, what, example in ((friction, "friction", "Dahl"), (linear, "linear part", "Mass")):
+    for part, name, example in ((friction, "friction", "Dahl"), (linear, "linear part", "Mass")):
         if not part:
-            raise ModelError(f"{plant!r} has no {what}; add one, such as {example}(...)")
+            raise ModelError(f"{plant!r} has no {name}; add one, such as {example}(...)")
     return Model(*friction), Model(*linear)
 
 
 def rational_stiffness(model: Element) -> Rational:
-    """Return the sum Z(s) of linear elements, its common factors kept."""
+    """Return the sum Z(s) of linear elements; common factors are not cancelled."""
     total = Rational(np.zeros(1), np.ones(1))
     for element in as_model(model).elements:
         rational = element.rational_stiffness()
-        if rational is None:  # discrete or an FRD, which no polynomials in s describe
+        if rational is None:  # a discrete system or an FRD
             raise ModelError(f"{element!r} has no transfer function; expected a linear element")
         total = total + Rational(*rational)
     return total
@@ -63,12 +61,12 @@ def controller_response(controller: Any, omega: FloatArray) -> ComplexArray:
 
 
 def has_polynomials(model: Element) -> bool:
-    """Return whether every linear system of the model is continuous and no FRD."""
+    """Return whether every linear system of the model is continuous and not an FRD."""
     return all(not isinstance(s, control.FRD) and s.isctime() for s in _systems(model))
 
 
 def known_range(model: Element) -> tuple[float, float]:
-    """Return the angular frequencies between which every linear system is known, rad/s."""
+    """Return the range of angular frequency in which every linear system is known, rad/s."""
     low, high = 0.0, np.inf
     for system in _systems(model):
         if isinstance(system, control.FRD):
@@ -105,12 +103,12 @@ def closed_loop_response(
     controller : control.TransferFunction, control.StateSpace or control.FRD
         C in F = C (r - x), N/m.
     covariance : array_like, shape (n, 2, 2), optional
-        Of the real and imaginary part of `response`.
+        Covariance of the real and imaginary part of `response`.
 
     Returns
     -------
     FrequencyResponse
-        Receptance rows, controlled by force, one level for each reference. Fit a model that
+        Receptance with controlled force, one level for each reference. Fit a model that
         holds the controller: ``plant + LinearSystem(controller, quantity="dynamic_stiffness")``.
 
     Raises
@@ -139,15 +137,15 @@ def closed_loop_response(
             f"the controller is 0 at {f[C == 0.0][0]:g} Hz, where nothing drives the plant; "
             "leave that frequency out"
         )
-    turned = None
+    converted = None
     if covariance is not None:
-        turn = jacobian(1.0 / C)
-        turned = turn @ finite_array(covariance, "covariance") @ np.swapaxes(turn, -1, -2)
+        J = jacobian(1.0 / C)
+        converted = J @ finite_array(covariance, "covariance") @ np.swapaxes(J, -1, -2)
     return FrequencyResponse(
         f,
         X_over_R / C,
         drive=np.abs(C) * r,
-        covariance=turned,
+        covariance=converted,
         level=np.broadcast_to(r, f.shape),
         controlled="force",
         quantity="receptance",

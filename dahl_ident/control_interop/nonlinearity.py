@@ -34,8 +34,8 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
     A abs(N) sin(theta + arg N); this package drives with A cos(theta). Both measure the phase
     of the output against the input in time, so N is the same number: friction leads its
     displacement, Im N > 0, where python-control's relay with hysteresis lags, Im N < 0. In a
-    loop, python-control looks for H(j omega) N(A) = -1: H is displacement over a force that acts
-    with the drive, and friction acts against it.
+    loop, python-control solves H(j omega) N(A) = -1: H is displacement over a force in the
+    direction of the drive, and friction acts in the opposite direction.
 
     Called with successive displacements, it returns the law's force and stores the history of the
     motion, like python-control's nonlinearities with memory. Use ``describing_function``, which is
@@ -81,7 +81,7 @@ class FrictionNonlinearity(control.DescribingFunctionNonlinearity):
         """Return the force, N, after a monotonic move to the displacement `A`, m."""
         x = finite_number(np.squeeze(A), "displacement")
         if len(self._turns) > 1 and (x - self._turns[-1]) * (self._turns[-1] - self._turns[-2]) > 0:
-            self._turns[-1] = x  # between turning points the force does not depend on the samples
+            self._turns[-1] = x  # the force depends only on the turning points
         else:
             self._turns.append(x)
         return float(self._model.force(self._turns)[-1])

@@ -36,17 +36,17 @@ from dahl_ident.errors import MultipleSolutionsWarning, NoSteadyMotionWarning, V
 from dahl_ident.units import percent
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
-_DISTORTED = 0.02  # third harmonic over the fundamental: its error is as large as a measurement's
-_LOOKED_AT = 1000  # points of many: neighbours hardly differ
-_REACH = (1e-290, 1e290)  # numbers end at 1e-308 and 1e308; squares of ratios stay inside
+_DISTORTED = 0.02  # third harmonic over fundamental with an error like that of a measurement
+_MOST_CHECKED = 1000  # points, evenly spread, because neighbours hardly differ
+_RANGE = (1e-290, 1e290)  # of amplitudes; floating-point numbers end at 1e-308 and 1e308
 
 
 @dataclass(frozen=True)
 class SteadyResponse:
     """Displacement X for a drive u_0 cos(omega t): x(t) = A cos(omega t + phase).
 
-    All arrays have the broadcast shape of frequency and drive, with one more axis, the
-    amplitudes in rising order, if all were requested. Scalars for scalar arguments.
+    All arrays have the broadcast shape of frequency and drive, with one more axis for the
+    amplitudes in rising order if all were requested. Scalars for scalar arguments.
 
     Attributes
     ----------
@@ -55,26 +55,26 @@ class SteadyResponse:
     drive : ndarray
         Zero-to-peak force u_0, N (N m in rotation).
     amplitude : ndarray
-        Zero-to-peak fundamental A of the displacement, m (rad); NaN where there is none.
+        Zero-to-peak fundamental A of the displacement, m (rad); NaN if there is none.
     displacement : ndarray of complex
-        Phasor X = A exp(j phase) of the fundamental, the drive's phase being zero.
+        Phasor X = A exp(j phase) of the fundamental, relative to the phase of the drive.
     found : ndarray of bool
         Whether the entry is an amplitude.
     number_of_solutions : ndarray of int
-        How many amplitudes the point has; shape of frequency and drive.
+        Number of amplitudes of the point; shape of frequency and drive.
     message : str
-        Empty where every point has exactly one amplitude, and it is stable; else which have none,
-        several, or none that is stable, and why; of the describing function, where the motion is
-        not the sine for which it takes it.
+        Empty if every point has exactly one amplitude, and it is stable. Otherwise it says which
+        points have none, several, or none that is stable, and why; with the describing function,
+        also where the motion is not nearly a sine.
     harmonics : ndarray of complex
         X_k of the mean displacement, the fundamental and the harmonics 2 to 9, along one more axis;
-        x(t) is the sum of Re X_k exp(j k omega t). The describing function has the fundamental
-        alone.
+        x(t) is the sum of Re X_k exp(j k omega t). The describing function has only the
+        fundamental.
     multiplier : ndarray
         Largest modulus of Floquet's multipliers: a small change of the motion grows by this factor
         each cycle. NaN for the describing function.
     steady : str
-        "exact" or "describing function": what the motions are.
+        "exact" or "describing function": the method of the motions.
 
     Examples
     --------
@@ -98,7 +98,7 @@ class SteadyResponse:
 
     @property
     def stable(self) -> BoolArray:
-        """Whether a motion nearby comes back; False where there is none, or it is not known."""
+        """Whether nearby motions return to this one; False if there is none, or it is unknown."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.multiplier < 1.0 + NEUTRAL)[()]
 
@@ -112,17 +112,17 @@ class SteadyResponse:
 
     @property
     def phase(self) -> FloatArray:
-        """Phase of the displacement against the drive, rad; negative where it lags."""
+        """Phase of the displacement relative to the drive, rad; negative if it lags."""
         return np.angle(self.displacement)[()]
 
     @property
     def receptance(self) -> ComplexArray:
-        """X/u_0, m/N; NaN where there is no amplitude."""
+        """X/u_0, m/N; NaN if there is no amplitude."""
         return (self.displacement / self.drive)[()]
 
     @property
     def dynamic_stiffness(self) -> ComplexArray:
-        """u_0/X, N/m; NaN where there is no amplitude."""
+        """u_0/X, N/m; NaN if there is no amplitude."""
         with np.errstate(invalid="ignore"):
             return (self.drive / self.displacement)[()]
 
@@ -148,27 +148,27 @@ def response(
         Zero-to-peak force u_0, N, > 0; for levels against frequencies give it the shape
         (levels, 1).
     all_roots : bool, default False
-        Return every amplitude of each point along a last axis, rising, filled up with NaN, stable
-        or not. Otherwise one: the stable motion that a sweep through the points in their order
-        follows, up to where it jumps; of the describing function the smallest. Only plants with
-        negative damping, or with laws such as Backlash, have several.
+        Return all amplitudes of each point, stable or not, along a last axis in rising order,
+        followed by NaN. Otherwise one: the stable motion that a sweep through the points in their
+        order follows, up to where it jumps; with the describing function the smallest. Only plants
+        with negative damping, or with laws such as Backlash, have several.
     steady : {"exact", "describing function"}, default "exact"
-        "exact" is the periodic solution of Eqn. 2 with all harmonics, its fundamental given. The
-        describing function takes the displacement for a sine, A abs(Z(A, omega)) = u_0 (Eqn. 53);
-        it also stands for plants without a mass, and at 0 Hz, where the `message` says so.
+        "exact" is the periodic solution of Eqn. 2 with all harmonics. The describing function
+        assumes a sinusoidal displacement, A abs(Z(A, omega)) = u_0 (Eqn. 53); it is also used for
+        plants without a mass and at 0 Hz, as the `message` then says.
 
     Returns
     -------
     SteadyResponse
-        Amplitude, phase, phasor, receptance, dynamic stiffness, and what was found. Where no
-        amplitude is steady it holds NaN, and its `message` says why.
+        Amplitude, phase, phasor, receptance, dynamic stiffness, and the number of solutions. If
+        there is no steady amplitude it holds NaN, and its `message` says why.
 
     Warns
     -----
     MultipleSolutionsWarning
-        If a point has several amplitudes and `all_roots` is off.
+        If a point has several amplitudes and `all_roots` is False.
     NoSteadyMotionWarning
-        If a point has no steady motion, or none that is stable, and `all_roots` is off.
+        If a point has no steady motion, or none that is stable, and `all_roots` is False.
 
     Raises
     ------
@@ -180,15 +180,14 @@ def response(
 
     Notes
     -----
-    Exact motions are known to 1e-8. They start from those of the describing function, and each is
-    followed through the neighbouring points, in their order, as far as it goes: give the points of
-    a sweep in the order of the sweep. A sweep begins with the smallest stable motion, and so does
-    every point more than 20 % in frequency and drive from the one before. For the describing
-    function
+    Exact motions are accurate to 1e-8. They start from those of the describing function, and each
+    is followed through the neighbouring points, in their order, as long as it exists: give the
+    points of a sweep in the order of the sweep. A sweep begins with the smallest stable motion, and
+    so does every point more than 20 % in frequency and drive from the previous one.
 
-    ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L) + abs(N))/abs(Z): near a
-    sharp resonance L and N nearly cancel. Two of several amplitudes may be missed where A abs(Z)
-    turns twice within 1.8 % of amplitude.
+    With the describing function ``A |Z| = u_0`` holds within 1e-12 max(1, kappa/4), kappa = (abs(L)
+    + abs(N))/abs(Z): near a sharp resonance L and N nearly cancel. Two of several amplitudes may be
+    missed if A abs(Z) has two extrema within 1.8 % of amplitude.
 
     Examples
     --------
@@ -207,15 +206,15 @@ def response(
     plant = as_model(plant)
     with np.errstate(over="ignore"):
         points, _ = flatten(plant, plant.known_values(), 2.0 * np.pi * f, u0)
-        _check_reach(np.minimum(points.bounds()[0], 1.0))  # infinite without any stiffness
+        _check_range(np.minimum(points.bounds()[0], 1.0))  # infinite without any stiffness
         roots = find_roots(points)
-        _check_reach(roots)
+        _check_range(roots)
         amplitude = roots * points.unit[:, None]
-        _check_reach(amplitude)
+        _check_range(amplitude)
     exists = np.isfinite(roots)
     force = points.at(np.nonzero(exists)[0]).force(roots[exists])
     X: ComplexArray = np.full(roots.shape, np.nan, dtype=np.complex128)
-    with np.errstate(invalid="ignore"):  # a law without a settled loop there
+    with np.errstate(invalid="ignore"):  # the law may have no settled loop
         X[exists] = amplitude[exists] * (force.conj() / np.abs(force))
     harmonics = np.where(np.array(HARMONICS) == 1, X[..., None], 0.0)
     multiplier = np.full(X.shape, np.nan)
@@ -227,9 +226,9 @@ def response(
         omega, u = (np.broadcast_to(v, shape).ravel()[exact] for v in (2.0 * np.pi * f, u0))
         unique = points.friction.unique & (points.linear.imag[exact] >= 0.0)
         motions = exact_motions(plant, omega, u, X[exact], unique)
-        more = ((0, 0), (0, motions.multiplier.shape[1] - X.shape[1]))
-        multiplier = np.pad(multiplier, more, constant_values=np.nan)
-        harmonics = np.pad(harmonics, (*more, (0, 0)), constant_values=np.nan)
+        padding = ((0, 0), (0, motions.multiplier.shape[1] - X.shape[1]))
+        multiplier = np.pad(multiplier, padding, constant_values=np.nan)
+        harmonics = np.pad(harmonics, (*padding, (0, 0)), constant_values=np.nan)
         harmonics[exact], multiplier[exact], chosen[exact] = motions
     exists = np.isfinite(harmonics[..., 1])
     count = exists.sum(axis=1).reshape(shape)
@@ -241,11 +240,11 @@ def response(
         np.broadcast_to(f, shape), np.broadcast_to(u0, shape),
     )  # fmt: skip
     if steady == "exact" and not exact.all() and why != LINEAR:
-        taken = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
-        message = "; ".join(filter(None, (message, taken)))
+        replaced = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
+        message = "; ".join(filter(None, (message, replaced)))
     if steady == "describing function" and not obstacle(plant):
         at = np.flatnonzero(moving & (count.ravel() == 1))
-        at = at[:: 1 + at.size // _LOOKED_AT]
+        at = at[:: 1 + at.size // _MOST_CHECKED]
         omega, u = (np.broadcast_to(v, shape).ravel()[at] for v in (2.0 * np.pi * f, u0))
         message = "; ".join(filter(None, (message, _not_a_sine(plant, omega, u, amplitude[at, 0]))))
     if all_roots:
@@ -279,7 +278,7 @@ def response(
 
 
 def _not_a_sine(plant: Model, omega: FloatArray, drive: FloatArray, A: FloatArray) -> str:
-    """Return where the motion is farthest from a sine, by its third harmonic to first order."""
+    """Return a message if the motion is not nearly a sine, from its approximate third harmonic."""
     values = plant.known_values()
     with np.errstate(all="ignore"):
         third = np.abs(
@@ -296,21 +295,21 @@ def _not_a_sine(plant: Model, omega: FloatArray, drive: FloatArray, A: FloatArra
     )
 
 
-def _check_reach(amplitude: FloatArray) -> None:
-    """Refuse an amplitude that is too large or too small for floating-point numbers."""
-    least, most = _REACH
-    lost = (amplitude < least) | (amplitude > most)
-    if lost.any():
-        row = int(np.argwhere(lost)[0, 0])
+def _check_range(amplitude: FloatArray) -> None:
+    """Refuse amplitudes too large or too small for floating-point arithmetic."""
+    least, most = _RANGE
+    outside = (amplitude < least) | (amplitude > most)
+    if outside.any():
+        row = int(np.argwhere(outside)[0, 0])
         raise ValidationError(
-            f"point {row} ({lost.sum()} such points) has an amplitude of about "
-            f"{amplitude[lost][0]:g}, outside the range of numbers, {least:g} to {most:g}; "
+            f"point {row} ({outside.sum()} such points) has an amplitude of about "
+            f"{amplitude[outside][0]:g}, outside the range of numbers, {least:g} to {most:g}; "
             "check the units"
         )
 
 
 def _read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
-    """Return the array, read-only, or its scalar."""
+    """Return the array, made read-only, or its scalar."""
     array = np.asarray(array)
     array.flags.writeable = False
     return array[()]
@@ -326,7 +325,7 @@ def _message(
 ) -> str:
     """Return which points have no amplitude, several, or none that is stable, and why.
 
-    Empty where all have one that is; `active` says where the linear part feeds energy in.
+    Empty if all have a stable one; at `active` points the linear part supplies energy.
     """
     why = (
         "friction differs between the directions, and no spring brings the motion back: it goes "
@@ -352,12 +351,12 @@ def _message(
         ),
     )
     parts = []
-    for where, verdict in verdicts:
-        if not where.any():
+    for points, verdict in verdicts:
+        if not points.any():
             continue
-        first = tuple(np.argwhere(where)[0])
+        first = tuple(np.argwhere(points)[0])
         parts.append(
-            f"{where.sum()} of {where.size} points: {verdict}; the first at "
+            f"{points.sum()} of {points.size} points: {verdict}; the first at "
             f"{frequency_hz[first]:g} Hz, drive {drive[first]:g}"
         )
     return "; ".join(parts)

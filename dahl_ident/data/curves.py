@@ -1,6 +1,6 @@
 """Curves of a frequency response: the choice of axis, and of the rows of each curve.
 
-The plot functions, of a higher layer, are imported when a plot is requested.
+The plot functions belong to a higher layer, and are imported when a plot is requested.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dahl_ident.units import engineering, polar_std, si_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-_SAME_FREQUENCY = 5e-3  # relative difference of frequencies that are one
-_NOMINAL = 1.5  # factor within which a numeric level is the amplitude that was held
+_SAME_FREQUENCY = 5e-3  # largest relative difference of frequencies that are one
+_NOMINAL = 1.5  # factor within which a numeric level is the controlled amplitude
 
 
 Stds = tuple[FloatArray | None, FloatArray | None]
@@ -35,26 +35,23 @@ def draw(
     """Draw gain and phase of the fundamental, or a backbone, over amplitude or frequency.
 
     `stds` gives the standard deviations of gain and phase of some rows, by default those of their
-    covariance; `fitted` gives a curve through some rows, over frequency or not.
+    covariance; `fitted` gives a curve through some rows, over frequency or over amplitude.
     """
     from dahl_ident.plots import plot_amplitude_response, plot_backbone, plot_frequency_response
 
     if data.quantity == "backbone":
-        std, ratio_std = backbone_std(data, 0), backbone_std(data, 1)
-        curves_of = [
-            ("natural frequency [Hz]", data.frequency_hz, std),
-            ("damping ratio [1]", data.response.imag, ratio_std),
+        rows = [
+            ("natural frequency [Hz]", data.frequency_hz, backbone_std(data, 0)),
+            ("damping ratio [1]", data.response.imag, backbone_std(data, 1)),
         ]
-        amplitude_label = held_label(data)
-        return plot_backbone(
-            held_amplitude(data), curves_of, amplitude_label=amplitude_label, ax=ax
-        )
+        return plot_backbone(held_amplitude(data), rows, amplitude_label=held_label(data), ax=ax)
 
     def errors(part: Table) -> Stds:
         if stds is not None:
             return stds(part)
-        known = part.covariance is not None
-        return polar_std(part.response, part.covariance) if known else (None, None)
+        if part.covariance is None:
+            return None, None
+        return polar_std(part.response, part.covariance)
 
     fundamental = data.select(harmonic=1)
     over_frequency = is_over_frequency(fundamental)
@@ -98,7 +95,7 @@ def draw_waveforms(time: FloatArray, frame: pd.DataFrame, kind: str, ax: Any = N
 
 
 def is_force_controlled(data: Table) -> bool:
-    """Return whether most rows were driven by force."""
+    """Return whether the force was controlled in most rows."""
     return bool(np.mean(data.controlled == "force") > 0.5)
 
 
@@ -132,7 +129,7 @@ def is_over_frequency(data: Table) -> bool:
 
 
 def curves(data: Table) -> list[tuple[str, Table]]:
-    """Return the parts of the table that make one curve each, with their labels."""
+    """Return the part of the table for each curve, with its label."""
     if is_over_frequency(data):
         levels = [(label, data.select(level=label)) for label in data.levels]
         return [(_level(label, part), part) for label, part in levels] or [("", data)]
@@ -141,7 +138,7 @@ def curves(data: Table) -> list[tuple[str, Table]]:
 
 
 def curve_of_row(data: Table) -> FloatArray:
-    """Return for each row the frequency or the level's index that it shares with its curve."""
+    """Return a number for each row that identifies its curve: frequency, or index of the level."""
     if not is_over_frequency(data):
         return _nominal_frequency(data.frequency_hz)
     if data.level is None:
@@ -150,12 +147,12 @@ def curve_of_row(data: Table) -> FloatArray:
 
 
 def abscissa(part: Table, over_frequency: bool) -> FloatArray:
-    """Return the places of some rows on the axis."""
+    """Return the abscissae of some rows."""
     return part.frequency_hz if over_frequency else held_amplitude(part)
 
 
 def _level(label: Any, part: Table) -> str:
-    """Return a level with a unit if it is the controlled amplitude and not just a name."""
+    """Return the label of a level, with a unit if the level is the controlled amplitude."""
     if not isinstance(label, (int, float)):
         return str(label)
     held = float(np.median(held_amplitude(part)))
@@ -165,7 +162,7 @@ def _level(label: Any, part: Table) -> str:
 
 
 def _nominal_frequency(f: FloatArray) -> FloatArray:
-    """Return frequencies that differ only by measurement error as one; a fine grid unchanged."""
+    """Return frequencies; those that differ only by measurement error become one."""
     order = np.argsort(f)
     jump = np.diff(f[order], prepend=f[order][0]) > _SAME_FREQUENCY * f[order]
     group = np.empty(f.size, dtype=int)

@@ -1,4 +1,4 @@
-"""Metadata that a test report names (ISO/IEC 17025:2017, 7.8.2 and 7.8.3), and calibrations."""
+"""Metadata of a test report (ISO/IEC 17025:2017, 7.8.2 and 7.8.3), and calibrations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dahl_ident.errors import DahlIdentError, ValidationError, choices
 from dahl_ident.units import parse_quantity
 
 CHANNELS = {"force": "force_gain", "displacement": "displacement_gain", "delay": "delay"}
-"""The quantities of instruments' uncertainties, and the sensors' parameters for them."""
+"""The channels of instruments, and the sensor parameters to which their uncertainties apply."""
 
 _FIELDS = {
     "laboratory": "Laboratory",
@@ -31,13 +31,13 @@ _FIELDS = {
     "operator": "Operator",
     "remarks": "Remarks",
 }
-"""The printed fields in their order."""
+"""The printed fields in order."""
 _LISTS = ("ambient", "instruments")
 _TEXTS = (
     "title", "number", *(key for key in _FIELDS if key not in _LISTS), "authorised_by", "role"
 )  # fmt: skip
-_BLANK = ("specimen", "instruments", "ambient", "measured", "operator")
-_WORDS = {
+_ALWAYS_PRINTED = ("specimen", "instruments", "ambient", "measured", "operator")
+_PREFIXES = {
     "serial": "serial ",
     "calibration": "calibrated: ",
     "uncertainty": "uncertainty ",
@@ -57,7 +57,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Metadata that a laboratory states; the usual fields left out are printed as blank lines."""
+    """Metadata stated by a laboratory; usual fields that are missing are printed as blank lines."""
 
     texts: Mapping[str, str] = field(default_factory=dict)
     ambient: tuple[str, ...] = ()
@@ -65,44 +65,44 @@ class Metadata:
 
     @property
     def title(self) -> str:
-        """Title of the report; empty where none is given."""
+        """Title of the report; empty by default."""
         return self.texts.get("title", "")
 
     @property
     def number(self) -> str:
-        """Number of the report; empty where none is given."""
+        """Number of the report; empty by default."""
         return self.texts.get("number", "")
 
     @property
     def signatory(self) -> tuple[str, ...]:
-        """Name and role of who signs the report."""
+        """Name and role of the person who signs the report."""
         return tuple(self.texts[n] for n in ("authorised_by", "role") if self.texts.get(n))
 
     @property
     def lines(self) -> dict[str, tuple[str, ...]]:
-        """The lines of each printed field, by its printed name, in order."""
+        """The lines of each printed field by its printed name, in order."""
         stated = self.facts()
         printed = {
             key: value if key in _LISTS else tuple(map(str.strip, value.splitlines()))
             for key, value in stated.items()
         }
-        kept = (key for key in _FIELDS if any(printed[key]) or key in _BLANK)
+        kept = (key for key in _FIELDS if any(printed[key]) or key in _ALWAYS_PRINTED)
         return {_FIELDS[key]: printed[key] for key in kept}
 
     def facts(self) -> dict[str, Any]:
-        """Return the fields for machines, empty where they are not stated."""
+        """Return all fields as plain data; those not stated are empty."""
         texts = {name: self.texts.get(name, "") for name in _TEXTS}
         instruments = tuple(one.text for one in self.instruments)
         return {**texts, "ambient": self.ambient, "instruments": instruments}
 
     def calibrations(self) -> dict[str, float]:
-        """Return the standard uncertainty of each parameter of the sensors, root sum of squares."""
-        squares: dict[str, float] = {}
-        for one in self.instruments:
-            if one.u > 0.0:
-                name = CHANNELS[one.channel]
-                squares[name] = squares.get(name, 0.0) + one.u**2
-        return {name: math.sqrt(square) for name, square in squares.items()}
+        """Return the standard uncertainty (root sum of squares) of each sensor parameter."""
+        variances: dict[str, float] = {}
+        for instrument in self.instruments:
+            if instrument.u > 0.0:
+                name = CHANNELS[instrument.channel]
+                variances[name] = variances.get(name, 0.0) + instrument.u**2
+        return {name: math.sqrt(variance) for name, variance in variances.items()}
 
 
 def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
@@ -128,7 +128,7 @@ def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
 def _texts(
     entries: Mapping[str, Any], known: Sequence[str], others: Sequence[str], name: str, where: str
 ) -> dict[str, str]:
-    """Return the texts that are known, in their order; refuse what is neither they nor others."""
+    """Return the texts of the `known` fields, in their order; refuse fields not in either list."""
     unknown = sorted(set(entries) - {*known, *others})
     if unknown:
         expected = choices((*known, *others), *unknown)
@@ -142,23 +142,23 @@ def _text(value: Any, name: str) -> str:
     raise ValidationError(f"{name} is {value!r}; expected a text, a number or a date")
 
 
-def _instrument(one: Any, name: str) -> Instrument:
+def _instrument(entry: Any, name: str) -> Instrument:
     """Return an instrument that is given as a text or as a table."""
-    if not isinstance(one, Mapping):
-        return Instrument(_text(one, name))
-    texts = _texts(one, _INSTRUMENT, (), name, f"{name}.")
-    parts = [_WORDS.get(key, "") + text for key, text in texts.items() if key != "channel"]
+    if not isinstance(entry, Mapping):
+        return Instrument(_text(entry, name))
+    texts = _texts(entry, _INSTRUMENT, (), name, f"{name}.")
+    parts = [_PREFIXES.get(key, "") + text for key, text in texts.items() if key != "channel"]
     parts += [f"{key} not stated" for key in ("calibration", "uncertainty") if key not in texts]
     channel = texts.get("channel", "")
     if "channel" in texts and channel not in CHANNELS:
         raise ValidationError(
             f"{name}.channel is {channel!r}; expected {choices(CHANNELS, channel)}"
         )
-    u = _standard(texts, name) if channel and "uncertainty" in texts else 0.0
+    u = _standard_uncertainty(texts, name) if channel and "uncertainty" in texts else 0.0
     return Instrument(", ".join(parts), channel, u)
 
 
-def _standard(texts: Mapping[str, str], name: str) -> float:
+def _standard_uncertainty(texts: Mapping[str, str], name: str) -> float:
     """Return the standard uncertainty of an instrument's channel."""
     channel, text = texts["channel"], texts["uncertainty"]
     if "k" not in texts:

@@ -1,10 +1,10 @@
-"""Tables that are there as cells, rows or columns: Excel, Parquet, pandas, JSON, SDyPy.
+"""Tables stored as cells, rows or columns: Excel, Parquet, pandas, JSON, SDyPy.
 
 JSON may hold ``{"x [mm]": [...], ...}``; ``[{"name": "x", "values": [...], "unit": "mm"}, ...]``;
 rows, ``[{"x [mm]": 1.0}, ...]`` or ``[["x [mm]"], [1.0], ...]``; ``{"columns": [...], "data":
 [[...], ...]}`` and ``{"x [mm]": {"0": 1.0, ...}}`` as pandas writes them; or the time series of
-SDyPy (its enhancement proposal 5). Units stand in the names, in each column, or under ``"units"``
-or ``"displacement units"``.
+SDyPy (its enhancement proposal 5). Units are part of the names, of each column, or given as
+``"units"`` or ``"displacement units"``.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from dahl_ident.units import parse_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-_HEAD_ROWS = 400  # read as text, which is slow, to find the table
-_BYTES, _SECONDS = 1 << 30, 15  # that reading may take: a small archive can unpack to anything
+_HEAD_ROWS = 400  # converted to text, which is slow, to find the table
+_BYTES, _SECONDS = 1 << 30, 15  # limits of reading, as a small archive can unpack to any size
 _UNNAMED = "column {}"
 _UNIT_OF = re.compile(r"(.+?)[ _]units?")  # "displacement units": "mm"
 _VALUES, _UNITS = ("values", "data"), ("unit", "unit_str", "units")
 _TABLES = ("channels", "signals", "columns", "data", "rows")
-_NUMBERED = "x-axis"  # before the numbers by which Keysight oscilloscopes call their channels
+_NUMBERED = "x-axis"  # precedes the channel numbers in files of Keysight oscilloscopes
 
 
 def read_workbook(file: File, sheet: str | None = None) -> RawFile:
-    """Return the table on a sheet; without a name, on the only sheet that has one."""
+    """Return the table on a sheet, by default on the only sheet with a table."""
     sheets = _cells(file)
     if sheet is not None:
         if sheet not in sheets:
@@ -76,11 +76,11 @@ def read_workbook(file: File, sheet: str | None = None) -> RawFile:
 
 def _cells(file: File) -> dict[str, list[list[Any]]]:
     """Return the cells of every sheet, read in a separate process."""
-    broken = None
+    damaged = None
     with contextlib.suppress(*ZIP_ERRORS), zipfile.ZipFile(file.stream()) as archive:
-        broken = archive.testzip()
-    if broken is not None:
-        raise ValueError(f"the check sum of {broken} differs")
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"the check sum of {damaged} differs")
     calamine = library("python_calamine", "excel")
 
     def read() -> dict[str, list[list[Any]]]:  # pragma: no cover
@@ -96,12 +96,12 @@ def _cells(file: File) -> dict[str, list[list[Any]]]:
 
 
 def _rows(book: Any, name: str) -> list[list[Any]]:  # pragma: no cover
-    """Return the cells of a sheet; numbers, text and truth values as they are, dates as text."""
+    """Return the cells of a sheet; numbers, text and truth values unchanged, dates as text."""
     try:
         rows = book.get_sheet_by_name(name).to_python(skip_empty_area=False)
     except Exception as exc:
         if "worksheet" in type(exc).__name__.lower() or "chart" in str(exc).lower():
-            return []  # a sheet of diagrams
+            return []  # a sheet with a chart
         raise
     plain = (float, int, str, bool)
     return [[cell if isinstance(cell, plain) else str(cell) for cell in row] for row in rows]
@@ -129,13 +129,13 @@ def _table(file: File, sheet: str, cells: list[list[Any]]) -> RawFile | None:
 
 
 def read_parquet(file: File) -> RawFile:
-    """Return the columns of a Parquet file, each read when it is used."""
+    """Return the columns of a Parquet file, each of which is read when used."""
     pa, pq = library("pyarrow", "parquet"), library("pyarrow.parquet")
     table = pq.ParquetFile(file.stream())
     schema, rows = table.schema_arrow, table.metadata.num_rows
     stored = schema.metadata or {}
     attributes = json.loads(stored.get(b"pandas", b"{}")).get("attributes")
-    if not attributes:  # where older releases of pyarrow and pandas put them
+    if not attributes:  # of older releases of pyarrow and pandas
         attributes = json.loads(stored.get(b"PANDAS_ATTRS", b"{}"))
     saved = attributes.get("dahl_ident") if isinstance(attributes, dict) else None
     metadata = {} if saved is None else read_metadata(json.dumps(saved))
@@ -154,18 +154,18 @@ def read_parquet(file: File) -> RawFile:
         read = functools.partial(_parquet_values, table, field.name)
         what = f"{file.name}: column {field.name!r}"
         content: Any = Stored((rows,), np.dtype(np.float64), read, what)
-        number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
-        channels.append(RawChannel(name, content if number else content.array, unit))
+        is_number = pa.types.is_floating(field.type) or pa.types.is_integer(field.type)
+        channels.append(RawChannel(name, content if is_number else content.array, unit))
     if not channels:
         raise DataError(f"{file.name}: no column of numbers or text; {listed(file.notes, 3)}")
     return file.source("Parquet", channels, metadata=metadata)
 
 
 def _added_bytes(file: File, metadata: Any) -> int:
-    """Return the bytes between the columns and the footer, where Arrow writes indices at most."""
+    """Return the number of bytes between columns and footer, where Arrow writes only indices."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     parts = [g.column(k) for g in groups for k in range(g.num_columns)]
-    # older releases repeat the description of a column behind it, and state where
+    # older releases repeat the description of a column after it, and state the offset
     described = any(
         p.has_offset_index or p.file_offset or getattr(p, "bloom_filter_offset", None)
         for p in parts
@@ -191,7 +191,7 @@ def _parquet_values(table: Any, name: str, rows: slice) -> NDArray[Any]:
 
 
 def frame_source(frame: pd.DataFrame) -> RawFile:
-    """Return the columns of a pandas table, a named index among them, units out of their names."""
+    """Return the columns of a pandas table, including a named index, with units from the names."""
     metadata = frame.attrs.get("dahl_ident", {})
     if any(level is not None for level in frame.index.names):
         frame = frame.reset_index()
@@ -230,9 +230,11 @@ def read_json(file: File) -> RawFile:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    for repeated in [name for name, n in Counter(name for name, _ in pairs).items() if n > 1][:1]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        repeated = next(n for n, count in Counter(n for n, _ in pairs).items() if count > 1)
         raise ValueError(f"one object has the name {repeated[:60]!r} twice")
-    return dict(pairs)
+    return content
 
 
 def dictionary_source(
@@ -248,12 +250,12 @@ def dictionary_source(
 
 
 def _channels(content: Any, name: str, units: Any = None) -> Iterator[RawChannel]:
-    """Yield the columns; `units` are by their names, or in the order of a list of names."""
-    of_names = _is_list_of(Mapping, content) and all("name" in c for c in content)
-    sampled = of_names and any("fs" in c or "time" in c for c in content)
+    """Yield the columns; `units` are given by name, or in the order of a list of names."""
+    named = _is_list_of(Mapping, content) and all("name" in c for c in content)
+    sampled = named and any("fs" in c or "time" in c for c in content)
     if sampled and all("data" in c for c in content):
         yield from _sdypy(content, name)
-    elif of_names and all(any(isinstance(c.get(v), list) for v in _VALUES) for c in content):
+    elif named and all(any(isinstance(c.get(v), list) for v in _VALUES) for c in content):
         for column in content:
             yield from _columns({str(column["name"]): column}, name, units)
     elif _is_list_of(dict, content):
@@ -262,9 +264,9 @@ def _channels(content: Any, name: str, units: Any = None) -> Iterator[RawChannel
         columns = {key: [row.get(key) for row in content] for key in keys}
         yield from _columns(columns, name, units)
     elif _is_list_of(list, content):
-        named = all(isinstance(cell, str) for cell in content[0])
-        labels = content[0] if named else [_UNNAMED.format(i + 1) for i in range(len(content[0]))]
-        yield from _columns(_upright(labels, content[named:], name), name, units)
+        header = all(isinstance(cell, str) for cell in content[0])
+        labels = content[0] if header else [_UNNAMED.format(i + 1) for i in range(len(content[0]))]
+        yield from _columns(_transposed(labels, content[header:], name), name, units)
     elif isinstance(content, dict):
         yield from _tables(content, name, units)
     else:
@@ -279,7 +281,7 @@ def _is_list_of(kind: type, content: Any) -> bool:
     return is_list and all(isinstance(one, kind) for one in content)
 
 
-def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
+def _transposed(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
     """Return the columns of a list of rows."""
     if not isinstance(labels, list) or any(
         not isinstance(row, list) or len(row) != len(labels) for row in rows
@@ -291,12 +293,12 @@ def _upright(labels: Any, rows: list[Any], name: str) -> dict[str, Any]:
 
 
 def _tables(content: dict[str, Any], name: str, units: Any) -> Iterator[RawChannel]:
-    """Yield the columns of an object, or of the table in it."""
+    """Yield the columns of an object, or of a table in it."""
     common = {m[1]: unit for key, unit in content.items() if (m := _UNIT_OF.fullmatch(key))}
     units = content.get("units", units or common)
     rows = [content[key] for key in ("data", "rows") if _is_list_of(list, content.get(key))]
     if "columns" in content and rows:
-        columns = _upright(content["columns"], rows[0], name)
+        columns = _transposed(content["columns"], rows[0], name)
         if isinstance(units, list) and len(units) == len(columns):
             units = dict(zip(columns, units, strict=True))
         yield from _columns(columns, name, units)
@@ -334,7 +336,7 @@ def _channel(key: Any, values: Any, unit: Any, name: str) -> RawChannel:
 
 
 def _array(values: Any, what: str) -> NDArray[Any]:
-    """Return numbers, or text where some cell is none; None is an empty cell."""
+    """Return numbers, or text if some cell is not a number; None is an empty cell."""
     if isinstance(values, np.ndarray):
         array: NDArray[Any] = values
         if np.ma.is_masked(values) and values.dtype.kind in "fiu":
@@ -348,11 +350,13 @@ def _array(values: Any, what: str) -> NDArray[Any]:
 
 
 def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[RawChannel]:
-    """Yield SDyPy's channels and the time that they share."""
+    """Yield the channels of SDyPy and their common time."""
     labels = Counter(str(c["name"]) for c in channels)
-    twice = [label for label, count in labels.items() if count > 1]
-    if twice:
-        raise DataError(f"{name}: several channels are called {listed(twice)}; expected one each")
+    repeated = [label for label, count in labels.items() if count > 1]
+    if repeated:
+        raise DataError(
+            f"{name}: several channels are called {listed(repeated)}; expected one each"
+        )
     times: list[NDArray[Any]] = []
     for channel, label in zip(channels, labels, strict=True):
         what = f"{name}: channel {label!r}"
@@ -380,7 +384,7 @@ def _sdypy(channels: Sequence[Mapping[str, Any]], name: str) -> Iterator[RawChan
 
 
 class Run(NamedTuple):
-    """Consecutive rows of one width, each with a number in it, and how numeric they are."""
+    """Consecutive rows of one width with a number in each, and a score for the share of numbers."""
 
     start: int
     width: int
@@ -391,7 +395,7 @@ class Run(NamedTuple):
 class Header:
     """Names and units of the columns; no names for a table without a header.
 
-    `cells` is how many columns the header line has; `contradicted` is whether another line differs.
+    `cells` is the number of columns in the header line; `contradicted`: another line differs.
     """
 
     names: tuple[str, ...]
@@ -401,9 +405,9 @@ class Header:
 
 
 def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
-    """Return the run with the most numbers, half weighed against by cells of text.
+    """Return the run with the highest score: twice the numbers, minus the cells of text.
 
-    None stands for a blank line or a comment. A line of another width belongs to the run it breaks.
+    None stands for a blank line or a comment. A line of another width does not end a run.
     """
     is_number = CELL[mark].fullmatch
     best: Run | None = None
@@ -430,7 +434,7 @@ def best_run(rows: Iterable[Sequence[str] | None], mark: str) -> Run | None:
 def refuse_second_header(
     rows: Sequence[Sequence[str] | None], start: int, mark: str, where: Callable[[int], str]
 ) -> None:
-    """Refuse rows of the table's own form above its header: the file has another one there."""
+    """Refuse rows above the header that look like those of the table: a second table."""
 
     def numeric(row: Sequence[str]) -> list[bool | None]:  # None for empty cells
         return [CELL[mark].fullmatch(c) is not None if c.strip() else None for c in row]
@@ -439,7 +443,7 @@ def refuse_second_header(
     for i, row in enumerate(rows[: start if first.count(True) > 1 else 0]):
         if row is not None and len(row) == len(first):
             same = zip(numeric(row), first, strict=True)
-            if all(one is other or None in (one, other) for one, other in same):
+            if all(a is b or None in (a, b) for a, b in same):
                 raise DataError(
                     f"{where(i)} is a row of numbers like those from {where(start)} on, and "
                     "between them are lines of words: the file has more than one header. Split "
@@ -448,7 +452,7 @@ def refuse_second_header(
 
 
 def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None) -> Header:
-    """Return names and units from the lines directly above the numbers, the nearest last."""
+    """Return names and units from the lines directly above the numbers, in file order."""
     least = width - 1 if filled is None else min(filled, width - 1)
     lines: list[list[str]] = []
     for row in reversed(above):
@@ -475,7 +479,7 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
         ]
     names, units = zip(*named, strict=True)
     contradicted = any(contradict(named, other) for other in split)
-    if k is not None and k + 1 < len(lines):  # real and imaginary part, say, of one name
+    if k is not None and k + 1 < len(lines):  # such as real and imaginary part, of one name
         parts = zip(names, lines[k + 1], strict=True)
         names = tuple(part if part and names.count(n) > 1 else n for n, part in parts)
     return Header(names, units, len(_without_trailing(names)), contradicted)
@@ -484,7 +488,7 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
 def contradict(
     one: Sequence[tuple[str, str | None]], other: Sequence[tuple[str, str | None]]
 ) -> bool:
-    """Return whether two lines of names and units name the same columns, but not alike."""
+    """Return whether two lines name the same columns in another order or with other units."""
     names = [plain(name) for name, _ in one]
     others = [plain(name) for name, _ in other]
     if sorted(filter(None, names)) != sorted(filter(None, others)) or len(set(names)) < 2:
@@ -516,7 +520,7 @@ def _bare(cell: str) -> str | None:
 
 
 def are_units(cells: Sequence[str]) -> bool:
-    """Return whether each cell is empty or a unit, and some is one."""
+    """Return whether each cell is empty or a unit, and at least one is a unit."""
     try:
         return bool([parse_unit(unit) for cell in cells if (unit := _bare(cell)) is not None])
     except UnitError:
@@ -526,7 +530,7 @@ def are_units(cells: Sequence[str]) -> bool:
 def named_channels(
     columns: Sequence[NDArray[Any]], named: Header, file: str
 ) -> tuple[RawChannel, ...]:
-    """Return the columns with their names and units, blank ones without a name left out."""
+    """Return the columns with their names and units, without blank columns that have no name."""
     if named.contradicted:
         raise DataError(
             f"{file}: several lines above the numbers name the columns, with different units or "
