@@ -77,7 +77,7 @@ def test_refusals():
 def test_derivatives_against_high_precision(k):
     rng = np.random.default_rng(k)
     law = Model(Dahl(1.0, 3.0, asymmetry=0.2)).with_free(["f_max", "sigma", "asymmetry"])
-    for beta in 10.0 ** rng.uniform(-2.0, 2.0, 2):
+    for beta in 10.0 ** rng.uniform(-2.0, 2.0, 1):
         at = [2.0, 50.0, float(rng.uniform(-0.8, 0.8)), float(beta) / 25.0]
         values = [np.asarray(v) for v in (*at[:2], 1.0, at[2])]
         found = law.stiffness_gradient(values, np.asarray(at[3]), AT_REST, k)

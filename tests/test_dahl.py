@@ -154,7 +154,6 @@ def test_every_call_is_finite_to_the_edges_of_what_is_accepted(f_max, sigma, alp
 # what is refused
 
 
-@every_call
 @pytest.mark.parametrize(
     ("amplitude", "text"),
     [
@@ -169,9 +168,10 @@ def test_every_call_is_finite_to_the_edges_of_what_is_accepted(f_max, sigma, alp
         ([[1.0], [1.0, 2.0]], r"^amplitude: expected an array of real numbers"),
     ],
 )
-def test_bad_amplitudes_are_named(call, amplitude, text):
-    with pytest.raises(ValidationError, match=text):
-        call(Dahl(0.5, 30.0), amplitude)
+def test_bad_amplitudes_are_named(amplitude, text):
+    for call in CALLS.values():
+        with pytest.raises(ValidationError, match=text):
+            call(Dahl(0.5, 30.0), amplitude)
 
 
 @pytest.mark.parametrize("parameter", ["f_max", "sigma", "alpha"])

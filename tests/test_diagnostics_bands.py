@@ -61,12 +61,12 @@ class TestBands:
     def test_cover_the_true_curve(self):
         truth = di.Dahl(0.1, 30.0).describing_function(GRID)
         inside = []
-        for seed in range(60):
+        for seed in range(30):
             found = fit(table(seed=seed, n=8), di.Dahl())
             low, high = found.predict(1.0, amplitude=GRID, noise=False).gain(0.9545)
             inside.append((low <= np.abs(truth)) & (np.abs(truth) <= high))
         cover = np.mean(inside, axis=0)  # the size of a model error is known badly from 8 rows
-        assert cover.min() > 0.87 - 2.0 * np.sqrt(0.87 * 0.13 / 60)
+        assert cover.min() > 0.87 - 2.0 * np.sqrt(0.87 * 0.13 / 30)
         assert 0.89 < cover.mean() < 0.99
 
     def test_plant_at_drives(self):

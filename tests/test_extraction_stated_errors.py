@@ -17,7 +17,7 @@ from dahl_ident.extraction import extract
 from dahl_ident.extraction.sine_fit import sine_fit, steady_segment
 from dahl_ident.extraction.transient import estimate_transient
 
-BETA, CYCLES, PER_CYCLE, RUNS = 2.0, 12, 60.37, 120
+BETA, CYCLES, PER_CYCLE, RUNS = 2.0, 12, 60.37, 60
 N = int(CYCLES * PER_CYCLE)
 ORDERS = (1, 3, 5)
 

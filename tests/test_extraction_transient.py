@@ -76,8 +76,7 @@ def test_a_drifting_sensor_is_no_memory_where_friction_forgets_fast():
     assert data.response[0] == pytest.approx(FRICTION.describing_function(3.0), rel=1e-3)
 
 
-@pytest.mark.parametrize("noise", [white, one_over_f])
-@pytest.mark.parametrize("fixed", [True, False])
+@pytest.mark.parametrize(("noise", "fixed"), [(white, True), (one_over_f, False)])
 def test_verdicts_on_descending_levels_with_too_few_cycles(noise, fixed):
     result = settling(8, seed=11, noise=noise, fixed=fixed)
     assert result.found > 0.95

@@ -62,7 +62,7 @@ def exact_harmonic(beta, k):
 
 @pytest.fixture(scope="module")
 def betas():
-    return grid(60)
+    return grid(20)
 
 
 @pytest.fixture(scope="module")
