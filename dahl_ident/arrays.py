@@ -19,6 +19,14 @@ SMALLEST, LARGEST = 1e-90, 1e90
 """Allowed magnitudes: squares, products and ratios of such numbers remain representable."""
 
 
+def quotient(
+    numerator: ComplexArray | float, denominator: ComplexArray | FloatArray
+) -> ComplexArray:
+    """Return a quotient, 0 where the denominator is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(denominator != 0.0, numerator / denominator, 0.0)
+
+
 def real_array(value: ArrayLike, name: str) -> FloatArray:
     """Return `value` as a float array, or raise an error that names the argument."""
     refuse_masked(value, name)

@@ -117,7 +117,7 @@ class TestDepartures:
 
     def test_another_exponent(self):
         found = judge(table(model=Dahl(0.1, 30.0, alpha=1.5)))
-        assert found.exponent.wanted == pytest.approx(1.5, rel=0.15)
+        assert found.exponent.indicated == pytest.approx(1.5, rel=0.15)
         assert "these data are not linear Dahl" in found.headline
         free = fit(table(model=Dahl(0.1, 30.0, alpha=1.5)), Dahl(alpha=None)).goodness
         assert free.acceptable
@@ -126,7 +126,7 @@ class TestDepartures:
     def test_the_exponent_s_score_is_close_to_its_estimate(self):
         data = table(model=Dahl(0.1, 30.0, alpha=1.05))
         found, estimate = judge(data), fit(data, Dahl(alpha=None)).params["alpha"]
-        assert found.exponent.wanted == pytest.approx(estimate.value, abs=0.005)
+        assert found.exponent.indicated == pytest.approx(estimate.value, abs=0.005)
         assert found.exponent.stderr == pytest.approx(estimate.stderr, rel=0.2)
 
     def test_a_missing_spring(self):

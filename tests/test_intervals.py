@@ -398,4 +398,4 @@ def test_profiles_are_searched_only_where_noise_leaves_a_parameter_vague():
     assert str(found.verdict).startswith("Trusted")
     p = found.params["p"]  # not a logarithm: its error counts over its size
     assert 1.0 < p.stderr < 0.1 * abs(p.value)
-    assert [one.method for one in found.assessment.intervals_run(0.9545)] == ["combined"]
+    assert [one.method for one in found.assessment.computed_intervals(0.9545)] == ["combined"]

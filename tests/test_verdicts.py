@@ -164,8 +164,8 @@ class TestWords:
         for place in ("r.md", "r.json"):
             report(found, tmp_path / place)
         assert "sum of squares" not in (tmp_path / "r.md").read_text("utf-8")
-        told = json.loads((tmp_path / "r.json").read_text("utf-8"))["fits"][0]
-        assert told["redchi"] == pytest.approx(found.redchi)
+        shown = json.loads((tmp_path / "r.json").read_text("utf-8"))["fits"][0]
+        assert shown["redchi"] == pytest.approx(found.redchi)
 
 
 class TestComparison:
@@ -309,12 +309,12 @@ class TestNamed:
         )  # fmt: skip
         found = fit(data, Dahl() + Spring())
         assert len(found.findings) > 5
-        assert len(found.judgement.told) == 5
+        assert len(found.judgement.shown) == 5
         below = found.fit_report().partition("Further findings")[2]
         shorter = [text for text in map(str, found.findings) if text not in found.verdict]
         assert len(shorter) == len(found.findings) - 5
         assert all(text in below for text in shorter)
-        assert all(len(text.split()) <= 35 for text in map(str, found.judgement.told))
+        assert all(len(text.split()) <= 35 for text in map(str, found.judgement.shown))
 
     @pytest.mark.parametrize("law", [
         MaxwellSlip([0.3 * X_C, 3.0 * X_C], [25.0, 8.0]),

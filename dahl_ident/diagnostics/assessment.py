@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.budget import Budget, ParameterBudget, budget, taken
 from dahl_ident.diagnostics.confidence_levels import LEVELS, checked_levels
 from dahl_ident.diagnostics.contributions import NOISE
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
-from dahl_ident.diagnostics.error_sources import in_order_of_level
+from dahl_ident.diagnostics.error_sources import is_monotonic
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.goodness import Goodness, goodness
 from dahl_ident.diagnostics.held_out import CrossValidation, cross_validation
@@ -39,14 +39,14 @@ from dahl_ident.fitting.optimum import ConstraintCost, Optimum, propagated
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import shown_unit
 
-_OF_ONE_KIND = {
+_SPECIFIC = {
     "cross_validation": "held-out tests",
     "errors_of_combinations": "errors of combinations",
     "predict_record": "prediction of a record",
     "record_at_draws": "prediction of a record",
     "residuals": "residuals sample by sample",
 }
-"""Texts that depend on the kind of data."""
+"""Attributes that fits of one kind of data only have, in words."""
 _OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
 _NOISE = {
     "measured": "measured: the data's covariance, scale known",
@@ -56,21 +56,21 @@ _NOISE = {
 
 
 class ContradictedExponent(NamedTuple):
-    """An exponent at its range's end or as stated, and what the data ask for instead."""
+    """An assumed or stated exponent, and the different one that the data indicate."""
 
     name: str
-    held: float
-    asked: float
+    fixed: float
+    indicated: float
     stderr: float
     range: tuple[float, float] | None  # None where the user stated the value
 
 
 class Assessment(ABC):
-    """An optimum, judged with its data; a ``FitResult`` passes all of this on."""
+    """An optimum, judged with its data; the attributes are those of a ``FitResult`` as well."""
 
     problem: Any
-    quick_methods: tuple[Method, ...] = ("wald",)  # that a report has time for
-    instead: str  # what to do where this kind of data has no answer
+    quick_methods: tuple[Method, ...] = ("wald",)  # of intervals, for reports
+    alternative: str  # what to do instead of what this kind of data does not offer
 
     def __init__(self, optimum: Optimum, *, first_order: bool = False) -> None:
         self.optimum, self.first_order = optimum, first_order
@@ -78,15 +78,15 @@ class Assessment(ABC):
         self._intervals: dict[tuple[Any, ...], ConfidenceIntervals] = {}
 
     def __getattr__(self, name: str) -> Any:
-        if name in _OF_ONE_KIND:
+        if name in _SPECIFIC:
             raise ValidationError(
-                f"a fit of {self.problem.called} has no {_OF_ONE_KIND[name]}; {self.instead}"
+                f"a fit of {self.problem.called} has no {_SPECIFIC[name]}; {self.alternative}"
             )
         raise AttributeError(name)
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Statements for machines, apart from parameters, verdict and budget."""
+        """Plain data for JSON, apart from parameters, verdict and budget."""
         optimum = self.optimum
         return {
             "search": optimum.status.name.lower().replace("_", " "),
@@ -140,7 +140,7 @@ class Assessment(ABC):
         replicates: int | None = None,
         seed: int = 0,
     ) -> ConfidenceIntervals:
-        """Return confidence intervals, each kind of them made once."""
+        """Return confidence intervals, which are computed once for the same arguments."""
         if method not in METHODS:
             raise ValidationError(
                 f"method is {method!r}; expected one of {choices(METHODS, method)}"
@@ -148,15 +148,15 @@ class Assessment(ABC):
         levels = tuple(checked_levels(levels).tolist())
         key = (method, levels, replicates, seed)
         if key not in self._intervals:
-            made = self._new_intervals(method, levels, replicates, seed)
-            units = tuple(shown_unit(unit, self.problem.motion) for unit in made.units)
-            self._intervals[key] = replace(made, units=units)
+            intervals = self._new_intervals(method, levels, replicates, seed)
+            units = tuple(shown_unit(unit, self.problem.motion) for unit in intervals.units)
+            self._intervals[key] = replace(intervals, units=units)
         return self._intervals[key]
 
-    def intervals_run(self, level: float) -> list[ConfidenceIntervals]:
-        """Return the intervals at a level of every method that has been asked for until now."""
-        matching = (one for one in self._intervals.values() if np.isclose(one.levels, level).any())
-        return list({one.method: one for one in matching}.values())
+    def computed_intervals(self, level: float) -> list[ConfidenceIntervals]:
+        """Return the intervals at a level that have been computed until now, one of each method."""
+        matching = (i for i in self._intervals.values() if np.isclose(i.levels, level).any())
+        return list({intervals.method: intervals for intervals in matching}.values())
 
     def _new_intervals(
         self, method: Method, levels: Sequence[float], replicates: int | None, seed: int
@@ -183,7 +183,7 @@ class TableAssessment(Assessment):
 
     problem: TableProblem
     quick_methods = ("wald", "profile")
-    instead = "extract the table from the waveforms, or fit the record itself"
+    alternative = "extract the table from the waveforms, or fit the record itself"
 
     @cached_property
     def errors(self) -> ErrorModel | None:
@@ -192,14 +192,14 @@ class TableAssessment(Assessment):
 
     @cached_property
     def errors_of_combinations(self) -> ErrorModel | None:
-        """The errors, also where only combinations are determined; then of these alone."""
+        """The errors of parameters, or of combinations where only these are determined."""
         if self.first_order:
             return None
         return self.errors or error_model(self.optimum, of_combinations=True)
 
     @property
     def device(self) -> tuple[Optimum, ErrorModel | None, ErrorModel | None]:
-        """The basis of predictions: optimum, errors of its parameters and of combinations."""
+        """The optimum and its errors, of parameters and of combinations, from which to predict."""
         return self.optimum, self.errors, self.errors_of_combinations
 
     @property
@@ -209,9 +209,9 @@ class TableAssessment(Assessment):
         values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
         stderr = dict(optimum.stderr)
         if errors is not None:
-            held = [name for name in (*values, *errors.assumed) if errors.holds(name)]
-            values |= {name: errors.values[name] for name in held}
-            stderr |= {name: errors.stderr[name] for name in held}
+            determined = [name for name in (*values, *errors.assumed) if errors.holds(name)]
+            values |= {name: errors.values[name] for name in determined}
+            stderr |= {name: errors.stderr[name] for name in determined}
         return values, stderr
 
     @cached_property
@@ -233,12 +233,12 @@ class TableAssessment(Assessment):
         if errors is None:
             return self.optimum.values_covariance
         free = [errors.names.index(name) for name in self.optimum.names]
-        whole = propagated(errors.covariance, errors.problem.value_slopes(errors.theta))
-        return np.asarray(whole[np.ix_(free, free)])
+        covariance = propagated(errors.covariance, errors.problem.value_slopes(errors.theta))
+        return np.asarray(covariance[np.ix_(free, free)])
 
     @property
     def estimate(self) -> Optimum:
-        """The estimate, as an optimum; the search's where nothing else is estimated."""
+        """The estimate, as an optimum; that of the search without an error model."""
         errors = self.errors_of_combinations
         return self.optimum if errors is None else errors.at_estimate
 
@@ -290,7 +290,7 @@ class TableAssessment(Assessment):
 
     @cached_property
     def goodness(self) -> Goodness:
-        """Whether residuals are consistent with noise, and estimates physically possible."""
+        """Tests whether residuals are consistent with noise, and estimates physically possible."""
         return goodness(self.optimum, self.errors_of_combinations)
 
     @property
@@ -315,13 +315,13 @@ class TableAssessment(Assessment):
         return check
 
     @cached_property
-    def with_less(self) -> TableAssessment | None:
-        """The fit to the fundamentals alone, without a stated covariance that they contradict.
+    def reduced(self) -> TableAssessment | None:
+        """The fit to the fundamentals alone, or without a stated covariance that they contradict.
 
-        None where there is nothing to leave out.
+        None where neither applies.
         """
         problem = self.problem
-        first = self.problem.data.harmonic == 1
+        first = problem.data.harmonic == 1
         if self.first_order or not first.any():
             return None
         try:
@@ -344,7 +344,7 @@ class TableAssessment(Assessment):
 
     @property
     def contradicted_exponents(self) -> Iterator[ContradictedExponent]:
-        """The assumed exponents that the data put outside their range."""
+        """The assumed exponents whose estimates are outside their range."""
         errors = self.errors
         parameters = () if errors is None else errors.problem.parameters
         for p in parameters:
@@ -356,8 +356,8 @@ class TableAssessment(Assessment):
                 yield ContradictedExponent(p.name, value, value, u, (low, high))
 
     @property
-    def missed(self) -> tuple[float, float] | None:
-        """The misfit within runs, and in all; None where there is none that counts."""
+    def significant_misfit(self) -> tuple[float, float] | None:
+        """The rms misfit within runs, and in all; None where it is consistent with noise."""
         rows = self.problem.stiffness_data.harmonic == 1
         if not (self.goodness.objections and self.is_determined and rows.any()):
             return None
@@ -374,12 +374,12 @@ class TableAssessment(Assessment):
         return float(np.sqrt(np.mean(np.abs(part) ** 2)))
 
     def design(self, *, counted: bool) -> dict[str, Any]:
-        """Return what the order of the rows assumes, with all sources of error or noise alone."""
+        """Return the assumptions about runs and drift, with all sources of error or noise alone."""
         data = self.problem.data
         errors = self.errors if counted else None
         runs = len((data if errors is None else errors.problem.data).runs or ())
         passes = runs * (data.run is None)
-        return {"single_run": runs < 2, "passes": passes, "no_drift": in_order_of_level(data)}
+        return {"single_run": runs < 2, "passes": passes, "no_drift": is_monotonic(data)}
 
     @cached_property
     def _budget(self) -> Budget:
@@ -402,7 +402,7 @@ class TableAssessment(Assessment):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Statements for machines, see ``Assessment``."""
+        """Plain data for JSON, see ``Assessment``."""
         suspicious = [str(point) for point in self.goodness.suspicious]
         return super().facts | {
             "noise": self.problem.noise, "suspicious": suspicious, "redchi": self.redchi
@@ -422,10 +422,10 @@ class TableAssessment(Assessment):
             scale = self.estimate.scale
             error = scale / math.sqrt(2.0 * dof) if dof > 0 else None
             size = with_unit(scale, error, problem.data.unit * (problem.noise == "absolute"))
-            made = "the limit of rounding; the residuals are smaller"
-            if not optimum.is_exact:
-                made = f"estimated with {dof} degrees of freedom"
-            lines.append(f"scale {size}, {made}")
+            source = f"estimated with {dof} degrees of freedom"
+            if optimum.is_exact:
+                source = "the limit of rounding; the residuals are smaller"
+            lines.append(f"scale {size}, {source}")
         for name, prior in problem.priors.items():
             lines.append(f"prior of {name}: {float(prior.mean()):g} ± {float(prior.std()):g}")
         return lines

@@ -4,7 +4,7 @@ First order: with d = dR/dtheta at the estimate and C its covariance, Re R and I
 covariance Re(d) C Re(d)', Re(d) C Im(d)', Im(d) C Im(d)', and d(ln R) = dR/R gives ln gain and
 phase together. Real and imaginary part are always treated together. Where the sources of error are
 known (:mod:`dahl_ident.diagnostics.error_model`) all of them are included, around the estimate that
-takes them into account (:mod:`dahl_ident.diagnostics.prediction_error`); else noise alone.
+accounts for them (:mod:`dahl_ident.diagnostics.prediction_error`); else noise alone.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from dahl_ident.problem import Problem, TableProblem
 from dahl_ident.units import shown_unit
 
 ENERGY = "energy lost in a cycle"  # name of a derived quantity
-_STEP = 1e-5  # relative, of parameters, for the slope of a knee; of frequencies, for a stiffness
-_RESONANT = 1e-12  # relative: a natural frequency is found
-_PASSES = 50  # at most; one is enough unless the stiffness depends on the frequency
+_STEP = 1e-5  # relative step of a finite difference
+_RESONANT = 1e-12  # relative tolerance of a natural frequency
+_PASSES = 50  # most iterations; one suffices unless the stiffness depends on the frequency
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,25 @@ class ResponseBand:
     """A predicted response with its standard deviations and bands, at n points."""
 
     response: ComplexArray  # at the estimate
-    # middle of the bands: the response, and how far the device is expected to depart from the model
-    # there, judged by the residuals
+    # middle of the bands: the response and the departure of the device from the model that the
+    # residuals predict
     centre: ComplexArray
     real_std: FloatArray  # in the response's unit
     imag_std: FloatArray
     log_gain_std: FloatArray  # of ln gain
     phase_std: FloatArray  # rad
-    # (2, n): of the standard deviations of ln gain and phase, for the factor of Student's t; those
-    # of real and imaginary part are the smaller ones
+    # (2, n): degrees of freedom of the standard deviations of ln gain and phase, for Student's t;
+    # the smaller of the two is that of real and imaginary part
     dof: FloatArray
-    # (k,): deviations of measured tests from their predictions without them, over their standard
-    # deviations; where more of them are large than Student's t makes, bands of one more test are
-    # wider
+    # (k,): deviations of tests from predictions without them, over their standard deviations; if
+    # more of them are large than Student's t predicts, bands of one more test are wider
     scores: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def gain(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the gain at each point."""
         size = np.abs(self.centre)
-        less, more = self._around(0.0 * size, level, self.dof[0], self.log_gain_std)
-        return size * np.exp(less), size * np.exp(more)
+        lower, upper = self._around(0.0 * size, level, self.dof[0], self.log_gain_std)
+        return size * np.exp(lower), size * np.exp(upper)
 
     def phase(self, level: float = 0.9545) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper limit of the phase at each point, rad."""
@@ -111,22 +110,22 @@ def response_band(
     With `errors` the band is that of one more test, or of the device itself.
     """
     problem, theta = _estimate(optimum, errors)
-    there = problem_at(problem, frequency_hz, amplitude, drive, quantity)
-    R, by = there.predict(theta), there.prediction_jacobian(theta)
+    new = problem_at(problem, frequency_hz, amplitude, drive, quantity)
+    R, by = new.predict(theta), new.prediction_jacobian(theta)
     known = np.isfinite(R) & (R != 0.0)
     if not known.any():
         real, imag = gain, phase = nothing = np.full((2, R.size), np.nan)
         return ResponseBand(R, R, real, imag, gain, phase, nothing)
-    predicted = replace(there.data.select(rows=known), response=R[known])
-    seen = there.like(data=predicted, noise="absolute").stiffness_data  # as if measured
+    predicted = replace(new.data.select(rows=known), response=R[known])
+    view = new.like(data=predicted, noise="absolute").stiffness_data  # as if measured
     if errors is None:
         noise = np.zeros((R.size, 2, 2))
         if of_a_test:
-            stated = stated_noise(problem, theta, seen.amplitude, seen.omega)
+            stated = stated_noise(problem, theta, view.amplitude, view.omega)
             noise[known] = optimum.scale**2 * stated
         return _noise_band(optimum, R, by, noise)
     return _combined_band(
-        errors, R, by, known, seen.amplitude, seen.omega, seen.stiffness, of_a_test
+        errors, R, by, known, view.amplitude, view.omega, view.stiffness, of_a_test
     )
 
 
@@ -164,7 +163,7 @@ def predicted_backbone(
 
 
 def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[TableProblem, FloatArray]:
-    """Return the combined estimate with the problem it belongs to, or the plain one."""
+    """Return the problem and theta of the combined estimate, or of the optimum without errors."""
     return (optimum.problem, optimum.theta) if errors is None else (errors.problem, errors.theta)
 
 
@@ -175,13 +174,13 @@ def problem_at(
     drive: ArrayLike | None,
     quantity: Any,
 ) -> TableProblem:
-    """Return the same problem at other operating points, to predict with."""
-    held = drive if amplitude is None else amplitude
-    if held is None or (amplitude is not None and drive is not None):
+    """Return the same problem at other operating points, for predictions."""
+    level = drive if amplitude is None else amplitude
+    if level is None or (amplitude is not None and drive is not None):
         raise ValidationError("give either amplitude (displacement controlled) or drive (force)")
     name = "drive" if amplitude is None else "amplitude"
     f = np.atleast_1d(positive_array(frequency_hz, "frequency_hz"))
-    at_points = np.atleast_1d(positive_array(held, name))
+    at_points = np.atleast_1d(positive_array(level, name))
     try:
         f, at_points = np.broadcast_arrays(f, at_points)
     except ValueError:
@@ -189,16 +188,14 @@ def problem_at(
             f"frequency_hz has shape {f.shape} and {name} {at_points.shape}; expected one "
             "shape, or one number for all"
         ) from None
-    held_at: dict[str, Any] = {name: at_points}
-    measured = problem.response
-    controlled = "displacement" if drive is None else "force"
-    usual = "dynamic_stiffness" if measured is None else measured.quantity
+    levels: dict[str, Any] = {name: at_points}
+    default = "dynamic_stiffness" if problem.response is None else problem.response.quantity
     grid = FrequencyResponse(
-        f, np.ones(f.shape), **held_at, controlled=controlled, quantity=quantity or usual,
-        motion=problem.motion,
+        f, np.ones(f.shape), **levels, controlled="displacement" if drive is None else "force",
+        quantity=quantity or default, motion=problem.motion,
     )  # fmt: skip
-    there: TableProblem = problem.at(grid)
-    return there
+    moved: TableProblem = problem.at(grid)
+    return moved
 
 
 def describing_function_band(
@@ -209,7 +206,7 @@ def describing_function_band(
     N, by = friction_and_slopes(*_estimate(optimum, errors), A)
     if errors is None:
         return _noise_band(optimum, N, by)
-    omega = np.exp(np.log(errors.problem.stiffness_data.omega).mean())  # the middle of them
+    omega = np.exp(np.log(errors.problem.stiffness_data.omega).mean())  # mean frequency
     columns = by.reshape(-1, by.shape[-1])
     band = _combined_band(errors, N.ravel(), columns, np.isfinite(N.ravel()), A.ravel(), omega)
     parts = {k: v.reshape(*v.shape[:-1], *A.shape) for k, v in vars(band).items() if k != "scores"}
@@ -244,10 +241,10 @@ def quantities(
     amplitudes: Sequence[float],
     frequency_hz: float | None,
 ) -> Iterator[tuple[str, str, float | None, FloatArray]]:
-    """Yield name, unit, amplitude and values of what follows from an estimate.
+    """Yield name, unit, amplitude and values of the derived quantities.
 
-    That is x_c of each law that has one, then loss, stiffness and damping at each amplitude, at
-    (n,) values of the free parameters, by name.
+    These are x_c of each law that has one, then loss, stiffness and damping at each amplitude, for
+    (n,) values of each free parameter, by name.
     """
     motion, size = problem.motion, len(next(iter(by_name.values())))
     friction = [
@@ -255,16 +252,15 @@ def quantities(
         for e in problem.model.elements
         if e.has_memory
     ]
-    for element, at in friction:
-        low, high = (np.broadcast_to(k, size) for k in element.knee(at))
+    for element, values in friction:
+        low, high = (np.broadcast_to(k, size) for k in element.knee(values))
         if np.array_equal(low, high):  # a law with a range of knees has no single x_c
             label = "x_c" if element.name is None else f"{element.name}_x_c"
             yield label, shown_unit("m", motion), None, low
     omega = 2.0 * np.pi * float(positive_array(1.0 if frequency_hz is None else frequency_hz, "f"))
     responses = []
     for A in positive_array(amplitudes, "amplitudes").ravel().tolist():
-        sine = np.full(size, A), np.full(size, omega)
-        parts = (e.stiffness(at, *sine) for e, at in friction)
+        parts = (e.stiffness(v, np.full(size, A), np.full(size, omega)) for e, v in friction)
         responses.append((A, sum(parts, np.zeros(size, np.complex128))))
     for A, N in responses:
         yield ENERGY, "J", A, np.pi * A**2 * N.imag
@@ -277,13 +273,13 @@ def quantities(
 def quantities_and_slopes(
     problem: Problem, values: FloatArray, amplitudes: Sequence[float], frequency_hz: float | None
 ) -> Iterator[tuple[str, str, float | None, float, FloatArray]]:
-    """Yield the same at one estimate, (P,), with the derivatives with respect to it, (P,)."""
+    """Yield them at the values of an estimate, (P,), with their derivatives, (P,)."""
     steps, count = _STEP * np.maximum(np.abs(values), SMALLEST), values.size
     points = np.vstack([values, values + np.diag(steps), values - np.diag(steps)])
     by_name = dict(zip(problem.names, points.T, strict=False))
-    for name, unit, A, at in quantities(problem, by_name, amplitudes, frequency_hz):
-        slopes = (at[1 : count + 1] - at[count + 1 :]) / (2.0 * steps)
-        yield name, unit, A, float(at[0]), slopes
+    for name, unit, A, results in quantities(problem, by_name, amplitudes, frequency_hz):
+        slopes = (results[1 : count + 1] - results[count + 1 :]) / (2.0 * steps)
+        yield name, unit, A, float(results[0]), slopes
 
 
 def derived(
@@ -303,13 +299,13 @@ def derived(
         band = describing_function_band(optimum, A, errors)
         damping = band.imag_std / (2.0 * np.pi * (frequency_hz or 1.0))
         stds = iter([*np.pi * A**2 * band.imag_std, *band.real_std, *damping])
-    for name, unit, at, value, slopes in quantities_and_slopes(
+    for name, unit, amplitude, value, slopes in quantities_and_slopes(
         problem, problem.to_values(theta), amplitudes, frequency_hz
     ):
-        if at is None and (slopes[infinite] != 0.0).any():
+        if amplitude is None and (slopes[infinite] != 0.0).any():
             continue
-        error = std(slopes * by_search) if at is None else next(stds)
-        yield DerivedQuantity(name, unit, at, value, float(error))
+        error = std(slopes * by_search) if amplitude is None else next(stds)
+        yield DerivedQuantity(name, unit, amplitude, value, float(error))
 
 
 def _noise_band(
@@ -331,10 +327,10 @@ def _parts_std(R: ComplexArray, covariance: FloatArray) -> FloatArray:
 
     `covariance`, (n, 2, 2), is that of ln gain and phase.
     """
-    turned = np.stack([R, 1j * R], axis=-1)  # by ln gain and phase
+    slopes = np.stack([R, 1j * R], axis=-1)  # with respect to ln gain and phase
     gain, phase = (np.tile(axis, (R.size, 1)) for axis in np.eye(2))
-    levers = np.array([turned.real, turned.imag, gain, phase])
-    squares = np.einsum("kni,nij,knj->kn", levers, covariance, levers)
+    rows = np.array([slopes.real, slopes.imag, gain, phase])
+    squares = np.einsum("kni,nij,knj->kn", rows, covariance, rows)
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
@@ -351,13 +347,13 @@ def _combined_band(
     """Return the band of responses (n,); NaN where a response is not `known`."""
     R_known = R[known]
     parts, dof = np.full((4, R.size), np.nan), np.full((2, R.size), np.nan)
-    made = prediction_error(
+    error = prediction_error(
         errors, by[known] / R_known[:, None], amplitude, omega, stiffness, of_a_test=of_a_test
     )
-    parts[:, known] = _parts_std(R_known, made.covariance)
-    dof[:, known] = made.dof.T
+    parts[:, known] = _parts_std(R_known, error.covariance)
+    dof[:, known] = error.dof.T
     centre = R.copy()
-    centre[known] *= np.exp(made.departure @ np.array([1.0, 1.0j]))
+    centre[known] *= np.exp(error.departure @ np.array([1.0, 1.0j]))
     left_out = errors.left_out if of_a_test else None
     scores = np.empty(0) if left_out is None else left_out.scores
     real, imag, gain, phase = parts

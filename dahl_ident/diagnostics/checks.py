@@ -1,8 +1,8 @@
-"""The checks of a fit: each yields findings, of which the worst is the status.
+"""The checks of a fit: each yields findings, the worst of which sets the status.
 
 Determined: every parameter, or which combinations. Described: size and kind of the misfit. Assumed:
-what the result depends on and the data cannot test. A check asks for quantities that fits of tables
-and of records both have, or says for which of the two it is.
+what the result depends on and the data cannot test. A check uses quantities that fits of tables and
+of records both have, or is marked as one for tables or records only.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from dahl_ident.diagnostics.judgement import (
 )
 from dahl_ident.diagnostics.misfit_explanations import rms_misfit_of
 from dahl_ident.diagnostics.physics import (
-    below_zero,
     beyond_friction_limit,
     is_single,
-    slight,
+    negative_elements,
     steady_findings,
+    weak_elements,
 )
 from dahl_ident.diagnostics.record_assessment import RecordAssessment
 from dahl_ident.diagnostics.record_misfit import REMEDY
 from dahl_ident.fitting.losses import LOSSES
 from dahl_ident.units import si_unit
 
-_TOO_LARGE = 0.5  # rms misfit: half of the response is not the model's
-_FAIRLY = 0.2  # rms that a model misses beyond the noise: beyond it, intervals do not hold
-_OF_WRONG_LAW = 0.05  # the same where another law misses far less
-_SLOW = 0.3  # effective share of the samples, below which noise looks like another law,
-_VISIBLE = 0.05  # where it is more than this share of the output, rms
-_FEW = 10.0  # degrees of freedom with which an uncertainty is known to a fifth
+_TOO_LARGE = 0.5  # rms misfit: the model does not describe half of the response
+_FAIRLY = 0.2  # rms misfit in excess of noise, above which intervals do not hold
+_OF_WRONG_LAW = 0.05  # the same where another law has a far smaller misfit
+_SLOW = 0.3  # effective share of the samples, below which noise looks like a wrong law,
+_VISIBLE = 0.05  # if its rms is more than this share of the output
+_FEW = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
-_ENOUGH_HELD_OUT = 16  # held-out values; of so many, 80 % lie in bands of 95 % once in 100 times
-_DOUBTS_SHOWN = 5  # more would hide the verdict
-_CHANCE = 0.0027  # probability that data contradict a right constraint or prior as much
+_ENOUGH_HELD_OUT = 16  # held-out values: with 16, fewer than 80 % in 95 % bands is a 1 % chance
+_DOUBTS_SHOWN = 5  # warnings shown; more would hide the verdict
+_CHANCE = 0.0027  # probability that data contradict a correct constraint as much
 _CONTRADICTED = 3.0  # standard deviations of a prior: once in 370 times by chance
-_PASSES, _SETTLED = 100, 1e-3  # of a robust fit: far below the one uncertainty that matters
+_PASSES, _SETTLED = 100, 1e-3  # most iterations of a robust fit; tolerance in uncertainties
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 Assessed = TableAssessment | RecordAssessment
@@ -72,17 +72,21 @@ _of_tables, _of_records = partial(_of, "table"), partial(_of, "records")
 
 
 def judgement(fit: Assessed) -> Judgement:
-    """Return the findings of every check, and with them the status.
+    """Return the findings of every check, and the status that follows from them.
 
-    Neither harmonics nor a covariance hide what the fundamentals show without them.
+    Misfit findings of the reduced fit replace those of the fit where they are worse: harmonics or
+    a stated covariance may otherwise hide a misfit of the fundamentals.
     """
     findings = [finding for check in CHECKS for finding in check(fit)]
-    if fit.with_less is not None:
+    if fit.reduced is not None:
         worst = max(
             (f.severity.rank for f in findings if f.question is Question.DESCRIBED), default=0
         )
-        every = judgement(fit.with_less).findings
-        hidden = [f for f in every if f.question is Question.DESCRIBED and f.severity.rank > worst]
+        hidden = [
+            f
+            for f in judgement(fit.reduced).findings
+            if f.question is Question.DESCRIBED and f.severity.rank > worst
+        ]
         replaced = {"noise", *(f.code for f in hidden)} if hidden else set()
         findings = [f for f in findings if f.code not in replaced] + hidden
     return Judgement(findings)
@@ -93,7 +97,7 @@ def judgement(fit: Assessed) -> Judgement:
 
 @_of_records
 def _parameters_of_records(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the parameters that are not determined, the reasons, and a motion that would do it."""
+    """Yield the parameters that are not determined, why, and which motion would determine them."""
     for name, why in fit.undetermined.items():
         stderr, unit = fit.known[1][name], fit.identifiability.parameters[name].unit
         yield undetermined("record_parameter", name=name, stderr=stderr, unit=unit, why=why)
@@ -103,12 +107,12 @@ def _parameters_of_records(fit: RecordAssessment) -> Iterator[Finding]:
 def _parameters(fit: TableAssessment) -> Iterator[Finding]:
     """Yield which parameters or combinations are determined."""
     if fit.goodness.sign:
-        return  # what the numbers leave undetermined says nothing of the mechanism
+        return  # with the wrong sign, parameters have no meaning
     optimum, known = fit.optimum, fit.identifiability
-    can_tell = optimum.scale_known or optimum.dof > 0
-    if can_tell or known.complete:
+    noise_known = optimum.scale_known or optimum.dof > 0
+    if noise_known or known.complete:
         yield known.finding
-    if can_tell and not known.complete and known.combinations:
+    if noise_known and not known.complete and known.combinations:
         yield undetermined("combinations", combinations=tuple(map(str, known.combinations)))
     if not optimum.success:
         message = optimum.status.value if optimum.status.at_infinity else optimum.message
@@ -118,9 +122,9 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
             "no_degrees_of_freedom", numbers=optimum.problem.n_residuals,
             parameters=len(optimum.names), scale_known=optimum.scale_known,
         )  # fmt: skip
-    if can_tell:
+    if noise_known:
         for why in dict.fromkeys(parameter.why for parameter in known.open):
-            shown = {p.name: p.known_as for p in known.open if p.why == why}
+            shown = {p.name: p.known_text for p in known.open if p.why == why}
             yield undetermined("undetermined_parameters", shown=shown, why=why)
 
 
@@ -128,7 +132,7 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
 
 
 def _misfit(fit: Assessed) -> Iterator[Finding]:
-    """Yield size and kind of the misfit, and reasons for doubt whether there is one or not."""
+    """Yield size and kind of the misfit, then the reservations about the fit."""
     reservations = [finding for check in RESERVATIONS for finding in check(fit)]
     if isinstance(fit, TableAssessment):
         yield from _misfit_of_table(fit, reservations)
@@ -140,7 +144,7 @@ def _misfit(fit: Assessed) -> Iterator[Finding]:
 def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     """Yield whether the model describes the records."""
     problem, converged = fit.problem, fit.optimum.converged
-    far = fit.goodness.rms_in_band > (_FAIRLY if fit.misses else _TOO_LARGE)
+    far = fit.goodness.rms_in_band > (_FAIRLY if fit.exceeds_noise else _TOO_LARGE)
     if far:
         yield described("records_not_described", _NOT_DESCRIBED, rms=fit.goodness.rms_in_band)
     if not converged:
@@ -148,14 +152,14 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     displaced = all(record.displacement is not None for record in problem.records)
     if problem.output == "motion" and (far or not converged) and displaced:
         yield described("motion_may_be_imposed", _NOT_DESCRIBED)
-    if fit.misses and not far:
+    if fit.exceeds_noise and not far:
         follows = fit.errors.misfit.follows if fit.errors.misfit else ""
         kind, remedy = REMEDY.get(follows, ("", ""))
         if kind and all(element.kind != kind for element in problem.model.elements):
             remedy = f"add a {kind}, or {remedy}"
         yield described("records_misfit", _APPROXIMATE, follows=follows, remedy=remedy)
     effective = fit.errors.effective / problem.n_samples
-    if not fit.misses and effective < _SLOW and fit.goodness.rms_in_band > _VISIBLE:
+    if not fit.exceeds_noise and effective < _SLOW and fit.goodness.rms_in_band > _VISIBLE:
         yield described("slow_misfit", _APPROXIMATE, rms=fit.goodness.rms_in_band)
     if fit.errors.dof_of(NOISE) < _FEW:
         few = {"effective": fit.errors.effective, "unknowns": len(problem.names)}
@@ -163,21 +167,23 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 def _misfit_of_table(fit: TableAssessment, reservations: Sequence[Finding]) -> Iterator[Finding]:
-    """Yield size and kind of the misfit, and whether bands hold where anything is doubted."""
+    """Yield size and kind of the misfit, and whether bands hold if there are objections."""
     goodness = fit.goodness
     bands = list[Finding]()
     if not goodness.sign and (goodness.objections or goodness.flagged or reservations):
         bands = list(_bands(fit))
-    lost = (
+    unusable = (
         (fit.errors is None and fit.is_determined)
         or _stated_exponent_is_wrong(fit)
         or goodness.beyond_any_sensor
-        or goodness.of_several
+        or goodness.is_of_several_devices
         or any(finding.severity is _NOT_DESCRIBED for finding in bands)
     )
-    fairly = _OF_WRONG_LAW if goodness.law_is_wrong else _FAIRLY
-    large = goodness.rms_misfit > (fairly if goodness.objections else _TOO_LARGE)
-    severity = _NOT_DESCRIBED if lost or large else _APPROXIMATE
+    limit = _TOO_LARGE
+    if goodness.objections:
+        limit = _OF_WRONG_LAW if goodness.law_is_wrong else _FAIRLY
+    large = goodness.rms_misfit > limit
+    severity = _NOT_DESCRIBED if unusable or large else _APPROXIMATE
     yield from goodness.findings(severity, counted=severity is _APPROXIMATE and fit.is_determined)
     if large and not goodness.objections:
         yield described("large_misfit", severity, rms=goodness.rms_misfit)
@@ -211,27 +217,27 @@ def _bands(fit: TableAssessment) -> Iterator[Finding]:
 def _misfit_within_runs(errors: ErrorModel) -> float:
     """Return the misfit that bands have to cover.
 
-    It is that within runs: a row that was held out leaves other rows of its run. A force in
-    addition to the model and a change with speed do not count, as bands are centred on them.
-    A smooth departure from the law does: parameters of another law have no uncertainty.
+    Differences between runs are not counted: the other rows of its run predict a row that is held
+    out. A force in parallel with the model and a change with speed are not counted, as bands are
+    centred on them. A smooth departure from the law is counted.
     """
     fitted = (errors.within_runs, errors.parallel_to_the_law)
-    return min(rms_misfit_of(errors.problem, each) for each in fitted)
+    return min(rms_misfit_of(errors.problem, responses) for responses in fitted)
 
 
 @_of_tables
 def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield where a force exceeds what friction can carry; not rows that a loss sets aside."""
+    """Yield where a force exceeds what friction can carry, except outliers of a robust fit."""
     errors, differ = fit.errors, fit.goodness.runs_differ
     scatter = 0.0 if differ is None else sum(differ.scatter.values())
     optimum = fit.optimum if errors is None else errors.at_estimate
-    aside = [p.row for p in fit.goodness.suspicious] if optimum.loss != "linear" else []
-    yield from beyond_friction_limit(optimum, scatter, aside)
+    outliers = [p.row for p in fit.goodness.suspicious] if optimum.loss != "linear" else []
+    yield from beyond_friction_limit(optimum, scatter, outliers)
 
 
-def _below_zero(fit: Assessed) -> Iterator[Finding]:
-    """Yield every mass, damping or stiffness below zero, and what else no mechanism has."""
-    yield from below_zero(fit.problem, fit.known)
+def _unphysical(fit: Assessed) -> Iterator[Finding]:
+    """Yield every mass, damping or stiffness below zero, and other physical objections."""
+    yield from negative_elements(fit.problem, fit.known)
     for element in fit.model.elements:
         values = [p.value or 0.0 for p in element.parameters]
         if np.isfinite(values).all() and not is_single(element):
@@ -239,14 +245,14 @@ def _below_zero(fit: Assessed) -> Iterator[Finding]:
                 yield described("unphysical", _APPROXIMATE, objection=text)
 
 
-def _slight(fit: Assessed) -> Iterator[Finding]:
-    """Yield a finding for every mass, damper or spring of less force than the model misses."""
-    if fit.missed is not None:
-        yield from slight(fit.problem, fit.known, fit.force_share, *fit.missed)
+def _weak_elements(fit: Assessed) -> Iterator[Finding]:
+    """Yield every mass, damper or spring whose force is smaller than the misfit."""
+    if fit.significant_misfit is not None:
+        yield from weak_elements(fit.problem, fit.known, fit.force_share, *fit.significant_misfit)
 
 
 def _constraints(fit: Assessed) -> Iterator[Finding]:
-    """Yield the constraints that the data contradict: their cost is not due to chance."""
+    """Yield the constraints if the data contradict them."""
     cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
         yield described(
@@ -265,16 +271,19 @@ def _priors(fit: Assessed) -> Iterator[Finding]:
 
 
 def _exponents(fit: Assessed) -> Iterator[Finding]:
-    """Yield every exponent that the data put outside its range, or contradict."""
-    for one in fit.contradicted_exponents:
-        if one.range is None:
-            wanted = with_unit(one.asked, one.stderr, "")
-            stated = {"name": one.name, "held": one.held, "wanted": wanted}
-            yield described("stated_exponent", _NOT_DESCRIBED, **stated)
+    """Yield every assumed or stated exponent that the data contradict."""
+    for exponent in fit.contradicted_exponents:
+        if exponent.range is None:
+            yield described(
+                "stated_exponent", _NOT_DESCRIBED, name=exponent.name, held=exponent.fixed,
+                wanted=with_unit(exponent.indicated, exponent.stderr, ""),
+            )  # fmt: skip
         else:
-            low, high = one.range
-            asked = {"name": one.name, "value": one.asked, "stderr": one.stderr}
-            yield described("beyond_range", _APPROXIMATE, **asked, low=low, high=high)
+            low, high = exponent.range
+            yield described(
+                "beyond_range", _APPROXIMATE, name=exponent.name, value=exponent.indicated,
+                stderr=exponent.stderr, low=low, high=high,
+            )  # fmt: skip
 
 
 @_of_tables
@@ -295,11 +304,11 @@ def _moved_by_outliers(fit: TableAssessment) -> Iterator[Finding]:
 def robust_values(
     errors: ErrorModel, scale: float
 ) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Return a robust fit's values about the estimate, by iterated weights of a linear model.
+    """Return the values of a robust fit, and the noise's standard errors of the estimate, by name.
 
-    Also the standard errors of the estimate by its weights. Assumed exponents stay where they are.
-    The noise's scale, where it is not stated, is the robust one of
-    :mod:`dahl_ident.fitting.losses`, from `scale` on.
+    The fit is one of iterated weights to the model linearised at the estimate. Assumed exponents
+    are fixed. The noise's scale, where it is not stated, is the robust one of
+    :mod:`dahl_ident.fitting.losses`, with `scale` as its start.
     """
     problem, loss = errors.estimate.problem, LOSSES["huber"]
     y, J = problem.residuals_and_jacobian(errors.theta)
@@ -308,7 +317,7 @@ def robust_values(
     variance = 1.0 if problem.scale_known else scale**2
     weight = np.ones(len(y))
     weight[2 * rows :] = variance  # priors have a known variance
-    known = np.linalg.pinv(J.T @ (weight[:, None] * J) / variance)
+    covariance = np.linalg.pinv(J.T @ (weight[:, None] * J) / variance)
     move: FloatArray = np.zeros(len(free))
     for _ in range(_PASSES):
         square = np.sum((y + J @ move)[: 2 * rows].reshape(rows, 2) ** 2, axis=1)
@@ -323,7 +332,7 @@ def robust_values(
             break
     theta, std = errors.theta.copy(), np.zeros(len(errors.theta))
     theta[free] += move
-    std[free] = np.sqrt(np.diagonal(known))
+    std[free] = np.sqrt(np.diagonal(covariance))
     std *= np.abs(problem.value_slopes(errors.theta))
     robust = dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
     by_noise = dict(zip(problem.names, std.tolist(), strict=True))
@@ -337,7 +346,7 @@ def _steady(fit: TableAssessment) -> Iterator[Finding]:
 
 @_of_records
 def _delay(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield the delay that was taken out: a doubt where it moves the output by more than noise."""
+    """Yield the delay that was removed; it is doubtful if its effect exceeds the noise."""
     problem = fit.problem
     if not problem.delay:
         return
@@ -369,10 +378,8 @@ def _notes(fit: RecordAssessment) -> Iterator[Finding]:
 
 
 def reading(fit: Any) -> Iterator[Finding]:
-    """Yield the warnings that were shown when the data of a fit or posterior were read."""
-    texts = list(
-        dict.fromkeys(text for one in fit.problem.provenances for text in warnings_in(one))
-    )
+    """Yield the warnings on reading the data of a fit or posterior."""
+    texts = list(dict.fromkeys(text for p in fit.problem.provenances for text in warnings_in(p)))
     yield from (described("warning", text=text) for text in texts[:_DOUBTS_SHOWN])
     if len(texts) > _DOUBTS_SHOWN:
         yield described("more_warnings", count=len(texts) - _DOUBTS_SHOWN)
@@ -389,9 +396,10 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
         if p.prior is None or p.free:
             continue
         if counted and p.name in fit.assumed:
-            low, high = p.prior
-            place = {"name": p.name, "low": low, "high": high, "unit": p.unit}
-            ranges.append({**place, "value": values[p.name], "stderr": stderr[p.name]})
+            ranges.append({
+                "name": p.name, "low": p.prior[0], "high": p.prior[1], "unit": p.unit,
+                "value": values[p.name], "stderr": stderr[p.name],
+            })  # fmt: skip
         elif p.value is not None:
             stated[p.name] = p.value
     sensors = {p.name for p in fit.problem.sensors.parameters if p.free}
@@ -411,10 +419,10 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
 
 
 RESERVATIONS: tuple[_Check, ...] = (
-    _beyond_limit, _below_zero, _priors, _exponents, _moved_by_outliers
+    _beyond_limit, _unphysical, _priors, _exponents, _moved_by_outliers
 )  # fmt: skip
 """Reasons not to trust a fit although its residuals may look like noise."""
 CHECKS: tuple[_Check, ...] = (
-    _constraints, _parameters, _parameters_of_records, _misfit, _slight, _steady, _delay, _notes,
-    reading, assumptions,
+    _constraints, _parameters, _parameters_of_records, _misfit, _weak_elements, _steady, _delay,
+    _notes, reading, assumptions,
 )  # fmt: skip

@@ -1,12 +1,12 @@
 """Which model describes the data, and the quantities of friction that do not depend on the model.
 
-Candidates come from what the fit leaves: a mean force asks for two limits, a response that changes
-with frequency for a damper, a force that falls with it for LuGre's law, any other misfit for
-another shape of loop. Each is judged by how it predicts tests that it was not fitted to
+Candidates follow from the misfit of the fit: a mean force suggests two limits, a response that
+changes with frequency a damper, a force that falls with it LuGre's law, any other misfit another
+shape of loop. Each is judged by how it predicts tests that it was not fitted to
 (:mod:`dahl_ident.diagnostics.predictive_density`). Of those whose density is within one standard
 error of the highest, the simplest is the best. The model fitted stays the best unless another's
-density exceeds its by more than chance explains among many candidates. AIC and BIC do not count:
-over harmonics whose covariance is tiny they prefer a model that spoils the fundamental. If no model
+density is higher by more than chance explains among many candidates. AIC and BIC are not used: with
+harmonics whose covariance is tiny they prefer a model that fits the fundamental badly. If no model
 describes the data, the best of them does not either; a model with negative damping does not
 describe a mechanism. Each model is fitted as :func:`dahl_ident.fit` fits it, with the range of an
 exponent that the user did not give.
@@ -49,15 +49,15 @@ from dahl_ident.problem import Problem
 from dahl_ident.units import percent, si_unit
 
 _BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
-_ASTRAY = 0.5  # misfit at which a search has ended far from any description
-_RATES = 1.05  # highest over lowest frequency that can show a dependence on the rate
+_ASTRAY = 0.5  # misfit above which a search has failed
+_RATES = 1.05  # least ratio of highest to lowest frequency that can show rate dependence
 _SMOOTH = 8  # degree in ln A of the change of gain that is allowed at every frequency
-_FALSE_ALARM = 1e-4  # of a force that falls with the frequency: it only adds a candidate
-_SEEN = 3.0  # rms differences over noise that has been averaged over all rows
-_RUNAWAY = 100.0  # times as large: a candidate's parameter that the data leave open
-_UNUSUAL = 5.0  # times beyond the usual range of an exponent: no mechanism's
-_DISAGREE = 0.2  # of a force limit or a stiffness: what friction is then depends on the choice
-_PLACES = 6  # of a change: less is rounding
+_FALSE_ALARM = 1e-4  # rate for a force that falls with the frequency, which adds a candidate
+_SEEN = 3.0  # rms difference over noise averaged over all rows, that distinguishes laws
+_RUNAWAY = 100.0  # ratio to the fit's value, above which the data leave a parameter open
+_UNUSUAL = 5.0  # factor beyond the usual range of an exponent that no mechanism has
+_DISAGREE = 0.2  # relative difference of force limits or stiffnesses that matters to the user
+_PLACES = 6  # decimals of a change: less is rounding
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
 _LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
@@ -70,9 +70,9 @@ class ComparedModel:
     name: str  # what distinguishes it
     optimum: Optimum  # its estimate
     density: PredictiveDensity  # how it predicts tests left out
-    reason: str = ""  # what in the data speaks for trying it
-    # of the model that was fitted: its parameters as the fit states them, every source of error
-    # counted; the others count noise alone
+    reason: str = ""  # evidence in the data for trying it
+    # of the model that was fitted: its parameters as the fit states them, with every source of
+    # error; errors of the others are from noise alone
     stated: Mapping[str, Any] | None = None
 
     @property
@@ -83,28 +83,28 @@ class ComparedModel:
 
     @property
     def estimates(self) -> str:
-        """The free parameters in one line; a number without an error is none."""
-        rows = [(p.name, v, e, p.unit) for p, v, e in self._of_device]
+        """The free parameters in one line; those without an error are not determined."""
+        rows = [(p.name, v, e, p.unit) for p, v, e in self._estimated]
         if self.stated is not None:
-            every = self.stated.values()
-            rows = [(p.name, p.value, p.stderr, p.unit) for p in every if p.stderr is not None]
+            stated = self.stated.values()
+            rows = [(p.name, p.value, p.stderr, p.unit) for p in stated if p.stderr is not None]
         known = [f"{name} = {with_unit(v, e, unit)}" for name, v, e, unit in rows if np.isfinite(e)]
         unknown = [name for name, _, e, _ in rows if not np.isfinite(e)]
         return ", ".join(known + ([f"{listed(unknown)} not determined"] if unknown else []))
 
     @property
-    def _of_device(self) -> list[tuple[Parameter, float, float]]:
-        """The free parameters of the device, with value and standard error of each."""
-        o, count = self.optimum, self.optimum.problem.n_reported
-        parameters = o.problem.parameters[:count]
-        return list(zip(parameters, o.values.tolist(), o.stderr.values(), strict=False))
+    def _estimated(self) -> list[tuple[Parameter, float, float]]:
+        """The free parameters of the model, with value and standard error of each."""
+        optimum, count = self.optimum, self.optimum.problem.n_reported
+        parameters = optimum.problem.parameters[:count]
+        return list(zip(parameters, optimum.values.tolist(), optimum.stderr.values(), strict=False))
 
     @cached_property
     def is_determined(self) -> bool:
-        """Whether the data determine every parameter to a factor, or how near to zero it is.
+        """Whether every parameter's standard error is below half of its value, or typical size.
 
-        For a table, every source of error counts. The like parts of a law, such as those of Maxwell
-        slip, need not be determined one by one.
+        For a table, every source of error counts. The identical parts of a law, such as those of
+        Maxwell slip, need not be determined one by one.
         """
         stderr = self.optimum.stderr
         parts = set[str]()
@@ -113,7 +113,7 @@ class ComparedModel:
             parts |= {element.parameter(label).name for label in labels}
 
         def size(parameter: Parameter) -> float:
-            """Return what a parameter that may be zero is compared with: its unit's size."""
+            """Return the typical size of a parameter that may be zero; 0 for others."""
             may_be_zero = parameter.lower < 0.0
             sizes = self.optimum.problem.unit_sizes(parameter.dimension)
             return float(np.median(sizes)) * may_be_zero
@@ -121,17 +121,17 @@ class ComparedModel:
         return all(
             np.isfinite(value)
             and (p.name in parts or stderr[p.name] < _VAGUE * max(abs(value), size(p)))
-            for p, value, _ in self._of_device
+            for p, value, _ in self._estimated
         )
 
     @property
     def is_physical(self) -> bool:
         """Whether every exponent is near its usual range."""
         return all(
-            p.prior is None or any(p.dimension) or not p.positive
-            or p.prior[0] / _UNUSUAL < value < p.prior[1] * _UNUSUAL
-            for p, value, _ in self._of_device
-        )  # fmt: skip
+            p.prior[0] / _UNUSUAL < value < p.prior[1] * _UNUSUAL
+            for p, value, _ in self._estimated
+            if p.is_exponent and p.prior is not None
+        )
 
     @cached_property
     def meaning(self) -> dict[str, float]:
@@ -142,31 +142,32 @@ class ComparedModel:
         a law never slips, NaN where these data do not determine it.
         """
         problem = self.optimum.problem
-        every = _meaning(problem, parameter_values(self.optimum))
-        undetermined = _undetermined(self.optimum, every)
+        quantities = _meaning(problem, parameter_values(self.optimum))
+        undetermined = _undetermined(self.optimum, quantities)
         if self.stated is not None:
-            every = _meaning(problem, {name: p.value for name, p in self.stated.items()})
-        return every | dict.fromkeys(undetermined, np.nan)
+            quantities = _meaning(problem, {name: p.value for name, p in self.stated.items()})
+        return quantities | dict.fromkeys(undetermined, np.nan)
 
     @property
     def resemblances(self) -> list[str]:
-        """Which element these data cannot distinguish from a simpler one, in sentences."""
+        """Sentences on elements that these data cannot distinguish from a simpler one."""
         problem, values = self.optimum.problem, parameter_values(self.optimum)
         sentences = []
         for element in problem.model.elements:
             at_element = [values[p.name] for p in element.parameters]
-            known = element.resembles(at_element, *_levels(problem))
-            if known is not None and known[1] < _SEEN * self.density.noise:
+            resemblance = element.resembles(at_element, *_levels(problem))
+            if resemblance is not None and resemblance[1] < _SEEN * self.density.noise:
                 sentences.append(
-                    f"{self.name}: at these levels it differs from {known[0]} by "
-                    f"{percent(known[1])} rms, too little for these data to distinguish the two."
+                    f"{self.name}: at these levels it differs from {resemblance[0]} by "
+                    f"{percent(resemblance[1])} rms, too little for these data to distinguish the "
+                    "two."
                 )
         return sentences
 
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Models side by side; the first is the one that was fitted, with what it states.
+    """Models side by side; the first is the one that was fitted.
 
     Examples
     --------
@@ -184,9 +185,10 @@ class ModelComparison:
         """The simplest model within one standard error of the highest predictive density.
 
         Apart from the one that was fitted, only models count whose parameters are determined and
-        physical, and whose force limit and stiffness are not a hundred times those of the fit. It
-        is the one that was fitted where models that are alike disagree (`undecided`), and where
-        one that the data do not determine leaves far less (`undetermined`).
+        physical, and whose force limit and stiffness are below a hundred times those of the fit.
+        The model that was fitted is kept where models that the data do not distinguish disagree
+        (`undecided`), and where a model that the data do not determine has a far smaller misfit
+        (`undetermined`).
         """
         return self.models[0] if self.undecided or self.undetermined else self._simplest
 
@@ -194,29 +196,28 @@ class ModelComparison:
     def undetermined(self) -> ComparedModel | None:
         """A physical model that the data do not determine, of far smaller misfit than the best."""
         best = self._simplest
-        every = [model for model in self.models if model.is_physical or model is best]
-        likeliest = max(every, key=lambda model: model.density.total)
+        physical = [model for model in self.models if model.is_physical or model is best]
+        likeliest = max(physical, key=lambda model: model.density.total)
         gain, error = likeliest.density.gain_over(best.density)
-        far = likeliest.density.misfit < FAR_LESS * best.density.misfit
-        return likeliest if far and gain > max(error, _BY_CHANCE) else None
+        far_less = likeliest.density.misfit < FAR_LESS * best.density.misfit
+        return likeliest if far_less and gain > max(error, _BY_CHANCE) else None
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
-        """The simplest of models that these data do not distinguish, and one that disagrees.
+        """The simplest of models that these data do not distinguish, and one that differs.
 
-        The likeliest of those that disagree, on the force limit or on the stiffness at zero force.
-        Empty where none does, or where the simplest is the one that was fitted.
+        The latter is the likeliest whose force limit or stiffness at zero force is different. Empty
+        where there is none, or where the simplest is the one that was fitted.
         """
-        one = self._simplest
-        others = [m for m in self._alike if m is not self.models[0] and _disagreement(one, m)]
-        if one is self.models[0] or not others:
+        best = self._simplest
+        others = [m for m in self._alike if m is not self.models[0] and _disagreement(best, m)]
+        if best is self.models[0] or not others:
             return ()
-        return one, max(others, key=lambda model: model.density.total)
+        return best, max(others, key=lambda model: model.density.total)
 
     @cached_property
     def _likeliest(self) -> ComparedModel:
-        falling = sorted(self.models, key=lambda model: -model.density.total)
-        return next(m for m in falling if m is self.models[0] or self._is_sound(m))
+        return max(filter(self._is_sound, self.models), key=lambda model: model.density.total)
 
     @cached_property
     def _alike(self) -> list[ComparedModel]:
@@ -224,22 +225,21 @@ class ModelComparison:
         alike = []
         for model in self.models:
             gain, error = self._likeliest.density.gain_over(model.density)
-            near = gain <= max(error, _BY_CHANCE)
-            if near and (model is self.models[0] or self._is_sound(model)):
+            if gain <= max(error, _BY_CHANCE) and self._is_sound(model):
                 alike.append(model)
         return alike
 
     @property
     def _simplest(self) -> ComparedModel:
-        def complexity(model: ComparedModel) -> tuple[int, float]:
-            return model.complexity, -model.density.total
-
-        return min(self._alike, key=complexity)
+        return min(self._alike, key=lambda model: (model.complexity, -model.density.total))
 
     def _is_sound(self, model: ComparedModel) -> bool:
-        sizes = [(model.meaning[k], self.models[0].meaning[k]) for k in _OF_FRICTION]
-        absurd = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
-        return model.is_physical and not absurd and model.is_determined
+        """Return whether a model is the one that was fitted, or physical and determined."""
+        fitted = self.models[0]
+        sizes = [(model.meaning[k], fitted.meaning[k]) for k in _OF_FRICTION]
+        runs_away = any(b > 0.0 and a > _RUNAWAY * b for a, b in sizes)
+        is_sound = model.is_physical and not runs_away and model.is_determined
+        return model is fitted or is_sound
 
     @property
     def headline(self) -> str:
@@ -247,19 +247,18 @@ class ModelComparison:
         first, best = self.models[0], self.best
         output = first.optimum.problem.output_in_words
         if self.undecided:
-            one, two = self.undecided
-            key = _disagreement(one, two)
+            simplest, other = self.undecided
+            key = _disagreement(simplest, other)
             sizes = listed([f"{m.meaning[key]:.3g}" for m in self.undecided])
             return (
-                f"{one.name} and {two.name} would both be better, and these data do not "
+                f"{simplest.name} and {other.name} would both be better, and these data do not "
                 f"distinguish them: {key} {sizes}. Neither is recommended."
             )
         if self.undetermined is not None:
-            one = self.undetermined
+            misfit = percent(self.undetermined.density.misfit)
             return (
-                f"{one.name} would leave far less ({percent(one.density.misfit)} of {output}), "
-                "but these data do not determine its parameters. No model compared "
-                "is recommended."
+                f"{self.undetermined.name} would leave far less ({misfit} of {output}), but these "
+                "data do not determine its parameters. No model compared is recommended."
             )
         if best is first:
             return "No model compared is better than the one fitted."
@@ -269,8 +268,8 @@ class ModelComparison:
             f"{gain:.0f} ± {error:.0f}. It leaves {percent(best.density.misfit)} of {output}, "
             f"and {_noise(best.optimum.problem)}."
         )
-        absurd = [f"There {warning}." for warning in negative_parameters(best.optimum)]
-        return " ".join([text, *absurd])
+        negative = [f"There {warning}." for warning in negative_parameters(best.optimum)]
+        return " ".join([text, *negative])
 
     def __str__(self) -> str:
         lines = [self.headline, table([self.columns, *self.rows], left=(0, 1))]
@@ -352,28 +351,27 @@ def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
                 contact = float(element.quasi_static_slope(np.zeros(()), 1.0, at_element))
             stiffness += contact
             energy += np.pi * sizes**2 * np.imag(element.stiffness(at_element, sizes, omega))
-    sizes_in_common = {"force limit": limit, "stiffness at zero force": stiffness}
     unit = si_unit("displacement", problem.motion)
-    return sizes_in_common | {
+    return dict(zip(_OF_FRICTION, (limit, stiffness), strict=True)) | {
         f"energy a cycle at {size:.2g} {unit}": float(e)
         for size, e in zip(sizes, energy, strict=True)
     }
 
 
-def _undetermined(optimum: Optimum, every: Mapping[str, float]) -> list[str]:
+def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str]:
     """Return which quantities are not determined, by the first-order error of their logarithms."""
-    names, theta = [key for key in every if not key.startswith("energy")], optimum.theta
+    names, theta = _OF_FRICTION, optimum.theta
     if not optimum.converged:
-        return names
-    before = np.array([every[name] for name in names])
+        return list(names)
+    at_optimum = np.array([quantities[name] for name in names])
     changes = np.zeros((len(names), len(theta)))
     for i, size in enumerate(np.maximum(1.0, np.abs(theta)).tolist()):
         for step in (-RELATIVE_STEP * size, RELATIVE_STEP * size):
             moved = theta.copy()
             moved[i] += step
-            there = _meaning(optimum.problem, values_at(optimum.problem, moved))
+            at_moved = _meaning(optimum.problem, values_at(optimum.problem, moved))
             with np.errstate(all="ignore"):
-                changes[:, i] += np.array([there[n] for n in names]) / before / (2.0 * step)
+                changes[:, i] += np.array([at_moved[n] for n in names]) / at_optimum / (2.0 * step)
     stds = Information(optimum).std(np.nan_to_num(changes))
     return [n for n, u in zip(names, stds.tolist(), strict=True) if not u <= NOT_IDENTIFIED_ABOVE]
 
@@ -463,9 +461,10 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
         offered = [(name, "", (model,)) for name, model in models.items()]
     for name, reason, elements in offered:
         try:
-            of_model = problem.like(model=Model(*elements))
-            # parameters at their limits at infinity are those of simpler candidates
-            candidate = solve(of_model, loss=optimum.loss, limits=models is not None)
+            # limits at infinity are other, simpler candidates
+            candidate = solve(
+                problem.like(model=Model(*elements)), loss=optimum.loss, limits=models is not None
+            )
             errors = error_model(candidate) if problem.kind == "table" else None
             candidate = candidate if errors is None else errors.at_estimate
             density = predictive_density(candidate, optimum)
@@ -482,41 +481,41 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
 
 
 def _candidates(
-    optimum: Optimum, problem: Problem, left: PredictiveDensity
+    optimum: Optimum, problem: Problem, fitted: PredictiveDensity
 ) -> Iterator[tuple[str, str, Sequence[Element]]]:
     """Yield the name of each candidate, its reason and the model's elements.
 
     `optimum` is the estimate, with assumed exponents free, and `problem` that of the fit.
     """
     model, values = problem.model, parameter_values(optimum)
-    misfit = f"{percent(left.misfit)} of {problem.output_in_words} left"
-    if np.isfinite(left.harmonic_misfit):
-        misfit += f", {percent(left.harmonic_misfit)} in harmonics"
+    misfit = f"{percent(fitted.misfit)} of {problem.output_in_words} left"
+    if np.isfinite(fitted.harmonic_misfit):
+        misfit += f", {percent(fitted.harmonic_misfit)} in harmonics"
     smallest = float(_levels(problem)[0].min())
     offers: list[tuple[Element, Mapping[str, Alternative]]] = []
     for e in model.elements:
         at_element = [values[p.name] for p in e.parameters]
         finite = bool(np.all(np.isfinite(at_element)))
-        known = finite and all(at_element[:2])
-        stays = e.started(at_element) if finite else e
-        offers.append((stays, e.alternatives(at_element, smallest) if known else {}))
+        usable = finite and all(at_element[:2])
+        unchanged = e.started(at_element) if finite else e
+        offers.append((unchanged, e.alternatives(at_element, smallest) if usable else {}))
     reasons = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
     if problem.response is not None:
         reasons["asymmetry"] = _even(optimum)
         reasons["speed"] = _falling_force(optimum)
-        reasons["masing"] = _jenkins(optimum, left)
+        reasons["masing"] = _jenkins(optimum, fitted.misfit)
     exponent_is_assumed = any(p.assumed for e in model.elements for p in e.parameters)
     for name in dict.fromkeys(name for _, offered in offers for name in offered):
-        taken = [offered[name] for _, offered in offers if name in offered]
-        reason = next((reasons[i.shows] for i in taken if i.shows != "shape"), misfit)
-        # the fit estimates an assumed exponent; more elements of one law in place of several would
+        alternatives = [offered[name] for _, offered in offers if name in offered]
+        reason = next((reasons[a.shows] for a in alternatives if a.shows != "shape"), misfit)
+        # an assumed exponent is estimated anyway; several elements in place of each of two would
         # share their names
         estimated = name == "exponent free" and exponent_is_assumed
-        named_twice = len(taken) > 1 and any(len(instead.elements) > 1 for instead in taken)
+        named_twice = len(alternatives) > 1 and any(len(a.elements) > 1 for a in alternatives)
         if reason and not estimated and not named_twice:
             yield name, reason, [
-                n for e, offered in offers
-                for n in (offered[name].elements if name in offered else (e,))
+                element for e, offered in offers
+                for element in (offered[name].elements if name in offered else (e,))
             ]  # fmt: skip
     if not any(is_spring(e) for e in model.elements):
         yield "spring added", misfit, (model, Spring())
@@ -530,7 +529,7 @@ def _candidates(
             span = f"{misfit}; one frequency, so only the amplitude can tell"
     if several:  # at one frequency a mass is a spring
         added += [Mass(), Damper()]
-    if several or optimum.loss == "linear":  # else outliers at large amplitudes look like a damper
+    if several or optimum.loss == "linear":  # outliers at large amplitudes look like a damper
         added.append(PowerDamper())
     for element in added:
         if all(e.kind != element.kind for e in model.elements):
@@ -555,8 +554,8 @@ def _even(optimum: Optimum) -> str:
 def _falling_force(optimum: Optimum) -> str:
     """Return how much abs(N) falls with the frequency against the model's; "" where it does not.
 
-    By straight lines over the frequency's logarithm, whose slopes are a parabola of the
-    amplitude's, in addition to any smooth dependence on the amplitude.
+    A straight line over ln f is fitted, whose slope is a parabola in ln A, in addition to any
+    smooth dependence on the amplitude.
     """
     problem = optimum.problem
     view, fitted = problem.stiffness_data, problem.predicted_stiffness(optimum.theta).stiffness
@@ -566,31 +565,30 @@ def _falling_force(optimum: Optimum) -> str:
         return ""
     with np.errstate(divide="ignore", invalid="ignore"):
         y = np.log(np.abs(view.stiffness / fitted))[rows]
-    place = 2.0 * (ln_A - ln_A.mean()) / max(float(np.ptp(ln_A)), 1e-9)
+    unit_range = 2.0 * (ln_A - ln_A.mean()) / max(float(np.ptp(ln_A)), 1e-9)
     degree = min(_SMOOTH, np.unique(ln_A.round(2)).size - 1)
-    smooth = legendre.legvander(place, degree)
-    slopes = legendre.legvander(place, min(2, degree))
+    smooth = legendre.legvander(unit_range, degree)
+    slopes = legendre.legvander(unit_range, min(2, degree))
     X = np.hstack([smooth, slopes * (rate - rate.mean())[:, None]])
     dof, Q = y.size - X.shape[1], slopes.shape[1]
     if dof < 1 or not np.isfinite(y).all():
         return ""
     detrended = y - smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
-    solution, _, _, _ = np.linalg.lstsq(X, y, rcond=None)
-    left = float(np.sum((y - X @ solution) ** 2))
-    by_chance = float(
-        special.fdtrc(Q, dof, (float(detrended @ detrended) - left) / Q / (left / dof))
-    )
+    solution = np.linalg.lstsq(X, y, rcond=None)[0]
+    remaining = float(np.sum((y - X @ solution) ** 2))
+    explained = float(detrended @ detrended) - remaining
+    p = float(special.fdtrc(Q, dof, explained / Q / (remaining / dof)))
     change = (slopes @ solution[-Q:]) * float(np.ptp(rate))
     fall = -float(change[np.argmax(np.abs(change))])
-    if not (by_chance < _FALSE_ALARM and fall > 0.0):
+    if not (p < _FALSE_ALARM and fall > 0.0):
         return ""
     f = view.omega[rows] / (2.0 * np.pi)
     return f"force falls by {percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"
 
 
-def _jenkins(optimum: Optimum, left: PredictiveDensity) -> str:
+def _jenkins(optimum: Optimum, misfit: float) -> str:
     """Return the misfit of parallel Jenkins elements where it is far smaller, else ""."""
     least = least_misfit(optimum)
-    if least is None or not least < FAR_LESS * left.misfit:
+    if least is None or not least < FAR_LESS * misfit:
         return ""
     return f"parallel Jenkins elements would leave {percent(least)} of the fundamental"

@@ -49,9 +49,9 @@ from dahl_ident.diagnostics.contributions import (
 from dahl_ident.diagnostics.error_sources import (
     Source,
     error_sources,
-    own_errors,
+    errors_of_suspicious,
+    grouped_rows,
     passes,
-    rows_of,
     rows_of_tests,
 )
 from dahl_ident.diagnostics.estimate import (
@@ -61,7 +61,7 @@ from dahl_ident.diagnostics.estimate import (
     with_assumed,
 )
 from dahl_ident.diagnostics.held_out import HeldOut, held_out
-from dahl_ident.diagnostics.misfit_explanations import at_an_end, neighbourhood, suspicious_points
+from dahl_ident.diagnostics.misfit_explanations import is_at_end, neighbourhood, suspicious_points
 from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.residual_space import (
     Linearization,
@@ -339,7 +339,10 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
     few = problem.n_numbers - len(problem.names) + len(assumed) < _LEAST_DOF
     sources: tuple[Source, ...] = ()
     if not few:
-        sources = (*error_sources(estimate), *own_errors(estimate, _standing_apart(optimum)))
+        sources = (
+            *error_sources(estimate),
+            *errors_of_suspicious(estimate, _standing_apart(optimum)),
+        )
     state = _mixed(estimate, sources).reml(np.array([source.chance for source in sources]))
     if few and problem.scale_known and not estimate.problem.has_misfit:
         # too few to doubt the noise
@@ -384,7 +387,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
             every[TESTS] = positive_part(C * np.outer(wider, wider) - C)
     by_runs = None
     if estimate.regular and len(problem.data.runs or ()) > 1:
-        runs = rows_of(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
+        runs = grouped_rows(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
         by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     return ErrorModel(
         optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed),
@@ -398,7 +401,7 @@ def _standing_apart(optimum: Optimum) -> list[int]:
     Neighbours, or a row at an end of the table, may be where the model fails.
     """
     rows = sorted(p.row for p in suspicious_points(optimum, ResidualSpace(optimum)))
-    return [] if at_an_end(optimum, rows) or neighbourhood(optimum, rows) else rows
+    return [] if is_at_end(optimum, rows) or neighbourhood(optimum, rows) else rows
 
 
 def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:

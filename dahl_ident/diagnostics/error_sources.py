@@ -1,7 +1,7 @@
 r"""Sources of error that several rows share: scatter, model error, errors of the levels.
 
-Each source is a set of columns: its errors are the columns times independent numbers of one
-variance. Departures are relative changes of the response, so that the same source serves every
+Each source is a set of columns: its errors are the columns times independent random numbers of one
+variance. Departures are relative changes of the response, so that a source applies to every
 quantity and noise model. The model error is a Gaussian process with the correlation
 
     exp(-(d ln A)^2/2 - (d ln omega)^2/2),
@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, quotient
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import (
     APART,
@@ -34,68 +34,68 @@ from dahl_ident.diagnostics.estimate import WeightedEstimate, tests_of
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import COMPLIANCES
 
-_SAME_LEVEL = 0.02  # of ln A and ln f, beyond which the response is another
-_MOST_LEVELS = 50  # with an error each: the cost is cubic in their number
-_EQUAL = 1e-9  # of the same: one number, stored twice
-_BY_CHANCE = 0.01  # tables without repeats in which some seem to be
+_SAME_LEVEL = 0.02  # of ln A and ln f: values farther apart are different levels
+_MOST_LEVELS = 50  # levels with an error each: the cost is cubic in their number
+_EQUAL = 1e-9  # of the same: equal except for rounding
+_BY_CHANCE = 0.01  # share of tables without repeats in which some levels seem repeated
 FEWEST_TESTS = 3  # runs, or labelled levels, that count as tests
 
-# Share of tables in which noise alone may look like a model error, or like noisy levels: with less,
-# a spring or an amplifier's gain that is off is overlooked, with more, intervals of a right model
-# are too long.
+# Share of tables in which noise alone may look like a model error, or like noisy levels: if it is
+# lower, a missing spring or a wrong gain is overlooked; if higher, intervals of a correct model are
+# too long.
 _OFTEN = 0.15
 _SHARED_LEVELS = 0.02  # of three kinds together
 _SELDOM = 0.01  # of suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
-_MOST_PLACES = 200  # of shapes, chosen evenly where rows are more
+_MOST_PLACES = 200  # points of shapes, chosen evenly among more rows
 _MOST_NOISY = 100  # levels with a noise each: the cost is cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
-_MOST_DEPARTURE = 5.0  # rms of a model error over that of the misfit which it leaves
-_LEAST_RATE_RANGE = np.log(2.0)  # of frequency, that tells speed from amplitude
-_MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more of it would hide a wrong model
+_MOST_DEPARTURE = 5.0  # largest rms of a model error over that of the misfit
+_LEAST_RATE_RANGE = np.log(2.0)  # of ln omega, to distinguish speed from amplitude
+_MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more would hide a wrong model
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
 _LEVELS_OF: WeakKeyDictionary[FrequencyResponse, NDArray[np.intp]] = WeakKeyDictionary()
-"""Number of each row's level, by table: sources, tests and groups ask for it."""
+"""Number of each row's level, by table, as several callers need it."""
 
 
 def rows_of_levels(data: FrequencyResponse) -> FloatArray:
-    """Return which rows belong to each drive or amplitude held at several frequencies, (L, n)."""
-    held = _agreeing(np.log(_held(data)), (data.controlled == "force").astype(np.intp))
-    rows = held == np.arange(held.max() + 1)[:, None]
+    """Return which rows share a drive or amplitude at several frequencies, (L, n)."""
+    level = _agreeing(np.log(_level(data)), (data.controlled == "force").astype(np.intp))
+    rows = level == np.arange(level.max() + 1)[:, None]
     count = (rows & (data.harmonic == 1)).sum(axis=1)
     if len(rows) > _MOST_LEVELS or not (count > 1).all():
         return np.empty((0, data.n))
     return np.asarray(rows, dtype=np.float64)
 
 
-def _held(data: FrequencyResponse) -> FloatArray:
-    """Return the drive or amplitude that was held in each row, (n,)."""
-    driven, held = data.controlled == "force", np.ones(data.n)
+def _level(data: FrequencyResponse) -> FloatArray:
+    """Return the drive or amplitude that was controlled in each row, (n,)."""
+    driven, level = data.controlled == "force", np.ones(data.n)
     for rows, column in ((driven, data.drive), (~driven, data.amplitude)):
         if column is not None:
-            held[rows] = column[rows]
-    return held
+            level[rows] = column[rows]
+    return level
 
 
-def in_order_of_level(data: FrequencyResponse) -> bool:
-    """Return whether every run goes from level to level in one direction, the same for all.
+def is_monotonic(data: FrequencyResponse) -> bool:
+    """Return whether the levels of all runs rise, or all fall, from row to row.
 
-    A drift along the rows then cannot be distinguished from a change with the level.
+    A drift with time then cannot be distinguished from a change with the level.
     """
     runs = np.zeros(data.n) if data.run is None else data.run
-    first, held = data.harmonic == 1, _held(data)
-    steps = [np.diff(held[first & (runs == run)]) for run in np.unique(runs)]
-    way = np.sign(np.concatenate(steps))
-    return bool(np.abs(way).sum() > 1 and abs(way.sum()) == np.abs(way).sum())
+    first, level = data.harmonic == 1, _level(data)
+    steps = [np.diff(level[first & (runs == run)]) for run in np.unique(runs)]
+    signs = np.sign(np.concatenate(steps))
+    return bool(np.abs(signs).sum() > 1 and abs(signs.sum()) == np.abs(signs).sum())
 
 
 def repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
     """Return which rows belong to each level that was measured more than once, (levels, n).
 
-    Of very many levels, neighbours share what is then the scatter of their mean.
+    Of very many levels, neighbours are combined.
     """
     repeated = np.flatnonzero(np.bincount(level[fundamental], minlength=level.max() + 1) > 1)
     groups = min(len(repeated), _MOST_LEVELS)
@@ -107,18 +107,18 @@ def repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArr
 def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
     """Return the number of each row's level, shape (n,).
 
-    Rows are of one level where the frequency and what was held, drive or amplitude, agree as
-    closely as repeats do; not where a sweep is dense.
+    Rows have one level if the frequency and the controlled drive or amplitude agree as closely as
+    in repeats, but not merely because a sweep is dense.
     """
     if data not in _LEVELS_OF:
         driven = data.controlled == "force"
         frequency = _agreeing(np.log(data.frequency_hz), np.zeros(data.n, dtype=np.intp))
-        _LEVELS_OF[data] = _agreeing(np.log(_held(data)), 2 * frequency + driven)
+        _LEVELS_OF[data] = _agreeing(np.log(_level(data)), 2 * frequency + driven)
     return _LEVELS_OF[data]
 
 
 def passes(data: FrequencyResponse) -> NDArray[np.str_] | None:
-    """Return the pass over the levels that each row belongs to, (n,); None where there is one.
+    """Return the pass over the levels that each row belongs to, (n,); None for a single pass.
 
     Levels that are repeated one block after the other may have been measured on several days.
 
@@ -132,9 +132,9 @@ def passes(data: FrequencyResponse) -> NDArray[np.str_] | None:
     """
     if data.run is not None:
         return None
-    place = np.column_stack([repeated_levels(data), data.harmonic])
+    keys = np.column_stack([repeated_levels(data), data.harmonic])
     number = np.empty(data.n, dtype=np.intp)
-    for rows in rows_of(np.unique(place, axis=0, return_inverse=True)[1].ravel()):
+    for rows in grouped_rows(np.unique(keys, axis=0, return_inverse=True)[1].ravel()):
         number[rows] = np.arange(len(rows))
     if number[-1] == 0 or (np.diff(number) < 0).any() or np.bincount(number).min() < _FEWEST:
         return None
@@ -145,23 +145,24 @@ def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
     """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
     for labels in (data.run, data.level):
         if labels is not None:
-            names, which = np.unique(labels, return_inverse=True)
+            names, number = np.unique(labels, return_inverse=True)
             if FEWEST_TESTS <= len(names) < data.n:
-                return rows_of(which)
-    return rows_of(repeated_levels(data))
+                return grouped_rows(number)
+    return grouped_rows(repeated_levels(data))
 
 
-def rows_of(which: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return the rows of each number."""
-    return np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
+def grouped_rows(group: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return the rows of each group, given the number of each row's group."""
+    return np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
 
 
 def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return a label for each value: one for values of a group that repeat one another.
+    """Return a label for each value: the same for values of a group that repeat one another.
 
-    Gaps between values without repeats are taken as exponential, with the mean that the larger of
-    them have; that all of the k smallest are below some size then has a probability. Gaps up to
-    the least likely such size are between repeats, if chance made it in one of a hundred tables.
+    The gaps between values without repeats are assumed to be exponentially distributed, with the
+    mean of the larger gaps. This gives the probability that the k smallest are as small as they
+    are. If the lowest of these probabilities is below 1 % for the table, the gaps up to that k are
+    gaps between repeats.
     """
     order = np.lexsort((x, groups))
     apart = np.diff(x[order])
@@ -169,7 +170,7 @@ def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
     gaps = np.sort(apart[joined & (apart > _EQUAL)])
     small = gaps[gaps < _SAME_LEVEL]
     k = np.arange(1, len(small) + 1)
-    larger = np.append(gaps, np.maximum(gaps[-1:], _SAME_LEVEL))  # a last one that ends the table
+    larger = np.append(gaps, np.maximum(gaps[-1:], _SAME_LEVEL))  # and one after the last value
     mean = np.maximum(np.cumsum(larger[::-1])[::-1][k] / (len(larger) - k) - small, _EQUAL)
     unlikely = k * np.log(np.expm1(-larger[k] / mean) / np.expm1(-small / mean))
     apart_at_most = _EQUAL
@@ -193,20 +194,20 @@ def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
 class Source:
     """One source of random error."""
 
-    name: str  # as a budget lists it; several sources may share one
-    columns: FloatArray  # (M, q): residuals of unit variance that the source makes at unit variance
+    name: str  # in a budget; several sources may share one
+    columns: FloatArray  # (M, q): whitened residuals that the source makes at unit variance
     mean_square: float  # of ln gain and phase over the rows, at unit variance
     shapes: Shapes | None = None  # extension of the source to other amplitudes and frequencies
-    # what differs from test to test: "gain", "phase", "both" or a parameter's name; empty for noise
+    # what varies from test to test: "gain", "phase", "both" or a parameter's name; empty for noise
     # and model error
     per_test: str = ""
     largest: float = np.inf  # variance
-    # (Q, q): changes of theta that do the same as each column; taken out of the columns
+    # (Q, q): changes of theta with the same effect as a part of each column, which is removed
     absorbed: FloatArray | None = None
-    # parameter that changes as a power of the peak speed, and ln of the speed where it is its
+    # parameter that varies as a power of the peak speed, and ln of the speed at which it equals its
     # estimate
     rate_of: tuple[str, float] | None = None
-    # share of tables in which noise alone may make the source appear; 1 where it is always counted
+    # share of tables in which noise alone may make the source appear; 1 for one always included
     chance: float = 1.0
 
     @property
@@ -216,7 +217,7 @@ class Source:
 
     @property
     def kind(self) -> tuple[bool, str]:
-        """What distinguishes it from other model errors."""
+        """Key that distinguishes it from other model errors."""
         return self.parallel, "" if self.rate_of is None else self.rate_of[0]
 
     def changes(
@@ -226,15 +227,16 @@ class Source:
         where: FloatArray,
         stiffness: ComplexArray | None,
     ) -> FloatArray | None:
-        """Return ln gain and phase that the source makes at other places, (n, 2, q), if it does.
+        """Return the changes of ln gain and phase at other points, (n, 2, q), at unit variance.
 
         `slopes` (n, Q) are the derivatives of ln R with respect to theta there, and `stiffness`
-        the dynamic stiffness; None leaves out forces in parallel with the model.
+        the dynamic stiffness; None leaves out forces in parallel with the model. None is returned
+        for a source that does not extend to other points.
         """
         if self.rate_of is not None:
             name, centre = self.rate_of
-            away = (where.sum(axis=1) - centre)[:, None, None]
-            return np.asarray(parts(slopes[:, [names.index(name)]]) * away)
+            ln_speed = (where.sum(axis=1) - centre)[:, None, None]
+            return np.asarray(parts(slopes[:, [names.index(name)]]) * ln_speed)
         if self.shapes is None or (self.parallel and stiffness is None):
             return None
         ratio = np.ones(len(slopes), dtype=np.complex128) if stiffness is None else stiffness
@@ -244,7 +246,7 @@ class Source:
     def drawn(
         self, names: Sequence[str], slopes: ComplexArray, near: NDArray[np.intp], units: FloatArray
     ) -> FloatArray | None:
-        """Return ln gain and phase (n, 2, q) that a new test draws at unit variance, if it does.
+        """Return the changes (n, 2, q) that vary from test to test, at unit variance; None without.
 
         Its noise is that of the rows `near`, where `units` turn residuals into ln gain and phase.
         """
@@ -263,7 +265,7 @@ def parts(relative: ComplexArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Shapes:
-    """Eigenvectors of a smooth correlation between rows, continued to other places."""
+    """Eigenvectors of a smooth correlation between rows, extended to other points."""
 
     places: FloatArray  # (n, 2): ln A and ln omega of the rows
     weights: FloatArray
@@ -273,7 +275,7 @@ class Shapes:
 
     @classmethod
     def of(cls, places: FloatArray, *, parallel: bool, unit: float = 1.0) -> Shapes:
-        """Return the eigenvectors that rows notice, from evenly chosen ones of many rows."""
+        """Return the significant eigenvectors; of many rows, for evenly chosen ones."""
         if len(places) > _MOST_PLACES:
             order = np.lexsort(places.T[::-1])
             chosen = np.linspace(0, len(places) - 1, _MOST_PLACES).round().astype(int)
@@ -283,17 +285,14 @@ class Shapes:
         return cls(places, vectors[:, kept] / np.sqrt(values[kept]), parallel, unit)
 
     def at(self, places: FloatArray) -> FloatArray:
-        """Return the shapes at other places (k, 2), shape (k, q)."""
+        """Return the shapes at other points (k, 2), shape (k, q)."""
         return np.asarray(_correlation(places, self.places, self.parallel) @ self.weights)
 
     def changes(self, places: FloatArray, stiffness: ComplexArray) -> ComplexArray:
-        """Return relative changes of the response by each shape, gain and phase, (2 q, k)."""
+        """Return relative changes of the response by each shape in gain and phase, (2 q, k)."""
         shapes = self.at(places).T.astype(np.complex128)
         if self.parallel:
-            # a response of zero has no relative change that an element could make
-            shapes = shapes * np.divide(
-                self.unit, stiffness, out=np.zeros_like(stiffness), where=stiffness != 0.0
-            )
+            shapes = shapes * quotient(self.unit, stiffness)
         return np.asarray(np.concatenate([shapes, 1j * shapes]))
 
 
@@ -307,9 +306,8 @@ def error_sources(
 ) -> tuple[Source, ...]:
     """Return the sources that several rows share, and noise of the levels.
 
-    Their shapes are those of the model at the estimate. If they were those of the measured
-    responses, noise would explain itself. `further`, (k, 2), are further places where shapes are
-    needed.
+    Their columns are relative to the model's responses at the estimate; relative to the measured
+    ones, they would contain the noise. `further`, (k, 2), are more points where shapes are needed.
     """
     return tuple(
         source
@@ -322,31 +320,34 @@ def error_sources(
 
 
 def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iterator[Source]:
-    """Yield the smooth departure from the model, and a force in parallel with it."""
+    """Yield a smooth departure from the model, a force in parallel, and errors of harmonics."""
     problem = estimate.problem
     view = estimate.view
     first = view.harmonic == 1
-    there = places(view.amplitude, view.omega)
+    points = places(view.amplitude, view.omega)
     unit = float(np.abs(view.stiffness[first]).max(initial=0.0)) or 1.0
-    every = there if further is None else np.vstack([there, further])
+    all_points = points if further is None else np.vstack([points, further])
     size = _sizes(problem, estimate.predicted)
-    some = first & (size != 0.0)  # a gap that is not crossed has no response
-    missed = problem.data.response[some] / size[some] - 1.0
-    left = float(np.mean(np.abs(missed) ** 2)) if some.any() else 0.0
+    responding = first & (size != 0.0)  # within a gap there is no response
+    departure = problem.data.response[responding] / size[responding] - 1.0
+    misfit = float(np.mean(np.abs(departure) ** 2)) if responding.any() else 0.0
     stiffness = np.where(first, view.stiffness, np.inf)
-    for shape in (Shapes.of(every, parallel=False), Shapes.of(every, parallel=True, unit=unit)):
-        changes, absorbed = shape.changes(there, stiffness) * first, None
-        square, made = _mean_square(changes), estimate.changed(changes * size)
+    for shape in (
+        Shapes.of(all_points, parallel=False),
+        Shapes.of(all_points, parallel=True, unit=unit),
+    ):
+        changes, absorbed = shape.changes(points, stiffness) * first, None
+        square, columns = _mean_square(changes), estimate.changed(changes * size)
         if shape.parallel:
-            absorbed = _absorbed(problem, estimate.jacobian, made)
-            made = made + estimate.jacobian @ absorbed
-        most = 0.5 * _MOST_DEPARTURE**2 * left / square
+            absorbed = _absorbed(problem, estimate.jacobian, columns)
+            columns = columns + estimate.jacobian @ absorbed
+        largest = 0.5 * _MOST_DEPARTURE**2 * misfit / square
         yield Source(
-            MODEL_ERROR, made, square, shape, largest=most, absorbed=absorbed, chance=_OFTEN
+            MODEL_ERROR, columns, square, shape, largest=largest, absorbed=absorbed, chance=_OFTEN
         )
     orders = np.unique(view.harmonic[~first])
     if len(orders) > 0 and first.any():
-        smooth = Shapes.of(there, parallel=False).changes(there, stiffness)
+        smooth = Shapes.of(points, parallel=False).changes(points, stiffness)
         changes = np.concatenate([smooth * (view.harmonic == k) for k in orders])
         yield Source(HARMONICS, estimate.changed(changes * size), 0.0, chance=_OFTEN)
 
@@ -368,30 +369,32 @@ def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
 def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
     """Yield what differs from run to run: gain, phase, and parameters of friction.
 
-    Passes over the levels that differ by more than noise are runs that nobody stated.
+    Without stated runs, each pass over the levels may be a run.
     """
     problem = estimate.problem
     stated = problem.data.run
     labels, chance = (passes(problem.data), _OFTEN) if stated is None else (stated, 1.0)
-    runs = np.empty((0, problem.data.n)) if labels is None else _indicators(labels)
+    if labels is None:
+        return
+    runs = (np.unique(labels)[:, None] == labels).astype(np.float64)
     if len(runs) < _FEWEST:
         return
-    share = runs * estimate.predicted
-    turned = 1j * problem.data.harmonic * share
-    yield Source(RUNS, estimate.changed(share), 0.5, per_test="gain", chance=chance)
-    yield Source(RUNS, estimate.changed(turned), 0.5, per_test="phase", chance=chance)
-    each = np.pad(np.repeat(runs, 2, axis=1).T, ((0, problem.n_priors), (0, 0)))
+    gain = runs * estimate.predicted
+    phase = 1j * problem.data.harmonic * gain
+    yield Source(RUNS, estimate.changed(gain), 0.5, per_test="gain", chance=chance)
+    yield Source(RUNS, estimate.changed(phase), 0.5, per_test="phase", chance=chance)
+    members = np.pad(np.repeat(runs, 2, axis=1).T, ((0, problem.n_priors), (0, 0)))
     for i in _scattering_parameters(problem):
-        column = -each * estimate.jacobian[:, i : i + 1]
-        yield Source(RUNS, column, 0.0, per_test=problem.names[i], chance=chance)
+        columns = -members * estimate.jacobian[:, i : i + 1]
+        yield Source(RUNS, columns, 0.0, per_test=problem.names[i], chance=chance)
 
 
 def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
-    """Yield errors of the levels: of each row, of a level in common, of each repeated level.
+    """Yield errors of the levels: of each row, of all rows of a level, of each repeated level.
 
-    The level itself may be wrong, and a level that the response was divided by: a stiffness is
-    then off by as much in microslip, and right in slip. All rows of a level may share these, and
-    a gain.
+    The level itself may be wrong, or the level that the response was divided by as well: a
+    stiffness then has the same relative error in microslip, and none in slip. All rows of a level
+    may share these errors, and a gain.
     """
     problem, data = estimate.problem, estimate.problem.data
     predicted = estimate.predicted
@@ -402,8 +405,7 @@ def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
     stated = problem.scale_known or problem.noise != "relative"
     if data.n <= _MOST_NOISY and not (stated and (data.controlled != "force").all()):
         for change, most in ((by_level, np.inf), (by_both, _MOST_LEVEL_NOISE)):
-            share = np.divide(change, predicted, out=np.zeros_like(change), where=predicted != 0.0)
-            square = 0.5 * float(np.mean(np.abs(share) ** 2))
+            square = 0.5 * float(np.mean(np.abs(quotient(change, predicted)) ** 2))
             columns = estimate.changed(np.diag(change))
             yield Source(NOISE, columns, square, largest=most**2, chance=_OFTEN)
     in_common = rows_of_levels(data)
@@ -419,8 +421,8 @@ def _levels(estimate: WeightedEstimate) -> Iterator[Source]:
         yield Source(LEVELS, columns, 1.0, per_test="both")
 
 
-def own_errors(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Source]:
-    """Yield one error of all rows that stand apart, beyond those that they share with others."""
+def errors_of_suspicious(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Source]:
+    """Yield the additional error of all suspicious rows."""
     if len(rows) > 0:
         changes = np.zeros((len(rows), estimate.problem.data.n), dtype=np.complex128)
         changes[np.arange(len(rows)), rows] = estimate.predicted[rows]
@@ -429,15 +431,14 @@ def own_errors(estimate: WeightedEstimate, rows: Sequence[int]) -> Iterator[Sour
 
 
 def _sizes(problem: TableProblem, predicted: ComplexArray) -> ComplexArray:
-    """Return what a departure is relative to: the row's response, a harmonic's fundamental."""
+    """Return the reference of a relative departure: the fundamental's size, at the row's phase."""
     _, fundamental = tests_of(problem.data)
     size = np.abs(predicted)
-    phase = np.divide(predicted, size, out=np.zeros_like(predicted), where=size != 0.0)
-    return np.asarray(size[fundamental] * phase)
+    return size[fundamental] * quotient(predicted, size)
 
 
 def _absorbed(problem: TableProblem, J: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return what the model's linear parts take of forces in parallel, as changes of theta."""
+    """Return changes of the linear elements' theta that explain part of the columns, (Q, q)."""
     names = {p.name for e in problem.model.elements if e.is_linear for p in e.parameters}
     linear = [i for i, name in enumerate(problem.names) if name in names]
     changes = np.zeros((J.shape[1], columns.shape[1]))
@@ -457,10 +458,6 @@ def _scattering_parameters(problem: TableProblem) -> list[int]:
             if name in problem.names:
                 indices.append(problem.names.index(name))
     return indices
-
-
-def _indicators(labels: NDArray[np.str_]) -> FloatArray:
-    return np.asarray(np.unique(labels)[:, None] == labels, dtype=np.float64)
 
 
 def _correlation(first: FloatArray, second: FloatArray, parallel: bool) -> FloatArray:

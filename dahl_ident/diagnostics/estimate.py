@@ -1,15 +1,17 @@
 r"""The estimate: weighted least squares, with one misfit in addition to the stated covariance.
 
-A row of the covariance C and the fundamental force F_1 of its test counts as one of the covariance
+A row with the stated covariance C, whose test has the fundamental force F_1, is weighted as if its
+covariance were
 
-    C + s^2 |F_1|^2,
+    C + s^2 |F_1|^2.
 
-the misfit s the same for all fundamentals, and such that chi-square equals its degrees of freedom:
-zero where the model describes the data. That of harmonics is the larger of it and their own, and
-they count less the farther their estimate lies from that of the fundamentals, so that they cannot
-pull it away. Where no covariance is stated, the noise's scale takes its place.
+The misfit s is the same for all fundamentals, and such that chi-square equals its degrees of
+freedom: zero where the model describes the data. The misfit of harmonics is that value or the one
+from their own residuals, whichever is larger. In addition, their weight is reduced as far as their
+estimate disagrees with that of the fundamentals. Where no covariance is stated, the estimated scale
+of the noise is used instead of s.
 With a robust loss the residuals are its scores, and chi-square and scale are those of
-:mod:`dahl_ident.fitting.losses`; to first order all else is as in least squares.
+:mod:`dahl_ident.fitting.losses`; everything else is as in least squares, to first order.
 Priors of sensors and ranges of assumed exponents are further rows. Where the optimum lies at
 infinity, the coordinates are those of its limit (:mod:`dahl_ident.fitting.asymptotes`), such as
 sigma^2/f_max in microslip. Source: Paule and Mandel,
@@ -39,23 +41,23 @@ from dahl_ident.noise import squares_of
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
-_NOTICED = 1e-5  # change of residuals over the largest, below which a direction is undetermined
-_OUTSIDE = 1e-3  # share of a direction that the data may leave open, from rounding
+_NOTICED = 1e-5  # singular value over the largest, below which a direction is undetermined
+_OUTSIDE = 1e-3  # undetermined part of a direction that counts as rounding
 GAIN = "force_gain"
-_STEPS = 60  # Gauss-Newton steps; five are the rule
-_LITTLE_SAID = 0.25  # of the variance of a range: the data say little more of an exponent
-_APART = 0.1  # standard deviations between two minima
-_NEAR_ENOUGH = 0.03  # the same for the estimates of a jackknife
-_LINEAR = 0.3  # change of a logarithm, with which the model changes in proportion
-_SETTLED = 1e-3  # of a standard deviation that a step still moves the estimate
-_LONGEST_STEP = 0.7  # of a logarithm, in one step: the model is linearised
-_FIRST_DAMPING, _DAMPED = 1e-3, 10.0  # of a step after which the sum of squares does not fall
-_TRIALS = 8  # of one step, each damped more
-_ROOT_STEPS = 200  # Newton's, from below, for the misfit: it doubles where it is far off
-_LEAST_LEFT = 1e-3  # of a test, that the others do not determine
-_MOST_DISAGREEMENT = 1e6  # of harmonics with fundamentals, as a factor of their variance
-_SAME_FACTOR = 1e-8  # of its logarithm
-_SAME = 1e-9  # relative change of the misfit's square that no longer counts
+_STEPS = 60  # most Gauss-Newton steps; five are usual
+_NO_BETTER = 0.25  # variance of an exponent over that of its range: there may be two minima
+_APART = 0.1  # distance of two different minima, in standard deviations
+_NEAR_ENOUGH = 0.03  # last step of an estimate of a jackknife, in standard deviations
+_LINEAR = 0.3  # change of a logarithm up to which the model is linear
+_SETTLED = 1e-3  # last step of a search, in standard deviations
+_LONGEST_STEP = 0.7  # change of a logarithm in one step of the linearised model
+_FIRST_DAMPING, _DAMPED = 1e-3, 10.0  # damping after a step that fails, and its factor
+_TRIALS = 8  # trials of one step, each with more damping
+_ROOT_STEPS = 200  # most Newton steps for the misfit; far from the root, it doubles
+_LEAST_LEFT = 1e-3  # least part of a test's residuals that is left at high leverage
+_MOST_DISAGREEMENT = 1e6  # largest factor of the harmonics' variance
+_SAME_FACTOR = 1e-8  # tolerance of the logarithm of that factor
+_SAME = 1e-9  # relative tolerance of the misfit's square
 
 
 @dataclass(frozen=True)
@@ -77,9 +79,9 @@ class Basis:
     def of(cls, J: FloatArray, theta: FloatArray, chart: Chart) -> Basis:
         """Return the directions that residuals with the Jacobian J determine."""
         slopes = chart.derivative(theta)
-        by_coordinates = J @ slopes
-        size = 1.0 / np.maximum(np.linalg.norm(by_coordinates, axis=0), np.finfo(float).tiny)
-        _, singular, directions = np.linalg.svd(by_coordinates * size, full_matrices=False)
+        columns = J @ slopes
+        size = 1.0 / np.maximum(np.linalg.norm(columns, axis=0), TINY)
+        _, singular, directions = np.linalg.svd(columns * size, full_matrices=False)
         return cls(size, directions[singular > _NOTICED * singular[0]].T, slopes, chart)
 
     @property
@@ -94,15 +96,14 @@ class Basis:
     def holds(self, slopes: FloatArray) -> NDArray[np.bool_]:
         """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
 
-        One that no coordinate changes is infinite in the limit, unless nothing changes it at all.
+        A quantity that depends on theta, but on no coordinate, is infinite in the limit.
         """
-        # directions alone count, and slopes may be as large as numbers can be
-        largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=np.finfo(np.float64).tiny)
+        largest = np.abs(slopes).max(axis=-1, keepdims=True, initial=TINY)  # against overflow
         scaled = (slopes / largest) @ self.slopes * self.size
-        left = scaled - (scaled @ self.directions) @ self.directions.T
-        whole = np.linalg.norm(scaled, axis=-1)
-        known = np.linalg.norm(left, axis=-1) <= _OUTSIDE * whole
-        return np.asarray(known & ((whole > 0.0) | ~slopes.any(axis=-1)))
+        outside = scaled - (scaled @ self.directions) @ self.directions.T
+        length = np.linalg.norm(scaled, axis=-1)
+        determined = np.linalg.norm(outside, axis=-1) <= _OUTSIDE * length
+        return np.asarray(determined & ((length > 0.0) | ~slopes.any(axis=-1)))
 
 
 def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
@@ -110,36 +111,37 @@ def chart_of_limit(optimum: Optimum, problem: TableProblem) -> Chart:
 
     `problem` may have more free parameters, coordinates in addition to those of the limit.
     """
-    gone = {
+    extremes = {
         p.name: value
         for p, value in zip(optimum.problem.parameters, optimum.values.tolist(), strict=True)
         if np.isinf(value) or (value == 0.0 and p.positive)
     }
-    reached = [one for one in limits(optimum.problem) if one.extremes == gone] if gone else []
+    every = limits(optimum.problem) if extremes else ()
+    reached = [limit for limit in every if limit.extremes == extremes]
     if not reached:
         return Basis.every(len(problem.names)).chart
     chart = min(
-        (one.chart.of(0) for one in reached),
+        (limit.chart.of(0) for limit in reached),
         key=lambda c: float(np.abs(c.theta(c.phi(optimum.theta)) - optimum.theta).max()),
     )
     of_optimum = [problem.names.index(name) for name in optimum.names]
     others = [i for i in range(len(problem.names)) if i not in of_optimum]
-    place, unit = np.argsort([*of_optimum, *others]), np.eye(len(others))
+    order, unit = np.argsort([*of_optimum, *others]), np.eye(len(others))
     tied = None if chart.tied is None else (of_optimum[chart.tied[0]], of_optimum[chart.tied[1]])
-    offset = np.append(chart.offset, np.zeros(len(others)))[place]
-    matrix, back = block_diag(chart.matrix, unit)[place], block_diag(chart.back, unit)[:, place]
+    offset = np.append(chart.offset, np.zeros(len(others)))[order]
+    matrix, back = block_diag(chart.matrix, unit)[order], block_diag(chart.back, unit)[:, order]
     return Chart(matrix, offset, back, tied)
 
 
 class Assumption(NamedTuple):
-    """A parameter held at a value that has an uncertainty: its source, and that of its log."""
+    """Uncertainty of a parameter held at a value: its source in a budget, and that of its log."""
 
     source: str
     std: float
 
 
 def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumption]]:
-    """Return the problem with what was assumed free: exponents, and the factor of the drive."""
+    """Return the problem with assumed exponents and an uncertain drive factor free."""
     assumed = {
         p.name: Assumption(EXPONENT, float(np.log(p.prior[1] / p.prior[0]) / np.sqrt(12.0)))
         for p in problem.model.parameters
@@ -151,7 +153,7 @@ def with_assumed(problem: TableProblem) -> tuple[TableProblem, dict[str, Assumpt
         assumed[gain.name] = Assumption(DRIVE_FACTOR, float(u))
     if not assumed:
         return problem, {}
-    return problem.assuming({name: one.std for name, one in assumed.items()}), assumed
+    return problem.assuming({name: a.std for name, a in assumed.items()}), assumed
 
 
 @dataclass(frozen=True)
@@ -160,14 +162,14 @@ class WeightedEstimate:
 
     problem: TableProblem  # the assumed exponents free, its covariances with the misfit
     theta: FloatArray  # (Q,): the estimate, search coordinates
-    misfit_variance: FloatArray  # (n,): what the misfit adds to the stated covariances
+    misfit_variance: FloatArray  # (n,): added to the stated covariances by the misfit
     scale: float  # of the residuals; 1 where the data state it
     residuals: FloatArray  # (M,): those of data, then of priors, of unit variance
     jacobian: FloatArray  # (M, Q): their derivatives
     loss: Loss | None
     regular: bool  # whether the data determine every parameter
-    basis: Basis  # what they determine
-    # (Q,): how far a second minimum is, times the root of its probability; None where there is none
+    basis: Basis  # directions that they determine
+    # (Q,): distance to a second minimum times the root of its probability; None without one
     second: FloatArray | None = None
 
     @cached_property
@@ -181,7 +183,7 @@ class WeightedEstimate:
 
     @cached_property
     def y(self) -> FloatArray:
-        """Residuals that are least squares at the estimate, (M,): scores where there is a loss."""
+        """Residuals in the least-squares sense, (M,): with a robust loss, its scores."""
         return scores_of(self.residuals, self.problem.n_residuals, self.loss)
 
     @property
@@ -190,15 +192,15 @@ class WeightedEstimate:
         return self.jacobian @ self.basis.matrix
 
     def changed(self, changes: ComplexArray) -> FloatArray:
-        """Return the changes of `y`, (M, k), by changes (k, n) of the measured responses."""
+        """Return the changes of `y`, (M, k), caused by changes (k, n) of the responses."""
         columns = -self.problem.residual_change(self.theta, changes).T / self.scale
         return np.pad(columns, ((0, self.problem.n_priors), (0, 0)))
 
     def factors(self, problem: TableProblem) -> FloatArray:
         """Return the matrices from each row's residuals in `problem` to those of `y`, (n, 2, 2)."""
         ones = np.ones(self.problem.data.n)
-        ours = by_row(self.problem, self.theta, ones) / self.scale
-        return np.asarray(ours @ np.linalg.pinv(by_row(problem, self.theta, ones)))
+        to_y = row_changes(self.problem, self.theta, ones) / self.scale
+        return np.asarray(to_y @ np.linalg.pinv(row_changes(problem, self.theta, ones)))
 
     @cached_property
     def predicted(self) -> ComplexArray:
@@ -216,7 +218,7 @@ class WeightedEstimate:
         return relative_units(self.problem, self.theta, self.predicted) * self.scale
 
     def lever(self, left_out: Collection[str] = ()) -> FloatArray:
-        """Return G = (J'J)^-1 J', d theta/d y (Q, M), some parameters left out: exact."""
+        """Return G = (J'J)^-1 J', d theta/d y (Q, M); the parameters `left_out` are exact."""
         kept = self.basis.matrix
         if left_out:
             kept = kept[:, [name not in left_out for name in self.problem.names]]
@@ -224,7 +226,7 @@ class WeightedEstimate:
         return np.asarray(kept @ np.linalg.solve(R, Q.T))
 
     def without(self, left_out: NDArray[np.intp]) -> WeightedEstimate:
-        """Return the estimate without some residuals: a Gauss-Newton step, which is short."""
+        """Return the estimate without some residuals, by one Gauss-Newton step."""
         kept = np.ones(len(self.y), dtype=bool)
         kept[left_out] = False
         step = np.linalg.lstsq(self.columns[kept], -self.y[kept], rcond=1e-13)[0]
@@ -237,30 +239,32 @@ class WeightedEstimate:
     def jackknife(self, tests: Sequence[NDArray[np.intp]]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
 
-        Each counts with the root of its leverage, so that the sum is without bias where the
-        weights are right. Source: Wu, Annals of Statistics 14 (1986) 1261.
+        The change by each test is weighted with the root of its leverage, so that the covariance
+        is unbiased where the weights are right. Source: Wu, Annals of Statistics 14 (1986) 1261.
         """
         Q, R = np.linalg.qr(self.jacobian)
         moves = []
         for rows in tests:
             of_test = (2 * rows[:, None] + np.arange(2)).ravel()
-            left, turn = np.linalg.eigh(np.eye(len(R)) - Q[of_test].T @ Q[of_test])
-            along = turn.T @ (Q[of_test].T @ self.y[of_test])
-            moves.append(turn @ (along / np.sqrt(np.maximum(left, _LEAST_LEFT))))
-        each = np.linalg.solve(R, np.array(moves).T).T
-        each = np.clip(each, *(bound - self.theta for bound in self.problem.bounds()))
-        return np.asarray(each.T @ each)
+            remaining, vectors = np.linalg.eigh(np.eye(len(R)) - Q[of_test].T @ Q[of_test])
+            scores = vectors.T @ (Q[of_test].T @ self.y[of_test])
+            moves.append(vectors @ (scores / np.sqrt(np.maximum(remaining, _LEAST_LEFT))))
+        changes = np.linalg.solve(R, np.array(moves).T).T
+        changes = np.clip(changes, *(bound - self.theta for bound in self.problem.bounds()))
+        return np.asarray(changes.T @ changes)
 
 
-def by_row(problem: TableProblem, theta: FloatArray, size: FloatArray | ComplexArray) -> FloatArray:
-    """Return the changes of each row's residuals by `size` and by i times it, (n, 2, 2)."""
+def row_changes(
+    problem: TableProblem, theta: FloatArray, size: FloatArray | ComplexArray
+) -> FloatArray:
+    """Return the changes of each row's residuals by changes `size` and i `size`, (n, 2, 2)."""
     both = problem.residual_change(theta, np.array([[1.0], [1.0j]]) * size)
     return both.reshape(2, -1, 2).transpose(1, 2, 0)
 
 
 def relative_units(problem: TableProblem, theta: FloatArray, predicted: ComplexArray) -> FloatArray:
     """Return the matrices from each row's residuals to ln gain and phase, (n, 2, 2)."""
-    return np.asarray(np.linalg.pinv(-by_row(problem, theta, predicted)), dtype=np.float64)
+    return np.asarray(np.linalg.pinv(-row_changes(problem, theta, predicted)), dtype=np.float64)
 
 
 def weighted_estimate(
@@ -268,36 +272,32 @@ def weighted_estimate(
 ) -> WeightedEstimate:
     """Return the estimate, searched from an optimum.
 
-    Where the data say little more of an assumed exponent than its range does, there may be a second
-    minimum: it is searched from the ends of the range as well, and the likelier one is taken.
+    Where the data determine an assumed exponent little better than its range does, there may be a
+    second minimum: the search also starts at the ends of the range, and the likelier one is taken.
     """
-    known = dict(zip(optimum.names, optimum.theta, strict=True))
-    theta = np.array(
-        [known[p.name] if p.name in known else np.log(p.value or 1.0) for p in problem.parameters]
-    )
-    best = _descended(optimum, problem, theta, determined=determined)
+    best = _minimum(optimum, problem, optimum.theta_in(problem), determined=determined)
     if not determined:
         return best
     covariance = np.linalg.pinv(best.jacobian.T @ best.jacobian, hermitian=True)
     minima = [best]
     for name, (centre, std) in problem.ranges.items():
-        place = problem.names.index(name)
-        along, variance = covariance[:, place], float(covariance[place, place])
-        if name == GAIN or not variance > _LITTLE_SAID * std**2:
+        i = problem.names.index(name)
+        column, variance = covariance[:, i], float(covariance[i, i])
+        if name == GAIN or not variance > _NO_BETTER * std**2:
             continue
         for end in (centre - 3.0**0.5 * std, centre + 3.0**0.5 * std):
-            change = along / variance * (end - best.theta[place])
+            change = column / variance * (end - best.theta[i])
             begin = np.clip(best.theta + change, *problem.bounds())
             with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):  # far off
-                there = _descended(optimum, problem, begin, determined=True)
-                minima += [there] if np.isfinite(there.deviance) else []
-    if len(minima) == 1:
+                minimum = _minimum(optimum, problem, begin, determined=True)
+                minima += [minimum] if np.isfinite(minimum.deviance) else []
+    best, *others = sorted(minima, key=lambda minimum: minimum.deviance)
+    different = [
+        m for m in others if np.linalg.norm(best.columns @ (m.theta - best.theta)) > _APART
+    ]
+    if not different:
         return best
-    best = min(minima, key=lambda minimum: minimum.deviance)
-    apart = [m for m in minima if np.linalg.norm(best.columns @ (m.theta - best.theta)) > _APART]
-    if not apart:
-        return best
-    second = min(apart, key=lambda minimum: minimum.deviance)
+    second = different[0]
     chance = 1.0 / (1.0 + np.exp(0.5 * (second.deviance - best.deviance)))
     return replace(best, second=np.sqrt(chance) * (second.theta - best.theta))
 
@@ -305,55 +305,55 @@ def weighted_estimate(
 def jackknife_with_weights(
     estimate: WeightedEstimate, optimum: Optimum, tests: Sequence[NDArray[np.intp]]
 ) -> FloatArray:
-    """Return the covariance of theta (Q, Q) by estimating again without each test, weights too.
+    """Return the covariance of theta, (Q, Q), by estimating it and the weights without each test.
 
     The model is linearised at the estimate, and refitted where a test moves it far.
     """
     theta, loss = estimate.theta, estimate.loss
     problem = estimate.problem.widened(np.zeros(estimate.problem.data.n))
-    every, basis, bounds = LinearRows.at(problem, theta), Basis.every(len(theta)), problem.bounds()
+    rows, basis, bounds = LinearRows.at(problem, theta), Basis.every(len(theta)), problem.bounds()
     moves = []
-    for rows in tests:
+    for test in tests:
         kept = np.ones(problem.data.n, dtype=bool)
-        kept[rows] = False
-        others, there = every.take(kept), theta.copy()
+        kept[test] = False
+        others, refitted = rows.take(kept), theta.copy()
         with suppress(np.linalg.LinAlgError):  # the others do not determine it
             for _ in range(_STEPS):
-                at = others.moved(there - theta)
+                at = others.moved(refitted - theta)
                 r, columns = at.weighted(at.squares(loss))
                 y = scores_of(r, 2 * len(at.z), loss)
-                step = _step(columns, y, there, basis, bounds)
-                there = there + step
+                step = _step(columns, y, refitted, basis, bounds)
+                refitted = refitted + step
                 if np.linalg.norm(columns @ step) < _NEAR_ENOUGH:
                     break
-            if np.abs(there - theta)[problem.space.positive].max(initial=0.0) > _LINEAR:
+            if np.abs(refitted - theta)[problem.space.positive].max(initial=0.0) > _LINEAR:
                 part = problem.part(kept, problem.data.response[kept])
-                there = _descended(optimum, part, theta, determined=True).theta
-            moves.append(there - theta)
-    each = np.array(moves).reshape(-1, len(theta))
-    return np.asarray((1.0 - 1.0 / len(tests)) * each.T @ each)
+                refitted = _minimum(optimum, part, theta, determined=True).theta
+            moves.append(refitted - theta)
+    changes = np.array(moves).reshape(-1, len(theta))
+    return np.asarray((1.0 - 1.0 / len(tests)) * changes.T @ changes)
 
 
 @dataclass(frozen=True)
 class LinearRows:
-    """Residuals by the stated covariances, each row's turned so that a misfit weighs both parts.
+    """Rows whitened by the stated covariances, rotated so that their two parts are independent.
 
-    A misfit of the square x makes the variances of the two parts 1 + growth x.
+    A squared misfit x makes the variances of the two parts 1 + growth x.
     """
 
     z: FloatArray  # (n, 2)
     slopes: FloatArray  # (n, 2, Q): derivatives with respect to theta
     growth: FloatArray  # (n, 2)
-    of_priors: tuple[FloatArray, FloatArray]  # (p,) and (p, Q): residuals and derivatives
+    priors: tuple[FloatArray, FloatArray]  # (p,) and (p, Q): residuals and derivatives
     first: NDArray[np.bool_]  # (n,): fundamentals
-    numbers: FloatArray  # (n,): of each row
+    numbers: FloatArray  # (n,): real numbers in each row, 1 or 2
 
     @classmethod
     def at(cls, stated: TableProblem, theta: FloatArray) -> LinearRows:
-        """Return the rows of a problem whose misfit is zero."""
+        """Return the rows of a problem without misfit."""
         m = stated.n_residuals
         y, J = stated.residuals_and_jacobian(theta)
-        D = by_row(stated, theta, fundamental_sizes(stated.data))
+        D = row_changes(stated, theta, fundamental_sizes(stated.data))
         growth, turn = np.linalg.eigh(D @ D.swapaxes(1, 2))
         return cls(
             np.einsum("nji,nj->ni", turn, y[:m].reshape(-1, 2)),
@@ -371,29 +371,29 @@ class LinearRows:
 
     def moved(self, step: FloatArray) -> LinearRows:
         """Return the rows after a step of theta."""
-        y, J = self.of_priors
-        return replace(self, z=self.z + self.slopes @ step, of_priors=(y + J @ step, J))
+        y, J = self.priors
+        return replace(self, z=self.z + self.slopes @ step, priors=(y + J @ step, J))
 
     def weighted(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return residuals of unit variance, and derivatives, for misfits of the squares (n,)."""
         weight = 1.0 / np.sqrt(1.0 + self.growth * square[:, None])
-        y, J = self.of_priors
+        y, J = self.priors
         slopes = (weight[:, :, None] * self.slopes).reshape(-1, J.shape[1])
         return np.concatenate([(weight * self.z).ravel(), y]), np.concatenate([slopes, J])
 
     def squares(self, loss: Loss | None) -> FloatArray:
-        """Return the square of each row's misfit, (n,), with which chi-square is as expected."""
-        y, J = self.of_priors
+        """Return each row's squared misfit, (n,), with which chi-square has its expected value."""
+        y, J = self.priors
         first, square = self.first, np.zeros(len(self.z))
-        apart = bool(first.any() and not first.all() and 2 * first.sum() > J.shape[1])
-        first = first | (not apart)
+        separate = bool(first.any() and not first.all() and 2 * first.sum() > J.shape[1])
+        first = first | (not separate)
         free = J.shape[1] - len(y) + float(y @ y)
         targets = [(first, self.numbers[first].sum() - free), (~first, self.numbers[~first].sum())]
         if targets[0][1] <= 0.0:
             return square
         for rows, target in targets:
             square[rows] = _square(self.z[rows] ** 2, self.growth[rows], float(target), loss)
-        if apart and square.any():
+        if separate and square.any():
             square[~first] = np.maximum(square[~first], square[first].max())
             r, slopes = self.weighted(square)
             factor = _disagreement(scores_of(r, 2 * len(first), loss), slopes, ~first)
@@ -401,7 +401,7 @@ class LinearRows:
         return square
 
 
-def _descended(
+def _minimum(
     optimum: Optimum, problem: TableProblem, theta: FloatArray, *, determined: bool
 ) -> WeightedEstimate:
     """Return the minimum at which a search from theta ends."""
@@ -426,8 +426,8 @@ def _descended(
         if size < _SETTLED:
             break
         moved = columns @ step
-        further = _further(moved, last)
-        step, last = further * step, moved if further == 1.0 else None
+        factor = _extrapolation(moved, last)
+        step, last = factor * step, moved if factor == 1.0 else None
         mean = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
         cost = _cost(r, m, loss, mean)
         for _ in range(_TRIALS):
@@ -450,7 +450,7 @@ def _descended(
 
 
 def scores_of(r: FloatArray, m: int, loss: Loss | None) -> FloatArray:
-    """Return residuals whose sum of squares the estimate makes least, the first m of data."""
+    """Return the residuals of least squares: scores of a robust loss for the first m, of data."""
     return r if loss is None else np.concatenate([loss.scores(r[:m]), r[m:]])
 
 
@@ -467,27 +467,27 @@ def _step(
     basis: Basis,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Return Gauss and Newton's step; parameters that it would take out of bounds go to them."""
+    """Return the Gauss-Newton step; parameters that it would move out of bounds go to the bound."""
     to_bounds, inside = np.zeros(columns.shape[1]), np.ones(columns.shape[1], dtype=bool)
     matrix = basis.matrix
-    alone = (matrix != 0.0).sum(axis=1) == 1
+    uncoupled = (matrix != 0.0).sum(axis=1) == 1
     step = to_bounds
     for _ in range(len(theta)):
-        rest = np.linalg.lstsq(columns * inside, -y - columns @ to_bounds, rcond=1e-13)[0]
-        step = to_bounds + inside * rest
-        there = theta + matrix @ step
-        within = np.clip(there, *bounds)
-        beyond = np.flatnonzero(alone & (there != within))
-        places = np.abs(matrix[beyond]).argmax(axis=1)
-        if inside[places].sum() == 0:
+        free_step = np.linalg.lstsq(columns * inside, -y - columns @ to_bounds, rcond=1e-13)[0]
+        step = to_bounds + inside * free_step
+        end = theta + matrix @ step
+        within = np.clip(end, *bounds)
+        beyond = np.flatnonzero(uncoupled & (end != within))
+        directions = np.abs(matrix[beyond]).argmax(axis=1)
+        if inside[directions].sum() == 0:
             break
-        inside[places] = False
-        to_bounds[places] = (within - theta)[beyond] / matrix[beyond, places]
+        inside[directions] = False
+        to_bounds[directions] = (within - theta)[beyond] / matrix[beyond, directions]
     return np.asarray(step)
 
 
-def _further(moved: FloatArray, last: FloatArray | None) -> float:
-    """Return the factor that lengthens a step to the sum of the geometric series it continues."""
+def _extrapolation(moved: FloatArray, last: FloatArray | None) -> float:
+    """Return the factor of a step that continues a geometric series, to reach its sum at once."""
     ratio = 0.0 if last is None else float(moved @ last) / max(float(last @ last), TINY)
     return 1.0 / (1.0 - ratio) if 0.0 < ratio <= 0.5 else 1.0
 
@@ -496,12 +496,12 @@ def _further(moved: FloatArray, last: FloatArray | None) -> float:
 def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the number of each row's test, and the row of its fundamental, (n,) each.
 
-    A test is all rows of one level in one run; a row without a fundamental has itself.
+    A test is all rows of one level in one run; a row without a fundamental refers to itself.
     """
     runs = np.zeros(data.n) if data.run is None else np.unique(data.run, return_inverse=True)[1]
     levels = (v for v in (data.amplitude, data.drive) if v is not None)
-    places = (runs, data.frequency_hz, *levels)
-    test = np.unique(np.column_stack(places), axis=0, return_inverse=True)[1].ravel()
+    keys = np.column_stack((runs, data.frequency_hz, *levels))
+    test = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
     first = np.flatnonzero(data.harmonic == 1)
     fundamental = np.full(test.max() + 1, -1)
     fundamental[test[first][::-1]] = first[::-1]  # the first of several
@@ -517,7 +517,7 @@ def fundamental_sizes(data: FrequencyResponse) -> FloatArray:
 def _weights(
     stated: TableProblem, theta: FloatArray, loss: Loss | None
 ) -> tuple[FloatArray, float]:
-    """Return what the misfit adds to each row's variance, and the scale of the residuals."""
+    """Return the variance that the misfit adds to each row, and the scale of the residuals."""
     if stated.scale_known:
         square = LinearRows.at(stated, theta).squares(loss)
         return square * fundamental_sizes(stated.data) ** 2, 1.0
@@ -530,7 +530,7 @@ def _weights(
 
 
 def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) -> float:
-    """Return the factor of the harmonics' variance by which they agree with the fundamentals.
+    """Return the factor of the harmonics' variance with which they agree with the fundamentals.
 
     Both are estimates of the parameters, and the factor is that of Paule and Mandel: the square of
     their distance, over its variance, is the number of directions that harmonics determine.
@@ -551,8 +551,8 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
         return float(v @ np.linalg.pinv(M, rcond=_NOTICED**2, hermitian=True) @ v)
 
     def distance(factor: float) -> float:
-        apart = explained(A, b) + explained(A_h, b_h) / factor
-        return apart - explained(A + A_h / factor, b + b_h / factor)
+        separately = explained(A, b) + explained(A_h, b_h) / factor
+        return separately - explained(A + A_h / factor, b + b_h / factor)
 
     def excess(ln_factor: float) -> float:
         return distance(np.exp(ln_factor)) - directions
@@ -562,13 +562,13 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
         return 1.0
     if excess(most) >= 0.0:
         return _MOST_DISAGREEMENT
-    from scipy.optimize import brentq  # slow to import, and for harmonics that disagree alone
+    from scipy.optimize import brentq  # slow to import, and rarely needed
 
     return float(np.exp(brentq(excess, 0.0, most, xtol=_SAME_FACTOR)))
 
 
 def _square(z: FloatArray, b: FloatArray, target: float, loss: Loss | None) -> float:
-    """Return the square x of a misfit with which chi-square of rows (n, 2) meets its target."""
+    """Return the squared misfit x with which chi-square of rows (n, 2) equals its target."""
     x = _root(z, b, target)
     if loss is None or not len(z):
         return x
@@ -581,7 +581,7 @@ def _square(z: FloatArray, b: FloatArray, target: float, loss: Loss | None) -> f
 
 
 def _root(z: FloatArray, b: FloatArray, target: float) -> float:
-    """Return x >= 0 with sum z/(1 + b x) = target, or below; the sum falls and is convex."""
+    """Return x >= 0 at which sum z/(1 + b x), convex and falling, reaches the target."""
     x = 0.0
     if z.sum() <= target:
         return x
@@ -600,7 +600,7 @@ def _root(z: FloatArray, b: FloatArray, target: float) -> float:
 
 
 def _moved(problem: TableProblem, theta: FloatArray, step: FloatArray, basis: Basis) -> FloatArray:
-    """Return theta after a step, or the part of it that changes no logarithm by much."""
+    """Return theta after a step, shortened so that no logarithm changes by much."""
     basis = basis.at(theta)
     logarithmic = (basis.slopes[problem.space.positive] != 0.0).any(axis=0)
     move = basis.size * (basis.directions @ step)

@@ -7,9 +7,9 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 
-_DIGITS = 12  # of a number with a very small uncertainty
+_DIGITS = 12  # significant digits of a number with a very small uncertainty
 _MANY_DOF = 999.5  # degrees of freedom from which k is that of a normal distribution to 0.1 %
-_LEAST_P = 1e-12  # smaller ones depend on unknown tails
+_LEAST_P = 1e-12  # smaller values depend on unknown tails of distributions
 _SYMBOLS = {"f_max": r"f_\mathrm{max}", "sigma": r"\sigma", "alpha": r"\alpha"}
 
 
@@ -41,15 +41,15 @@ def rounded(value: float, uncertainty: float | None) -> tuple[str, str]:
         return f"{value:.2g}", f"{uncertainty:.2g}"
     # rounding 0.0996 to two digits gives 0.10, so the digits follow the rounded uncertainty
     last = math.floor(math.log10(float(f"{uncertainty:.1e}"))) - 1
-    number, error = _alike((value, uncertainty), last)
+    number, error = _with_last_digit((value, uncertainty), last)
     return number, error
 
 
-def _alike(numbers: Sequence[float], last: int) -> list[str]:
-    """Return numbers with one exponent, the last digit standing for 10^last."""
+def _with_last_digit(numbers: Sequence[float], last: int) -> list[str]:
+    """Return numbers with the same exponent, whose last digit is that of 10^last."""
     power = math.floor(math.log10(max(abs(number) for number in numbers)))
     exponent = power if power >= 5 or power < -3 else 0
-    digits = exponent - last  # negative where the last digit that counts stands before the point
+    digits = exponent - last  # negative where the last digit is left of the decimal point
     texts = [f"{round(number / 10.0**exponent, digits):.{max(0, digits)}f}" for number in numbers]
     return [f"{text}e{exponent:+03d}" for text in texts] if exponent else texts
 
@@ -61,20 +61,20 @@ def with_unit(value: float, uncertainty: float | None, unit: str) -> str:
 
 
 def p_text(p: float) -> str:
-    """Return ``"p = 0.012"``, or a bound where noise alone cannot be the reason."""
+    """Return ``"p = 0.012"``, or ``"p < 1e-12"``."""
     return f"p = {p:.2g}" if p >= _LEAST_P else f"p < {_LEAST_P:.0e}"
 
 
 def degrees_text(dof: Iterable[float]) -> str:
-    """Return degrees of freedom in words, or the range of several.
+    """Return degrees of freedom as text, or the range of several.
 
     Examples
     --------
     >>> degrees_text([24.08]), degrees_text([math.inf]), degrees_text([57.0, 6250.0])
     ('24.1', 'infinite', '57 to more than 1000')
     """
-    several = list(dof) or [math.inf]
-    least, most = min(several), max(several)
+    values = list(dof) or [math.inf]
+    least, most = min(values), max(values)
     if least >= _MANY_DOF:
         return "more than 1000" if math.isfinite(least) else "infinite"
     text = f"{least:.3g}"
@@ -88,7 +88,7 @@ def listed(words: Sequence[str]) -> str:
 
 
 def interval(lower: float, upper: float, unit: str) -> str:
-    """Return ``"0.098 to 0.102 N"``; an open end is said in words.
+    """Return ``"0.098 to 0.102 N"``; an open end is written in words.
 
     Examples
     --------
@@ -112,12 +112,12 @@ def interval(lower: float, upper: float, unit: str) -> str:
         return f"{lower:.{_DIGITS}g} {unit}".rstrip()
     if 0.0 < lower < 0.1 * upper:  # its digits would be rounded away
         return f"{lower:.2g} to {upper:.2g} {unit}".rstrip()
-    low, high = _alike((lower, upper), math.floor(math.log10(upper - lower)) - 1)
+    low, high = _with_last_digit((lower, upper), math.floor(math.log10(upper - lower)) - 1)
     return f"{low} to {high} {unit}".rstrip()
 
 
 def table(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
-    """Return rows of text as aligned columns, those numbered in `left` to the left."""
+    """Return rows of text as aligned columns; those numbered in `left` are left-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     columns = [f"{'<' if i in left else '>'}{width}" for i, width in enumerate(widths)]
     lines = (map(format, row, columns) for row in rows)
@@ -125,7 +125,7 @@ def table(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
 
 
 def html_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return an HTML table, without any style."""
+    """Return an HTML table without style."""
 
     def row(cells: Sequence[str], tag: str) -> str:
         return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
@@ -135,7 +135,7 @@ def html_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def tabular(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a LaTeX table that needs no package."""
+    """Return a LaTeX table that requires no package."""
     lines = [" & ".join(row) + r" \\" for row in (header, *rows)]
     body = "\n".join([r"\hline", lines[0], r"\hline", *lines[1:], r"\hline"])
     return f"\\begin{{tabular}}{{l{'r' * (len(header) - 2)}l}}\n{body}\n\\end{{tabular}}\n"
@@ -152,7 +152,7 @@ def unit(text: str) -> str:
 
 
 def pair(value: float, uncertainty: float | None) -> tuple[str, str]:
-    """Return a value and its uncertainty as LaTeX, to the same place."""
+    """Return a value and its uncertainty as LaTeX, rounded to the same digit."""
     if uncertainty is None or not math.isfinite(uncertainty):
         return f"${_power(f'{value:g}')}$", ""
     first, second = rounded(value, uncertainty)

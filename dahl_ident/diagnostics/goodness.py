@@ -3,14 +3,14 @@
 Every test that applies is made: chi-square where the noise is known, trends and runs of the
 residuals over amplitude, frequency and drive, a stiffness that rises with amplitude, the
 exponent's score (departure from the universal curve h(beta)), the third harmonic against the
-model's. Their joint false-alarm rate is 1 %: the level of each is a hundredth over the number of
-those that do not object more strongly (Holm, Scandinavian Journal of Statistics 6 (1979) 65).
-Trends are judged beyond the misfit of the estimate, which is noise to them.
+model's. Their joint false-alarm rate is 1 %: the level of each test is 1 % divided by the number of
+tests with at least its p-value (Holm, Scandinavian Journal of Statistics 6 (1979) 65).
+The noise that trends have to exceed includes the misfit of the estimate.
 
-Where the data are not described, the sign of the response and the suspicious rows are tried as
-the cause (:mod:`dahl_ident.diagnostics.misfit_explanations`); a cause found leads the verdict.
+Where the model does not describe the data, the sign of the response and the suspicious rows are
+tried as causes (:mod:`dahl_ident.diagnostics.misfit_explanations`); a cause leads the verdict.
 
-A fit can be statistically perfect and physically impossible; this gives a warning
+A fit may agree with the data and still be physically impossible; this gives a warning
 (:mod:`dahl_ident.diagnostics.physics`).
 """
 
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, quotient
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import p_text, with_unit
@@ -32,11 +32,11 @@ from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.diagnostics.misfit_explanations import (
     EXPLAINS,
     SuspiciousPoint,
-    at_an_end,
     flagged_rows,
+    is_at_end,
     neighbourhood,
+    refitted_without,
     rms_misfit,
-    set_aside,
     sign_convention,
     suspicious_points,
 )
@@ -55,7 +55,6 @@ from dahl_ident.diagnostics.trends import (
     stiffening,
     trends,
 )
-from dahl_ident.elements import Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
@@ -63,19 +62,19 @@ from dahl_ident.units import percent
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
 _FALSE_ALARM = 0.01  # of all tests together: one sound data set in a hundred is doubted
-_HINT = 0.05  # the same of hints, which doubt nothing
-_FAR_MORE = 2.0  # scatter over what was measured
-_NO_SENSOR = 0.15  # noise over the response
+_HINT = 0.05  # the same for hints, which do not change the verdict
+_FAR_MORE = 2.0  # scatter over that which the data's covariance states
+_NO_SENSOR = 0.15  # noise over the response, more than any sensor has
 _MEDIAN_SQUARE = 2.0 * np.log(2.0)  # of two normal numbers' sum of squares
-_CLOSE = 0.8  # of the misfit: a bound above shows that no such law helps
+_CLOSE = 0.8  # bound over the misfit, above which no law of this kind helps
 _OF_ONE_DEVICE = 0.25  # u of a logarithm: 95 % within a factor of 1.6, see verdicts.py
 _SEGMENTS = 50  # of a record: the worst one is 2 % of it
-_WORTH_NAMING = 0.1  # of the largest scatter: less is not mentioned
+_WORTH_NAMING = 0.1  # share of the largest scatter, below which a scatter is not listed
 
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """Sum of squared residuals of known variance, and how likely noise alone gives as much."""
+    """Sum of squared residuals of known variance; `p_value` is the probability by noise alone."""
 
     value: float
     dof: int
@@ -87,7 +86,7 @@ class ChiSquare:
 
 @dataclass(frozen=True)
 class ThirdHarmonic:
-    """Measured third harmonic of the force over the model's, from rows that hold it.
+    """Measured third harmonic of the force over the model's, from the rows of that harmonic.
 
     `ratio` is the data's over the model's, where 1 is agreement; `p_value` also sees wrong phases.
     """
@@ -102,20 +101,21 @@ class ThirdHarmonic:
 
 @dataclass(frozen=True)
 class Exponent:
-    """The exponent that the data ask for by their score, where the fit holds it fixed."""
+    """The exponent that the score test indicates, where the fit holds it fixed."""
 
     name: str
     fixed: float
-    wanted: float
+    indicated: float
     stderr: float
     p_value: float
     widened: float = 1.0
-    """How many times the error is what the data's covariance states, as they scatter more."""
+    """Factor of `stderr`, because the data scatter more than their covariance states."""
 
     def __str__(self) -> str:
-        value = with_unit(self.wanted, self.stderr, "")
-        wide = f" (error widened {self.widened:.2g} times because of the misfit)"
-        widening = wide if self.widened > 1.0 else ""
+        value = with_unit(self.indicated, self.stderr, "")
+        widening = ""
+        if self.widened > 1.0:
+            widening = f" (error widened {self.widened:.2g} times because of the misfit)"
         return f"{self.name} near {value}{widening} describes the data better than {self.fixed:g}"
 
 
@@ -185,7 +185,7 @@ class Goodness:
     # root mean square of abs(measured - fitted)/abs(measured), of fundamentals where there are any;
     # of records, of the residuals over that of the measured output's variation
     rms_misfit: float
-    warnings: tuple[str, ...] = ()  # what no mechanism does
+    warnings: tuple[str, ...] = ()  # what is physically impossible or unsafe
     flagged: tuple[str, ...] = ()  # rows that the extraction flagged, with the reason
     chi_square: ChiSquare | None = None  # where the noise's scale is known
     # estimated noise over the size of the response; None where the noise's scale is known
@@ -199,40 +199,41 @@ class Goodness:
     third_harmonic: ThirdHarmonic | None = None
     scatter: Scatter | None = None  # where the data have a covariance that is not used
     smooth: SmoothMisfit | None = None  # where it exceeds the noise
-    # where the scatter between runs exceeds the noise; other tests then judge what is within runs
+    # where the scatter between runs exceeds the noise; the other tests are then those within runs
     runs_differ: RunsDiffer | None = None
     suspicious: tuple[SuspiciousPoint, ...] = ()  # points that stand apart
-    # whether the amplitudes give no more numbers than friction has free parameters, which then
-    # meet them whatever the mechanism is
+    # whether the amplitudes give no more numbers than friction has free parameters, so that any
+    # law fits
     untested: bool = False
     rows: int = 0
     fundamentals: int = 0  # rows of the fundamental
-    sign: str = ""  # the sign convention that explains data which the fit does not
+    sign: str = ""  # the sign convention that would explain the misfit
     apart: tuple[str, ...] = ()  # suspicious rows, where they alone contradict the model
-    without_them: str = ""  # how the model describes the data without those rows
-    # where the suspicious rows lie, if they alone depart from the model, but side by side; of a
+    verdict_without: str = ""  # how the model describes the data without those rows
+    # where the suspicious rows lie, if they alone depart from the model but are neighbours; for a
     # robust fit also if a single one is at an end
     neighbours: str = ""
-    # where it helps with data that are not described: least misfit of parallel Jenkins elements
+    # least misfit of parallel Jenkins elements, where it helps to explain a misfit
     bound: float | None = None
 
     @cached_property
     def level(self) -> float:
         """p-value below which one test counts, by Holm's procedure."""
-        left = len(self._tests)
+        remaining = len(self._tests)
         for p in sorted(test.p_value for test in self._tests):
-            if left == 1 or not p < _FALSE_ALARM / left:
+            if remaining == 1 or not p < _FALSE_ALARM / remaining:
                 break
-            left -= 1
-        return _FALSE_ALARM / max(left, 1)
+            remaining -= 1
+        return _FALSE_ALARM / max(remaining, 1)
 
     @property
     def _tests(self) -> list[_Test]:
         """Every test that applies."""
-        first = (self.runs_differ, self.chi_square, self.stiffening)
-        last = (self.exponent, self.third_harmonic, self.smooth)
-        every = (*first, *self.groups, *self.trends, *self.runs, *last)
-        return [test for test in every if test is not None]
+        tests = (
+            self.runs_differ, self.chi_square, self.stiffening, *self.groups, *self.trends,
+            *self.runs, self.exponent, self.third_harmonic, self.smooth,
+        )  # fmt: skip
+        return [test for test in tests if test is not None]
 
     @property
     def acceptable(self) -> bool:
@@ -259,13 +260,13 @@ class Goodness:
         return tuple(self._departures(_HINT / _FALSE_ALARM * self.level))
 
     def _departures(self, level: float) -> Iterator[str]:
-        """Yield every departure whose p-value is below `level`, those that say most first."""
-        yield from (str(one) for one in self.groups if one.p_value < level)
+        """Yield every departure whose p-value is below `level`, the most informative first."""
+        yield from (str(group) for group in self.groups if group.p_value < level)
         if self.runs_differ is not None:
             yield str(self.runs_differ)
         departing = [trend for trend in self.trends if trend.p_value < level]
-        rate = [trend for trend in departing if trend.covariate == "frequency"]
-        yield from (f"{t.brief}, which no rate-independent model can describe" for t in rate)
+        with_rate = [trend for trend in departing if trend.covariate == "frequency"]
+        yield from (f"{t.brief}, which no rate-independent model can describe" for t in with_rate)
         if self.stiffening is not None and self.stiffening.p_value < level:
             yield str(self.stiffening)
         if self.beyond_any_sensor and self.noise_share is not None:
@@ -273,30 +274,31 @@ class Goodness:
                 f"the scatter is {percent(self.noise_share)} of the response, "
                 "more than any sensor's noise"
             )
-        curve = [test for test in (self.exponent,) if test is not None and test.p_value < level]
-        over = [trend for trend in departing if trend not in rate]
-        of_curve = [*(trend.brief for trend in over), *map(str, curve)]
-        if self.exponent is not None and self.exponent.fixed == 1.0 and of_curve:
-            of_curve[0] = f"these data are not linear Dahl: {of_curve[0]}"
-        yield from of_curve
+        with_level = [trend.brief for trend in departing if trend not in with_rate]
+        if self.exponent is not None:
+            if self.exponent.p_value < level:
+                with_level.append(str(self.exponent))
+            if self.exponent.fixed == 1.0 and with_level:
+                with_level[0] = f"these data are not linear Dahl: {with_level[0]}"
+        yield from with_level
         if self.smooth is not None and self.smooth.p_value < level and not departing:
             yield str(self.smooth)
         for test in (self.third_harmonic, self.chi_square):
             if test is not None and test.p_value < level:
                 yield str(test)
         if not departing:
-            yield from (f"{r}" for r in self.runs if r.p_value < level)
+            yield from (str(test) for test in self.runs if test.p_value < level)
 
     @property
-    def of_several(self) -> bool:
+    def is_of_several_devices(self) -> bool:
         """Whether runs or labelled rows scatter as those of several devices do."""
         runs = [] if self.runs_differ is None else list(self.runs_differ.scatter.values())
-        labelled = [one.scatter for one in self.groups if one.p_value < self.level]
-        return max([*runs, *labelled], default=0.0) > _OF_ONE_DEVICE
+        groups = [group.scatter for group in self.groups if group.p_value < self.level]
+        return max([*runs, *groups], default=0.0) > _OF_ONE_DEVICE
 
     @property
     def law_is_wrong(self) -> bool:
-        """Whether another law of friction describes the data far better."""
+        """Whether a law of parallel Jenkins elements describes the data far better."""
         return self.bound is not None and self.bound < FAR_LESS * self.rms_misfit
 
     @property
@@ -312,7 +314,7 @@ class Goodness:
         if self.sign:
             yield described("sign", _NOT_DESCRIBED, convention=self.sign)
         elif self.apart:
-            apart = {"names": self.apart, "rows": self.rows, "remaining": self.without_them}
+            apart = {"names": self.apart, "rows": self.rows, "remaining": self.verdict_without}
             yield described("rows_apart", severity, **misfit, **apart)
         elif self.objections:
             yield described(
@@ -323,8 +325,8 @@ class Goodness:
         elif self.untested:
             yield described("one_amplitude", _NOT_DETERMINED, **misfit)
         elif not self.objections:
-            far = self.scatter is not None and self.scatter.ratio > _FAR_MORE
-            scatter = str(self.scatter) if far else ""
+            far_more = self.scatter is not None and self.scatter.ratio > _FAR_MORE
+            scatter = str(self.scatter) if far_more else ""
             yield described("noise", _TRUSTED, **misfit, hints=self.hints, scatter=scatter)
         if self.flagged:
             every = len(self.flagged) == self.fundamentals
@@ -367,25 +369,25 @@ class Goodness:
 
 
 def goodness(optimum: Optimum, errors: ErrorModel | None = None) -> Goodness:
-    """Return every test of an estimate's residuals, physical warnings, and what explains both.
+    """Return every test of an estimate's residuals, physical warnings, and the cause of a misfit.
 
     The estimate is that of `errors`, if known; a scatter between runs that exceeds the noise is
-    taken out first.
+    removed first.
     """
     tested = _tested(optimum, errors)
     if errors is not None and tested.objections:
         within, stated = _within_runs(errors), optimum.problem.data.run is not None
-        if within is not None:  # labels may say what passes over the levels are
+        if within is not None:  # unless runs are stated, labels may explain their differences
             tested = within if stated else replace(within, groups=tested.groups)
-    if optimum.loss != "linear":  # which hides where the model fails
+    if optimum.loss != "linear":  # a robust loss hides where the model fails
         tested = replace(tested, neighbours=_side_by_side(optimum, tested))
     if optimum.method == "ipopt" or (optimum.success and not tested.objections):
-        return tested  # another solver may have had constraints, which no trial would keep
+        return tested  # Ipopt may have had constraints, which other searches would not keep
     sign = sign_convention(optimum, tested.rms_misfit, _misfit_if_described)
     if sign:
         return replace(tested, sign=sign, warnings=(*tested.warnings, sign))
     tested = _without_suspicious(optimum, tested)
-    differ = tested.runs_differ or any(one.p_value < tested.level for one in tested.groups)
+    differ = tested.runs_differ or any(group.p_value < tested.level for group in tested.groups)
     if differ or not tested.objections:
         return tested  # no law describes several devices at once
     least, misfit = least_misfit(optimum), tested.rms_misfit
@@ -406,11 +408,11 @@ def _misfit_if_described(optimum: Optimum) -> float:
 def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
     """Return `tested` with the objections that remain without the suspicious rows."""
     rows = [point.row for point in tested.suspicious]
-    if not (rows and tested.objections and not at_an_end(optimum, rows)):
+    if not (rows and tested.objections and not is_at_end(optimum, rows)):
         return tested
-    optimum_without = set_aside(optimum, rows)
+    optimum_without = refitted_without(optimum, rows)
     without = None if optimum_without is None else _tested_estimate(optimum_without)
-    if without is None or without.hints or not without.judged:  # hints hold the objections
+    if without is None or without.hints or not without.judged:  # hints include objections
         return tested
     if not without.rms_misfit * EXPLAINS < tested.rms_misfit:
         return tested
@@ -419,13 +421,13 @@ def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
         return replace(tested, neighbours=where)
     (remaining,) = (str(f) for f in without.findings() if f.code == "noise")
     names = tuple(point.name for point in tested.suspicious)
-    return replace(tested, apart=names, without_them=remaining)
+    return replace(tested, apart=names, verdict_without=remaining)
 
 
 def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
-    """Return where suspicious rows lie close together, or at an end; "" where they do not."""
+    """Return in words where suspicious rows are neighbours, or one at an end; otherwise ""."""
     rows = [point.row for point in tested.suspicious]
-    if at_an_end(optimum, rows):
+    if is_at_end(optimum, rows):
         return "it is the first or the last"
     where = neighbourhood(optimum, rows)
     return f"they are neighbours, {where}" if where else ""
@@ -434,17 +436,17 @@ def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
 def _within_runs(errors: ErrorModel) -> Goodness | None:
     """Return the tests of the residuals within runs; None where the runs do not differ.
 
-    Where differences between runs take half of the degrees of freedom, as with one point a run,
-    they cannot be distinguished from a wrong model, which the plain residuals test.
+    Where differences between runs use half of the degrees of freedom, as with one point a run,
+    they cannot be distinguished from a wrong model, for which the plain residuals are tested.
     """
     runs, optimum = errors.runs, errors.at_estimate
     if runs is None:
         return None
-    every, within = ResidualSpace(optimum), ResidualSpace(optimum, runs)
-    if 2 * within.dof <= every.dof:
+    plain, within = ResidualSpace(optimum), ResidualSpace(optimum, runs)
+    if 2 * within.dof <= plain.dof:
         return None
-    explained = float(every.residuals @ every.residuals - within.residuals @ within.residuals)
-    p = every.tail(explained, every.dof - within.dof)
+    explained = float(plain.residuals @ plain.residuals - within.residuals @ within.residuals)
+    p = plain.tail(explained, plain.dof - within.dof)
     tested = _tested(optimum, errors, within)
     if not p < tested.level:
         return None
@@ -461,7 +463,7 @@ def _tested(
 ) -> Goodness:
     """Return every test of the residuals at the estimate, and physical warnings.
 
-    Trends are those beyond the estimate's misfit, which is noise to them.
+    The noise that trends have to exceed includes the estimate's misfit.
     """
     if errors is not None:
         optimum = errors.at_estimate
@@ -509,8 +511,7 @@ def _untested(optimum: Optimum) -> bool:
     view = problem.stiffness_data
     elements = [e for e in problem.model.elements if not e.is_linear]
     free = sum(bool(p.free) for e in elements for p in e.parameters)
-    alike = bool(np.ptp(np.log(view.amplitude)) < LEAST_RANGE)
-    return alike and free >= 2 * len(view.orders)
+    return np.ptp(np.log(view.amplitude)) < LEAST_RANGE and free >= 2 * len(view.orders)
 
 
 def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
@@ -523,7 +524,7 @@ def _chi_square(optimum: Optimum, space: ResidualSpace) -> ChiSquare | None:
 def _noise_share(optimum: Optimum) -> float | None:
     """Return the estimated noise over the size of the response, 0 where it is rounding.
 
-    That of most rows, where some stand apart.
+    It is that of most rows, where a few depart far.
     """
     if optimum.scale_known:
         return None
@@ -548,45 +549,32 @@ def _scatter(optimum: Optimum) -> Scatter | None:
 def _exponent(
     optimum: Optimum, space: ResidualSpace, chi_square: ChiSquare | None
 ) -> Exponent | None:
-    """Return the score of the fixed exponent of a law that is alone."""
+    """Return the score test of the exponent that the only friction law holds fixed."""
     elements = [e for e in optimum.problem.model.elements if not e.is_linear]
-    exponents = [p for e in elements for p in e.parameters if _is_exponent(p)]
+    exponents = [p for e in elements for p in e.parameters if p.is_exponent]
     if len(elements) != 1 or len(exponents) != 1 or optimum.status.at_infinity:
         return None
     (alpha,) = exponents
     if alpha.free or alpha.value is None:
         return None
-    change = _by_alpha(optimum, alpha.name)
+    change = _change_with_exponent(optimum, alpha.name)
     slope, error = space.coefficient(change)
     p = space.p_value(change[None])
-    if not error < 1.0 or np.isnan(p):  # so wide an error says nothing of the exponent
+    if not error < 1.0 or np.isnan(p):  # with a larger error the exponent is unknown
         return None
-    wanted = alpha.value * float(np.exp(slope))
+    indicated = alpha.value * float(np.exp(slope))
     widened = 1.0
     if chi_square is not None and chi_square.p_value < _FALSE_ALARM:
         widened = (chi_square.value / chi_square.dof) ** 0.5
-    return Exponent(alpha.name, alpha.value, wanted, wanted * error * widened, p, widened)
+    return Exponent(alpha.name, alpha.value, indicated, indicated * error * widened, p, widened)
 
 
-def _is_exponent(parameter: Parameter) -> bool:
-    """Return whether a parameter is a positive pure number whose usual range is known."""
-    pure = not any(parameter.dimension) and parameter.positive
-    return pure and parameter.prior is not None
-
-
-def _by_alpha(optimum: Optimum, name: str) -> ComplexArray:
+def _change_with_exponent(optimum: Optimum, name: str) -> ComplexArray:
     """Return the relative change of the response with ln alpha, sensors and drive included."""
     freed = optimum.problem.like(free=[name])
-    theta = np.zeros(len(freed.names))
-    known = dict(zip(optimum.names, optimum.theta, strict=True))
-    for i, parameter in enumerate(freed.parameters):
-        theta[i] = known.get(parameter.name, np.log(parameter.value or 1.0))
-    response, jacobian = freed.predict(theta), freed.prediction_jacobian(theta)
-    changes = jacobian[:, freed.names.index(name)]
-    ratio: ComplexArray = np.divide(
-        changes, response, out=np.zeros_like(changes), where=response != 0.0
-    )
-    return ratio
+    theta = optimum.theta_in(freed)
+    slope = freed.prediction_jacobian(theta)[:, freed.names.index(name)]
+    return quotient(slope, freed.predict(theta))
 
 
 def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | None:
@@ -600,23 +588,23 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
 
 @dataclass(frozen=True)
 class RecordGoodness(Goodness):
-    """Residuals of all records, by their size, place and correlation."""
+    """Residuals of all records: their size, where they are largest, and their correlation."""
 
-    share_left: float = 0.0  # variance of the residuals over that of the measured output
+    unexplained_share: float = 0.0  # variance of the residuals over that of the measured output
     # root mean square over that of the output, at the drive's frequencies where residuals are
     # weighted by their spectrum
     rms_in_band: float = 0.0
     rms: float = 0.0  # of the residuals, in the output's unit
-    # the segment, a fiftieth of a record, with the largest residuals: record (from 1), times in s
-    worst_record: int = 1
-    worst: str = ""  # the same in words
+    worst_record: int = 1  # record, from 1, of the fiftieth of a record with the largest residuals
+    worst: str = ""  # that segment in words, with its times in s
     correlation: float = 0.0  # of residuals of neighbouring samples
 
     @property
     def details(self) -> list[str]:
         """The numbers as text."""
         return [
-            f"unexplained share of variance {self.share_left:.3g} ({percent(self.rms_misfit)} rms)",
+            f"unexplained share of variance {self.unexplained_share:.3g} "
+            f"({percent(self.rms_misfit)} rms)",
             f"residuals {self.rms:.3g} rms; {self.worst}",
             f"correlation of neighbouring residuals {self.correlation:.2f}",
         ]
@@ -635,9 +623,9 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     unexplained share of variance 0.01 (10 % rms)
     """
     records, measured = problem.records, problem.measured
-    together = np.concatenate(list(residuals))
-    total = float(together @ together)
-    rms = float(np.sqrt(total / together.size))
+    joined = np.concatenate(list(residuals))
+    total = float(joined @ joined)
+    rms = float(np.sqrt(total / joined.size))
     share = total / sum(float(np.sum((y - y.mean()) ** 2)) for y in measured)
     in_band = share
     if problem.whitening.size > 1:
@@ -647,9 +635,9 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
         width = max(1, e.size // _SEGMENTS)
         sums = np.concatenate([[0.0], np.cumsum(e**2)])
         mean = (sums[width:] - sums[:-width]) / width
-        place = int(np.argmax(mean))
-        stop = min(place + width, e.size) - 1
-        segments.append((float(mean[place]), number, record.time[place], record.time[stop]))
+        first = int(np.argmax(mean))
+        last = min(first + width, e.size) - 1
+        segments.append((float(mean[first]), number, record.time[first], record.time[last]))
     square, number, start, stop = max(segments, key=lambda segment: segment[0])
     which = f" of record {number}" if len(records) > 1 else ""
     ends = dict.fromkeys((f"{start:.4g}", f"{stop:.4g}"))
@@ -660,6 +648,6 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     )
     products = sum(float(e[1:] @ e[:-1]) for e in residuals)
     return RecordGoodness(
-        share**0.5, share_left=share, rms_in_band=in_band**0.5, rms=rms, worst_record=number,
+        share**0.5, unexplained_share=share, rms_in_band=in_band**0.5, rms=rms, worst_record=number,
         worst=worst, correlation=products / total if total else 0.0,
     )  # fmt: skip

@@ -4,12 +4,12 @@
     Every source of the uncertainty budget (:mod:`dahl_ident.diagnostics.budget`), with Student's
     t for its effective degrees of freedom; the default.
 
-Three ways count noise alone, and a misfit beyond a stated noise as if it were noise. From quick to
-thorough:
+Three methods count noise alone, where a misfit in excess of a stated noise counts as noise. From
+quick to thorough:
 
 ``wald``
     Estimate plus and minus standard errors, in search coordinates (for positive parameters a
-    factor). Right where the problem is nearly linear over the interval.
+    factor). Correct where the problem is nearly linear over the interval.
 ``profile``
     Where the deviance, with all other parameters optimal, rises to its threshold
     (:mod:`dahl_ident.diagnostics.profile`). Follows curvature; a side on which the data set no
@@ -18,7 +18,7 @@ thorough:
     Fits to simulated repetitions of the measurement, studentised
     (:mod:`dahl_ident.diagnostics.bootstrap`). Follows the estimate's actual distribution.
 
-Which when: ``wald`` comes with every fit and is enough while ``compare_intervals`` shows no
+Use: ``wald`` is computed with every fit and suffices while ``compare_intervals`` shows no
 disagreement; ``profile`` whenever a parameter is badly determined; ``bootstrap`` to check both.
 Where the noise's scale was estimated, thresholds are those of Student's t and F.
 """
@@ -48,11 +48,11 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.problem.space import Space
 
 Method = Literal["combined", "wald", "profile", "bootstrap"]
-_BY_FACTOR = 0.2  # u of a logarithm, above which an interval is a factor either way
-_LARGE = 0.1  # the same from noise alone, above which a side may be open
+_BY_FACTOR = 0.2  # u of a logarithm, above which limits are value * factor and value / factor
+_LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be open
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
-_ROUNDING = 1e-9  # relative difference of limits that counts as none
+_ROUNDING = 1e-9  # relative difference of limits that is rounding
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
@@ -157,9 +157,9 @@ def combined_intervals(
 ) -> ConfidenceIntervals:
     """Return intervals that count every source of error: value -+ k u.
 
-    Of a positive parameter whose u is above 20 %, value times or over exp(k u). Of one with an open
-    side, the profile's, widened by the sources that it does not count. What was assumed follows the
-    parameters that were fitted.
+    For a positive parameter whose u is above 20 %, the limits are value exp(-+ k u/value). For one
+    with an open side, they are those of the profile, widened by the other sources. Assumed
+    parameters come after those that were fitted.
     """
     array, every = checked_levels(levels), errors.problem
     estimates, directions = every.to_values(errors.theta), np.eye(len(errors.names))
@@ -167,22 +167,26 @@ def combined_intervals(
     dof_of_all = np.array([errors.dof(direction) for direction in directions])
     k_of_all = coverage_factors(dof_of_all, array[:, None])
     low, high = around(every.space, estimates, u_of_all * every.space.slopes(estimates), k_of_all)
-    place = [errors.names.index(name) for name in optimum.names]
-    held = np.array([errors.holds(name) for name in optimum.names])
-    values, lower, upper = estimates[place], low[:, place], high[:, place]
-    u, k, dof = u_of_all[place], k_of_all[:, place], np.where(held, dof_of_all[place], np.inf)
+    fitted = [errors.names.index(name) for name in optimum.names]
+    determined = np.array([errors.holds(name) for name in optimum.names])
+    values, lower, upper = estimates[fitted], low[:, fitted], high[:, fitted]
+    u, k, dof = (
+        u_of_all[fitted],
+        k_of_all[:, fitted],
+        np.where(determined, dof_of_all[fitted], np.inf),
+    )
     positive = optimum.problem.space.positive
     noise = errors.by_noise
     by_noise = np.sqrt(np.diagonal(noise.covariance))
-    doubtful = ~held | ~(by_noise <= _LARGE * natural_sizes(noise))
+    doubtful = ~determined | ~(by_noise <= _LARGE * natural_sizes(noise))
     if doubtful.any():
         shape = profile()
-        values = np.where(held, values, shape.estimate)
-        # with no limit on one side, u is not a measure of the other: use the profile's limit,
-        # moved away from the estimate by the sources that the profile does not count
+        values = np.where(determined, values, shape.estimate)
+        # where one side is open, u says nothing about the other: its limit is that of the profile,
+        # moved away from the estimate by the other sources
         unlimited = np.isinf(shape.upper) | np.isinf(shape.lower) | (positive & (shape.lower == 0))
-        by_profile = doubtful & (~held | unlimited.any(axis=0))
-        beyond = np.where(held, np.maximum(u**2 - by_noise**2, 0.0), 0.0)
+        by_profile = doubtful & (~determined | unlimited.any(axis=0))
+        beyond = np.where(determined, np.maximum(u**2 - by_noise**2, 0.0), 0.0)
         ends = []
         for end, sign in ((shape.lower, -1.0), (shape.upper, 1.0)):
             theta = search_coordinates(noise, end)
@@ -191,7 +195,7 @@ def combined_intervals(
             ends.append(np.where(np.isfinite(theta) & (beyond > 0.0), moved, end))
         lower = np.where(by_profile, ends[0], lower)
         upper = np.where(by_profile, ends[1], upper)
-    shown = degrees_text(np.where(dof < MANY, dof, np.inf)[held])
+    shown = degrees_text(np.where(dof < MANY, dof, np.inf)[determined])
     law = "normal distribution" if shown == "infinite" else f"t with {shown} degrees of freedom"
     note = f"every source of the budget: {law}"
     assumed = [name for name in errors.assumed if errors.holds(name)]
@@ -207,7 +211,7 @@ def combined_intervals(
 
 
 def natural_sizes(optimum: Optimum) -> FloatArray:
-    """Return the size in theta that a standard deviation is compared with: 1 for logarithms."""
+    """Return the reference of each standard deviation of theta: 1 for logarithms."""
     problem = optimum.problem
     if problem.space.positive.all():
         return np.ones(optimum.theta.size)
@@ -224,7 +228,7 @@ def around(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the limits value -+ k u within the bounds, each (L, P).
 
-    Of a positive parameter whose u is above 20 %, value times or over exp(k u / value).
+    For a positive parameter whose u is above 20 %, they are value exp(-+ k u/value).
     """
     least, most = (space.to_values(bound) for bound in space.bounds)
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
@@ -240,7 +244,7 @@ def around(
 def intervals_from_search(
     optimum: Optimum, method: Method, levels: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> ConfidenceIntervals:
-    """Return intervals whose limits are given in search coordinates, shape (L, P)."""
+    """Return intervals with limits in search coordinates, (L, P)."""
     problem, count = optimum.problem, lower.shape[1]  # of records, the model's parameters alone
     theta = np.broadcast_to(optimum.theta, (len(levels), len(optimum.theta))).copy()
     low, high = problem.bounds()
@@ -270,10 +274,10 @@ class Disagreement(NamedTuple):
     limits: tuple[float, float]
 
     def __str__(self) -> str:
-        theirs, ours = (f"{v:.4g}" if np.isfinite(v) and v else "open" for v in self.limits)
+        first, second = (f"{v:.4g}" if np.isfinite(v) and v else "open" for v in self.limits)
         return (
-            f"{self.name}: the {self.side} {level_text(self.level)} limit is {theirs} by "
-            f"{self.methods[0]} and {ours} by {self.methods[1]}; trust the latter"
+            f"{self.name}: the {self.side} {level_text(self.level)} limit is {first} by "
+            f"{self.methods[0]} and {second} by {self.methods[1]}; trust the latter"
         )
 
 

@@ -1,4 +1,4 @@
-"""A judgement is a list of findings: data first, its status the worst severity, words last."""
+"""Judgements: lists of findings, the worst severity of which is the status."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Question(StrEnum):
     DETERMINED = "determined"
     """Which parameters or combinations do the data determine?"""
     DESCRIBED = "described"
-    """Does the model describe the data, and how far not?"""
+    """Does the model describe the data, and how large is the misfit?"""
     ASSUMED = "assumed"
     """What does the result depend on that the data cannot test?"""
 
@@ -74,35 +74,34 @@ def undetermined(code: str, /, **values: Any) -> Finding:
     return Finding(Question.DETERMINED, VerdictStatus.NOT_DETERMINED, code, values)
 
 
-_MOST_TOLD = 5  # findings of a verdict; more are not read
+_MOST_SHOWN = 5  # findings of a verdict; more would not be read
 
 
 class Judgement:
     """The findings about a result, the most serious first.
 
-    The worst severity is its `status`. At most five findings are `told`: of an unusable result
-    without what only a usable one needs, which is what is identified or assumed; of a usable one
-    with what is assumed. The `further` ones back the verdict.
+    The worst severity is its `status`. At most five findings are `shown`, including the assumptions
+    of a usable result; for an unusable one, what is identified or assumed is left out. The others
+    are `supporting`.
     """
 
     def __init__(self, findings: Iterable[Finding]) -> None:
-        every = sorted(findings, key=lambda finding: -finding.severity.rank)
-        self.status = every[0].severity if every else VerdictStatus.TRUSTED
-        self.findings = tuple(every)
+        self.findings = tuple(sorted(findings, key=lambda finding: -finding.severity.rank))
+        self.status = self.findings[0].severity if self.findings else VerdictStatus.TRUSTED
         needed = [
             finding
-            for finding in every
+            for finding in self.findings
             if self.status.usable
             or finding.severity is not VerdictStatus.TRUSTED
             or finding.question is Question.DESCRIBED
         ]
         assumed = [finding for finding in needed if finding.question is Question.ASSUMED]
         others = [finding for finding in needed if finding.question is not Question.ASSUMED]
-        self.told = (*others[: _MOST_TOLD - len(assumed)], *assumed)
-        self.further = tuple(finding for finding in every if finding not in self.told)
+        self.shown = (*others[: _MOST_SHOWN - len(assumed)], *assumed)
+        self.supporting = tuple(f for f in self.findings if f not in self.shown)
 
     @property
     def statements(self) -> tuple[str, ...]:
         """The verdict in words; the first sentence begins with the status."""
-        texts = [str(finding) for finding in self.told]
+        texts = [str(finding) for finding in self.shown]
         return (" ".join([f"{self.status.capitalize()}.", *texts[:1]]), *texts[1:])

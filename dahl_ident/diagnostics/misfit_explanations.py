@@ -234,7 +234,7 @@ def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimu
     )
 
 
-def set_aside(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
+def refitted_without(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
     """Return the optimum of the other rows; None where they have none."""
     data = optimum.problem.data
     kept = ~np.isin(np.arange(data.n), rows)
@@ -260,7 +260,7 @@ def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:
     return ""
 
 
-def at_an_end(optimum: Optimum, rows: Sequence[int]) -> bool:
+def is_at_end(optimum: Optimum, rows: Sequence[int]) -> bool:
     """Return whether a single row is the first or last of a covariate: the model may fail there."""
     if len(rows) != 1:
         return False

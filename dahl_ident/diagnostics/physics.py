@@ -1,4 +1,4 @@
-"""Warnings about estimates that fit the data but are physically impossible or unsafe."""
+"""Estimates that may agree with the data, but are physically impossible or unsafe."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from dahl_ident.fitting.optimum import Status
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.units import engineering, percent, shown_unit
 
-_SEEN = 1e-3  # relative difference that is worth a place
-_DISTORTED = 0.05  # of a force: less changes the fundamental by well below 1 %
-_LEVEL = 1e-3  # false-alarm rate, low: such a fit is called physically impossible
+_SEEN = 1e-3  # relative difference that is worth stating
+_DISTORTED = 0.05  # distortion of a force that matters: less changes the fundamental below 1 %
+_LEVEL = 1e-3  # false-alarm rate, low as such a fit is called physically impossible
 _OFF = 0.02  # relative error of a prediction: as large as a good measurement's
 _CLEARLY = 2.0  # standard uncertainties below zero
-_IMPOSSIBLE = 3.0  # standard errors of a limit that a force exceeds
+_IMPOSSIBLE = 3.0  # standard errors of a limit by which a force has to exceed it
 _WITH_HARMONICS = 4.0  # a mass at three times the frequency carries nine times as much of a third
 _APPROXIMATE = VerdictStatus.APPROXIMATE
 _FALLING = "fit a law whose force falls with speed (LuGre)"
@@ -44,15 +44,15 @@ _TYPICAL_ROTATION = {
 }  # fmt: skip
 _DIMENSIONS = {(1, 0, 0): "force limit", (1, -1, 0): "contact stiffness"}
 _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
-_ALIKE = 0.05  # relative difference from such a ratio, and spread
+_ALIKE = 0.05  # largest relative difference from such a ratio
 Estimates = tuple[Mapping[str, float], Mapping[str, float]]
 """Values and their standard uncertainties, by name."""
 
 
-def _steady_difference(optimum: Optimum) -> tuple[int, float]:
-    """Return the row where exact and describing-function response differ most, and by how much.
+def _largest_difference(optimum: Optimum) -> tuple[int, float]:
+    """Return the row with the largest relative error of the describing function, and that error.
 
-    Relative to the exact one; zero where no row has both.
+    It is zero if no row has both responses.
     """
     problem = optimum.problem
     forced = (problem.data.controlled == "force") & (problem.data.harmonic == 1)
@@ -63,13 +63,13 @@ def _steady_difference(optimum: Optimum) -> tuple[int, float]:
         for steady in ("exact", "describing function")
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.where(forced & np.isfinite(exact), np.abs(sine / exact - 1.0), 0.0)
-    row = int(np.nanargmax(apart))
-    return row, float(apart[row])
+        error = np.where(forced & np.isfinite(exact), np.abs(sine / exact - 1.0), 0.0)
+    row = int(np.nanargmax(error))
+    return row, float(error[row])
 
 
 def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
-    """Yield how driven rows were predicted, the difference from the other method, and jumps.
+    """Yield how responses to a force were predicted, how much it matters, and jumps.
 
     `model` has the estimates put in.
     """
@@ -77,9 +77,9 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
     if not (problem.data.controlled == "force").any():
         return
     if problem.is_exact:
-        row, apart = _steady_difference(optimum)
-        if apart >= _SEEN:
-            yield described("steady", difference=apart, row=row_names(problem.data, [row])[0])
+        row, error = _largest_difference(optimum)
+        if error >= _SEEN:
+            yield described("steady", difference=error, row=row_names(problem.data, [row])[0])
         yield from _distorted(problem.data)
         yield from _jumps(problem.data, model)
         if unstable := problem.unstable_rows(optimum.theta):
@@ -94,22 +94,22 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
 
 
 def _distorted(data: FrequencyResponse) -> Iterator[Finding]:
-    """Yield where the force is farthest from the sine for which the motion is predicted."""
+    """Yield the row with the largest distortion of the force, if that matters."""
     harmonics = data.quality.get("force_distortion")
     if harmonics is None:
         return
-    apart = np.nan_to_num(np.where(data.controlled == "force", harmonics, 0.0))
-    row = int(np.argmax(apart))
-    if apart[row] > _DISTORTED:
+    distortion = np.nan_to_num(np.where(data.controlled == "force", harmonics, 0.0))
+    row = int(np.argmax(distortion))
+    if distortion[row] > _DISTORTED:
         (name,) = row_names(data, [row])
         provenance = data.provenance or {}
         parts = provenance.get("parts", (provenance,))
         files = tuple(dict.fromkeys(str(p["file"]) for p in parts if "file" in p))
-        yield described("distorted_force", row=name, distortion=float(apart[row]), files=files)
+        yield described("distorted_force", row=name, distortion=float(distortion[row]), files=files)
 
 
 def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
-    """Yield at which drives, and between which frequencies, there are several stable motions."""
+    """Yield the drives and ranges of frequencies with several stable motions."""
     if data.drive is None:
         return
     rows = np.flatnonzero((data.controlled == "force") & (data.harmonic == 1))
@@ -119,18 +119,18 @@ def _jumps(data: FrequencyResponse, model: Model) -> Iterator[Finding]:
         return
     places = []
     for level in levels(drive[rows]):
-        there = rows[level]
-        exact = response(model, f[there], drive[there], all_roots=True)
-        several = f[there[np.asarray(exact.stable).sum(axis=1) > 1]]
+        at_level = rows[level]
+        exact = response(model, f[at_level], drive[at_level], all_roots=True)
+        several = f[at_level[np.asarray(exact.stable).sum(axis=1) > 1]]
         if several.size:
-            mean = float(np.median(drive[there]))
-            places.append((mean, float(several.min()), float(several.max())))
+            middle = float(np.median(drive[at_level]))
+            places.append((middle, float(several.min()), float(several.max())))
     if places:
         yield described("jump", places=tuple(places), unit=shown_unit("N", data.motion))
 
 
 def physical_warnings(optimum: Optimum) -> Iterator[str]:
-    """Yield a sentence for everything in an estimate that physics forbids or that is unsafe."""
+    """Yield a sentence for each property of an estimate that is impossible or unsafe."""
     yield from negative_parameters(optimum)
     if optimum.status is Status.AT_BOUND:
         yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
@@ -140,21 +140,21 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
 
 
 def _not_a_sine(optimum: Optimum) -> Iterator[str]:
-    """Yield where the motion of a driven plant is far from the sine that is assumed."""
+    """Yield the largest error of the describing function of a driven plant, if it matters."""
     problem = optimum.problem
     if problem.is_exact or not (problem.data.controlled == "force").any():
         return
-    row, apart = _steady_difference(optimum)
-    if apart > _OFF:
+    row, error = _largest_difference(optimum)
+    if error > _OFF:
         (name,) = row_names(problem.data, [row])
         yield (
             "the describing function, which takes the motion for a sine, is "
-            f"{percent(apart)} off at {name}: fit with {argument('steady', 'exact')}"
+            f"{percent(error)} off at {name}: fit with {argument('steady', 'exact')}"
         )
 
 
 def negative_parameters(optimum: Optimum) -> Iterator[str]:
-    """Yield every mass, damping or stiffness below zero, with its number."""
+    """Yield every mass, damping or stiffness below zero, with its value."""
     problem, values = optimum.problem, parameter_values(optimum)
     values |= dict(zip(optimum.names, optimum.values.tolist(), strict=True))
     for parameter in (e.parameters[0] for e in problem.model.elements if is_single(e)):
@@ -168,13 +168,13 @@ def negative_parameters(optimum: Optimum) -> Iterator[str]:
 
 
 def beyond_friction_limit(
-    optimum: Optimum, scatter: float, aside: Sequence[int]
+    optimum: Optimum, scatter: float, ignored: Sequence[int]
 ) -> Iterator[Finding]:
-    """Yield where friction would have to exceed its limits, rows that are set `aside` not counted.
+    """Yield where friction would have to exceed its limits, except in the rows `ignored`.
 
-    Its fundamental is at most 4/pi of them. A sinusoidal force that is held has its peak in
-    common with friction and the linear elements, whose harmonics may be as large as a few times
-    their fundamental. `scatter` is the relative standard deviation of the force between runs.
+    The fundamental of friction is at most 4/pi times its limit. At the peak of a sinusoidal force,
+    friction and the linear elements balance it; the peak of the latter is at most a few times their
+    fundamental. `scatter` is the relative standard deviation of the force between runs.
     """
     problem, values = optimum.problem, parameter_values(optimum)
     bound, u = 0.0, 0.0
@@ -195,18 +195,18 @@ def beyond_friction_limit(
     force = np.where((view.harmonic == 1) & seen, np.abs(friction) * size, np.nan)
     noise = np.sqrt(2.0) * optimum.scale / np.where(seen, view.weights, np.nan) * size
     error = np.hypot(noise, scatter * bound)
-    force[aside] = np.nan
+    force[ignored] = np.nan
     excess = np.nan_to_num((force - bound) / error, nan=-np.inf)
-    row, judged = int(np.argmax(excess)), max(np.isfinite(excess).sum(), 1)
+    row, tests = int(np.argmax(excess)), max(np.isfinite(excess).sum(), 1)
     dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
-    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / judged):
+    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / tests):
         shown = {"force": with_unit(force[row], error[row], unit), "limit": f"{bound:.3g} {unit}"}
         yield described("beyond_slip", _APPROXIMATE, row=names([row])[0], **shown)
     if problem.data.drive is None:
         return
-    held = (problem.data.controlled == "force") & np.isfinite(force)
-    carried = _WITH_HARMONICS * np.abs(view.stiffness * _sensed(optimum) - friction) * size
-    beyond = np.where(held, problem.data.drive - carried - limit, -np.inf)
+    driven = (problem.data.controlled == "force") & np.isfinite(force)
+    carried = _WITH_HARMONICS * np.abs(view.stiffness * _sensor_factor(optimum) - friction) * size
+    beyond = np.where(driven, problem.data.drive - carried - limit, -np.inf)
     row = int(np.argmax(beyond))
     if beyond[row] > _IMPOSSIBLE * np.hypot(u, scatter * limit):
         shown = {"carried": f"{carried[row]:.2g} {unit}", "limit": f"{limit:.3g} {unit}"}
@@ -219,23 +219,22 @@ def is_spring(element: Element) -> bool:
 
 
 def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> ComplexArray:
-    """Return the measured dynamic stiffness, sensors corrected, of friction (and springs).
+    """Return the measured dynamic stiffness of friction (and springs), sensors corrected.
 
-    The modelled parts of all linear elements are subtracted, or of all but springs.
+    The model's linear elements, with or without springs, are subtracted.
     """
     problem = optimum.problem
     view = problem.stiffness_data
-    ratio = _sensed(optimum)
     linear = np.zeros(len(view.amplitude), dtype=np.complex128)
     values = parameter_values(optimum)
     for element in problem.model.elements:
         if element.is_linear and not (with_springs and is_spring(element)):
             linear += view.of(element, [np.asarray(values[p.name]) for p in element.parameters])
-    return np.asarray(view.stiffness * ratio - linear)
+    return np.asarray(view.stiffness * _sensor_factor(optimum) - linear)
 
 
-def _sensed(optimum: Optimum) -> ComplexArray:
-    """Return the factor from stiffness at the sensors' starts to that at their estimates."""
+def _sensor_factor(optimum: Optimum) -> ComplexArray:
+    """Return the stiffness at the sensors' estimates over that at their starting values."""
     problem = optimum.problem
     if problem.sensors.are_exact:
         return np.ones(1, dtype=np.complex128)
@@ -271,7 +270,7 @@ def _estimated_singles(
             yield element, parameter, {"name": name, **estimate}
 
 
-def below_zero(problem: Any, known: Estimates) -> Iterator[Finding]:
+def negative_elements(problem: Any, known: Estimates) -> Iterator[Finding]:
     """Yield a finding for every mass, damping or stiffness clearly below zero, with what to do."""
     for _, parameter, estimate in _estimated_singles(problem, known):
         value, instead = estimate["value"], _INSTEAD[parameter.dimension]
@@ -279,20 +278,21 @@ def below_zero(problem: Any, known: Estimates) -> Iterator[Finding]:
             yield described("negative", _APPROXIMATE, **estimate, instead=instead)
 
 
-def slight(
+def weak_elements(
     problem: Any,
     known: Estimates,
     share_of: Callable[[Element, float], float],
-    missed: float,
+    misfit_within: float,
     misfit: float,
 ) -> Iterator[Finding]:
-    """Yield a finding for every mass, damper or spring of less force than the model has `missed`.
+    """Yield a finding for every mass, damper or spring whose force is smaller than the misfit.
 
-    `share_of` returns the rms force of an element at its value over the whole; `misfit` is shown.
+    `share_of` returns the rms force of an element at its value over the whole force, which is
+    compared with `misfit_within`, that within runs; the finding states the whole `misfit`.
     """
     for element, _, estimate in _estimated_singles(problem, known):
         share = share_of(element, estimate["value"])
-        if share < missed and estimate["value"] >= -_CLEARLY * estimate["stderr"]:
+        if share < misfit_within and estimate["value"] >= -_CLEARLY * estimate["stderr"]:
             yield described("slight", **estimate, share=share, misfit=misfit)
 
 
@@ -323,7 +323,7 @@ def _sizes(optimum: Optimum) -> Iterator[str]:
 
 
 def _levels(optimum: Optimum) -> Iterator[str]:
-    """Yield that amplitudes are not zero-to-peak, where nominal levels say what they should be."""
+    """Yield that amplitudes are not zero-to-peak values, if nominal levels show it."""
     data = optimum.problem.data
     driven = bool((data.controlled == "force").all())
     size = data.drive if driven else data.amplitude

@@ -72,8 +72,8 @@ class RecordAssessment(Assessment):
     """A fit of records, with its errors by source."""
 
     problem: RecordProblem
-    instead = "it has errors, residuals and hold_out() of the samples"
-    with_less = None
+    alternative = "it has errors, residuals and hold_out() of the samples"
+    reduced = None
 
     @property
     def known(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
@@ -209,7 +209,7 @@ class RecordAssessment(Assessment):
         return record_goodness(self.problem, self.residuals)
 
     @property
-    def misses(self) -> bool:
+    def exceeds_noise(self) -> bool:
         """Whether the model has a misfit in excess of noise."""
         return not {MODEL_ERROR, ALONG_MOTION}.isdisjoint(self.errors.contributions)
 
@@ -218,14 +218,14 @@ class RecordAssessment(Assessment):
         """The exponents that the records contradict, or put outside their range."""
         for one in self.errors.exponents:
             if one.contradicted:
-                asked = one.value * float(np.exp(one.asked))
-                u, limits = asked * one.by_records, one.range if one.assumed else None
-                yield ContradictedExponent(one.name, one.value, asked, u, limits)
+                value = one.value * float(np.exp(one.log_ratio))
+                u, limits = value * one.log_ratio_std, one.range if one.assumed else None
+                yield ContradictedExponent(one.name, one.value, value, u, limits)
 
     @property
-    def missed(self) -> tuple[float, float] | None:
+    def significant_misfit(self) -> tuple[float, float] | None:
         """The misfit, within runs and in all; None if there is none, or the output is a motion."""
-        if self.problem.output == "motion" or not self.misses:
+        if self.problem.output == "motion" or not self.exceeds_noise:
             return None
         return (self.goodness.rms_in_band,) * 2
 
@@ -246,12 +246,12 @@ class RecordAssessment(Assessment):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Statements for machines, see ``Assessment``."""
+        """Plain data for JSON, see ``Assessment``."""
         return super().facts | {
             "records": len(self.problem.records),
             "samples": self.problem.n_samples,
             "effective_samples": self.errors.effective,
-            "share_of_variance_left": self.goodness.share_left,
+            "share_of_variance_left": self.goodness.unexplained_share,
         }
 
     @property
@@ -304,7 +304,7 @@ class RecordAssessment(Assessment):
             covariance = self.covar[:count, :count] / np.outer(slopes, slopes)
         unknown = ~np.isfinite(covariance)
         covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
-        share = (0.5 * self.goodness.share_left) ** 0.5 if self.misses else _LEAST
+        share = (0.5 * self.goodness.unexplained_share) ** 0.5 if self.exceeds_noise else _LEAST
         optimum = replace(
             self.optimum, problem=problem, theta=theta, values=values, covariance=covariance,
             scale=share, dof=int(self.errors.least_dof),
@@ -346,7 +346,7 @@ class RecordAssessment(Assessment):
         A misfit is proportional to the output, so its scatter grows with the record's level.
         """
         scatter = float(np.mean(np.concatenate(self.residuals) ** 2))
-        if self.misses:
+        if self.exceeds_noise:
             scatter *= max(1.0, problem.level / self.problem.level) ** 2
         U = coverage_factor(self.errors.least_dof) * np.sqrt(variance + scatter)
         return RecordBand(

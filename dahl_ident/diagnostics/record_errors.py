@@ -31,11 +31,11 @@ from dahl_ident.diagnostics.record_channels import (
 from dahl_ident.diagnostics.record_misfit import MotionMisfit, motion_misfit
 from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
-    HeldValue,
+    FixedExponent,
     LinearFit,
     between_blocks,
     between_records,
-    held_exponents,
+    fixed_exponents,
 )
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.problem.record_problem import RecordProblem
@@ -52,12 +52,12 @@ class RecordErrors(ErrorContributions):
     effective: float  # samples of white noise that would tell as much as the residuals
     exact: tuple[str, ...]  # inputs without a stated uncertainty
     runs: int  # records that were fitted together
-    exponents: tuple[HeldValue, ...]  # what the records say of exponents that the fit holds
+    exponents: tuple[FixedExponent, ...]  # what the records say of exponents that the fit holds
     # what the residuals follow, from which `ALONG_MOTION` was estimated
     misfit: MotionMisfit | None = None
 
     @property
-    def assumed(self) -> list[HeldValue]:
+    def assumed(self) -> list[FixedExponent]:
         """The exponents that the user did not state."""
         return [one for one in self.exponents if one.assumed]
 
@@ -113,7 +113,7 @@ def record_errors(
         sources[MODEL_ERROR] = by_model
     if (scatter := between_records(fit, np.asarray(sum(sources.values())))) is not None:
         sources[RUNS] = scatter
-    exponents = held_exponents(fit)
+    exponents = fixed_exponents(fit)
     if assumed := [one.contribution for one in exponents if one.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
     other_motions = by_other_motions(fit)
@@ -122,7 +122,7 @@ def record_errors(
     misfit = motion_misfit(fit, other_motions.values())
     if misfit is not None:
         larger = misfit.covariance.diagonal() > _SHORTENS**2 * known.diagonal()
-        if larger[fit.judged].any():
+        if larger[fit.of_model].any():
             sources[ALONG_MOTION] = misfit.covariance
         else:
             misfit = None

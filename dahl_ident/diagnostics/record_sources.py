@@ -1,8 +1,8 @@
-"""What records show of a fit's errors: noise, model, scatter between runs, values that it holds.
+"""Errors of a fit to records: noise, model error, scatter between runs, fixed exponents and delay.
 
-What a model misses differs from place to place, and what a device does from run to run. Blocks of
-the records, or whole records, then ask for other parameters; the scatter beyond that of noise
-counts as a separate error.
+A misfit differs between the parts of a record, and a device between runs. Estimates from blocks of
+the records, or from single records, then scatter more than noise explains; the excess is a separate
+source of error.
 """
 
 from __future__ import annotations
@@ -26,23 +26,22 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
 """Number of blocks of all records together, from which the model error is estimated."""
-_LEVEL = 0.9995  # of chance, at which scatter between blocks is not noise
-_RUNS_LEVEL = 0.95  # the same between records: counted too often rather than too seldom
-_LONG = 0.05  # step of an exponent's logarithm, beyond which slopes change
+_LEVEL = 0.9995  # confidence at which scatter between blocks exceeds the noise
+_RUNS_LEVEL = 0.95  # the same between records: rather counted too often than too seldom
+_LONG = 0.05  # step of an exponent's logarithm, above which the model is not linear
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
 
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A fit of records to first order; waves of each record are filtered as the fit weighs them."""
+    """A fit of records to first order, with waves that are filtered as in the fit."""
 
     problem: RecordProblem
     values: FloatArray  # (P,): the estimate
     jacobians: Sequence[FloatArray]  # (n, P): derivatives of each record's prediction
     residuals: Sequence[FloatArray]  # (n,): measured minus predicted
     noise: Sequence[FloatArray]  # autocovariances of the residuals' noise
-    # (P,): the parameters in which a misfit shows: not the states and offsets of records
-    judged: NDArray[np.bool_]
+    of_model: NDArray[np.bool_]  # (P,): parameters that are not states or offsets of records
 
     @classmethod
     def of(
@@ -52,10 +51,10 @@ class LinearFit:
         jacobians: Sequence[FloatArray],
         residuals: Sequence[FloatArray],
     ) -> LinearFit:
-        """Return the fit with these waves, not filtered yet."""
+        """Return the fit with these waves, which are filtered here."""
         J, e = ([problem.filtered(wave) for wave in waves] for waves in (jacobians, residuals))
-        judged = np.arange(values.size) < len(problem.free)
-        return cls(problem, values, J, e, noise_in(J, e), judged)
+        of_model = np.arange(values.size) < len(problem.free)
+        return cls(problem, values, J, e, noise_in(J, e), of_model)
 
     @cached_property
     def by_noise(self) -> tuple[FloatArray, float]:
@@ -74,9 +73,9 @@ class LinearFit:
 
     @cached_property
     def exponent_slopes(self) -> Mapping[str, Sequence[FloatArray]]:
-        """Derivatives of the outputs with respect to ln of each exponent that the fit holds.
+        """Derivatives of the outputs with respect to ln of each fixed exponent, by name.
 
-        Nothing where there is no motion next to the estimate.
+        Empty if there is no motion close to the estimate.
         """
         problem = self.problem
         if not problem.exponents:
@@ -84,34 +83,34 @@ class LinearFit:
         free = problem.freed([p.name for p in problem.exponents])
         known = {p.name: p.value for p in problem.exponents}
         known |= dict(zip(problem.names, self.values.tolist(), strict=True))
-        at = np.array([known[name] for name in free.names], dtype=np.float64)
+        values = np.array([known[name] for name in free.names], dtype=np.float64)
         try:
-            by = [free.predict(at, number).by for number in range(len(problem.records))]
+            slopes = [free.predict(values, number).by for number in range(len(problem.records))]
         except FitError:
             return {}
-        places = {p.name: free.names.index(p.name) for p in problem.exponents}
+        columns = {p.name: free.names.index(p.name) for p in problem.exponents}
         return {
-            name: [problem.filtered(at[i] * slopes[:, i]) for slopes in by]
-            for name, i in places.items()
+            name: [problem.filtered(values[i] * J[:, i]) for J in slopes]
+            for name, i in columns.items()
         }
 
     def with_freed(self, *slopes: Sequence[FloatArray]) -> LinearFit:
-        """Return the fit with more parameters, which come last, of these derivatives."""
-        joint = [np.column_stack(waves) for waves in zip(self.jacobians, *slopes, strict=True)]
-        judged = np.append(self.judged, np.ones(len(slopes), dtype=bool))
-        return replace(self, jacobians=joint, judged=judged)
+        """Return the fit with more parameters at the end, which have these derivatives."""
+        jacobians = [np.column_stack(waves) for waves in zip(self.jacobians, *slopes, strict=True)]
+        of_model = np.append(self.of_model, np.ones(len(slopes), dtype=bool))
+        return replace(self, jacobians=jacobians, of_model=of_model)
 
     def projected(self, waves: Sequence[FloatArray]) -> FloatArray:
-        """Return the change of the estimate by filtered changes of the measured outputs."""
+        """Return the change of the estimate due to filtered changes of the measured outputs."""
         parts = zip(self.jacobians, waves, strict=True)
         return np.asarray(self.inverse @ sum(J.T @ y for J, y in parts))
 
     def changed(self, outputs: Sequence[FloatArray]) -> FloatArray:
-        """Return the change of the estimate by changes of the measured outputs."""
+        """Return the change of the estimate due to changes of the measured outputs."""
         return self.projected([self.problem.filtered(y) for y in outputs])
 
     def difference_to(self, other: RecordProblem) -> Sequence[FloatArray]:
-        """Return how the filtered outputs change if another problem is the right one."""
+        """Return the filtered outputs of another problem minus those of this one."""
         ends = zip(self.outputs, other.outputs(self.values), strict=True)
         return [self.problem.filtered(b - a) for a, b in ends]
 
@@ -122,129 +121,123 @@ class LinearFit:
 
     @cached_property
     def variances(self) -> FloatArray:
-        """Variances of the values by noise and by scatter between blocks, (P,)."""
+        """Variances of the values due to noise and scatter between blocks, (P,)."""
         covariance, _ = self.by_noise
         beyond = between_blocks(self)
         return np.diagonal(covariance if beyond is None else covariance + beyond)
 
 
 @dataclass(frozen=True)
-class HeldValue:
-    """An exponent that the fit holds."""
+class FixedExponent:
+    """An exponent that the fit holds fixed, and what the records show of it."""
 
     name: str
     unit: str
-    value: float  # what it is held at
-    range: tuple[float, float]  # where it may lie; nothing but `value` where the user stated it
+    value: float  # at which it is fixed
+    range: tuple[float, float]  # in which it may lie; only `value` if the user stated it
     std: float  # of its logarithm, by the records and its range together
-    # logarithm of the ratio of the estimate by the records alone, which may be outside the range,
-    # to `value`, and its standard deviation
-    asked: float
-    by_records: float
-    # (P, P): covariance of the estimate through it: as if it were estimated too, and at least as
-    # much as the value estimated from the records moves it
+    # ln of the estimate from the records alone, which may be outside the range, over `value`, and
+    # its standard deviation
+    log_ratio: float
+    log_ratio_std: float
+    # (P, P): covariance of the estimate due to its error, as if it were estimated too, or due to its
+    # distance from the value that the records indicate, if that is larger
     contribution: FloatArray
     assumed: bool  # whether the user did not state it
 
     @property
     def contradicted(self) -> bool:
         """Whether the records contradict the value."""
-        return abs(self.asked) > _CONTRADICTED * self.by_records
-
-    @property
-    def found(self) -> str:
-        """The estimate by the records alone, in words."""
-        value = self.value * np.exp(self.asked)
-        return with_unit(value, value * self.by_records, self.unit)
+        return abs(self.log_ratio) > _CONTRADICTED * self.log_ratio_std
 
     def __str__(self) -> str:
         low, high = self.range
-        here = with_unit(self.value, self.value * self.std, self.unit)
-        return f"{self.name} between {low:g} and {high:g} (here {here})"
+        value = with_unit(self.value, self.value * self.std, self.unit)
+        return f"{self.name} between {low:g} and {high:g} (here {value})"
 
 
-def held_exponents(fit: LinearFit) -> tuple[HeldValue, ...]:
-    """Return what the records say of each exponent that the fit holds, stated or not.
+def fixed_exponents(fit: LinearFit) -> tuple[FixedExponent, ...]:
+    """Return what the records show of each fixed exponent, stated or assumed.
 
-    By a search with a stated exponent free; with an assumed one, which the estimate fits already,
-    by a Gauss-Newton step, and a search where that leads far. As for tables, the range counts as a
-    uniform distribution of the logarithm, and for less where the records say more.
+    A stated exponent is estimated by a search in which it is free; an assumed one, which is close
+    to its optimum, by a Gauss-Newton step, and by a search if that step is long. As for tables, the
+    range is taken as a uniform distribution of the logarithm, with less weight if the records have
+    more information.
     """
-    held = []
+    exponents = []
     for p in (p for p in fit.problem.exponents if p.name in fit.exponent_slopes):
-        freed = _Freed.of(fit, fit.exponent_slopes[p.name])
+        freed = _FreedValue.of(fit, fit.exponent_slopes[p.name])
         value, limits = float(p.value or 1.0), p.prior or (1.0, 1.0)
         low, high = (float(np.log(end / value)) for end in limits)
         low, high = min(low, 0.0), max(high, 0.0)
-        asked, by_records = freed.asked, freed.variance**0.5
-        std, contribution = freed.counted(float(np.clip(asked, low, high)), (high - low) / 12**0.5)
-        if not p.assumed or abs(asked) > max(_LONG, _CONTRADICTED * by_records):
-            asked, by_records = _asked(fit, p.name) or (asked, by_records)
-        held.append(
-            HeldValue(
-                p.name, p.unit, value, limits, std, asked, by_records, contribution, p.assumed
+        ratio, ratio_std = freed.change, freed.variance**0.5
+        std, covariance = freed.with_prior(float(np.clip(ratio, low, high)), (high - low) / 12**0.5)
+        if not p.assumed or abs(ratio) > max(_LONG, _CONTRADICTED * ratio_std):
+            ratio, ratio_std = _searched_ratio(fit, p.name) or (ratio, ratio_std)
+        exponents.append(
+            FixedExponent(
+                p.name, p.unit, value, limits, std, ratio, ratio_std, covariance, p.assumed
             )
         )
-    return tuple(held)
+    return tuple(exponents)
 
 
-def _asked(fit: LinearFit, name: str) -> tuple[float, float] | None:
-    """Return the logarithm of an exponent's estimate over its value, and its standard deviation.
+def _searched_ratio(fit: LinearFit, name: str) -> tuple[float, float] | None:
+    """Return ln of an exponent's estimate over its value, and its standard deviation, by a search.
 
-    The displacement's noise is estimated anew: what was taken out of the records with the exponent
-    held may be misfit. None where that describes the records better.
+    The displacement's noise is estimated again, as its estimate with the exponent fixed may contain
+    misfit. None if the fixed exponent describes the records better.
     """
     problem = fit.problem
     search, free = RecordSearch("lm", "linear"), problem.freed([name])
-    place = free.names.index(name)
+    i = free.names.index(name)
     (value,) = (float(p.value or 1.0) for p in problem.exponents if p.name == name)
-    begin = free.to_search(np.insert(fit.values, place, value))
-    held, free = float(free.quadratic(begin).cost), free.without_noise(0.0)
+    begin = free.to_search(np.insert(fit.values, i, value))
+    cost, free = float(free.quadratic(begin).cost), free.without_noise(0.0)
     end = search.descend(free, begin, STEPS)
     if problem.output == "force":
         free, end = search.without_noise(free, end)
-    if not end.converged[0] or not end.cost[0] < held:
+    if not end.converged[0] or not end.cost[0] < cost:
         return None
-    at = free.to_values(end.theta[0])
-    predicted = [free.predict(at, number) for number in range(len(problem.records))]
+    values = free.to_values(end.theta[0])
+    predicted = [free.predict(values, number) for number in range(len(problem.records))]
     e = [y - p.output for y, p in zip(free.measured, predicted, strict=True)]
-    u = float(LinearFit.of(free, at, [p.by for p in predicted], e).variances[place]) ** 0.5
-    return float(np.log(at[place] / value)), u / float(at[place])
+    u = float(LinearFit.of(free, values, [p.by for p in predicted], e).variances[i]) ** 0.5
+    return float(np.log(values[i] / value)), u / float(values[i])
 
 
 def by_delay(fit: LinearFit) -> FloatArray:
-    """Return the covariance of the estimate through the delay, which the user did not state.
+    """Return the covariance of the estimate due to the delay, which the user did not state.
 
-    A normal distribution of one sample counts, and for less where the records say more; the
-    estimated delay is taken out already.
+    Its prior has the standard deviation of one sample, with less weight if the records have more
+    information; the estimated delay is removed already.
     """
     sample = 1.0 / fit.problem.records[0].sample_rate
-    freed = _Freed.of(fit, [sample * slope for slope in fit.delay_slopes])
-    return freed.counted(freed.asked, 1.0)[1]
+    freed = _FreedValue.of(fit, [sample * slope for slope in fit.delay_slopes])
+    return freed.with_prior(freed.change, 1.0)[1]
 
 
-class _Freed(NamedTuple):
-    """A value that a fit holds, estimated too by a Gauss-Newton step."""
+class _FreedValue(NamedTuple):
+    """A value that a fit holds fixed, estimated by a Gauss-Newton step."""
 
-    asked: float  # how far the records move it
-    variance: float  # of that
-    moved: FloatArray  # changes of the other values with it
+    change: float  # of the value, by the records
+    variance: float  # of the change
+    others: FloatArray  # changes of the other values per change of this one
 
     @classmethod
-    def of(cls, fit: LinearFit, slopes: Sequence[FloatArray]) -> _Freed:
-        """Return the value of which the outputs have these derivatives."""
+    def of(cls, fit: LinearFit, slopes: Sequence[FloatArray]) -> _FreedValue:
+        """Return the value with these derivatives of the outputs."""
         joint = fit.with_freed(slopes)
-        moved = np.zeros(fit.values.size)
-        if any(slope.any() for slope in slopes):  # a delay has none where nothing drives
-            moved = joint.inverse[:-1, -1] / joint.inverse[-1, -1]
-        asked = float(joint.projected(joint.residuals)[-1])
-        return cls(asked, float(joint.variances[-1]), moved)
+        others = np.zeros(fit.values.size)
+        if any(slope.any() for slope in slopes):  # without a drive, a delay has no effect
+            others = joint.inverse[:-1, -1] / joint.inverse[-1, -1]
+        change = float(joint.projected(joint.residuals)[-1])
+        return cls(change, float(joint.variances[-1]), others)
 
-    def counted(self, mean: float, s: float) -> tuple[float, FloatArray]:
-        """Return the standard deviation of the value, and the covariance that it makes.
+    def with_prior(self, mean: float, s: float) -> tuple[float, FloatArray]:
+        """Return the standard deviation of the value, and the covariance of the others due to it.
 
-        `mean` is the estimate by the records, `s` the standard deviation of what is known
-        beforehand.
+        `mean` is the estimate by the records, `s` the standard deviation of the prior.
         """
         std, u2 = s, self.variance
         if np.isfinite(u2):
@@ -253,12 +246,12 @@ class _Freed(NamedTuple):
             mean, std = mean * weight, (u2 * weight) ** 0.5
         else:
             mean = 0.0
-        change = self.moved * max(std, abs(mean))
-        return std, np.outer(change, change)
+        changes = self.others * max(std, abs(mean))
+        return std, np.outer(changes, changes)
 
 
 def between_blocks(fit: LinearFit) -> FloatArray | None:
-    """Return the covariance between blocks beyond that of noise, or None where it shows none."""
+    """Return the covariance between blocks in excess of noise; None if noise explains it."""
     if sum(e.size for e in fit.residuals) < BLOCKS * BLOCKS:
         return None
     blocks = [[block] for block in blocks_of(fit.residuals)]
@@ -280,10 +273,10 @@ def blocks_of(
 
 
 def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
-    """Return the covariance between records beyond the `known` one, or None; see above.
+    """Return the covariance between records in excess of the `known` one; None by chance.
 
-    The deviations of a whole record count once, however many samples it has, and in however many
-    parts it is: the problem's `runs` say which record each part is of.
+    A record counts once, however many samples or parts it has: the problem's `runs` state to which
+    record each part belongs.
     """
     runs = np.asarray(fit.problem.runs)
     whole = [np.arange(e.size) for e in fit.residuals]
@@ -298,7 +291,7 @@ def _between(
     noise: FloatArray,
     level: float,
 ) -> FloatArray | None:
-    """Return the covariance between groups of samples beyond `noise`, or None by chance.
+    """Return the covariance between groups of samples in excess of `noise`; None by chance.
 
     A group is a list of records' numbers, each with samples. The covariance between groups is that
     of Liang and Zeger, Biometrika 73 (1986) 13-22.
@@ -317,11 +310,11 @@ def _between(
     steps = np.array(scores) @ inverse
     between = len(steps) / (len(steps) - 1.0) * steps.T @ steps
     by_chance = noise[inside] / units
-    # how much each block says of each parameter
+    # information of each block on each parameter
     weights = np.array([(inverse @ part @ inverse).diagonal() for part in parts])
     dof = np.maximum(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0) - 1.0, 1.0)
     ratio = between.diagonal() / by_chance.diagonal()
-    if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[fit.judged[seen]].any():
+    if not (ratio > special.chdtri(dof, 1.0 - level) / dof)[fit.of_model[seen]].any():
         return None
     excess = np.zeros(noise.shape)
     excess[inside] = positive_part(between - by_chance) * units

@@ -1,4 +1,4 @@
-"""The words of every finding, by its code."""
+"""The text of every finding, by its code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dahl_ident.diagnostics.formatting import listed, p_text, with_unit
 from dahl_ident.errors import argument, spelled
 from dahl_ident.units import percent
 
-_MOST_ROWS = 3  # in the verdict; the details list all
+_MOST_ROWS = 3  # rows listed in the verdict; the details list all
 _LEVEL = level_text(CONFIDENCE)
 
 
@@ -26,7 +26,7 @@ def sentence(code: str, values: Mapping[str, Any]) -> str:
 
 
 class _Words(Formatter):
-    """Sentences with fields, which are numbers, shares or lists."""
+    """Formatter with the additional formats of `_FIELDS`."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if format_spec in _FIELDS:
@@ -41,13 +41,13 @@ _FIELDS: Mapping[str, Callable[[Any], str]] = {
 
 
 def joined(parts: Sequence[str], most: int = 100) -> str:
-    """Return parts as one text: no more than so many of them, and how many others there are."""
+    """Return at most so many parts as one text, and how many others there are."""
     others = len(parts) - most
     return "; ".join([*parts[:most], *([f"{others} more"] if others > 0 else [])])
 
 
 def departures(objections: Sequence[str]) -> str:
-    """Return the most serious objection, and how many more there are."""
+    """Return the most serious objection, and the number of others."""
     first, *others = objections
     more = len(others)
     return f"{first}; {more} more test{'s' if more > 1 else ''} failed" if more else first

@@ -3,11 +3,11 @@
 A parameter is **identified** where the standard deviation of its logarithm is below 0.25,
 **not identified** above 1, and **weakly identified** between. The standard deviation is the larger
 of two: the first-order one (Fisher information), and that of the profile (width of its 95.45 %
-interval over the widths of the threshold). A parameter short of identified whose profile is
-still open at 99.73 % is not identified. Where every first-order one is below 0.15, profiles are not
-searched: they would differ in the second digit. Parameters that may be zero or negative have no
-logarithm; theirs is the standard deviation over their size, or over a tenth of the size at which
-they would make up the whole response, if that is more.
+interval over that of a normal distribution with unit standard deviation). A weakly identified
+parameter whose profile is still open at 99.73 % is not identified. Where every first-order value is
+below 0.15, profiles are not computed: they would differ in the second digit. Parameters that may be
+zero or negative have no logarithm; for them it is the standard deviation over their size, or over a
+tenth of the size at which they would make up the whole response, whichever size is larger.
 
 Where parameters are not identified, combinations of them may be
 (:mod:`dahl_ident.diagnostics.combinations`); where no known combination fits, the least
@@ -48,18 +48,18 @@ from dahl_ident.fitting import Optimum
 IDENTIFIED_BELOW = 0.25  # u of a logarithm: 95 % within a factor of 1.6
 NOT_IDENTIFIED_ABOVE = 1.0  # the same: a factor of 7, hardly an order of magnitude
 _NEARLY_LINEAR = 0.15  # u of every logarithm: below it, profiles differ in the second digit
-# u of a logarithm that what is assumed makes, not the data: the exponent's range, and how smooth a
-# model error is
+# Largest u of a logarithm from sources that rest on assumptions: the exponent's range, and the
+# smoothness of a model error.
 _MOST_BY = {EXPONENT: 0.1, MODEL_ERROR: IDENTIFIED_BELOW}
 _MEASURE = "measure more points, or use a model that misses less"
 _REMEDY = {
     EXPONENT: "give it if it is known, or measure on both sides of the knee",
     RUNS: "measure on more days or mountings",
 }
-_BY_PRIOR = 0.7  # of a prior's standard deviation: above it, the data say less than the prior
-_NO_DIFFERENCE = 1.0  # of -2 ln L, between two values of which neither is the likelier
-_DIFFERENT = 9.0  # of -2 ln L, to first order: what an exchange would cost, 3 u
-_MOST_EXCHANGED = 6  # parameters, in pairs
+_BY_PRIOR = 0.7  # u over that of the prior, above which the prior has more information
+_NO_DIFFERENCE = 1.0  # of -2 ln L, between two values that are equally likely
+_DIFFERENT = 9.0  # of -2 ln L, to first order: parameters that differ by 3 u
+_MOST_EXCHANGED = 6  # parameters exchanged at once, in pairs
 _EVEN = "measure the mean force or even harmonics too"
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
@@ -85,10 +85,9 @@ class ParameterVerdict:
     name: str
     unit: str
     verdict: Verdict
-    # at 95.45 %: the profile's (first order where none was searched), or the combined one where a
-    # fit states it
+    # at 95.45 %: combined, of the profile, or of first order
     interval: Interval
-    known_as: str  # what is known of it, in words: interval and verdict
+    known_text: str  # interval and verdict in words
     why: str = ""  # the reason, and what to do, where it is not identified
 
     @property
@@ -98,13 +97,13 @@ class ParameterVerdict:
 
     @property
     def reason(self) -> str:
-        """What is known in words, with the reason where it is not identified."""
-        return f"{self.known_as}, not determined, {self.why}" if self.why else self.known_as
+        """Interval and verdict in words, with the reason if it is not identified."""
+        return f"{self.known_text}, not determined, {self.why}" if self.why else self.known_text
 
 
 @dataclass(frozen=True)
 class StatedCombination:
-    """A combination that is determined although its parts are not."""
+    """A combination that is determined although its parameters are not."""
 
     expression: str
     unit: str
@@ -144,7 +143,7 @@ class Identifiability:
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """Names of what the data determine: identified parameters, then combinations."""
+        """Names of the identified parameters, then of the combinations."""
         return (
             *self.named(Verdict.IDENTIFIED),
             *(combination.expression for combination in self.combinations),
@@ -172,9 +171,9 @@ class Identifiability:
 
     @property
     def open(self) -> tuple[ParameterVerdict, ...]:
-        """The parameters that are not identified, with what is known of each.
+        """The parameters that are not identified.
 
-        Those without any limit are left out where another one has some.
+        If some of them have a limit, those without one are left out.
         """
         lost = [p for p in self.parameters.values() if p.verdict is Verdict.NOT_IDENTIFIED]
         limited = [p for p in lost if p.interval.lower > 0.0 or np.isfinite(p.interval.upper)]
@@ -212,11 +211,11 @@ def judged(
     stated: ConfidenceIntervals,
     sources: Mapping[str, ParameterBudget],
 ) -> Identifiability:
-    """Return the verdicts on an optimum, given how to find its profiles at the three LEVELS.
+    """Return the verdicts on an optimum; `profile_of` computes its profiles at the three LEVELS.
 
-    With `errors`, parameters that noise leaves determined and other sources do not are not. The
-    limits in the texts are those of `stated`, and combinations that are determined those of the
-    budget's `sources`. Without profiles, or where none is needed, that is to first order.
+    With `errors`, sources other than noise may leave a parameter undetermined. The limits in the
+    texts are those of `stated`, and determined combinations those of the budget's `sources`.
+    Without profiles, or where none is needed, the verdicts are first order.
     """
     information, problem = Information(optimum), optimum.problem
     natural = natural_sizes(optimum)
@@ -230,16 +229,16 @@ def judged(
         name: _verdict(std, intervals[name][-1])
         for name, std in zip(problem.names, spread, strict=True)
     }
-    beyond = dict[str, str]()
-    blind = _unseen(optimum)
+    not_by_noise = dict[str, str]()
+    ambiguous = _ambiguous(optimum)
     if errors is not None:
-        beyond = _lost_beyond_noise(errors, verdicts, natural)
+        not_by_noise = _lost_beyond_noise(errors, verdicts, natural)
         for name, size in zip(problem.names, natural.tolist(), strict=True):
             direction = np.eye(len(errors.names))[errors.names.index(name)]
             U = coverage_factor(errors.dof(direction)) * float(errors.std(direction))
             if verdicts[name] is Verdict.IDENTIFIED and 0.5 * U / size > IDENTIFIED_BELOW:
                 verdicts[name] = Verdict.WEAK
-    verdicts |= dict.fromkeys((*beyond, *blind), Verdict.NOT_IDENTIFIED)
+    verdicts |= dict.fromkeys((*not_by_noise, *ambiguous), Verdict.NOT_IDENTIFIED)
     for name in _set_by_prior(optimum, errors):
         if verdicts[name] is Verdict.IDENTIFIED:
             verdicts[name] = Verdict.BY_PRIOR
@@ -257,17 +256,18 @@ def judged(
         unit = parameter.unit
         _, limits, widest = stated[name]
         shown, why = _within(limits, unit), ""
-        if name in blind:
-            shown = blind[name]
-        elif name in beyond and errors is not None:
-            shown, why = with_unit(errors.values[name], errors.stderr[name], unit), beyond[name]
+        if name in ambiguous:
+            shown = ambiguous[name]
+        elif name in not_by_noise and errors is not None:
+            shown = with_unit(errors.values[name], errors.stderr[name], unit)
+            why = not_by_noise[name]
         elif verdicts[name] is Verdict.NOT_IDENTIFIED:
             why = advice(optimum, name, widest, lost)
         else:
             shown = f"{shown}, {verdicts[name].value}"
         parameters[name] = ParameterVerdict(name, unit, verdicts[name], limits, shown, why)
     direction = {}
-    if lost - blind.keys() and not determined:
+    if lost - ambiguous.keys() and not determined:
         vector = information.weakest(natural)
         parts = zip(problem.names, vector.tolist(), strict=True)
         direction = {n: v for n, v in parts if abs(v) > _VECTOR_PART}
@@ -276,7 +276,7 @@ def judged(
 
 
 def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
-    """Return the names of parameters on which a prior says more than the data."""
+    """Return the names of parameters about which a prior has more information than the data."""
     stderr = optimum.stderr if errors is None else errors.stderr
     priors = optimum.problem.priors.items()
     return [name for name, prior in priors if stderr[name] > _BY_PRIOR * float(prior.std())]
@@ -285,7 +285,7 @@ def _set_by_prior(optimum: Optimum, errors: ErrorModel | None) -> list[str]:
 def _lost_beyond_noise(
     errors: ErrorModel, verdicts: Mapping[str, Verdict], natural: FloatArray
 ) -> dict[str, str]:
-    """Return why parameters that noise alone leaves determined are not, by name."""
+    """Return why sources other than noise leave parameters undetermined, by name."""
     reasons = {}
     for name, size in zip(verdicts, natural.tolist(), strict=True):
         i = errors.names.index(name)
@@ -299,12 +299,12 @@ def _lost_beyond_noise(
     return reasons
 
 
-def _unseen(optimum: Optimum) -> dict[str, str]:
+def _ambiguous(optimum: Optimum) -> dict[str, str]:
     """Return the texts on friction parameters whose sign or order the data do not determine.
 
-    Where a mirrored law is the same to a sine, it is to the exact motion's fundamental; so it is
-    with parameters that pulling and pushing exchange. A move that should have cost something, by
-    the derivatives, costs nothing.
+    The fundamental is the same for a mirrored law: for the opposite sign of an asymmetry, or for
+    parameters of pulling and pushing exchanged. Such a change does not raise the sum of squares,
+    although by the derivatives it should.
     """
     problem, theta = optimum.problem, optimum.theta
     scale, error = optimum.scale or 1.0, np.sqrt(np.diagonal(optimum.covariance))
@@ -322,9 +322,9 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
 
     reasons, names = dict[str, str](), problem.names
     for i in problem.friction_columns.tolist():
-        turned = theta.copy()
-        turned[i] = -turned[i]
-        if not problem.parameters[i].positive and abs(theta[i]) > error[i] and alike(turned):
+        mirrored = theta.copy()
+        mirrored[i] = -mirrored[i]
+        if not problem.parameters[i].positive and abs(theta[i]) > error[i] and alike(mirrored):
             reasons[names[i]] = (
                 f"its size is {shown(i, abs(float(optimum.values[i])))}, its sign is not "
                 f"determined: the fundamental is the same for either; {_EVEN}"
@@ -347,8 +347,8 @@ def _unseen(optimum: Optimum) -> dict[str, str]:
 def _exchanges(optimum: Optimum) -> Iterator[NDArray[np.intp]]:
     """Yield the orders in which like parameters of an element are exchanged, in pairs.
 
-    One pair first, then several at once; parts of which the law itself knows that they are alike
-    are in a fixed order already.
+    Single pairs come first, then several pairs at once. The identical parts that a law declares are
+    left out, as their order is fixed.
     """
     problem = optimum.problem
     for element in problem.model.elements:
@@ -395,8 +395,8 @@ def _combinations(
 ) -> Iterator[StatedCombination]:
     """Yield the combinations in the budget of parameters that are not identified.
 
-    A product needs two `loose` parameters, which are not identified: with one, and known ones, it
-    says no more than the verdict on that one. Nor does a sum of which one part is known better.
+    A product is only informative with two `loose` parameters, which are weakly or not identified,
+    and a sum only if it is known better than each of its parts.
     """
     stated = {c.expression for c in optimum.combinations}
     information = Information(optimum)

@@ -133,6 +133,11 @@ class Parameter:
         return powers
 
     @property
+    def is_exponent(self) -> bool:
+        """Whether it is a positive pure number whose usual range is known."""
+        return self.positive and self.prior is not None and not any(self.dimension)
+
+    @property
     def is_mass(self) -> bool:
         """Whether the unit is that of a mass."""
         return _dimension(self.unit) == (1, -1, 2)

@@ -190,6 +190,16 @@ class Optimum:
         r, J = self.problem.residuals_and_jacobian(self.theta, scale, tails=self.loss == "linear")
         return r * scale, J * scale
 
+    def theta_in(self, problem: Problem) -> FloatArray:
+        """Return theta of a problem with more free parameters, which are at their `value`."""
+        known = dict(zip(self.names, self.theta, strict=True))
+        return np.array(
+            [
+                known[p.name] if p.name in known else np.log(p.value or 1.0)
+                for p in problem.parameters
+            ]
+        )
+
     @cached_property
     def log_likelihood(self) -> float:
         """Log-density of the data at theta, for the most likely scale if that is unknown.

@@ -250,7 +250,7 @@ def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
         first, *others = fit.statements
         lines = [f"{fit.problem.model!r}: {first}", *others]
     else:
-        lines = [*map(str, fit.judgement.told)]
+        lines = [*map(str, fit.judgement.shown)]
     warnings = (f"Warning: {text}" for text in fit.goodness.warnings)
     yield from (f"{before}{line}" for line in (*lines, *warnings))
 
@@ -303,7 +303,7 @@ def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Se
 def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
     for method in ("wald",) if fit.first_order else fit.assessment.quick_methods:
         fit.conf_interval(method)
-    intervals = fit.assessment.intervals_run(CONFIDENCE)
+    intervals = fit.assessment.computed_intervals(CONFIDENCE)
     alike = of_kind(fit.problem.kind, drawn)
     yield tables.parameters(fit, intervals, alike)
     by_note: dict[str, list[str]] = {}
@@ -315,7 +315,7 @@ def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
 
 
 def _goodness(fit: FitResult) -> Iterator[Block]:
-    yield Bullets((*map(str, fit.judgement.further), *fit.goodness.details))
+    yield Bullets((*map(str, fit.judgement.supporting), *fit.goodness.details))
     yield tables.goodness(fit)
     if not fit.goodness.acceptable:
         compared = compare_models(fit)

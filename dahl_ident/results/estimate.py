@@ -458,10 +458,7 @@ def _density(
     _, assumed = with_assumed(problem)
     wider = problem.like(free=assumed) if assumed else problem
     errors = fit.errors_of_combinations
-    known = dict(zip(optimum.names, optimum.theta.tolist(), strict=True))
-    theta = np.array([known.get(p.name, np.log(p.value or 1.0)) for p in wider.parameters])
-    if errors is not None:
-        theta = errors.theta
+    theta = optimum.theta_in(wider) if errors is None else errors.theta
     ranges = {p.name: p.prior for p in wider.parameters if p.prior is not None}
     of_assumed = {
         name: ranges[name] if one.source == EXPONENT else stats.norm(1.0, one.std)

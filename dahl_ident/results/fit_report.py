@@ -68,7 +68,7 @@ def _all(fit: FittedModel, intervals: ConfidenceIntervals) -> Iterator[_Section]
     yield "Verdict", [first, *warnings, *others]
     yield "Parameters", _parameters(fit, intervals, fit.params)
     further = {
-        "Further findings": list(map(str, fit.judgement.further)),
+        "Further findings": list(map(str, fit.judgement.supporting)),
         "Determined combinations": list(map(str, fit.identifiability.combinations)),
         "Derived": list(map(str, fit.derived())),
         "Uncertainty budget": str(fit.stated_budget or "").splitlines(),
