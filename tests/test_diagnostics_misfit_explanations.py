@@ -8,12 +8,12 @@ import pytest
 
 from dahl_ident import Dahl, Damper, FrequencyResponse, Mass, Spring, fit, load_dataset
 from dahl_ident.diagnostics import VerdictStatus
-from dahl_ident.diagnostics.misfit_explanations import TURNS, neighbourhood
+from dahl_ident.diagnostics.misfit_explanations import SIGN_CHANGES, neighbourhood
 from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, X_C, plant_table, relative_noise, table
 
 MODEL = Dahl(alpha=1.0) + Mass(0.3) + Damper() + Spring()
-CONJUGATED, NEGATED, BOTH = TURNS
+CONJUGATED, NEGATED, BOTH = SIGN_CHANGES
 BY: Final = "describing function"  # which predicts in a moment, and makes the plant's table
 
 
@@ -101,7 +101,7 @@ class TestSign:
     @pytest.mark.parametrize(
         ("turn", "data", "model"),
         [
-            *((turn, noisy(), Dahl()) for turn in TURNS),
+            *((turn, noisy(), Dahl()) for turn in SIGN_CHANGES),
             (CONJUGATED, plant_table(steady=BY), MODEL),
         ],
     )

@@ -1,4 +1,4 @@
-"""Advice: why a parameter is not determined, and what to do about it."""
+"""Advice: why a parameter is not determined, and the remedy."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from dahl_ident.units import Motion, shown_unit
 
 _FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
-_LONG_ENOUGH = 0.02  # share of samples near a reversal
+_LONG_ENOUGH = 0.02  # share of samples near reversals that suffices
 _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
-_BECAUSE = {  # by the source of most of the uncertainty
+_BECAUSE = {  # reasons and remedies by the largest source of uncertainty
     EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
     RUNS: "the records ask for different values: fit each alone, and look at what differs",
     ALONG_MOTION: "the residuals follow the motion: choose a model that describes what it does",
@@ -51,9 +51,9 @@ def advice(optimum: Optimum, name: str, limits: Interval, lost: frozenset[str]) 
             continue
         if element.has_memory:
             parameter = element.parameters[names.index(name)]
-            return _of_friction(optimum, element, parameter, limits, lost)
+            return _friction_advice(optimum, element, parameter, limits, lost)
         if is_spring(element):
-            return _of_spring(optimum, lost)
+            return _spring_advice(optimum, lost)
     return (
         "because its effect on these data is below their noise or like that of another parameter: "
         "fix it, or measure where its effect is larger"
@@ -73,7 +73,7 @@ def _confounding_gain(optimum: Optimum, name: str, lost: frozenset[str]) -> str:
     return ""
 
 
-def _of_friction(
+def _friction_advice(
     optimum: Optimum, element: Element, parameter: Parameter, limits: Interval, lost: frozenset[str]
 ) -> str:
     label, dimension = element.label(parameter), parameter.dimension
@@ -131,12 +131,12 @@ def _of_friction(
 
 
 def _scaled(element: Element, dimension: tuple[int, int, int]) -> list[Parameter]:
-    """Return the scale parameters with a given dimension."""
+    """Return the scale parameters of a dimension."""
     scale = (element.parameter(label) for label in element.scale_parameters)
     return [p for p in scale if p.dimension == dimension]
 
 
-def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
+def _spring_advice(optimum: Optimum, lost: frozenset[str]) -> str:
     friction = (e for e in optimum.problem.model.elements if e.has_memory)
     stiff = [p.name for e in friction for p in _scaled(e, _STIFFNESS) if p.name in lost]
     if stiff:
@@ -148,7 +148,7 @@ def _of_spring(optimum: Optimum, lost: frozenset[str]) -> str:
 
 
 def reasons(model: Model, problem: RecordProblem, errors: RecordErrors) -> dict[str, str]:
-    """Return why records do not determine parameters, by name: u is a third of each.
+    """Return why records do not determine parameters whose u is above 30 %, by name.
 
     `model` has the estimates put in.
     """
@@ -157,23 +157,23 @@ def reasons(model: Model, problem: RecordProblem, errors: RecordErrors) -> dict[
     why = {}
     for element in model.elements:
         for parameter in (p for p in element.parameters if p.name in free):
-            place = free[parameter.name]
-            error = float(errors.covariance[place, place]) ** 0.5
+            i = free[parameter.name]
+            error = float(errors.covariance[i, i]) ** 0.5
             value = abs(float(parameter.value or 0))
-            # a parameter that may be zero, such as an asymmetry, is known whatever its bounds
+            # a parameter that may be zero, such as an asymmetry, is compared with its bounds
             limit = min(parameter.upper, -parameter.lower) if parameter.lower < 0.0 else 0.0
             if error > _UNCERTAIN * max(limit if np.isfinite(limit) else 0.0, value):
-                lacks = _motion_that_lacks(element, paths, problem.motion, known=error < value)
-                why[parameter.name] = lacks or _largest_source(problem, errors, place)
+                missing = _missing_motion(element, paths, problem.motion, known=error < value)
+                why[parameter.name] = missing or _largest_source(problem, errors, i)
     return why
 
 
-def _motion_that_lacks(
+def _missing_motion(
     element: Element, paths: Sequence[Stretches], motion: Motion, *, known: bool
 ) -> str:
-    """Return what the displacement lacks to determine a law; "" where it suffices.
+    """Return which motion is missing to determine a law; "" if none is.
 
-    An estimate that is not `known` to its own size says nothing of where slip begins.
+    Slip begins at an unknown displacement if the estimate is not `known`.
     """
     farthest = max((float(p.path.max()) for p in paths), default=np.nan)
     if farthest == 0.0:
@@ -198,7 +198,7 @@ def _motion_that_lacks(
 
 
 def _largest_source(problem: RecordProblem, errors: RecordErrors, place: int) -> str:
-    """Return the source of most of the uncertainty, or a parameter that acts alike."""
+    """Return the largest source of uncertainty, or a parameter with a similar effect."""
     covariance = errors.covariance
     for source, C in errors.contributions.items():
         if source in _BECAUSE and 0.5 * covariance[place, place] < C[place, place] < np.inf:

@@ -15,10 +15,10 @@ outside the interval, the distribution of t* is not informative, and the interva
 sides; use the profile there.
 
 If any parameter diverges in more than a hundredth of the replicates, the estimate lies at or near a
-limit of the model, and which tail of t* is long depends on the side of it on which the true value
-lies; a bootstrap from the estimate cannot determine this (Andrews, Econometrica 68 (2000) 399-405).
-The size of t* depends on it much less, and the interval is theta_hat -+ C stderr, C from the
-distribution of |t*| (Hall, Journal of the Royal Statistical Society B 50 (1988) 35-45).
+limit of the model. Which tail of t* is long depends on the side of the limit on which the true
+value lies; a bootstrap from the estimate cannot determine this (Andrews, Econometrica 68 (2000)
+399-405). The size of t* depends on it much less, and the interval is theta_hat -+ C stderr, C from
+the distribution of |t*| (Hall, Journal of the Royal Statistical Society B 50 (1988) 35-45).
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
 from dahl_ident.fitting.search import repetitions
 
-_FEWEST = 99  # with fewer a tail of 1 % holds no replicate
-_AT_LIMIT = 0.01  # of the replicates, from which on the tails cannot be distinguished
+_FEWEST = 99  # replicates: with fewer, a tail of 1 % has none
+_AT_LIMIT = 0.01  # share of diverging replicates above which the interval is symmetric
 
 
 def _replicate(optimum: Optimum, replicates: int | None, seed: int) -> FloatArray:
-    """Return t* of simulated repetitions, (S, P): NaN where one diverges or is not determined."""
+    """Return t* of simulated repetitions, (S, P); NaN if one diverges or is not determined."""
     if replicates is None:
         replicates = optimum.problem.repetitions
     count = whole_number(replicates, "replicates", _FEWEST)
@@ -66,13 +66,13 @@ def bootstrap_intervals(
     tail = 0.5 * (1.0 - array)
     count = optimum.problem.n_reported
     drawn = _replicate(optimum, replicates, seed)[:, :count]
-    gone = np.isnan(drawn)
-    symmetric = bool(gone.any(axis=1).mean() > _AT_LIMIT)
+    diverged = np.isnan(drawn)
+    symmetric = bool(diverged.any(axis=1).mean() > _AT_LIMIT)
     error = np.sqrt(np.diagonal(optimum.covariance))
     lower, upper = np.full((len(array), count), -np.inf), np.full((len(array), count), np.inf)
     for i in np.flatnonzero(np.isfinite(error[:count])):
-        t = drawn[~gone[:, i], i]
-        known = gone[:, i].mean() <= tail
+        t = drawn[~diverged[:, i], i]
+        known = diverged[:, i].mean() <= tail
         if known.any():
             size = np.quantile(np.abs(t), array[known])
             tails = np.quantile(t, [tail[known], 1.0 - tail[known]])

@@ -35,15 +35,14 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
-# Variance over the combined one below which a source contributes rounding errors alone.
-_ROUNDING = 1e-12
-_SAME = 1e-6  # relative difference of limits that counts as none
+_ROUNDING = 1e-12  # variance over the combined one that is a rounding error
+_SAME = 1e-6  # relative tolerance of equal limits
 _COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
 
 
 @dataclass(frozen=True)
 class BudgetRow:
-    """One source's part in the uncertainty of one parameter."""
+    """Contribution of one source to the uncertainty of one parameter."""
 
     source: str  # such as "noise" or "exponent"
     kind: Literal["A", "B"]  # evaluated from the data's scatter, or from knowledge beforehand
@@ -63,7 +62,7 @@ class ParameterBudget:
     u: float  # combined standard uncertainty
     dof: float  # its effective degrees of freedom
     k: float  # coverage factor for 95.45 %
-    # the interval where it is not value ± U, as that of a factor either way; no U is printed then
+    # the interval if it is not value ± U; it is printed instead of U
     limits: tuple[float, float] | None = None
 
     @property
@@ -108,7 +107,7 @@ class Budget(Mapping[str, ParameterBudget]):
         return len(self.parameters)
 
     def within(self, limits: Mapping[str, tuple[float, float]]) -> Budget:
-        """Return the budget with the intervals of its parameters, where they are not value ± U."""
+        """Return the budget with given intervals of its parameters, if they are not value ± U."""
 
         def stated(p: ParameterBudget) -> ParameterBudget:
             ends = limits.get(p.name, (p.value - p.U, p.value + p.U))
@@ -121,11 +120,12 @@ class Budget(Mapping[str, ParameterBudget]):
 
     @property
     def _cells(self) -> Iterator[tuple[str, ...]]:
-        """Yield name, value, then source, type, u, dof, share, k and U: the combined one first."""
+        """Yield rows of name, value and `_COLUMNS`: for each parameter first the total."""
         for p in self.parameters:
             value, u = rounded(p.value, p.u)
-            whole = ("combined", "", u, _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded)
-            yield (p.name, value, *whole)
+            yield (
+                p.name, value, "combined", "", u, _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded
+            )  # fmt: skip
             for r in p.rows:
                 share = f"{100.0 * r.share:.0f} %"
                 u = rounded(p.value, r.u)[1]
@@ -145,7 +145,7 @@ class Budget(Mapping[str, ParameterBudget]):
         return html_table(("", "value", *_COLUMNS), rows)
 
     def to_latex(self) -> str:
-        """Return a table of values with expanded uncertainties; it needs no package of LaTeX."""
+        """Return a LaTeX table of values with expanded uncertainties; it requires no package."""
         rows = [
             (symbol(p.name), *pair(p.value, p.U), f"{p.k:.2f}", unit(p.unit))
             for p in self.parameters
@@ -205,18 +205,18 @@ class Budget(Mapping[str, ParameterBudget]):
         gtc = data_library("GTC", "exports")
         u = np.sqrt(np.diagonal(self.covariance))
         dof = min(p.dof for p in self.parameters)  # one for an ensemble of correlated numbers
-        made = gtc.multiple_ureal(values, u.tolist(), dof, list(self))
-        for i in range(len(made)):
-            for j in range(i):
-                gtc.set_correlation(float(self.covariance[i, j] / (u[i] * u[j])), made[i], made[j])
-        return dict(zip(self, made, strict=True))
+        numbers = gtc.multiple_ureal(values, u.tolist(), dof, list(self))
+        for i, first in enumerate(numbers):
+            for j, second in enumerate(numbers[:i]):
+                gtc.set_correlation(float(self.covariance[i, j] / (u[i] * u[j])), first, second)
+        return dict(zip(self, numbers, strict=True))
 
 
 def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
     """Return the uncertainty budget of what a fit determines.
 
-    That is every free parameter; where one is not determined, the determined combinations of it
-    with others have a budget as well, and at infinity they alone.
+    It has every free parameter, and the determined combinations of those that are not determined;
+    at infinity, these combinations alone.
     """
     errors = errors or error_model(optimum, of_combinations=True)
     entries = [] if errors is None else list(_determined(optimum, errors))
@@ -225,7 +225,7 @@ def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
             "no uncertainty budget: a parameter is undetermined, or nothing is left to estimate "
             f"the errors from ({optimum.message}); fix a parameter or measure more points"
         )
-    parameters = [parameter_budget(errors, *each) for each in entries]
+    parameters = [parameter_budget(errors, *entry) for entry in entries]
     D = np.array([direction for *_, direction in entries])
     return Budget(tuple(parameters), D @ errors.covariance @ D.T, taken_as_exact(optimum))
 
@@ -234,7 +234,7 @@ _Entry = tuple[str, str, float, FloatArray]  # name, unit, value, d value/d thet
 
 
 def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
-    """Yield parameters, then determined combinations of those which are not."""
+    """Yield the determined parameters, then determined combinations of the others."""
     problem, names = errors.problem, errors.names
     slopes = problem.value_slopes(errors.theta)
     units = {p.name: p.unit for p in problem.parameters}
@@ -243,16 +243,18 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
     for name, direction, slope in zip(names, np.eye(len(names)), slopes, strict=True):
         if name in errors.assumed or name in lost:
             continue
-        held, u = errors.estimate.basis.holds(direction), float(errors.std(direction))
-        if held:
+        finite, u = errors.estimate.basis.holds(direction), float(errors.std(direction))
+        if finite:
             yield name, units[name], errors.values[name], direction * abs(float(slope))
-        if not held or (positive[name] and u > _DETERMINED):
+        if not finite or (positive[name] and u > _DETERMINED):
             lost |= {name}
-    # an exponent that was assumed is a member as any other
+    # combinations may contain assumed exponents
     freed = replace(optimum, problem=problem, theta=errors.theta)
     of_optimum = [names.index(name) for name in optimum.names]
     kept = {c.expression for c in optimum.combinations}
-    left = {tuple(c.direction): c.expression for c in candidates(optimum) if c.expression in kept}
+    old_names = {
+        tuple(c.direction): c.expression for c in candidates(optimum) if c.expression in kept
+    }
     information = Information(optimum)
     by_noise = information.std(np.eye(len(of_optimum)))
     vague = {n for n, std in zip(optimum.names, by_noise, strict=True) if std > _DETERMINED}
@@ -260,15 +262,16 @@ def _determined(optimum: Optimum, errors: ErrorModel) -> Iterator[_Entry]:
         direction, value = candidate.direction, candidate.value
         if not (candidate.members & lost and errors.estimate.basis.holds(direction)):
             continue
-        # a combination that a limit depends on keeps the name that the fit gave it
-        name = left.get(tuple(direction[of_optimum]), candidate.expression)
+        # a combination on which the limit depends keeps the name that the fit gave it
+        name = old_names.get(tuple(direction[of_optimum]), candidate.expression)
         u = float(errors.std(direction))
-        # where noise alone leaves parameters undetermined, the verdict names their combinations
-        open_ = candidate.members & vague and not candidate.is_sum
-        named = (name in kept and u < _HARDLY) or (
-            open_ and information.std(direction[of_optimum]) < _DETERMINED
+        # the verdict names combinations of parameters that are undetermined by noise alone
+        is_named = (name in kept and u < _HARDLY) or (
+            candidate.members & vague
+            and not candidate.is_sum
+            and information.std(direction[of_optimum]) < _DETERMINED
         )
-        if u < _DETERMINED or named:
+        if u < _DETERMINED or is_named:
             yield name, candidate.unit, float(value), direction * abs(value)
 
 
@@ -282,7 +285,7 @@ def taken_as_exact(optimum: Optimum) -> tuple[str, ...]:
 def parameter_budget(
     errors: ErrorContributions, name: str, unit: str, value: float, direction: FloatArray
 ) -> ParameterBudget:
-    """Return the budget of a value with the derivatives `direction`, source by source."""
+    """Return the budget of a value whose derivatives with respect to theta are `direction`."""
     u2 = float(errors.std(direction)) ** 2
     rows = []
     for source, covariance in errors.contributions.items():

@@ -1,7 +1,7 @@
 """Combinations of parameters that data can determine without determining each parameter.
 
 ========================================  =====================================================
-combination                               left by
+combination                               determined in
 ========================================  =====================================================
 products that an element names            microslip, an unknown gain: `Element.combinations`
 stiffness of friction + that of a spring  microslip: the stiffness seen at small amplitudes
@@ -32,7 +32,7 @@ _STIFFNESS = (1, -1, 0)  # powers of force, displacement and time
 
 @dataclass(frozen=True)
 class Candidate:
-    """A combination: name, value, and the derivatives of its logarithm with respect to theta."""
+    """A combination; `direction` are the derivatives of its logarithm with respect to theta."""
 
     expression: str
     unit: str
@@ -43,7 +43,7 @@ class Candidate:
 
 
 def candidates(optimum: Optimum) -> list[Candidate]:
-    """Return every combination that the optimum's free parameters could form."""
+    """Return every combination of the optimum's free parameters."""
     problem, names = optimum.problem, optimum.names
     theta = dict(zip(names, problem.to_values(optimum.theta), strict=True))
     slopes = dict(zip(names, problem.value_slopes(optimum.theta), strict=True))
@@ -83,8 +83,8 @@ def candidates(optimum: Optimum) -> list[Candidate]:
 def stiffness_seen(optimum: Optimum) -> Candidate | None:
     """Return the stiffness of friction and free springs together, in the middle of the amplitudes.
 
-    None without friction and a free spring. Stiffness data always determine it; it is reported only
-    if they determine nothing else.
+    None without friction and a free spring. Stiffness data always determine it, so it is reported
+    only if they determine nothing else.
     """
     problem, names = optimum.problem, optimum.names
     elements = problem.model.elements
@@ -109,7 +109,7 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
 
 
 def runaway(optimum: Optimum) -> frozenset[str]:
-    """Return the names of the parameters whose optimum lies at infinity, or at a positive zero."""
+    """Return the names of parameters whose optimum is infinite, or zero for positive ones."""
     positive, values = optimum.problem.space.positive, optimum.values
     gone = ~np.isfinite(values) | (positive & (values == 0.0))
     return frozenset(np.array(optimum.names)[gone].tolist())
@@ -118,8 +118,8 @@ def runaway(optimum: Optimum) -> frozenset[str]:
 def _unit(powers: Mapping[Parameter, float]) -> str:
     """Return the unit of a product, such as "N/m^2"."""
     above, below = list[str](), list[str]()
-    for place, unit in enumerate(_UNITS):
-        power = sum(by * p.dimension[place] for p, by in powers.items())
+    for i, unit in enumerate(_UNITS):
+        power = sum(exponent * p.dimension[i] for p, exponent in powers.items())
         if power:
             text = unit if abs(power) == 1 else f"{unit}^{abs(power):g}"
             (above if power > 0 else below).append(text)

@@ -1,7 +1,7 @@
-"""What the sources of error contribute to the uncertainty of an estimate.
+"""Contributions of the sources of error to the uncertainty of an estimate.
 
-Tables and records list their sources each in their own way; a source gives the covariance that it
-adds, and the covariance of the estimate is the sum (JCGM 100:2008).
+Each source contributes a covariance, and the covariance of the estimate is their sum
+(JCGM 100:2008). Tables and records have different sources.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class ErrorContributions(ABC):
 
     @abstractmethod
     def dof(self, direction: FloatArray, source: str | None = None) -> float:
-        """Return the effective degrees of freedom of u of direction . theta, or of a source's."""
+        """Return the effective degrees of freedom of u of direction . theta, or of one source."""
 
 
 def variances(directions: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the variances of directions (..., Q) . theta, infinite where they depend on one.
+    """Return the variances of directions . theta, (...), for directions (..., Q).
 
     Examples
     --------
@@ -68,9 +68,9 @@ def variances(directions: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def satterthwaite(variance: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return the degrees of freedom of variances that have the variances `spread`.
+    """Return the degrees of freedom of variances whose own variances are `spread`.
 
-    Twice the square of one over the other, at least 1; infinite where the spread is zero.
+    They are 2 variance^2/spread, at least 1; infinite if the spread is zero.
 
     Examples
     --------

@@ -2,7 +2,7 @@
 
 Least squares is unbiased with such residuals, but (J'J)^-1 times their variance is not its
 covariance, often ten times too small. The residuals' spectrum is estimated by an autoregressive
-model, its order by Akaike's criterion, and their correlation matrix R put where it belongs:
+model, its order by Akaike's criterion, and their covariance matrix R used in
 
     covariance = (J'J)^-1 J'R J (J'J)^-1
 """
@@ -18,12 +18,12 @@ from scipy.linalg import solve_toeplitz, toeplitz
 from dahl_ident.arrays import FloatArray
 from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 
-_SINGULAR = 1e-13  # eigenvalues of J'J of unit columns that are rounding
-_INVOLVED = 1e-6  # share of a parameter in what has no effect: beyond rounding
-_SLIGHT = 1e-3  # of the variance: changes of autocovariances below do not matter
+_SINGULAR = 1e-13  # eigenvalue of J'J, with unit diagonal, that is rounding
+_INVOLVED = 1e-6  # squared component of a parameter in undetermined directions that matters
+_SLIGHT = 1e-3  # change of autocovariances over the variance that does not matter
 _TRANSFORM = 2**15  # samples: enough unless the noise is very slow
-_VANISHED = 1e-9  # of the variance: autocovariances below are rounding
-_CORRECTIONS = 4  # each changes less, by the ratio of parameters to samples
+_VANISHED = 1e-9  # autocovariance over the variance that is rounding
+_CORRECTIONS = 4  # most iterations of the correction, which converges fast
 
 
 def sandwich(
@@ -45,7 +45,7 @@ def sandwich(
     Returns
     -------
     covariance : ndarray, shape (P, P)
-        Infinite variances where a parameter has no effect, or only one together with others.
+        Infinite variances where a parameter has no effect, or none of its own.
     effective : float
         Samples, divided by the mean ratio of a parameter's variance to what it would be if the
         residuals were not correlated.
@@ -68,15 +68,13 @@ def sandwich(
         noise = noise_in(jacobians, residuals)
     for J, known in zip(jacobians, noise, strict=True):
         # the states and offsets of other records have zero columns
-        concerned = np.flatnonzero((J != 0.0).any(axis=0))
-        involved = J if concerned.size == P else J[:, concerned]
-        smooth = correlated(involved, known)
-        middle[np.ix_(concerned, concerned)] += involved.T @ smooth
+        columns = np.flatnonzero((J != 0.0).any(axis=0))
+        nonzero = J if columns.size == P else J[:, columns]
+        middle[np.ix_(columns, columns)] += nonzero.T @ correlated(nonzero, known)
     size = np.sqrt(normal.diagonal())
     size = np.where(size > 0.0, size, 1.0)
     normal, middle = normal / np.outer(size, size), middle / np.outer(size, size)
-    covariance_of_theta = np.zeros((P, P))
-    covariance_of_theta[np.diag_indices(P)] = np.inf
+    covariance_of_theta = np.diag(np.full(P, np.inf))
     seen = np.flatnonzero(normal.diagonal() > 0.0)
     part = np.ix_(seen, seen)
     values, vectors = np.linalg.eigh(normal[part])
@@ -111,32 +109,32 @@ def autoregression(
     residual : ndarray, shape (n,)
         Of mean zero, nearly.
     jacobian : ndarray, shape (n, P), optional
-        Of the fit that left the residuals. A fit takes a part of the noise away, most of slow
-        noise; the autocovariances are corrected for what a fit of such noise would take.
+        Of the fit with these residuals. A fit explains a part of the noise, most of slow noise;
+        the autocovariances are corrected for that part.
 
     Returns
     -------
     coefficients : ndarray, shape (order,)
-        a_k in e_t = sum a_k e_(t-k) + innovation; the order has the least criterion of Akaike.
+        a_k in e_t = sum a_k e_(t-k) + innovation; the order has the lowest Akaike criterion.
     variance : float
     """
     n = residual.size
     highest = int(min(HIGHEST_ORDER, n // SAMPLES_PER_ORDER))
     spectrum = np.abs(fft.rfft(residual, 2 * n)) ** 2
-    seen = fft.irfft(spectrum)[: highest + 1] / n
-    model = _chosen(seen, n)
-    if jacobian is None or seen[0] <= 0.0:
+    observed = fft.irfft(spectrum)[: highest + 1] / n
+    model = _chosen(observed, n)
+    if jacobian is None or observed[0] <= 0.0:
         return model
     peak = float(np.max(spectrum_of(model, fft.next_fast_len(2 * n, real=True))))
-    if 3.0 * jacobian.shape[1] * peak < _SLIGHT * n * seen[0]:  # a bound of what a fit takes
+    if 3.0 * jacobian.shape[1] * peak < _SLIGHT * n * observed[0]:  # bound of the part
         return model
     basis = np.linalg.qr(jacobian)[0]
-    taken: FloatArray = np.zeros(highest + 1)
+    explained: FloatArray = np.zeros(highest + 1)
     for _ in range(_CORRECTIONS):
-        before, taken = taken, _taken_by_a_fit(basis, model, highest)
-        if np.max(np.abs(taken - before)) < _SLIGHT * seen[0]:
+        before, explained = explained, _explained_by_fit(basis, model, highest)
+        if np.max(np.abs(explained - before)) < _SLIGHT * observed[0]:
             break
-        corrected = seen + taken
+        corrected = observed + explained
         if np.linalg.eigvalsh(toeplitz(corrected))[0] <= 0.0:
             break
         model = _chosen(corrected, n)
@@ -149,23 +147,23 @@ def _chosen(covariance: FloatArray, n: int) -> tuple[FloatArray, float]:
     if covariance[0] <= 0.0:
         return chosen
     for order in range(covariance.size):
-        if order:
-            a = solve_toeplitz(covariance[:order], covariance[1 : order + 1])
-            left = float(covariance[0] - a @ covariance[1 : order + 1])
-        else:
-            a, left = np.zeros(0), float(covariance[0])
-        criterion = n * np.log(max(left, 1e-300)) + 2.0 * order
+        following = covariance[1 : order + 1]
+        a = solve_toeplitz(covariance[:order], following) if order else np.zeros(0)
+        variance = max(float(covariance[0] - a @ following), 1e-300)
+        criterion = n * np.log(variance) + 2.0 * order
         if criterion < best:
-            best, chosen = criterion, (a, max(left, 1e-300))
+            best, chosen = criterion, (a, variance)
     return chosen
 
 
-def _taken_by_a_fit(basis: FloatArray, model: tuple[FloatArray, float], highest: int) -> FloatArray:
-    """Return by how much a projection lowers the mean autocovariances of such noise.
+def _explained_by_fit(
+    basis: FloatArray, model: tuple[FloatArray, float], highest: int
+) -> FloatArray:
+    """Return the fall of the mean autocovariances of such noise by a projection.
 
     With Q an orthonormal basis of what was fitted, R the noise's covariance matrix and S_k the
-    shift by k: (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n, S_k made symmetric. All shifts at once,
-    as products of Fourier transforms.
+    shift by k: (2 tr(Q' R S_k Q) - tr(Q' S_k Q Q' R Q))/n, with the symmetric part of S_k; for all
+    shifts at once by Fourier transforms.
     """
     n = basis.shape[0]
     m = fft.next_fast_len(2 * n, real=True)
@@ -184,7 +182,7 @@ def spectrum_of(model: tuple[FloatArray, float], m: int) -> FloatArray:
 
 
 def autocovariances(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Return the autocovariances of the noise in residuals of a fit, up to where they are slight.
+    """Return the significant autocovariances of the noise in residuals of a fit.
 
     From the autoregressive model; see :func:`autoregression`.
     """
@@ -205,10 +203,10 @@ def noise_in(jacobians: Sequence[FloatArray], residuals: Sequence[FloatArray]) -
 
 
 def correlated(waves: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return R times waves, (n, k), R the matrix of these autocovariances."""
+    """Return R times waves, (n, k), with the matrix R of these autocovariances."""
     if covariance.size == 1:
         return waves * covariance
-    from scipy.signal import oaconvolve  # slow to import, and for records alone
+    from scipy.signal import oaconvolve  # slow to import, and only for records
 
     kernel = np.concatenate([covariance[:0:-1], covariance])[:, None]
     full = oaconvolve(waves, kernel, axes=0)

@@ -2,7 +2,7 @@ r"""Tests that are left out one at a time, and predicted from all others.
 
 The parameters are estimated again without each test, and with residuals and derivatives at that
 estimate the linear mixed model of :mod:`dahl_ident.diagnostics.error_model` predicts the rows b of
-the test from all others. They miss by
+the test from all others. Their deviations from the prediction are
 
     e_b = (P_bb)^-1 (P y)_b,    with the covariance (P_bb)^-1,
 
@@ -11,17 +11,17 @@ and with D = (P_bb)^-1 the covariance moves by dD/ds_k = D (P V_k P)_bb D, which
 of freedom. Source: Dubrule, *Cross validation of kriging in a unique neighborhood*, Mathematical
 Geology 15 (1983) 687.
 
-How far tests lay from their predictions also says how far the next one may lie, whatever the
-distribution of their errors is. With Student's t as the prior, worth a few values, the distribution
-of the next score is that of a Dirichlet process,
+The deviations of tests from their predictions also predict the deviation of the next one, whatever
+the distribution of their errors. With Student's t as the prior, with the weight of c scores, the
+distribution of the next score is that of a Dirichlet process,
 
     P(score > z) = (c P(|t| > z) + number of scores > z)/(c + their number),
 
-t where scores are few and what was observed where they are many. Source: Ferguson, *A Bayesian
+which is t with few scores and the observed distribution with many. Source: Ferguson, *A Bayesian
 analysis of some nonparametric problems*, Annals of Statistics 1 (1973) 209.
 
-The bands are checked so as well: the width of each follows from the other tests alone, the
-variances are those of all.
+Bands are checked in the same way: the width of each follows from the scores of the other tests, but
+the variances are those of all tests.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ from dahl_ident.diagnostics.estimate import WeightedEstimate
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 from dahl_ident.diagnostics.mixed_model import MixedState
 
-_MOST_TESTS = 100  # left out one at a time: the share inside is then known to 2 %
-_PRIOR_SCORES = 10.0  # values that Student's t counts for: a table's own 5 % are known from more
+_MOST_TESTS = 100  # tests left out: the share inside is then known to 2 %
+_PRIOR_SCORES = 10.0  # weight c of Student's t
 _NORMAL = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
-_WIDEST = 1e6  # standard deviation of ln gain or phase, beyond which nothing is predicted
+_WIDEST = 1e6  # standard deviation of ln gain or phase above which there is no prediction
 
 
 @dataclass(frozen=True)
 class HeldOut:
     """Fundamentals of tests left out, predicted from the others; ln gain and phase, (r, 2)."""
 
-    rows: NDArray[np.intp]  # (r,): of the data, and the number of each one's test
-    test: NDArray[np.intp]
-    # (r, 2): how far a value is from its prediction, the standard deviation of that, and the
-    # degrees of freedom of the latter; NaN where nothing is predicted
+    rows: NDArray[np.intp]  # (r,): indices in the data
+    test: NDArray[np.intp]  # (r,): number of each row's test
+    # (r, 2): deviations from the predictions, their standard deviations, and the degrees of freedom
+    # of these; NaN without a prediction
     deviation: FloatArray
     std: FloatArray
     dof: FloatArray
-    available: int  # tests there are; of very many, some were left out, chosen evenly
+    available: int  # number of tests; of very many, evenly chosen ones were left out
 
     @property
     def scores(self) -> FloatArray:
@@ -70,9 +70,9 @@ class HeldOut:
 
 
 def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray:
-    """Return the half width of a band over the standard deviation of a test's deviation.
+    """Return the half width of a band over the standard deviation of a test.
 
-    That of Student's t, or more where tests that were left out lie farther away than it says.
+    It is that of Student's t, or larger if tests that were left out deviate more.
 
     Examples
     --------
@@ -86,7 +86,7 @@ def band_factor(scores: FloatArray, dof: FloatArray, level: float) -> FloatArray
     least = special.stdtrit(nu, upper)
     falling = np.sort(scores[np.isfinite(scores)])[::-1]
     outside = (1.0 - level) * (_PRIOR_SCORES + falling.size)
-    larger = np.arange(min(int(outside), falling.size) + 1)  # scores that stay outside
+    larger = np.arange(min(int(outside), falling.size) + 1)  # number of scores outside
     by_prior = np.minimum((outside - larger) / _PRIOR_SCORES, 1.0)
     t = special.stdtrit(np.expand_dims(nu, -1), 1.0 - 0.5 * by_prior)
     best = np.maximum(t, np.append(falling, 0.0)[larger])[..., by_prior > 0.0].min(axis=-1)
@@ -107,34 +107,36 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
         index = (2 * rows[:, None] + np.arange(2)).ravel()
         refit = estimate.without(index)
         try:
-            there = state.model.elsewhere(refit.y, refit.columns).at(state.variances)
-            D = np.linalg.inv(there.block(index))
+            others = state.model.elsewhere(refit.y, refit.columns).at(state.variances)
+            D = np.linalg.inv(others.block(index))
         except np.linalg.LinAlgError:
             continue
-        turn, r = estimate.relative_units[rows], np.arange(len(rows))
-        blocks = np.concatenate([D[None], D @ there.block_falls(index) @ D]).reshape(
+        to_gain_and_phase, r = estimate.relative_units[rows], np.arange(len(rows))
+        blocks = np.concatenate([D[None], D @ others.block_falls(index) @ D]).reshape(
             -1, len(r), 2, len(r), 2
         )
-        by_source = np.einsum("rai,rkij,raj->kra", turn, blocks[:, r, :, r], turn)
-        predicted = refit.y[index] - D @ there.weighted[index]
-        missed = turn @ (refit.residuals[index] - predicted).reshape(-1, 2, 1)
+        by_source = np.einsum(
+            "rai,rkij,raj->kra", to_gain_and_phase, blocks[:, r, :, r], to_gain_and_phase
+        )
+        predicted = refit.y[index] - D @ others.weighted[index]
+        deviations = to_gain_and_phase @ (refit.residuals[index] - predicted).reshape(-1, 2, 1)
         variance = np.maximum(by_source[0], 0.0)
         spread = np.einsum("kra,kl,lra->ra", by_source[1:], W, by_source[1:])
         dof = satterthwaite(variance, spread)
         std = np.sqrt(variance)
         std = np.where((std > 0.0) & (std < _WIDEST), std, np.nan)
         kept = first[rows]
-        parts = (rows, np.full(len(rows), number), missed[..., 0], std, dof)
+        parts = (rows, np.full(len(rows), number), deviations[..., 0], std, dof)
         of_tests.append([part[kept] for part in parts])
     if not of_tests:
         return None
-    rows, test, deviation, std, dof = (np.concatenate(one) for one in zip(*of_tests, strict=True))
+    rows, test, deviation, std, dof = map(np.concatenate, zip(*of_tests, strict=True))
     return HeldOut(rows, test, deviation, std, dof, len(tests))
 
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Held-out gains and phases of fundamentals against their 95.45 % bands.
+    """Held-out gains and phases of fundamentals, compared with their 95.45 % bands.
 
     Attributes
     ----------
@@ -147,9 +149,9 @@ class CrossValidation:
     width : float
         Root mean square of the bands' half widths, in ln gain and phase (rad).
     misfit : float
-        Root mean square of the held-out deviations, in the same.
+        Root mean square of the held-out deviations, in ln gain and phase (rad).
     available : int
-        Tests there are; of very many, some were left out, chosen evenly.
+        Number of tests; of very many, evenly chosen ones were left out.
     """
 
     tests: int
@@ -162,12 +164,12 @@ class CrossValidation:
 
     @property
     def inside(self) -> int:
-        """Gains and phases together that are inside."""
+        """Gains and phases inside their bands."""
         return self.gains + self.phases
 
     @property
     def count(self) -> int:
-        """Gains and phases together."""
+        """Number of gains and phases."""
         return 2 * self.rows
 
     def finding(self, severity: VerdictStatus) -> Finding:

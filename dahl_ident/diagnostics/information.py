@@ -9,7 +9,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.problem import TableProblem
 
 _NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
-_PART = 1e-4  # of a direction in the undetermined ones that matters
+_PART = 1e-4  # component of a direction in undetermined ones that matters
 
 
 def parameter_values(optimum: Optimum) -> dict[str, float]:
@@ -29,9 +29,9 @@ def values_at(problem: TableProblem, theta: FloatArray) -> dict[str, float]:
 class Information:
     """First-order variances of anything that depends on the parameters.
 
-    Where the optimum's covariance is finite, it is used. Where data leave a direction open,
-    what does not depend on that direction still has a finite variance here; NaN where nothing
-    is left to estimate the noise's scale by.
+    The optimum's covariance is used if it is finite. If a direction is undetermined, quantities
+    that do not depend on it still have a finite variance. Variances are NaN if the noise's scale
+    cannot be estimated.
     """
 
     def __init__(self, optimum: Optimum) -> None:
@@ -75,10 +75,9 @@ class Information:
 
 
 def shares(optimum: Optimum) -> FloatArray:
-    """Return each row's share of what the data say about each parameter, shape (P, n).
+    """Return each row's share of the information on each parameter, shape (P, n).
 
-    The part of a parameter's information that no other parameter can explain away; the shares
-    of one parameter sum to 1.
+    It is information that other parameters cannot explain; the shares of a parameter sum to 1.
     """
     m = optimum.problem.n_residuals
     J = optimum.jacobian[:m]

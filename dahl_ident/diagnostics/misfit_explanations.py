@@ -1,9 +1,9 @@
 """Possible causes of a misfit: a sign convention, or single rows. Nothing is corrected or dropped.
 
-A row is suspicious where leaving its response free (the mean-shift test) lowers the sum of squares
-by more than noise would, leverage included. The most deviant row is set aside and the others are
-judged without it, so that outliers do not mask one another; up to a tenth of the rows, of more than
-500 several at a time. The level is 1 % for the whole table, divided by the number of rows.
+A row is suspicious if leaving it out (the mean-shift test, which accounts for leverage) lowers the
+sum of squares by more than noise would. The most deviant row is removed before the next is judged,
+so that outliers do not mask one another; up to a tenth of the rows, and of more than 500 several at
+a time. The level is 1 % for the whole table, divided by the number of rows.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from dahl_ident.fitting.global_start import global_starts
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import percent
 
-_LEVEL = 0.01  # false-alarm rate, of the worst of all points
-_SHARE = 0.1  # of the rows: if more stand out, model or noise is wrong, not single rows
-_ONE_BY_ONE = 500  # rows up to which each is set aside before the next is judged
-_LEAST_DOF = 4  # without the suspected rows; fewer do not show the noise
+_LEVEL = 0.01  # false-alarm rate of the worst of all points
+_SHARE = 0.1  # of the rows: if more deviate, the model or noise is wrong, not single rows
+_ONE_BY_ONE = 500  # rows up to which each is removed before the next is judged
+_LEAST_DOF = 4  # without the suspicious rows; fewer do not show the noise
 _GOOD = "good"
-EXPLAINS = 3.0  # times lower misfit
-_PROMISING = 1.5  # the same, at the start of a search
+EXPLAINS = 3.0  # factor by which a cause lowers the misfit
+_PROMISING = 1.5  # the same at the start of a search
 _BY_CHANCE = 0.01  # probability that rows at random lie as close together
-_RANGE = 5  # values, of which the first and the last are ends
+_RANGE = 5  # fewest values of which the first and the last are ends
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class SuspiciousPoint:
     """A point that noise does not explain."""
 
     row: int  # its index in the table
-    name: str  # what a person calls it: frequency, level, harmonic, run
-    frequency_hz: float  # where it is
+    name: str  # in words: frequency, level, harmonic, run
+    frequency_hz: float
     amplitude: float
-    level: Any  # its label, None where the table has none
-    deviation: float  # its distance from the fit to the others, in standard deviations
+    level: Any  # label of the level, None if the table has none
+    deviation: float  # distance from the fit to the others, in standard deviations
     p_value: float  # probability that the worst of all points deviates as far by noise alone
 
     def __str__(self) -> str:
@@ -55,22 +55,20 @@ class SuspiciousPoint:
 
 
 def suspicious_points(optimum: Optimum, space: ResidualSpace) -> tuple[SuspiciousPoint, ...]:
-    """Return the points that stand apart, the most deviant first."""
-    deviant = (
-        _beyond_noise(optimum) if optimum.loss != "linear" else _standing_apart(optimum, space)
-    )
+    """Return the suspicious points, the most deviant first."""
+    deviant = _outliers(optimum) if optimum.loss != "linear" else _suspicious(optimum, space)
     data, amplitude = optimum.problem.data, optimum.problem.stiffness_data.amplitude
     names = row_names(data, [row for row, *_ in deviant])
     points = []
     for (row, deviation, p), name in zip(deviant, names, strict=True):
         level = None if data.level is None else data.level[row].item()
-        place = float(data.frequency_hz[row]), float(amplitude[row]), level
-        points.append(SuspiciousPoint(row, name, *place, deviation, p))
+        f, A = float(data.frequency_hz[row]), float(amplitude[row])
+        points.append(SuspiciousPoint(row, name, f, A, level, deviation, p))
     return tuple(points)
 
 
-def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float, float]]:
-    """Return row, deviation and p-value of points found one after the other."""
+def _suspicious(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float, float]]:
+    """Return row, deviation and p-value of points that are judged one after the other."""
     n = optimum.problem.data.n
     at_once = 1 + n // _ONE_BY_ONE
     rows: list[int] = []
@@ -85,8 +83,8 @@ def _standing_apart(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, f
     return deviant[: max(significant, default=0)]
 
 
-def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
-    """Return the same for a robust fit, which outliers do not bend: all points beyond the noise."""
+def _outliers(optimum: Optimum) -> list[tuple[int, float, float]]:
+    """Return the same for a robust fit, on which outliers have no effect."""
     m, dof = optimum.problem.n_residuals, max(optimum.dof, 1)
     y, _ = optimum.problem.residuals_and_jacobian(optimum.theta, optimum.scale, tails=False)
     squares = y[:m:2] ** 2 + y[1:m:2] ** 2
@@ -99,14 +97,14 @@ def _beyond_noise(optimum: Optimum) -> list[tuple[int, float, float]]:
 def _most_deviant(
     optimum: Optimum, space: ResidualSpace, without: list[int], count: int
 ) -> list[tuple[int, float, float]]:
-    """Return row, deviation and p-value of the worst points, some rows set aside.
+    """Return row, deviation and p-value of the worst points, without some rows.
 
-    Each is judged without those before it, the effect of these few on the fit to many left out.
+    Each is judged without those before it, whose effect on the fit is neglected.
     """
     m, n = space.residuals.size, space.residuals.size // 2
-    keep = np.ones(n, dtype=np.bool_)
-    keep[without] = False
-    pairs = np.repeat(keep, 2)
+    kept = np.ones(n, dtype=np.bool_)
+    kept[without] = False
+    pairs = np.repeat(kept, 2)
     Q = np.linalg.qr(space.basis[pairs])[0] if without else space.basis
     r = np.zeros(m)
     r[pairs] = space.residuals[pairs] - Q @ (Q.T @ space.residuals[pairs])
@@ -117,27 +115,24 @@ def _most_deviant(
     total = float(r @ r)
     deviant: list[tuple[int, float, float]] = []
     for row in np.argsort(-squares, kind="stable")[:count].tolist():
-        aside = len(without) + len(deviant)
-        dof, explained = space.dof - 2 * aside, float(squares[row])
+        removed = len(without) + len(deviant)
+        dof, explained = space.dof - 2 * removed, float(squares[row])
         variance = 1.0 if optimum.scale_known else (total - explained) / max(dof - 2, 1)
         if dof < _LEAST_DOF or not variance > 0.0:
             break
-        p = min(1.0, (n - aside) * space.tail_of(explained, 2, total, dof))
+        p = min(1.0, (n - removed) * space.tail_of(explained, 2, total, dof))
         deviant.append((row, float(np.sqrt(explained / variance)), p))
         total -= explained
     return deviant
 
 
 def _shifts(r: FloatArray, lever: FloatArray) -> FloatArray:
-    """Return by how much the sum of squares falls without each point: r' (I - H)^-1 r."""
+    """Return the fall of the sum of squares without each point: r' (I - H)^-1 r."""
     pairs = r.reshape(-1, 2)
     Q = lever.reshape(len(pairs), 2, -1)
     first, second = Q[:, 0], Q[:, 1]
-    xx, xy, yy = (
-        1.0 - (first * first).sum(1),
-        -(first * second).sum(1),
-        1.0 - (second * second).sum(1),
-    )
+    xx, yy = 1.0 - (first * first).sum(1), 1.0 - (second * second).sum(1)
+    xy = -(first * second).sum(1)
     determinant = xx * yy - xy**2
     x, y = pairs.T
     form = yy * x**2 - 2.0 * xy * x * y + xx * y**2
@@ -158,8 +153,8 @@ def flagged_rows(data: FrequencyResponse) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """A change of sign of the response's real and imaginary part, and what makes it."""
+class SignChange:
+    """A change of sign of the response's real or imaginary part, and its likely cause."""
 
     name: str
     real: int
@@ -167,7 +162,7 @@ class Turn:
     check: str
 
     def __call__(self, data: FrequencyResponse) -> FrequencyResponse:
-        """Return the data turned, their covariances with them."""
+        """Return the data with these signs, their covariances included."""
         signs = np.array([self.real, self.imaginary])
         covariance = data.covariance
         cross, of_drive = data.amplitude_covariance, data.drive_covariance
@@ -185,10 +180,10 @@ _PHASE = (
     "displacement where friction dissipates"
 )
 _SIGN = "check that force and displacement are positive in the same direction"
-TURNS = (
-    Turn("conjugated", 1, -1, _PHASE),
-    Turn("negated", -1, -1, _SIGN),
-    Turn("negated and conjugated", -1, 1, f"{_PHASE}, and {_SIGN}"),
+SIGN_CHANGES = (
+    SignChange("conjugated", 1, -1, _PHASE),
+    SignChange("negated", -1, -1, _SIGN),
+    SignChange("negated and conjugated", -1, 1, f"{_PHASE}, and {_SIGN}"),
 )
 
 
@@ -198,44 +193,44 @@ def rms_misfit(problem: TableProblem, theta: FloatArray) -> float:
 
 
 def rms_misfit_of(problem: TableProblem, fitted: ComplexArray) -> float:
-    """Return the same for responses (n,) that were fitted in another way."""
+    """Return the same for given fitted responses, (n,)."""
     return float(np.sqrt(np.mean(_misfit(problem, fitted) ** 2)))
 
 
 def sign_convention(optimum: Optimum, before: float, misfit_of: Callable[[Optimum], float]) -> str:
-    """Return which sign of the response explains data that the fit does not; "" where none.
+    """Return in words which sign convention explains the misfit; "" if none does.
 
-    `before` is the misfit of the estimate, and `misfit_of` returns that of another optimum,
-    infinite where tests object to it: a missing mass or spring is met better with a turned sign as
-    well, but not to the noise.
+    `before` is the misfit of the estimate, and `misfit_of` returns that of another optimum, which
+    is infinite where tests object to it: a change of sign may also lower the misfit due to a
+    missing mass or spring, but not to the noise.
     """
     fitted = optimum.problem.predict(optimum.theta)
     middle = float(np.median(_misfit(optimum.problem, fitted)))
     promising = []
-    for turn in TURNS:
+    for change in SIGN_CHANGES:
         try:
-            problem = optimum.problem.like(data=turn(optimum.problem.data))
-            # single rows near a resonance may miss at a start: the median is not bent by them
+            problem = optimum.problem.like(data=change(optimum.problem.data))
+            # the median, as the start may be wrong for single rows near a resonance
             started = problem.predict(global_starts(problem).theta[0])
             first = float(np.median(_misfit(problem, started)))
         except DahlIdentError:
             continue
         if first * _PROMISING < middle:
-            promising.append((first, turn, problem))
+            promising.append((first, change, problem))
     if not promising:
         return ""
-    _, turn, problem = min(promising, key=lambda each: each[0])
-    turned = misfit_of(solve(problem, loss=optimum.loss))
-    if not turned * EXPLAINS < before:
+    _, change, problem = min(promising, key=lambda candidate: candidate[0])
+    after = misfit_of(solve(problem, loss=optimum.loss))
+    if not after * EXPLAINS < before:
         return ""
     return (
-        f"With the response {turn.name} the misfit falls from {percent(before)} to "
-        f"{percent(turned)} rms: {turn.check}"
+        f"With the response {change.name} the misfit falls from {percent(before)} to "
+        f"{percent(after)} rms: {change.check}"
     )
 
 
 def refitted_without(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
-    """Return the optimum of the other rows; None where they have none."""
+    """Return the optimum without some rows; None where there is none."""
     data = optimum.problem.data
     kept = ~np.isin(np.arange(data.n), rows)
     try:
@@ -246,22 +241,22 @@ def refitted_without(optimum: Optimum, rows: Sequence[int]) -> Optimum | None:
 
 
 def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:
-    """Return where several rows lie closer together than rows at random do; "" if they do not."""
+    """Return the range of several rows that are closer together than by chance, otherwise ""."""
     k, n = len(rows), optimum.problem.data.n
     if k < 2:
         return ""
     for name, values, unit in covariates(optimum):
         low, high = values[list(rows)].min(), values[list(rows)].max()
         span = int(((values >= low) & (values <= high)).sum())
-        beyond = min(int((values >= low).sum()), int((values <= high).sum()))
-        within = sum((n - s + 1) * comb(s - 2, k - 2) for s in range(k, span + 1))
-        if min(within, 2 * comb(beyond, k)) < _BY_CHANCE * comb(n, k):
+        to_end = min(int((values >= low).sum()), int((values <= high).sum()))
+        as_close = sum((n - s + 1) * comb(s - 2, k - 2) for s in range(k, span + 1))
+        if min(as_close, 2 * comb(to_end, k)) < _BY_CHANCE * comb(n, k):
             return f"{name} from {low:.3g} to {high:.3g} {unit}"
     return ""
 
 
 def is_at_end(optimum: Optimum, rows: Sequence[int]) -> bool:
-    """Return whether a single row is the first or last of a covariate: the model may fail there."""
+    """Return whether a row is the first or last of a covariate, where the model may fail."""
     if len(rows) != 1:
         return False
     ranges = (values for _, values, _ in covariates(optimum) if np.unique(values).size >= _RANGE)
@@ -272,6 +267,6 @@ def _misfit(problem: TableProblem, fitted: ComplexArray) -> FloatArray:
     response, harmonic = problem.data.response, problem.data.harmonic
     order = 1 if (harmonic == 1).any() else harmonic.min()
     rows = (harmonic == order) & (response != 0.0)
-    crossed = rows & (fitted != 0.0)  # within a gap there is nothing that a share could be of
-    rows = crossed if crossed.any() else rows
+    responding = rows & (fitted != 0.0)  # within a gap there is no response
+    rows = responding if responding.any() else rows
     return np.asarray(np.abs(1.0 - fitted[rows] / response[rows]))

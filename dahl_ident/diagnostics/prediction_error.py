@@ -1,15 +1,15 @@
 r"""Error of a prediction of a measurement: parameters, model error, scatter, noise.
 
 At an operating point where the model's relative slopes with respect to the parameters are j, ln
-gain and phase of the device are -j delta + sum_k C_k u_k in addition to the model's, delta and u_k
-those of :mod:`dahl_ident.diagnostics.mixed_model` and C_k what a source does at that point. Their
-best linear prediction is how far the device is expected to depart from the model there, and with x
-= [-j, C_1, ...] its error has the covariance x K x'. Another test adds its scatter and its noise.
+gain and phase of the device exceed those of the model by -j delta + sum_k C_k u_k, with delta and
+u_k as in :mod:`dahl_ident.diagnostics.mixed_model` and C_k the effect of a source at that point.
+Their best linear prediction is the expected departure of the device from the model there. With
+x = [-j, C_1, ...] its error has the covariance x K x'. A new test adds its scatter and its noise.
 Source: universal kriging, see Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
 
-Earlier data also determine the model error of later ones: for measurements to come, the u of C u,
-independent and of unit variance, are further parameters, and K^-1 is the information of the earlier
-data on all of them.
+Earlier data also determine the model error of later ones: for planned measurements, the u of C u,
+independent and of unit variance, are additional parameters, and K^-1 is the information of the
+earlier data on all parameters.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from dahl_ident.diagnostics.error_sources import error_sources, parts, places
 from dahl_ident.diagnostics.estimate import relative_units
 from dahl_ident.problem import TableProblem
 
-_NEGLIGIBLE = 0.1  # variance of the shapes left out over that of a row's noise
+_NEGLIGIBLE = 0.1  # variance of neglected shapes over that of a row's noise
 
 
 class PredictionError(NamedTuple):
-    """Error of ln gain and phase at n points: departure, (n, 2), covariance, dof, (n, 2)."""
+    """Departure, (n, 2), its covariance, (n, 2, 2), and dof, (n, 2), of ln gain and phase."""
 
     departure: FloatArray
     covariance: FloatArray
@@ -54,26 +54,26 @@ def prediction_error(
     X = np.zeros((len(slopes), 2, model.U.shape[1]))
     X[..., : model.parameters] = -by_theta @ basis.matrix
     for k, source in enumerate(errors.sources):
-        made = source.changes(names, slopes, where, stiffness)
-        if made is not None:
-            X[..., model.columns(k)] = made
+        changes = source.changes(names, slopes, where, stiffness)
+        if changes is not None:
+            X[..., model.columns(k)] = changes
     covariance, by_variance = state.prediction_variance(X)
     if TESTS in errors.contributions:
         covariance = covariance + by_theta @ errors.contributions[TESTS] @ by_theta.swapaxes(1, 2)
     if of_a_test:
         near = _nearest(errors.problem, amplitude, omega)
         units = errors.estimate.relative_units[near]
-        drawn = [units, *[None] * (model.noises - 1)]
-        drawn += [source.drawn(names, slopes, near, units) for source in errors.sources]
-        for k, made in enumerate(drawn):
-            if made is not None:
-                square = np.broadcast_to(made @ made.swapaxes(-1, -2), covariance.shape)
+        scatter = [units, *[None] * (model.noises - 1)]
+        scatter += [source.drawn(names, slopes, near, units) for source in errors.sources]
+        for k, columns in enumerate(scatter):
+            if columns is not None:
+                square = np.broadcast_to(columns @ columns.swapaxes(-1, -2), covariance.shape)
                 covariance = covariance + state.sizes[k] * square
                 by_variance[k] += _diagonal(square)
     total = _diagonal(covariance)
     spread = np.einsum("kni,kl,lni->ni", by_variance, state.variances_covariance, by_variance)
     dof = satterthwaite(total, spread)
-    if errors.by_runs is not None:  # a new run scatters about the mean of the others
+    if errors.by_runs is not None:  # a new run scatters about the mean of the runs
         mean = _diagonal(by_theta @ errors.by_runs.covariance @ by_theta.swapaxes(1, 2))
         runs = errors.by_runs.runs
         dof = no_narrower(dof, total, (1 + runs * of_a_test) * mean, runs)
@@ -88,9 +88,9 @@ def _diagonal(covariance: FloatArray) -> FloatArray:
 def stated_noise(
     problem: TableProblem, theta: FloatArray, amplitude: FloatArray, omega: FloatArray
 ) -> FloatArray:
-    """Return the covariance of ln gain and phase that residuals of unit variance are, (n, 2, 2).
+    """Return the covariance of ln gain and phase of residuals of unit variance, (n, 2, 2).
 
-    That of the row which was measured nearest to each point.
+    At each point it is that of the nearest measured row.
     """
     problem = problem.widened(np.zeros(problem.data.n))
     units = relative_units(problem, theta, problem.predict(theta))
@@ -102,19 +102,18 @@ def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) ->
     """Return the fundamental's row nearest to each point, in ln A and ln omega."""
     view = problem.stiffness_data
     rows = np.flatnonzero(view.harmonic == 1)
-    there = places(view.amplitude, view.omega)[rows]
-    apart = np.sum((places(amplitude, omega)[:, None] - there) ** 2, axis=-1)
-    return np.asarray(rows[np.argmin(apart, axis=1)])
+    measured = places(view.amplitude, view.omega)[rows]
+    distance = np.sum((places(amplitude, omega)[:, None] - measured) ** 2, axis=-1)
+    return np.asarray(rows[np.argmin(distance, axis=1)])
 
 
 class Departures(NamedTuple):
     """Model error at future operating points, and the information of earlier data on it."""
 
-    columns: FloatArray  # (K, 2, W): changes of ln gain and phase at each place, at unit variance
-    # (Q + W, Q + W): Of theta and of the departures: earlier data, their priors, and the unit
-    # variances
+    columns: FloatArray  # (K, 2, W): changes of ln gain and phase at each point, at unit variance
+    # (Q + W, Q + W): on theta and the departures, by earlier data, priors and unit variances
     information: FloatArray
-    # whether its variance is assumed, as residuals are too few to distinguish it from noise
+    # whether its variance is assumed, because too few residuals distinguish it from noise
     assumed: bool
 
 
@@ -125,9 +124,9 @@ def departures(
     omega: FloatArray,
     stiffness: ComplexArray,
 ) -> Departures | None:
-    """Return the model error of a fit at other places; None where it has none.
+    """Return the model error of a fit at other points; None without any.
 
-    Where residuals are too few to distinguish it from noise, it is assumed as large as the noise.
+    If there are too few residuals to distinguish it from noise, it is assumed equal to the noise.
     """
     variances = zip(errors.sources, errors.variances.tolist(), strict=True)
     sized = {source.kind: size for source, size in variances if source.name == MODEL_ERROR}
@@ -137,24 +136,24 @@ def departures(
     if not any(sized.values()):
         return None
     where, estimate = places(amplitude, omega), errors.estimate
-    wider = [s for s in error_sources(estimate, where) if s.name == MODEL_ERROR]
-    pairs = [(source, sized.get(source.kind, 0.0) ** 0.5) for source in wider]
+    sources = [s for s in error_sources(estimate, where) if s.name == MODEL_ERROR]
+    pairs = [(source, sized.get(source.kind, 0.0) ** 0.5) for source in sources]
     pairs = [(source, std) for source, std in pairs if std]
-    made = [(s.changes(errors.names, slopes, where, stiffness), v) for s, v in pairs]
-    there = np.concatenate([v * c for c, v in made if c is not None], axis=-1)
-    missed = np.concatenate([v * source.columns for source, v in pairs], axis=-1)
+    changes = [(s.changes(errors.names, slopes, where, stiffness), std) for s, std in pairs]
+    at_points = np.concatenate([std * c for c, std in changes if c is not None], axis=-1)
+    columns = np.concatenate([std * source.columns for source, std in pairs], axis=-1)
     n = errors.problem.n_residuals // 2
-    rows = estimate.relative_units @ missed[: 2 * n].reshape(n, 2, -1)
-    every = np.concatenate([rows, there]).reshape(-1, there.shape[-1])
-    _, singular, turned = np.linalg.svd(every, full_matrices=False)
+    at_rows = estimate.relative_units @ columns[: 2 * n].reshape(n, 2, -1)
+    every = np.concatenate([at_rows, at_points]).reshape(-1, at_points.shape[-1])
+    _, singular, directions = np.linalg.svd(every, full_matrices=False)
     noise = float(errors.noises[0]) * errors.noise_square
-    left = np.cumsum(singular[::-1] ** 2)[::-1] / len(every)
-    turned = turned[left > _NEGLIGIBLE * noise].T
+    remaining = np.cumsum(singular[::-1] ** 2)[::-1] / len(every)
+    directions = directions[remaining > _NEGLIGIBLE * noise].T
     others = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
     state, noises = errors.state, errors.state.model.noises
-    # residuals fall where a prediction rises
-    joint = state.model.elsewhere(estimate.y, -estimate.jacobian, others, missed @ turned)
+    # residuals fall as a prediction rises
+    joint = state.model.elsewhere(estimate.y, -estimate.jacobian, others, columns @ directions)
     sizes = [*state.variances[[*range(noises), *(noises + k for k in others)]], 1.0]
-    K, Q, W = joint.at(np.array(sizes)).K, len(errors.names), turned.shape[1]
+    K, Q, W = joint.at(np.array(sizes)).K, len(errors.names), directions.shape[1]
     kept = [*range(Q), *range(len(K) - W, len(K))]
-    return Departures(there @ turned, np.linalg.inv(K[np.ix_(kept, kept)]), assumed)
+    return Departures(at_points @ directions, np.linalg.inv(K[np.ix_(kept, kept)]), assumed)

@@ -40,8 +40,8 @@ from dahl_ident.diagnostics.record_sources import (
 from dahl_ident.fitting.optimum import Optimum
 from dahl_ident.problem.record_problem import RecordProblem
 
-_SLIGHT = 1e-6  # standard deviation along a direction over the largest, that counts as none
-_SHORTENS = 0.5  # of u: without a source of less, intervals are at most a tenth too short
+_SLIGHT = 1e-6  # standard deviation along a direction, over the largest, that is rounding
+_SHORTENS = 0.5  # part of u: without a smaller source, intervals are at most 10 % too short
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,21 @@ class RecordErrors(ErrorContributions):
     """Covariance of the estimate, source by source."""
 
     contributions: Mapping[str, FloatArray]  # (P, P) each, noise first
-    effective: float  # samples of white noise that would tell as much as the residuals
+    effective: float  # samples of white noise with the same information as the residuals
     exact: tuple[str, ...]  # inputs without a stated uncertainty
     runs: int  # records that were fitted together
-    exponents: tuple[FixedExponent, ...]  # what the records say of exponents that the fit holds
-    # what the residuals follow, from which `ALONG_MOTION` was estimated
+    exponents: tuple[FixedExponent, ...]
+    # dependence of the residuals on the motion, from which `ALONG_MOTION` was estimated
     misfit: MotionMisfit | None = None
 
     @property
     def assumed(self) -> list[FixedExponent]:
         """The exponents that the user did not state."""
-        return [one for one in self.exponents if one.assumed]
+        return [exponent for exponent in self.exponents if exponent.assumed]
 
     @property
     def least_dof(self) -> float:
-        """Degrees of freedom of the whole: of the source that was estimated from the fewest."""
+        """The fewest degrees of freedom of any source."""
         return min(map(self.dof_of, self.contributions))
 
     def dof_of(self, source: str) -> float:
@@ -82,7 +82,7 @@ class RecordErrors(ErrorContributions):
             return self.dof_of(source)
         parts = {name: float(variances(direction, C)) for name, C in self.contributions.items()}
         total = sum(parts.values())
-        if np.isinf(total):  # which an infinite source alone decides
+        if np.isinf(total):
             return min(self.dof_of(name) for name, part in parts.items() if np.isinf(part))
         spread = sum(2.0 * part**2 / self.dof_of(name) for name, part in parts.items())
         return float(satterthwaite(np.asarray(total), np.asarray(spread)))
@@ -96,15 +96,14 @@ def record_errors(
 ) -> RecordErrors:
     """Return the errors of an estimate.
 
-    A model that misses more than noise does so differently from place to place: where the blocks of
-    a record ask for parameters that scatter more than noise explains, the excess is the model
-    error; what it misses along the motion is a source of its own. Where several records
-    ask for parameters that scatter more than that explains, the excess is the scatter between runs.
-    What an assumed exponent changes counts with its range and with what the records say of it.
-    Errors of the channels are those of :mod:`dahl_ident.diagnostics.record_channels`.
+    A misfit differs between the parts of a record: if estimates from blocks of a record scatter
+    more than noise explains, the excess is the model error; a misfit that depends on the motion is
+    a separate source. If estimates from several records scatter more than that, the excess is the
+    scatter between runs. An assumed exponent contributes by its range and its estimate from the
+    records. Errors of the channels are those of :mod:`dahl_ident.diagnostics.record_channels`.
 
     `jacobians` and `residuals` are the derivatives of each record's prediction, and measured minus
-    predicted; of a robust fit the scores, which then say nothing of the prediction.
+    predicted; for a robust fit, the scores.
     """
     fit = LinearFit.of(problem, values, jacobians, residuals)
     covariance, effective = fit.by_noise
@@ -114,7 +113,7 @@ def record_errors(
     if (scatter := between_records(fit, np.asarray(sum(sources.values())))) is not None:
         sources[RUNS] = scatter
     exponents = fixed_exponents(fit)
-    if assumed := [one.contribution for one in exponents if one.assumed]:
+    if assumed := [exponent.contribution for exponent in exponents if exponent.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
     other_motions = by_other_motions(fit)
     sources |= dict(motion_sources(fit, other_motions))
@@ -144,8 +143,8 @@ def errors_on_constraints(
 ) -> RecordErrors:
     """Return the errors of an estimate on constraints, from noise alone.
 
-    The optimum's covariance has the directions that the constraints leave; in these the residuals'
-    correlation is accounted for.
+    The optimum's covariance spans the directions that the constraints allow, in which the
+    correlation of the residuals is accounted for.
     """
     slopes = optimum.problem.value_slopes(optimum.theta)
     lost = np.isinf(optimum.covariance.diagonal())

@@ -1,12 +1,12 @@
 """What the residuals of records follow: the friction force, the velocity or the displacement.
 
-Residuals of a right model are noise, white or not, and noise does not follow the motion. Those of a
-wrong model are a function of the motion's state. So functions of the state are fitted to the
-residuals together with the parameters, and judged by the noise that then remains: where it is slow,
-it has few effective samples, and may look like a function of the state by chance.
+Residuals of a correct model are noise, white or not, which does not depend on the motion. Those of
+a wrong model are a function of the motion's state. So functions of the state are fitted to the
+residuals together with the parameters, and compared with the remaining noise: slow noise has few
+effective samples, and may look like a function of the state by chance.
 
-What the functions do to the parameters is the model error: the misfit is taken to be as large in
-directions of the parameters, where no residual shows it, as it is in others.
+The changes of the parameters by these functions are the model error: the misfit is assumed to be as
+large in the directions of the parameters, where the residuals cannot show it, as in others.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from dahl_ident.errors import FitError
 from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
-_FALSE_ALARM = 1e-3  # of all functions together; wrong laws are far beyond it
-_SEEN = 0.01  # of a function's size: less of it is not a parameter's doing, or rounding
+_FALSE_ALARM = 1e-3  # of all functions together; wrong laws are far more significant
+_SEEN = 0.01  # part of a function that the parameters do not explain, above which it counts
 _LEVELS = np.linspace(-1.0, 1.0, 7)  # of the friction force in the direction of motion
-_SPEEDS = 2.0 ** np.arange(1, 4)  # of the highest speed, inverse
-_BLOCKS = 60  # of all records, in which the noise may differ: many more than functions
+_SPEEDS = 2.0 ** np.arange(1, 4)  # highest speed over the speeds of decaying functions
+_BLOCKS = 60  # of all records, between which the noise may differ: far more than functions
 _STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
 FRICTION, VELOCITY, DISPLACEMENT = "the friction force", "the velocity", "the displacement"
 REMEDY = {
@@ -41,17 +41,17 @@ REMEDY = {
     VELOCITY: ("damper", "fit a law that changes with the speed"),
     DISPLACEMENT: ("spring", "look for a stiffness that is not linear"),
 }
-"""An element to add, if the model has none, and what else may help where residuals follow it."""
+"""An element to add, if the model has none, and another remedy, by what the residuals follow."""
 
 
 @dataclass(frozen=True)
 class MotionMisfit:
-    """What the residuals follow beyond chance."""
+    """Dependence of the residuals on the motion's state that exceeds chance."""
 
-    covariance: FloatArray  # (P, P): of the estimate, by the functions that the residuals follow
-    follows: str  # what explains most of the residuals
+    covariance: FloatArray  # (P, P): of the estimate, due to this dependence
+    follows: str  # quantity that explains most of the residuals
     share: float  # of their variance that it explains
-    functions: int  # from which the covariance was estimated
+    functions: int  # number of functions from which the covariance was estimated
 
 
 def motion_misfit(
@@ -59,8 +59,8 @@ def motion_misfit(
 ) -> MotionMisfit | None:
     """Return the model error that the residuals show as functions of the motion's state.
 
-    What the delay explains needs no model error, nor do the changes of the outputs by
-    `other_motions`. None where chance explains what the residuals follow.
+    Residuals that the delay explains, or changes of the outputs by `other_motions`, are not a model
+    error. None if chance explains the dependence.
     """
     problem, values, residuals = fit.problem, fit.values, fit.residuals
     slopes = fit.exponent_slopes
@@ -69,74 +69,72 @@ def motion_misfit(
     ends, count = np.cumsum([e.size for e in residuals])[:-1], values.size
     J, e = np.concatenate(freed.jacobians), np.concatenate(residuals)
     channels = [np.concatenate(changes) for changes in other_motions]
-    with suppress(FitError):  # no motion next to the estimate
+    with suppress(FitError):  # no motion close to the estimate
         channels.append(np.concatenate(fit.delay_slopes))
     known = _basis(np.column_stack([J, *channels]))
     e = e - known @ (known.T @ e)
     waves = dict[str, FloatArray]()
     try:
         parts = [_functions(fit, number) for number in range(len(problem.records))]
-    except FitError:  # no motion next to the estimate
+    except FitError:  # no motion close to the estimate
         return None
     for name in parts[0]:
         wave = np.concatenate([problem.filtered(part[name]) for part in parts])
         waves[name] = _basis(wave, _SEEN)
-    beyond = {name: _part(B - known @ (known.T @ B), _SEEN) for name, B in waves.items()}
+    unexplained = {name: _part(B - known @ (known.T @ B), _SEEN) for name, B in waves.items()}
     gain = freed.inverse[:count] @ J.T
     starts = np.append(0, ends)
     blocks = [starts[number] + rows for number, rows in blocks_of(residuals, _BLOCKS)]
-    covariance, found = np.zeros((count, count)), dict[str, tuple[float, int]]()
-    for name, Q in beyond.items():
-        left = e - Q @ (Q.T @ e)
-        if not (Q.shape[1] and left.any()):
+    covariance, significant = np.zeros((count, count)), dict[str, tuple[float, int]]()
+    for name, Q in unexplained.items():
+        remaining = e - Q @ (Q.T @ e)
+        if not (Q.shape[1] and remaining.any()):
             continue
         whole = np.column_stack([known, Q])
-        noise = noise_in(np.split(whole, ends), np.split(left, ends))
+        noise = noise_in(np.split(whole, ends), np.split(remaining, ends))
         dof = max(_samples_of(noise, residuals) - whole.shape[1], 1.0)
         pieces = zip(np.split(Q, ends), noise, strict=True)
         by_noise = np.asarray(sum(q.T @ correlated(q, c) for q, c in pieces))
-        seen = Q.T @ e
-        square = float(seen @ np.linalg.solve(by_noise, seen))
-        expected = Q.shape[1] * max(_between_blocks(Q, left, blocks, by_noise), 1.0)
+        fitted = Q.T @ e
+        square = float(fitted @ np.linalg.solve(by_noise, fitted))
+        expected = Q.shape[1] * max(_between_blocks(Q, remaining, blocks, by_noise), 1.0)
         chance = special.fdtrc(Q.shape[1], dof, square / expected)
-        if not chance < _FALSE_ALARM / len(beyond):
+        if not chance < _FALSE_ALARM / len(unexplained):
             continue
         along = Q.T @ waves[name]
         unit = float(np.trace(np.linalg.solve(by_noise, along @ along.T)))
         moved = gain @ waves[name]
         covariance += (square - expected) / unit * moved @ moved.T
-        found[name] = float(seen @ seen) / float(e @ e), Q.shape[1]
-    if not found:
+        significant[name] = float(fitted @ fitted) / float(e @ e), Q.shape[1]
+    if not significant:
         return None
-    follows = max(found, key=lambda name: found[name][0])
-    return MotionMisfit(covariance, follows, *found[follows])
+    follows = max(significant, key=lambda name: significant[name][0])
+    return MotionMisfit(covariance, follows, *significant[follows])
 
 
 def _between_blocks(
-    Q: FloatArray, left: FloatArray, blocks: Sequence[NDArray[np.intp]], by_noise: FloatArray
+    Q: FloatArray, residuals: FloatArray, blocks: Sequence[NDArray[np.intp]], by_noise: FloatArray
 ) -> float:
-    """Return the variance of what is fitted to the residuals, by blocks, over that `by_noise`.
+    """Return the variance of the fitted coefficients, from blocks, over that `by_noise`.
 
-    Noise that a plant lets pass while it slips, and not while it sticks, is not the same all along
-    a record. Each block's residuals are those of a fit without it.
+    The noise may vary along a record, for example between sticking and slipping. Each block's
+    residuals are those of a fit without it.
     """
-    one = np.eye(Q.shape[1])
-    scores = [np.linalg.pinv(one - Q[b].T @ Q[b]) @ Q[b].T @ left[b] for b in blocks]
+    unit = np.eye(Q.shape[1])
+    scores = [np.linalg.pinv(unit - Q[b].T @ Q[b]) @ Q[b].T @ residuals[b] for b in blocks]
     squares = [float(score @ np.linalg.solve(by_noise, score)) for score in scores]
     return float(sum(squares) / Q.shape[1])
 
 
 def _samples_of(noise: Sequence[FloatArray], residuals: Sequence[FloatArray]) -> float:
-    """Return how many samples of white noise would show the noise's variance as well."""
-    lost, total = 0.0, 0.0
-    for c, e in zip(noise, residuals, strict=True):
-        lost += e.size * float(2.0 * c @ c - c[0] ** 2)
-        total += e.size * float(c[0])
-    return total**2 / lost
+    """Return the number of samples of white noise that would determine its variance as well."""
+    pairs = [(c, e.size) for c, e in zip(noise, residuals, strict=True)]
+    spread = sum(n * float(2.0 * c @ c - c[0] ** 2) for c, n in pairs)
+    return sum(n * float(c[0]) for c, n in pairs) ** 2 / spread
 
 
 def _basis(waves: FloatArray, least: float = 1e-9) -> FloatArray:
-    """Return an orthonormal basis of columns of one length, without what is small or rounding."""
+    """Return an orthonormal basis of normalized columns, without directions below `least`."""
     length = np.linalg.norm(waves, axis=0)
     return _part(waves[:, length > 0.0] / length[length > 0.0], least)
 
@@ -148,7 +146,7 @@ def _part(waves: FloatArray, least: float) -> FloatArray:
 
 
 def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
-    """Return what forces that depend on the state add to the output of record `number`, (n, k)."""
+    """Return the changes of a record's output by forces that depend on the state, (n, k) each."""
     problem, values = fit.problem, fit.values
     record = problem.records[number]
     if problem.output == "force":
@@ -176,9 +174,8 @@ def _forces(
 ) -> dict[str, FloatArray]:
     """Return forces that depend on the state of a motion, (n, k), by what they depend on.
 
-    Where friction goes on from its force in another way than the law says, by a function of the
-    force or of the speed, it forgets the difference as it forgets everything: over its
-    characteristic displacement.
+    An error of the law's slope, a function of the force or of the speed, changes the friction
+    force, and the change decays over the characteristic displacement.
     """
     parts = stretches(x)
     heading, farthest = parts.spread(parts.heading), float(parts.path.max()) or 1.0
@@ -197,17 +194,17 @@ def _forces(
     levels = np.maximum(1.0 - np.abs(ahead[:, None] - _LEVELS) / width, 0.0)
     limits = ahead[:, None] * np.exp(-((speed[:, None] * _SPEEDS) ** 2))
 
-    def remembered(slopes: FloatArray) -> FloatArray:
+    def decaying(slopes: FloatArray) -> FloatArray:
         steps = np.diff(x)
         term = 0.5 * (slopes[1:] + slopes[:-1]) * steps[:, None]
         zero = np.zeros(slopes.shape[1])
         return np.column_stack(
-            [linear_recursion(np.exp(-np.abs(steps) / one), term, zero) for one in sorted(lengths)]
+            [linear_recursion(np.exp(-np.abs(steps) / d), term, zero) for d in sorted(lengths)]
         )
 
     damping = np.column_stack([speed, speed * np.abs(speed), speed**3])
     return {
-        FRICTION: remembered(levels),
-        VELOCITY: np.column_stack([damping, remembered(limits)]),
+        FRICTION: decaying(levels),
+        VELOCITY: np.column_stack([damping, decaying(limits)]),
         DISPLACEMENT: np.column_stack([place, place**2, place**3]),
     }

@@ -140,8 +140,8 @@ class FixedExponent:
     # its standard deviation
     log_ratio: float
     log_ratio_std: float
-    # (P, P): covariance of the estimate due to its error, as if it were estimated too, or due to its
-    # distance from the value that the records indicate, if that is larger
+    # (P, P): covariance of the estimate due to the exponent's error, as if it were estimated too,
+    # or due to its distance from the value that the records indicate, if that is larger
     contribution: FloatArray
     assumed: bool  # whether the user did not state it
 

@@ -28,29 +28,29 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.problem import TableProblem
 
 _PER_DECADE = 48  # 5 % apart
-_BELOW = 100.0  # below the smallest amplitude, where all elements slip alike
-_SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)  # tried from the smoothest on
-_ALLOWED = 1.05  # of the least misfit that a smooth density may leave
-_FEWEST_ROWS = 6  # of which a misfit says something
-_EXACT = 1e-4  # misfit that counts as none
-FAR_LESS = 0.5  # of a model's misfit: such a law is worth naming
+_BELOW = 100.0  # smallest amplitude over the smallest slip displacement, where all elements slip
+_SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)  # tried in this order, the smoothest first
+_ALLOWED = 1.05  # misfit of a smooth density over the least misfit
+_FEWEST_ROWS = 6  # for which a misfit is informative
+_EXACT = 1e-4  # misfit that is rounding
+FAR_LESS = 0.5  # of a model's misfit, below which another law is far better
 
 
 @dataclass(frozen=True)
 class SlipDensity:
-    """Stiffness over slip displacement, and what it leaves of the data."""
+    """Stiffness over slip displacement, and its misfit."""
 
-    # (n,): slip displacements d, m, evenly spaced in their logarithm; the first stands for all
-    # smaller ones: only the product of both is determined there
+    # (n,): slip displacements d, m, evenly spaced in their logarithm; the first represents all
+    # smaller ones, for which only the product of both is determined
     slip: FloatArray
     # (n,): stiffness that slips at each, N/m; smooth, as far as the misfit allows
     stiffness: FloatArray
     spring: float  # stiffness that slips nowhere within the amplitudes, N/m
     parallel: dict[str, float]  # the free linear parameters
-    # root mean square of abs(measured - fitted)/abs(measured) over the fundamentals that the best
-    # law of this kind leaves, without any smoothness
+    # root mean square of abs(measured - fitted)/abs(measured) over the fundamentals, for the best
+    # law of this kind without smoothing
     least_misfit: float
-    misfit: float  # the same of the smooth density
+    misfit: float  # the same for the smooth density
 
     @property
     def statement(self) -> str:
@@ -72,7 +72,7 @@ class SlipDensity:
 def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> SlipDensity:
     """Return the density of slip displacements that describes the fundamentals best.
 
-    Errors count relative to the measured response.
+    Errors are relative to the measured response.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
         With known displacement amplitudes, or drives from which they follow.
     parallel : Element, optional
         Linear elements in parallel, such as ``Mass() + Damper()``; free parameters take any sign,
-        except where their bounds allow one only. A free spring is there already.
+        unless their bounds exclude it. A free spring is always included.
 
     Returns
     -------
@@ -128,10 +128,9 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
 
 
 def least_misfit(optimum: Optimum) -> float | None:
-    """Return the least misfit of parallel Jenkins elements in place of a model's friction.
+    """Return the least misfit if parallel Jenkins elements replace a model's friction.
 
-    None where nothing can be said: with few rows, unknown calibrations, no friction, or where the
-    displacement is not a sine.
+    None with few rows, unknown calibrations, no friction, or a displacement that is not a sine.
     """
     problem = optimum.problem
     linear = [e for e in problem.model.elements if e.is_linear]
@@ -146,11 +145,11 @@ def least_misfit(optimum: Optimum) -> float | None:
 
 
 class _SlipSystem(NamedTuple):
-    """Non-negative coefficients times the columns of `matrix` should give `right`, relatively."""
+    """Equations matrix coefficients = target, relative to the response, coefficients >= 0."""
 
     slip: FloatArray  # of the first columns; the next is a spring, the others are `names`
     matrix: ComplexArray
-    right: ComplexArray
+    target: ComplexArray
     names: list[str]
     signs: list[float]
 
@@ -159,8 +158,8 @@ def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _SlipSystem:
     rows = data.harmonic == 1
     if rows.sum() < 3:
         raise DataError(f"{int(rows.sum())} rows are fundamentals; a density needs at least three")
-    stand_in = MaxwellSlip(1, name="slip_density")
-    view = TableProblem(data.select(harmonic=1), Model(*linear, stand_in)).stiffness_data
+    friction = MaxwellSlip(1, name="slip_density")  # a problem needs one
+    view = TableProblem(data.select(harmonic=1), Model(*linear, friction)).stiffness_data
     A, Z = view.amplitude, view.stiffness
     if np.any(Z == 0.0):
         raise DataError("a response is zero; errors cannot count relative to it")
@@ -189,20 +188,20 @@ def _system(data: FrequencyResponse, linear: Sequence[Element]) -> _SlipSystem:
 
 
 def _solved(system: _SlipSystem, smoothing: float) -> tuple[FloatArray, float]:
-    """Return non-negative coefficients and the misfit; densities may not vary freely."""
-    matrix, right, n = system.matrix, system.right, system.slip.size
+    """Return non-negative coefficients, whose density is smooth, and the misfit."""
+    matrix, target, n = system.matrix, system.target, system.slip.size
     size = np.linalg.norm(matrix, axis=0)
     scaled = matrix / size
-    both = np.concatenate([scaled.real, scaled.imag])
-    want = np.concatenate([right.real, right.imag])
-    # of stiffnesses themselves, which are to have small second differences
+    rows = np.concatenate([scaled.real, scaled.imag])
+    values = np.concatenate([target.real, target.imag])
+    # second differences of the stiffnesses, to be small
     bend = np.diff(np.eye(n), n=2, axis=0) / size[:n] * float(size[n - 1])
     rough = np.zeros((n - 2, matrix.shape[1]))
-    rough[:, :n] = smoothing * np.sqrt(len(right) / n) * bend
+    rough[:, :n] = smoothing * np.sqrt(len(target) / n) * bend
     from scipy.optimize import nnls
 
     coefficients, _ = nnls(
-        np.concatenate([both, rough]), np.append(want, np.zeros(n - 2)), maxiter=10000
+        np.concatenate([rows, rough]), np.append(values, np.zeros(n - 2)), maxiter=10000
     )
-    misfit = float(np.sqrt(np.mean(np.abs(scaled @ coefficients - right) ** 2)))
+    misfit = float(np.sqrt(np.mean(np.abs(scaled @ coefficients - target) ** 2)))
     return coefficients / size, misfit

@@ -1,18 +1,17 @@
 """Trends of the residuals with amplitude, frequency or drive, which show a wrong model.
 
-For each covariate that varies, the response is allowed a smooth relative departure from the
-model, R exp(u), where u is a polynomial of the covariate's logarithm, complex, so that gain and
-phase each have their own. What the parameters could explain is taken out
-(:mod:`dahl_ident.diagnostics.residual_space`); an F or chi-square test shows whether the rest is
-more than noise. The departure's size comes with it, in percent and degrees, so that a significant
-trend can be distinguished from one that matters. A Wald-Wolfowitz test of the residuals' signs
-looks for runs that no low polynomial follows.
+For each covariate that varies, the response may have a smooth relative departure from the model,
+R exp(u), where u is a complex polynomial of the covariate's logarithm, for gain and phase. The part
+that the parameters could explain is removed (:mod:`dahl_ident.diagnostics.residual_space`); an F or
+chi-square test shows whether the remainder exceeds the noise. The size of the departure is given in
+percent, so that a significant trend can be distinguished from one that matters. A Wald-Wolfowitz
+test of the residuals' signs detects departures that no low polynomial follows.
 
-A stiffness that rises with amplitude speaks against every law that softens, whatever its
-parameters and whatever else the model misses. No curve is assumed: the real part of the dynamic
-stiffness, less that of the linear elements, is a straight line over ln A in each of a few bands,
-estimated with a free mass's correction by weighted least squares, and compared from centre to
-centre. Rows that are predicted by the exact steady motion have no such test.
+A stiffness that rises with amplitude contradicts every law that softens, whatever its parameters
+and whatever the rest of the misfit. No curve is assumed: the real part of the dynamic stiffness,
+minus that of the linear elements, is fitted by a straight line over ln A in each of a few bands,
+together with the correction of a free mass, by weighted least squares; the values at the centres
+are compared. Rows that are predicted by the exact steady motion are not tested.
 """
 
 from __future__ import annotations
@@ -33,30 +32,30 @@ from dahl_ident.diagnostics.residual_space import Coefficient, RelativeSpace, Re
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import COMPLIANCES, percent, shown_unit
 
-_BANDS = 8  # of the range of amplitudes: few, so that each holds rows for a mean
+_BANDS = 8  # of the range of amplitudes: few, so that each has enough rows
 _NARROWEST = np.log(1.1)  # of a band, in the logarithm of the amplitude
 _FEWEST_ROWS = 3  # in a band
-LEAST_DOF = 6  # with fewer, no test of residuals of unknown scale applies
+LEAST_DOF = 6  # least degrees of freedom of a test of residuals of unknown scale
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
-_FEWEST_IN_A_GROUP = 3  # rows on average: smaller groups are not separate levels
-_SAME = 0.01  # of the covariate's logarithm: values closer than this are one
-LEAST_RANGE = np.log(1.05)  # of a covariate that varies
-_LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests find little
-_FEWEST_SIGNS = 10  # of each kind on average, for the number of runs to be normal
-_STEEPEST = np.log(10.0)  # change of a logarithm that is worth a number
-_FARTHEST = 9.0  # departure that is
+_FEWEST_IN_A_GROUP = 3  # rows on average
+_SAME = 0.01  # of the covariate's logarithm: closer values are equal
+LEAST_RANGE = np.log(1.05)  # of the logarithm of a covariate that varies
+_LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests detect little
+_FEWEST_SIGNS = 10  # of each sign on average, for a normal number of runs
+_STEEPEST = np.log(10.0)  # largest change of a logarithm that is stated as a number
+_FARTHEST = 9.0  # the same of a relative departure
 
 
 @dataclass(frozen=True)
 class Stiffening:
     """The largest rise of stiffness with amplitude that the data show, against its error."""
 
-    low: float  # the amplitudes between which it rises: means over their bands, geometric
+    low: float  # amplitudes between which it rises: geometric means over their bands
     high: float
-    unit: str  # theirs
+    unit: str  # of the amplitudes
     rise: float  # relative to the stiffness at `low`
     stderr: float
-    p_value: float  # probability of as much by noise alone, all pairs of bands considered
+    p_value: float  # probability of such a rise by noise alone, over all pairs of bands
 
     def __str__(self) -> str:
         size = with_unit(100.0 * self.rise, 100.0 * self.stderr, "%")
@@ -93,8 +92,8 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     stiffness = friction_stiffness(optimum, with_springs=True).real[rows]
     inverse = np.linalg.pinv(weights[:, None] * design)
     values = inverse @ (weights * stiffness)
-    left = weights * (stiffness - design @ values)
-    covariance = inverse @ inverse.T * float(left @ left / dof)  # as they scatter
+    residuals = weights * (stiffness - design @ values)
+    covariance = inverse @ inverse.T * float(residuals @ residuals / dof)
     i, j = np.triu_indices(count, 1)
     rise = values[j] - values[i]
     variance = np.diagonal(covariance)
@@ -113,10 +112,10 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
 
 
 def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Return which rows lie in bands with enough of them, and the number of the band of each."""
+    """Return which rows lie in bands with enough rows, and the number of the band of each."""
     width = max(float(np.ptp(x)) / _BANDS, _NARROWEST) * (1.0 + 1e-9)
-    place = np.floor((x - x.min()) / width)
-    _, number, size = np.unique(place, return_inverse=True, return_counts=True)
+    position = np.floor((x - x.min()) / width)
+    _, number, size = np.unique(position, return_inverse=True, return_counts=True)
     kept = size[number] >= _FEWEST_ROWS
     _, band = np.unique(number[kept], return_inverse=True)
     return kept, band
@@ -130,14 +129,13 @@ class Trend:
     low: float  # its range, SI units (Hz for frequency)
     high: float
     unit: str
-    # change of the data's real and imaginary part of the friction force per displacement, against
-    # the model and relative to it, from `low` to `high`; a straight line over the covariate's
-    # logarithm. Natural logarithms: -0.36 is a fall by 30 %. The stiffness is that of friction and
-    # springs together where the data know only their sum
+    # changes from `low` to `high` of ln of the real and imaginary part of friction's stiffness,
+    # data over model, by a straight line over the covariate's logarithm: -0.36 is a fall by 30 %.
+    # The stiffness is that of friction and springs together where only their sum is determined
     stiffness: Coefficient
     loss: Coefficient
-    largest: float  # largest relative departure of the response that the smooth curve finds
-    p_value: float  # probability of as much departure by noise alone
+    largest: float  # largest relative departure of the response by the smooth curve
+    p_value: float  # probability of such a departure by noise alone
 
     @property
     def brief(self) -> str:
@@ -146,7 +144,7 @@ class Trend:
 
     @property
     def _changes(self) -> str:
-        """How friction's stiffness and loss change against the model's, where they do."""
+        """How friction's stiffness and loss change against the model's; "" if neither does."""
         parts = [
             f"{name} {_change(part)}"
             for name, part in (("stiffness", self.stiffness), ("loss", self.loss))
@@ -182,7 +180,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class GroupsDiffer:
-    """How the gain differs between groups of rows that a column names, such as devices."""
+    """How the gain differs between groups of rows that a column labels, such as devices."""
 
     column: str
     lowest: tuple[str, float]  # label, and its gain over the model's
@@ -205,19 +203,19 @@ class GroupsDiffer:
 def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
     """Return the differences between the groups of each column of labels.
 
-    Those in which the amplitude varies: else they are levels, over which there is a trend.
+    The amplitude has to vary within each group: otherwise they are levels, which trends test.
     """
     data = optimum.problem.data
     differences = []
     amplitude = np.log(optimum.problem.stiffness_data.amplitude)
-    columns = {} if "verdict" in data.quality else dict(data.quality)  # the extraction's are not
+    columns = {} if "verdict" in data.quality else dict(data.quality)  # not the extraction's
     if data.level is not None:
         columns["level"] = data.level
     for name, labels in columns.items():
-        names, which = np.unique(labels, return_inverse=True)
+        names, number = np.unique(labels, return_inverse=True)
         if not 1 < len(names) <= data.n // _FEWEST_IN_A_GROUP:
             continue
-        members = which == np.arange(len(names))[:, None]
+        members = number == np.arange(len(names))[:, None]
         if min(float(np.ptp(amplitude[rows])) for rows in members) < LEAST_RANGE:
             continue
         changes = members.astype(np.complex128)
@@ -226,8 +224,8 @@ def groups(optimum: Optimum, space: ResidualSpace) -> list[GroupsDiffer]:
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = np.log(np.abs(data.response / optimum.problem.predict(optimum.theta)))
             ratio[(data.harmonic != 1) | ~np.isfinite(ratio)] = np.nan
-            gain = [float(np.exp(np.nanmedian(ratio[rows]))) for rows in members]
-            low, high = ((str(names[i]), gain[i]) for i in (np.argmin(gain), np.argmax(gain)))
+            gains = [float(np.exp(np.nanmedian(ratio[rows]))) for rows in members]
+            low, high = ((str(names[i]), gains[i]) for i in (np.argmin(gains), np.argmax(gains)))
             differences.append(GroupsDiffer(name, low, high, p))
     return differences
 
@@ -296,7 +294,7 @@ def covariates(optimum: Optimum) -> Iterator[tuple[str, FloatArray, str]]:
 def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
     """Return the relative change of the response with the friction's real and imaginary part.
 
-    Where friction's stiffness and a spring's are known in sum only, the real part is that sum's.
+    The real part is that of friction and springs together if only their sum is determined.
     """
     problem = optimum.problem
     values = parameter_values(optimum)
@@ -318,7 +316,7 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
 
 
 def _change(part: Coefficient) -> str:
-    """Return "falls by 30 ± 4 %"; a line that steep is not a size, only a direction."""
+    """Return "falls by 30 ± 4 %", or "falls more than tenfold"."""
     word = "rises" if part.value > 0.0 else "falls"
     if abs(part.value) > _STEEPEST:
         return f"{word} more than tenfold"
