@@ -7,18 +7,18 @@ given,
     N = sigma h_alpha(A / x_c),
 
 and springs, dampers and masses are linear anyway. Least squares in dynamic stiffness, with
-amplitudes as measured and weights that the noise model has at the data, is therefore a search over
-the remaining directions (:mod:`dahl_ident.fitting.directions`): at each node of a grid of those,
+measured amplitudes and the weights of the noise model at the data, is therefore a search over the
+remaining directions (:mod:`dahl_ident.fitting.directions`): at each node of a grid of those,
 the linear parameters are solved exactly. The lowest local minima are the starts.
 
 A length has four nodes a decade from a hundredth of the smallest amplitude to a hundred times the
 largest, and one a decade beyond, down to 1e-8 and up to 1e6 times. Farther out the curve agrees
-with its limit to well below any noise; whether the optimum lies out there, at infinity, is for
-:mod:`dahl_ident.fitting.asymptotes` to decide. A pure number takes the values that its law
-declares. All nodes are combined while they are few; else points of a quasi-random sequence are.
+with its limit to well below any noise; :mod:`dahl_ident.fitting.asymptotes` decides whether the
+optimum lies at infinity. A pure number takes the values that its law declares. If there are too
+many combinations of nodes, a quasi-random selection of them is used.
 
-Where lengths scale the curve of a rate-independent law, the curve is read from tables over
-ln(A/length) whose steps divide those of the grid; several lengths are one and its multiples.
+If lengths scale the curve of a rate-independent law, the curve is read from tables over
+ln(A/length) whose steps divide those of the grid. Several lengths are multiples of the shortest.
 """
 
 from __future__ import annotations
@@ -47,41 +47,39 @@ _LOWEST, _NODES = -3200, 6400  # first step and number of steps of a table: 14 d
 _DECADE = np.log(10.0) / _STEP  # steps in a decade
 # steps between nodes of the grid: four a decade near the data, one a decade farther out
 _FINE, _COARSE = 58, 230
-_FINE_ENDS = (6, 4)  # nodes farther out below the fine ones, and above
-# a table is computed at every tenth step, with cubics between; the law is what takes the time
-_COMPUTED = 10
-_AROUND_KNEE = 1e3  # distance from the knee beyond which a curve is a power law
-# values tried of a number whose law names none, by its transform
+_FINE_ENDS = (6, 4)  # number of coarse nodes below the fine ones, and above
+_COMPUTED = 10  # steps of a table between computed values, which are interpolated
+_AROUND_KNEE = 1e3  # ratio to the knee beyond which a curve is a power law
+# values tried for a number whose law declares none, by its transform
 _NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
 _LARGEST = 1e150  # weighted stiffness whose square is still a number
-_DEPENDENT = 1e-12  # share of a column that others do not explain, below which it is rounding
+_DEPENDENT = 1e-12  # part of a column that others do not explain, below which it is rounding
 _MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # several lengths are tried at these times the shortest one
 _MOST_TABLES = 64  # tables kept: 6 MB a harmonic in all, and some seconds to compute
-_LEAST = 4  # amplitudes that a table needs for its cubics
-_TOGETHER = 20  # amplitudes computed together, until the law overflows
-_HIGHEST = 3  # highest harmonic in a start; more of them cost time and tell little more
+_LEAST = 4  # amplitudes of a table, for cubic interpolation
+_TOGETHER = 20  # amplitudes computed in one call, until the law overflows
+_HIGHEST = 3  # highest harmonic in a start; more cost time for little information
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # nodes of one element whose curves are computed node by node
-_MOST_LOOPS = 10_000  # loops integrated for a law that depends on the rate: a second or two
-_MOST_ROWS = 20  # rows for which they are
+_MOST_LOOPS = 10_000  # loops integrated for a rate-dependent law: a second or two
+_MOST_ROWS = 20  # rows for which loops are integrated
 _MOST_STARTS = 4  # searches of a table, each of which costs as much as the first
-# sum of squares, over the lowest, at which a node is no start, however coarse the grid
-_HOPELESS = 100.0
-_ALIKE = 0.01  # relative difference of the sums of squares of nodes that may be one start
+_HOPELESS = 100.0  # sum of squares over the lowest, above which a node is not a start
+_ALIKE = 0.01  # relative difference of sums of squares within which nodes may be one start
 
 
 class Starts(NamedTuple):
-    """Starts of all tables: the table of each, (M,), and its search coordinates, (M, P)."""
+    """Starts of all tables: the number of each start's table, (M,), and theta, (M, P)."""
 
     table: IntArray
     theta: FloatArray
 
     def joined(self, other: Starts) -> Starts:
-        """Return these and others."""
+        """Return these starts and those of `other`."""
         return Starts(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
     def of(self, tables: IntArray) -> Starts:
-        """Return those of some tables, in rising order, which are numbered anew."""
+        """Return the starts of some tables, in rising order, which are renumbered."""
         chosen = np.isin(self.table, tables)
         return Starts(np.searchsorted(tables, self.table[chosen]), self.theta[chosen])
 
@@ -89,41 +87,41 @@ class Starts(NamedTuple):
 def global_starts(problem: TableProblem, *, resistant: bool = False) -> Starts:
     """Return the best starts of every table of a problem, best first.
 
-    Values that the user gave to free parameters make one more start, the last. `resistant` starts
-    are made with two kinds of weights, so that an outlier dominates only some of them. A response
-    far too large has little weight where errors count relative to it, one far too small where all
-    count alike.
+    Values that the user gave to free parameters make one more start, the last. `resistant` adds
+    starts from two other kinds of weights, so that an outlier dominates only some of them: one that
+    is far too large has little weight with errors relative to the response, one that is far too
+    small with equal weights.
     """
     view = problem.stiffness_data
-    begin = _starts(problem, view)
+    starts = _starts(problem, view)
     if not resistant:
-        return begin
+        return starts
     size = np.maximum(np.abs(view.stiffness), SMALLEST)
     for weights in (1.0 / size, np.ones(size.shape)):
-        begin = begin.joined(_starts(problem, replace(view, weights=weights)))
-    return begin
+        starts = starts.joined(_starts(problem, replace(view, weights=weights)))
+    return starts
 
 
 def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
     grid = _grid(problem, view)
     cost, coefficients = grid.solved()
     S = problem.n_tables
-    table, place = _local_minima(cost.reshape(S, *grid.shape), mixed=grid.mixed)
+    table, node = _local_minima(cost.reshape(S, *grid.shape), mixed=grid.mixed)
     last = cost.shape[-1] - 1
     if grid.shape == (last + 1,) and last >= sum(_FINE_ENDS):
         first = np.flatnonzero(np.diff(table, prepend=-1))
         for edge, nearer in ((0, _FINE_ENDS[0]), (last, last - _FINE_ENDS[1])):
-            there = table[first[place[first] == edge]]  # a bound may keep it far out from there
-            table, place = np.append(table, there), np.append(place, np.full(there.size, nearer))
+            at_edge = table[first[node[first] == edge]]  # a bound may keep a search far out
+            table, node = np.append(table, at_edge), np.append(node, np.full(at_edge.size, nearer))
         order = np.argsort(table, kind="stable")
-        table, place = table[order], place[order]
+        table, node = table[order], node[order]
     if cost.ndim > 1:
-        theta = grid.of_tables(table).theta(coefficients[table], place[:, None])[:, 0]
+        theta = grid.of_tables(table).theta(coefficients[table], node[:, None])[:, 0]
     else:
-        theta = grid.theta(coefficients, place)
-    begin = Starts(table, theta)
+        theta = grid.theta(coefficients, node)
+    starts = Starts(table, theta)
     if all(p.value is None for p in problem.parameters):
-        return begin
+        return starts
     best = theta[np.diff(table, prepend=-1) > 0]
     values = problem.to_values(best)
     for index, parameter in enumerate(problem.parameters):
@@ -131,34 +129,34 @@ def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
             values[:, index] = parameter.value
     stated = problem.to_search(values)
     new = ~np.isclose(stated, best, rtol=1e-12).all(axis=1)
-    begin = begin.joined(Starts(np.flatnonzero(new), stated[new]))
-    order = np.argsort(begin.table, kind="stable")
-    return Starts(begin.table[order], begin.theta[order])
+    starts = starts.joined(Starts(np.flatnonzero(new), stated[new]))
+    order = np.argsort(starts.table, kind="stable")
+    return Starts(starts.table[order], starts.theta[order])
 
 
 def grid_size(problem: TableProblem) -> int:
-    """Return the number of nodes of the grid where starts are searched."""
+    """Return the number of nodes of the grid from which starts are chosen."""
     return len(_grid(problem, problem.stiffness_data).nodes)
 
 
 def edge_starts(problem: TableProblem) -> list[FloatArray]:
     """Return the best nodes at both ends of each direction's grid, each (P,) or (S, P).
 
-    They are where searches for limits start.
+    Searches for limits start at them.
     """
     grid = _grid(problem, problem.stiffness_data)
     cost, coefficients = grid.solved()
     edges = []
     for index, curves in enumerate(grid.curves):
-        for at in curves.edges:
-            there = np.where(at[grid.nodes[:, index]], cost, np.inf)
-            edges.append(grid.theta(coefficients, there.argmin(axis=-1)[..., None])[..., 0, :])
+        for edge in curves.edges:
+            edge_cost = np.where(edge[grid.nodes[:, index]], cost, np.inf)
+            edges.append(grid.theta(coefficients, edge_cost.argmin(axis=-1)[..., None])[..., 0, :])
     return edges
 
 
 @dataclass(frozen=True)
 class _LinearPart:
-    """A linear coefficient of one element: which parameters it multiplies, and its curve."""
+    """A linear coefficient of an element: the parameters that it multiplies, and its curve."""
 
     parameters: tuple[Parameter, ...]
     curve: ComplexArray  # at every row, (..., K, n)
@@ -173,12 +171,12 @@ class _Curves:
     """One element at the K nodes of its grid."""
 
     values: dict[str, FloatArray]
-    """Nonlinear parameters, and those that a column multiplies at 1: (K,) or (S, K)."""
+    """Nonlinear parameters, (K,) or (S, K), and 1 for those that a column multiplies."""
     columns: list[_LinearPart]
     known: ComplexArray | None
-    """The part that does not depend on any coefficient, (..., K, n)."""
+    """Part that does not depend on a coefficient, (..., K, n)."""
     edges: list[NDArray[np.bool_]]
-    """The nodes at either end of each direction, (K,)."""
+    """Nodes at either end of each direction, (K,)."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +190,7 @@ class _Grid:
     target: ComplexArray  # weighted, (..., n)
     weights: FloatArray  # (..., n)
     common: list[_LinearPart]  # the same at every node, curves of shape (..., n)
-    mixed: bool  # nodes of several directions follow each other: neighbours need not be near
+    mixed: bool  # nodes of several directions are in one axis, so neighbours need not be near
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
         """Return the sum of squares, (..., C), and the linear coefficients, (..., C, Q)."""
@@ -203,7 +201,7 @@ class _Grid:
         return np.where(allowed, cost, np.inf), coefficients
 
     def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
-        """Return the target, (..., C, 2 n), columns common to all nodes, and those of each."""
+        """Return the target, (..., C, 2 n), the common columns, and those of each node."""
         target = self.target[..., None, :]
         columns = []
         for index, curves in enumerate(self.curves):
@@ -221,7 +219,7 @@ class _Grid:
         return _parts(np.broadcast_to(target, shape)), common, columns
 
     def of_tables(self, tables: IntArray) -> _Grid:
-        """Return the grid for `theta` alone, of some tables of a batch."""
+        """Return the grid of some tables of a batch, for use of `theta` only."""
         return replace(
             self,
             curves=[
@@ -230,24 +228,24 @@ class _Grid:
             ],
         )
 
-    def theta(self, coefficients: FloatArray, places: IntArray) -> FloatArray:
+    def theta(self, coefficients: FloatArray, combinations: IntArray) -> FloatArray:
         """Return the search coordinates at some combinations of nodes, (..., k) -> (..., k, P)."""
         if coefficients.ndim == 2:
-            chosen = coefficients[places]
+            chosen = coefficients[combinations]
         else:
-            chosen = np.take_along_axis(coefficients, places[..., None], axis=-2)
+            chosen = np.take_along_axis(coefficients, combinations[..., None], axis=-2)
         by_name: dict[str, FloatArray] = {}
         used = 0
         for column in self.common:
             _scaled(by_name, column, chosen[..., used])
             used += 1
         for index, curves in enumerate(self.curves):
-            node = self.nodes[places, index]
+            node = self.nodes[combinations, index]
             by_name.update({name: _taken(v, node) for name, v in curves.values.items()})
             for column in curves.columns:
                 _scaled(by_name, column, chosen[..., used])
                 used += 1
-        theta = np.empty((*places.shape, len(self.problem.parameters)))
+        theta = np.empty((*combinations.shape, len(self.problem.parameters)))
         for index, parameter in enumerate(self.problem.parameters):
             value = by_name.get(parameter.name, parameter.value)
             assert value is not None
@@ -264,11 +262,11 @@ def _scaled(values: dict[str, FloatArray], column: _LinearPart, coefficient: Flo
 
 
 def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
-    every = [directions(e) for e in problem.model.elements]
-    searched = [d for d in every if d.nonlinear]
+    elements = [directions(e) for e in problem.model.elements]
+    searched = [d for d in elements if d.nonlinear]
     rows = np.flatnonzero(view.harmonic <= _HIGHEST)
     rows = rows if rows.size else np.arange(view.harmonic.size)
-    if any(_takes_loops(d) for d in searched) and rows.size > _MOST_ROWS:
+    if any(_needs_loops(d) for d in searched) and rows.size > _MOST_ROWS:
         first = view.harmonic[rows] == 1
         rows = rows[first] if first.any() else rows
         amplitude = view.amplitude.reshape(-1, view.harmonic.size)[0]
@@ -277,13 +275,13 @@ def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
         rows = np.sort(rows[order[chosen]])
     if rows.size < view.harmonic.size:
         view = view.of_rows(rows)
-    each = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
-    curves = [_curves(d, view, each) for d in searched]
-    counts = [_size(c) for c in curves]
+    most = _MOST_COMBINATIONS ** (1.0 / max(1, len(searched)))
+    curves = [_curves(d, view, most) for d in searched]
+    counts = [next(iter(c.values.values())).shape[-1] for c in curves]
     nodes = np.indices(counts).reshape(len(counts), math.prod(counts)).T
     fixed = np.zeros(view.stiffness.shape, dtype=np.complex128)
     common: list[_LinearPart] = []
-    for d in every:
+    for d in elements:
         if d.nonlinear:
             continue
         known, columns = _columns(d, {}, view)
@@ -301,14 +299,10 @@ def _grid(problem: TableProblem, view: StiffnessData) -> _Grid:
     )
 
 
-def _takes_loops(d: Directions) -> bool:
-    """Return whether a loop is integrated for every node and row."""
+def _needs_loops(d: Directions) -> bool:
+    """Return whether a loop has to be integrated for every node and row."""
     law = type(d.element)
     return not d.lengths and not law.rate_independent and law.settled is Friction.settled
-
-
-def _size(curves: _Curves) -> int:
-    return int(next(iter(curves.values.values())).shape[-1])
 
 
 def _columns(
@@ -331,49 +325,50 @@ def _columns(
             f"its force depends on it; give it a value and name it in {argument('free')}"
         )
 
-    def at(one: Parameter | None, scale: float) -> ComplexArray:
+    def stiffness_at(unit: Parameter | None, scale: float) -> ComplexArray:
         numbers = []
         for p in d.element.parameters:
             value: FloatArray | float
             if p.name in values:
                 value = values[p.name]
             elif p.name in linear:
-                value = float(p is one)
+                value = float(p is unit)
             elif p.name in scaled:
                 value = scale
             else:
                 value = float("nan") if p.value is None else p.value
             numbers.append(np.asarray(value, dtype=np.float64))
-        with np.errstate(all="ignore"):  # far out a law may overflow, and is not a start there
+        with np.errstate(all="ignore"):  # a law may overflow far out, where it is not a start
             return view.of(d.element, numbers, at_nodes=bool(values))
 
     columns = []
     if not d.linear:
-        return (None, [_LinearPart(d.scale, at(None, 1.0))]) if scaled else (at(None, 1.0), [])
-    if all(p in d.linear for p in d.element.parameters):  # a linear element: nothing else acts
-        return None, [_LinearPart((p,), at(p, 0.0)) for p in d.linear]
+        base = stiffness_at(None, 1.0)
+        return (None, [_LinearPart(d.scale, base)]) if scaled else (base, [])
+    if all(p in d.linear for p in d.element.parameters):  # a linear element
+        return None, [_LinearPart((p,), stiffness_at(p, 0.0)) for p in d.linear]
     scales = d.element.scale_parameters
     if scales and {d.element.parameter(label).name for label in scales} <= linear:
-        return None, [_LinearPart((p,), at(p, 1.0)) for p in d.linear]
-    base = at(None, 1.0)
+        return None, [_LinearPart((p,), stiffness_at(p, 1.0)) for p in d.linear]
+    base = stiffness_at(None, 1.0)
     if scaled:
         columns.append(_LinearPart(d.scale, base))
-    columns += [_LinearPart((p,), at(p, 1.0) - base) for p in d.linear]
+    columns += [_LinearPart((p,), stiffness_at(p, 1.0) - base) for p in d.linear]
     return (None if scaled or not np.any(base) else base), columns
 
 
 def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
-    """Return an element at the nodes of its grid, about `most` at most."""
+    """Return an element at the nodes of its grid, of which there are at most about `most`."""
     if d.lengths:
         return _tabulated_curves(d, view, most)
     most = min(most, _MOST_OF_ONE)
-    if _takes_loops(d):
+    if _needs_loops(d):
         most = min(most, _MOST_LOOPS / view.harmonic.size)
     lengths = [x for x in d.nonlinear if not x.is_number]
     numbers = [_numbers(x) for x in d.nonlinear if x.is_number]
     combined = float(np.prod([n.size for n in numbers])) if numbers else 1.0
-    each = max(12.0, (most / combined) ** (1.0 / max(1, len(lengths))))
-    axes = [_axis(x, view, each) for x in lengths] + [n[None] for n in numbers]
+    per_length = max(12.0, (most / combined) ** (1.0 / max(1, len(lengths))))
+    axes = [_axis(x, view, per_length) for x in lengths] + [n[None] for n in numbers]
     ordered = lengths + [x for x in d.nonlinear if x.is_number]
     counts = [a.shape[-1] for a in axes]
     if np.prod(counts) <= 2.0 * most:
@@ -381,7 +376,7 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
     else:
         index = _quasi_random(tuple(counts), int(most))
     lead = view.amplitude.shape[:-1]
-    index = index[:, _possible(d, [*ordered], [a.reshape(-1, a.shape[-1])[0] for a in axes], index)]
+    index = index[:, _possible(d, ordered, [a.reshape(-1, a.shape[-1])[0] for a in axes], index)]
     # numbers are the same for all tables
     ratios = [
         a[..., i] if lead and not x.is_number else a.reshape(-1)[i]
@@ -402,7 +397,7 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
 def _possible(
     d: Directions, ordered: list[Direction], axes: list[FloatArray], index: IntArray
 ) -> NDArray[np.bool_]:
-    """Return the nodes where an element is physically possible, or every node."""
+    """Return the nodes where an element is physically possible, or all if it is nowhere."""
     names = [x.parameter.name for x in ordered]
     possible = []
     for node in index.T:
@@ -415,7 +410,7 @@ def _possible(
 
 
 def _numbers(direction: Direction) -> FloatArray:
-    """Return the values of a pure number that are tried."""
+    """Return the values of a pure number that are nodes."""
     p = direction.parameter
     values = np.array(p.scan or _NUMBERS[p.transform])
     if not p.scan and np.isfinite([p.lower, p.upper]).all() and not p.positive:
@@ -425,7 +420,7 @@ def _numbers(direction: Direction) -> FloatArray:
 
 
 def _axis(direction: Direction, view: StiffnessData, most: float) -> FloatArray:
-    """Return the values of a direction with a unit that are tried, (..., K)."""
+    """Return the values of a direction with a unit that are nodes, (..., K)."""
     position = np.rint(direction.sizes(view) / _STEP).astype(np.intp)
     low = position.min(axis=-1)
     span = int((position.max(axis=-1) - low).max())
@@ -458,9 +453,9 @@ def _offsets(span: int, most: float) -> IntArray:
 
 
 def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
-    """Return an element whose curve lengths scale: from tables over ln(A/length).
+    """Return an element whose curve is scaled by lengths, from tables over ln(A/length).
 
-    The length is the shortest; the others are multiples of it.
+    Lengths are multiples of the shortest.
     """
     numbers = [x for x in d.nonlinear if x.is_number]
     ordered = [*d.lengths, *numbers]
@@ -502,7 +497,7 @@ def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curve
     if len(d.lengths) > 1:
         longest = index[: len(d.lengths)] % multiples.size == multiples.size - 1
         edges += [np.repeat(far, offsets.size) for far in longest]
-    # the curve at unit length is that of unit reference, whatever the reference's own dimension
+    # the curve at unit length is that of a reference of 1, whatever its dimension
     shift = d.reference.dimension[1] + 1
     if shift:
         curve = curve / np.exp(ln_lengths[..., None] * shift)
@@ -510,7 +505,7 @@ def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curve
 
 
 def _powers(direction: Direction, multiples: FloatArray) -> FloatArray:
-    """Return the values of a power of a length at multiples of unit length, of both signs."""
+    """Return a power of a length at multiples of unit length, of both signs if allowed."""
     values = multiples ** direction.dimension[1]
     return values if is_positive(direction.parameter) else np.concatenate([values, -values])
 
@@ -519,14 +514,14 @@ _TABLES: dict[Hashable, ComplexArray] = {}
 
 
 def _table(
-    d: Directions, ordered: list[Direction], at: tuple[float, ...], orders: tuple[int, ...]
+    d: Directions, ordered: list[Direction], unit_values: tuple[float, ...], orders: tuple[int, ...]
 ) -> ComplexArray:
     """Return F_k/X_1 over unit scale at ln(A/length) = -32, -31.99, ..., 32, (orders, n).
 
-    `at` are the values of the directions at unit length.
+    `unit_values` are those of the directions at unit length.
     """
     element = d.element
-    at_unit = dict(zip((x.parameter.name for x in ordered), at, strict=True))
+    at_unit = dict(zip((x.parameter.name for x in ordered), unit_values, strict=True))
     values = [
         np.asarray(at_unit.get(p.name, 1.0 if p.free or p.value is None else p.value), np.float64)
         for p in element.parameters
@@ -542,9 +537,9 @@ def _table(
 def _computed_table(
     element: Element, values: list[FloatArray], orders: NDArray[np.int64]
 ) -> ComplexArray:
-    """Return the table from amplitudes around the knee; power laws beyond.
+    """Return the table, computed around the knee and extended by power laws.
 
-    Beyond the last amplitude at which the law has a loop there is none.
+    It is NaN beyond the last amplitude at which the law has a loop.
     """
     low, high = (float(np.asarray(v)) for v in element.knee(values))
     if not 0.0 < low <= high < np.inf:
@@ -554,12 +549,12 @@ def _computed_table(
     coarse = np.arange(max(first, _LOWEST), min(last, _LOWEST + _NODES) + 1, _COMPUTED)
     x = coarse * _STEP
     parts = []
-    for some in np.array_split(x, max(1, x.size // _TOGETHER)):
+    for part in np.array_split(x, max(1, x.size // _TOGETHER)):
         with np.errstate(all="ignore"):
             parts.append(
                 element.stiffness(
-                    values, np.tile(np.exp(some), orders.size), np.ones(()),
-                    np.repeat(orders, some.size),
+                    values, np.tile(np.exp(part), orders.size), np.ones(()),
+                    np.repeat(orders, part.size),
                 ).reshape(orders.size, -1)
             )  # fmt: skip
         if not (np.abs(parts[-1]) < _LARGEST).all():
@@ -570,26 +565,26 @@ def _computed_table(
     count = usable.size if usable.all() else int(usable.argmin())
     if count < _LEAST:
         return np.full((orders.size, fine.size), np.nan, dtype=np.complex128)
-    x, Z, ends = x[:count], Z[:, :count], count < x.size
-    table = _between(Z, (np.clip(fine, x[0], x[-1]) - x[0]) / (_COMPUTED * _STEP))
+    x, Z, is_cut = x[:count], Z[:, :count], count < x.size
+    table = _interpolated(Z, (np.clip(fine, x[0], x[-1]) - x[0]) / (_COMPUTED * _STEP))
     for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
-        for whole, Y in ((table.real, Z.real), (table.imag, Z.imag)):
+        for extended, Y in ((table.real, Z.real), (table.imag, Z.imag)):
             with np.errstate(divide="ignore", invalid="ignore"):
                 slope = np.log(Y[:, end] / Y[:, near]) / (x[end] - x[near])
             slope = np.clip(np.where(np.isfinite(slope), slope, 0.0), -3.0, 3.0)[:, None]
-            whole[:, side] = Y[:, [end]] * np.exp(slope * (fine[side] - x[end]))
-    if ends:
+            extended[:, side] = Y[:, [end]] * np.exp(slope * (fine[side] - x[end]))
+    if is_cut:
         table[:, fine > x[-1]] = np.nan
     return table
 
 
-def _between(Z: ComplexArray, place: FloatArray) -> ComplexArray:
-    """Return columns (K, n) at places from 0 to n - 1, by cubics through the four nearest.
+def _interpolated(Z: ComplexArray, position: FloatArray) -> ComplexArray:
+    """Return columns of (K, n) at positions from 0 to n - 1, by cubics through the four nearest.
 
-    A spline of scipy takes longer to import than a small fit takes.
+    Splines of scipy take longer to import than a small fit takes.
     """
-    first = np.clip(place.astype(np.intp) - 1, 0, Z.shape[1] - 4)
-    u = place - first
+    first = np.clip(position.astype(np.intp) - 1, 0, Z.shape[1] - 4)
+    u = position - first
     weights = (
         (u - 1) * (u - 2) * (3 - u) / 6,
         u * (u - 2) * (u - 3) / 2,
@@ -602,10 +597,10 @@ def _between(Z: ComplexArray, place: FloatArray) -> ComplexArray:
 def _solve_linear(
     target: FloatArray, common: list[FloatArray], separate: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the least sum of squares of target - coefficients times columns, and those.
+    """Return the least sum of squares of target - coefficients times columns, and the coefficients.
 
     Columns in `common`, (..., 2 n), are the same at every node; they are projected out first,
-    because those in `separate`, (..., C, 2 n), can be hard to tell from them.
+    because those in `separate`, (..., C, 2 n), can be nearly dependent on them.
     """
     Q, R = _factors(common, target)
     residual = _projected(target, Q)
@@ -614,19 +609,18 @@ def _solve_linear(
         if separate
         else residual[..., None, :][..., :0, :]
     )
-    # a hardening law overflows at some nodes: no starts
+    # nodes at which a hardening law overflows are not starts
     usable = np.asarray((np.abs(columns) < _LARGEST).all(axis=(-2, -1)))
     if not usable.all():
         columns = np.where(usable[..., None, None], columns, 0.0)
-    left = _projected(columns, Q[..., None, :, :])
-    norm = np.sqrt(np.einsum("...i,...i->...", left, left))
+    remaining = _projected(columns, Q[..., None, :, :])
+    norm = _lengths(remaining)
     if common:
-        whole = np.sqrt(np.einsum("...i,...i->...", columns, columns))
-        norm[norm < _DEPENDENT * whole] = 0.0
-    left = left / np.where(norm > 0.0, norm, np.inf)[..., None]
-    gram = left @ left.swapaxes(-1, -2) + 1e-13 * np.eye(left.shape[-2])
-    scaled = np.linalg.solve(gram, left @ residual[..., None])
-    residual = residual - (scaled.swapaxes(-1, -2) @ left)[..., 0, :]
+        norm[norm < _DEPENDENT * _lengths(columns)] = 0.0
+    unit = remaining / np.where(norm > 0.0, norm, np.inf)[..., None]
+    gram = unit @ unit.swapaxes(-1, -2) + 1e-13 * np.eye(unit.shape[-2])
+    scaled = np.linalg.solve(gram, unit @ residual[..., None])
+    residual = residual - (scaled.swapaxes(-1, -2) @ unit)[..., 0, :]
     coefficients = scaled[..., 0] / np.where(norm > 0.0, norm, np.inf)
     cost = np.where(usable, np.einsum("...i,...i->...", residual, residual), np.inf)
     if not common:
@@ -636,8 +630,12 @@ def _solve_linear(
     return cost, np.concatenate([base, coefficients], axis=-1)
 
 
+def _lengths(rows: FloatArray) -> FloatArray:
+    return np.sqrt(np.einsum("...i,...i->...", rows, rows))
+
+
 def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q, (..., 2 n, L), and R of the common columns; dependent ones get no part."""
+    """Return Q, (..., 2 n, L), and R of the common columns; Q is 0 for dependent columns."""
     lead, m = target.shape[:-2], target.shape[-1]
     X = np.zeros((*lead, m, len(common)))
     for index, column in enumerate(common):
@@ -652,23 +650,23 @@ def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, 
 
 
 def _projected(rows: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return rows, (..., C, 2 n), less their part in the span of Q; twice, for the last digits."""
+    """Return rows, (..., C, 2 n), minus their part in the span of Q; twice, for accuracy."""
     for _ in range(2 if Q.shape[-1] else 0):
         rows = rows - (rows @ Q) @ Q.swapaxes(-1, -2)
     return rows
 
 
 def _parts(values: ComplexArray) -> FloatArray:
-    """Return real and imaginary parts side by side in the last axis."""
+    """Return real and imaginary parts, interleaved in the last axis."""
     return np.ascontiguousarray(values).view(np.float64)
 
 
 def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]:
     """Return each table's lowest local minima over its grid, (S, ...): table and flat index.
 
-    The lowest of a table comes first; a table without any has its first node. Where nodes are
-    `mixed`, minima of nearly the same cost count as one where there are others: a parameter may not
-    matter there.
+    The lowest of a table comes first; a table without any has its first node. If nodes are `mixed`,
+    minima of nearly the same cost count as one as long as others remain, because a parameter may
+    have no effect there.
     """
     S = len(cost)
     lowest = cost < np.inf
@@ -678,21 +676,21 @@ def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]
         mask[:-1] &= rows[:-1] < rows[1:]
     flat, lowest = cost.reshape(S, -1), lowest.reshape(S, -1)
     lowest[~lowest.any(axis=1), 0] = True
-    table, place = np.nonzero(lowest)
+    table, node = np.nonzero(lowest)
     if table.size == S:
-        return table, place
-    order = np.lexsort((flat[table, place], table))
-    table, place = table[order], place[order]
+        return table, node
+    order = np.lexsort((flat[table, node], table))
+    table, node = table[order], node[order]
     if mixed:
-        lows, alike = flat[table, place], np.zeros(table.size, dtype=np.bool_)
-        alike[1:] = (np.diff(table) == 0) & (lows[1:] <= (1.0 + _ALIKE) * lows[:-1])
+        costs, alike = flat[table, node], np.zeros(table.size, dtype=np.bool_)
+        alike[1:] = (np.diff(table) == 0) & (costs[1:] <= (1.0 + _ALIKE) * costs[:-1])
         alike &= (np.bincount(table[~alike], minlength=S) > 1)[table]
-        table, place = table[~alike], place[~alike]
+        table, node = table[~alike], node[~alike]
     first = np.searchsorted(table, table)
     rank = np.arange(table.size) - first
-    lows = flat[table, place]
-    good = (rank == 0) | ((rank < _MOST_STARTS) & (lows <= _HOPELESS * lows[first]))
-    return table[good], place[good]
+    costs = flat[table, node]
+    good = (rank == 0) | ((rank < _MOST_STARTS) & (costs <= _HOPELESS * costs[first]))
+    return table[good], node[good]
 
 
 def _taken(values: FloatArray, node: IntArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Least squares for records of any motion, with the delay and the noise that are removed."""
+"""Least squares for records of any motion, from which delay and noise are removed."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ from dahl_ident.problem import Quadratic
 from dahl_ident.problem.record_noise import prediction_error_filter, share_in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
-_SHORT = {"force": 8192, "motion": 4096}  # samples with which a long record is begun
+_SHORT = {"force": 8192, "motion": 4096}  # samples of a first search of a long record
 _COMPARED = 8  # steps after which starts of a driven motion are compared
-_GOOD = 0.01  # share of variance left beyond which a search that stagnates is not driven on
+_GOOD = 0.01  # unexplained share of variance above which a search that stagnates ends
 _LAGS = 20  # of the residuals' correlations
-_CORRELATED = 5.0  # standard deviations of white noise's statistic, beyond which they are not white
-_IDLE = 0.5  # standard error of a logarithm
-_ROUNDS = 8  # of looking elsewhere: a limit on time
-_WORTH = 3  # searches in each
-_ALIKE = 1e-8  # share of the largest eigenvalue below which parameters act alike
-_FARTHEST = 10.0  # factor by which a value is adapted
-_PRIORS = 4  # descents until the noise is known, of which a prior is one more sample
-_SAME_NOISE = 1.3  # factor within which it is
-_SETTLING = 2000  # samples after which simulated noise has forgotten its start
+_CORRELATED = 5.0  # standard deviations of the statistic of white noise that reject it
+_IDLE = 0.5  # standard error of a logarithm above which a parameter has hardly an effect
+_ROUNDS = 8  # most rounds of searches elsewhere: a limit on time
+_WORTH = 3  # searches in each round
+_ALIKE = 1e-8  # eigenvalue over the largest, below which effects of parameters are equal
+_FARTHEST = 10.0  # largest factor by which a value is adapted
+_PRIORS = 4  # most descents until the noise, and with it the weight of priors, is known
+_SAME_NOISE = 1.3  # factor within which the noise is known
+_SETTLING = 2000  # samples after which simulated noise is stationary
 _MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
-_DESCRIBED = 0.1  # share of variance left beyond which the model is wrong, not the drive noisy
-_REPEATS = 12  # a limit for weights that do not settle
+_DESCRIBED = 0.1  # unexplained share of variance that shows a wrong model, not a noisy drive
+_REPEATS = 12  # most iterations of the weights
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
-_ALIGNED = 0.02  # of the sum of squares that a delay has to explain to be removed
+_ALIGNED = 0.02  # part of the sum of squares that a delay has to explain to be removed
 _LONGEST_DELAY = 2.0  # samples: twice the assumed standard deviation
-_ALIGNMENTS = 4  # steps of the delay: each leaves a hundredth of the one before
-SLOW = 0.5  # correlation of neighbouring residuals that are weighted by their spectrum
-EXACT = 1e-12  # share of variance left that is rounding
-LOOSE = 1e4  # of the step at which a search of a long record has converged
+_ALIGNMENTS = 4  # most steps of the delay: each is a hundredth of the one before
+SLOW = 0.5  # correlation of neighbouring residuals above which they are weighted by their spectrum
+EXACT = 1e-12  # unexplained share of variance that is rounding
+LOOSE = 1e4  # factor of the step at which a search of a long record has converged
 ROUGH = 15  # steps after which the noise is known well enough to judge a step by it
-_STAGNANT = 0.01  # relative fall of the cost in as many steps, below which more lead nowhere
-WORTHLESS = 1e-5  # fall of the cost, over the residuals' variance
-SETTLED = 0.03  # step in standard errors that no longer matters
-_HINDERED = 0.2  # the same where the cost does not fall along it, as across the kinks of a law
-_CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is not chance
-STEPS = 75  # at most; a search without convergence is not an estimate
+_STAGNANT = 0.01  # relative fall of the cost in these steps, below which a search stagnates
+WORTHLESS = 1e-5  # fall of the cost, over the residuals' variance, that is negligible
+SETTLED = 0.03  # step in standard errors that is negligible
+_HINDERED = 0.2  # the same where the cost does not fall along a step, as across the kinks of a law
+_CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is significant
+STEPS = 75  # most steps; a search without convergence is not an estimate
 
 Tell = Callable[[int, float], None]
-"""Takes the number of evaluations and the share of variance left."""
+"""Callback with the number of evaluations and the unexplained share of variance."""
 
 
 def solve_records(
@@ -68,7 +68,7 @@ def solve_records(
 ) -> Optimum:
     """Return the least-squares estimate; see :func:`~dahl_ident.fitting.search.solve`.
 
-    Where all parameters of the model are started, no other start is looked at.
+    If `start` has all parameters of the model, no other start is tried.
     """
     search = RecordSearch(method, loss, tell)
     try:
@@ -77,7 +77,7 @@ def solve_records(
         if search.lowest is None:
             raise
         part, theta, _ = search.lowest
-        if part.records is not problem.records:  # of a shortened problem
+        if part.records is not problem.records:  # part is a shortened problem
             values = started_at(problem, part.to_values(theta)[: len(problem.free)].tolist())
             part, theta = problem, problem.to_search(values)
         at, count = part.quadratic(theta[None]), np.array([search.evaluations])
@@ -91,10 +91,11 @@ def solve_repetitions(
 ) -> tuple[FloatArray, FloatArray]:
     """Return search coordinates and standard errors of simulated repetitions, (S, P) each.
 
-    Noise of the residuals' spectrum is added to the prediction. Standard errors are those of the
-    optimum, whose covariance counts that spectrum, times the size of what each repetition leaves.
+    Noise with the residuals' spectrum is added to the prediction. Standard errors are those of the
+    optimum, whose covariance accounts for that spectrum, times the relative rms residual of each
+    repetition.
     """
-    from scipy.signal import lfilter  # slow to import, and for repetitions alone
+    from scipy.signal import lfilter  # slow to import, and only for repetitions
 
     problem: RecordProblem = optimum.problem
     values, search = optimum.values, RecordSearch("lm", "linear")
@@ -108,19 +109,19 @@ def solve_repetitions(
         drawn = [size * rng.standard_normal(y.size + _SETTLING) for y in outputs]
         errors = [lfilter([1.0], noise, e)[_SETTLING:] for e in drawn]
         noisy = tuple(y + e for y, e in zip(outputs, errors, strict=True))
-        again = problem.altered(sizes=problem.sizes, measured=noisy)
-        end = search.descend(again, optimum.theta, STEPS)
+        repetition = problem.altered(sizes=problem.sizes, measured=noisy)
+        end = search.descend(repetition, optimum.theta, STEPS)
         if end.converged[0]:
             theta[row] = end.theta[0]
-            scales[row] = (2.0 * end.cost[0] / again.n_residuals) ** 0.5
+            scales[row] = (2.0 * end.cost[0] / repetition.n_residuals) ** 0.5
     usual = (2.0 * optimum.cost / problem.n_residuals) ** 0.5
     return theta, np.sqrt(np.diagonal(optimum.covariance)) * scales / usual
 
 
 class RecordSearch:
-    """One search, from starts to the estimate, with delay and noise removed from the records.
+    """A search from starts to the estimate, with delay and noise removed from the records.
 
-    It holds the cost, the number of evaluations, and the lowest point.
+    It counts evaluations and stores the lowest point, for an interrupt.
     """
 
     def __init__(self, method: str, loss: str, tell: Tell | None = None) -> None:
@@ -128,10 +129,10 @@ class RecordSearch:
         self.evaluations, self.scale = 0, 1.0
         self.rho: Loss | None = None
         self.lowest: tuple[RecordProblem, FloatArray, float] | None = None
-        """Problem, search coordinates and cost of the best place until now."""
+        """Problem, search coordinates and cost of the lowest point so far."""
 
     def evaluated(self, problem: RecordProblem, theta: FloatArray) -> Quadratic:
-        """Return the cost at theta, (1, P), with its derivatives, and remember the lowest."""
+        """Return the cost at theta, (1, P), with its derivatives, and store the lowest."""
         at = problem.quadratic(theta, self.scale, self.rho)
         self.evaluations += 1
         cost = float(at.cost[0])
@@ -142,7 +143,7 @@ class RecordSearch:
         return at
 
     def descend(self, problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
-        """Return the minimum near a start; first roughly, then to a small part of the noise."""
+        """Return the minimum near a start: first roughly, then to a small part of the noise."""
         begin, before = theta[None], np.inf
         for _ in range(0, steps, ROUGH):
             end = self.minimise(problem, begin, ROUGH, bounded=before < np.inf)
@@ -156,35 +157,35 @@ class RecordSearch:
         return self._judged(problem, end)
 
     def _judged(self, problem: RecordProblem, end: Minima) -> Minima:
-        """Return an end that has converged if the next step would not matter."""
+        """Return the end, marked as converged if the next step would be negligible."""
         noise = 2.0 * float(end.cost[0]) / problem.n_residuals
         low, high = problem.step_bounds(problem.to_values(end.theta[0]), of_starts=True)
-        # where a motion comes to rest, errors of its integration hide the last falls of the cost
+        # errors of the integration hide small falls of the cost where a motion comes to rest
         with np.errstate(all="ignore"):
             at = problem.quadratic(end.theta[0], self.scale, self.rho)
             if not np.isfinite(at.cost):
                 return end
             size = np.sqrt(at.hessian.diagonal())
-            # parameters that vanish, such as a damper that these data do not need
+            # for parameters without effect, such as a damper that is zero
             size[size == 0.0] = 1.0
-            out = ((end.theta[0] <= low) & (at.gradient > 0.0)) | (
+            blocked = ((end.theta[0] <= low) & (at.gradient > 0.0)) | (
                 (end.theta[0] >= high) & (at.gradient < 0.0)
             )
-            slope = np.where(out, 0.0, at.gradient / size)
-            left = slope @ np.linalg.pinv(at.hessian / np.outer(size, size), hermitian=True) @ slope
-        return replace(end, converged=np.array([bool(left < _HINDERED**2 * noise)]))
+            slope = np.where(blocked, 0.0, at.gradient / size)
+            fall = slope @ np.linalg.pinv(at.hessian / np.outer(size, size), hermitian=True) @ slope
+        return replace(end, converged=np.array([bool(fall < _HINDERED**2 * noise)]))
 
     def minimise(
         self, problem: RecordProblem, begin: FloatArray, most: int, *, bounded: bool = False
     ) -> Minima:
-        """Return the minimum near a start, shape (1, P), after so many steps at most.
+        """Return the minimum near a start, shape (1, P), after at most `most` steps.
 
-        With first states `bounded`, which a search from far off must not be: it would end there.
+        `bounded` limits the first states; a search from far away would end at these bounds.
         """
         bounds = problem.step_bounds(problem.to_values(begin[0]), of_starts=bounded)
         within = bounds if np.isfinite(bounds).any() else None
-        known = bounded or problem.whitening.size > 1  # how large the noise is
-        enough = (lambda cost: WORTHLESS * 2.0 * cost / problem.n_residuals) if known else None
+        noise_known = bounded or problem.whitening.size > 1
+        enough = (lambda c: WORTHLESS * 2.0 * c / problem.n_residuals) if noise_known else None
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
             self.evaluations += int(end.evaluations[0])
@@ -202,14 +203,14 @@ class RecordSearch:
             restrained=True,
         )
         theta, signs = problem.space.unfolded(end.theta)
-        turned = end.hessian * (signs[:, :, None] * signs[:, None, :])
-        end = replace(end, theta=theta, hessian=turned)
-        if end.cost[0] < EXACT * problem.n_residuals:  # by a last step that may lead nowhere
+        hessian = end.hessian * (signs[:, :, None] * signs[:, None, :])
+        end = replace(end, theta=theta, hessian=hessian)
+        if end.cost[0] < EXACT * problem.n_residuals:  # as predicted for the last step
             end = replace(end, cost=self.evaluated(problem, end.theta).cost)
         return end
 
     def refined(self, problem: RecordProblem, end: Minima) -> tuple[RecordProblem, Minima]:
-        """Return the estimate without noise and delay that the residuals show, weighted if slow."""
+        """Return the estimate without noise and delay, and with weights if residuals are slow."""
         if problem.output == "force":
             problem, end = self.without_noise(problem, end)
         problem, end = self.aligned(problem, end)
@@ -220,40 +221,41 @@ class RecordSearch:
     def aligned(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate with the delay between the channels that the residuals show.
 
-        Steps of the delay with all values free, as long as each explains more than chance does.
-        Where it explains little, or what remains is not noise, it may as well stand for a part of
-        what the model misses: such a delay counts as an uncertainty alone. So does one beyond what
-        channels sampled together have, such as that of a damper that the model lacks. None is taken
-        out where the user stated the delay.
+        Steps of the delay are taken, with all values free, as long as each explains more than
+        chance. A delay is not removed, but counted as an uncertainty only, if it explains little or
+        the remaining residuals are not noise, because it may be due to a misfit; also if it is
+        longer than that between channels sampled together, such as the effect of a missing damper.
+        A delay that the user stated is not changed.
         """
         share = 2.0 * float(plain.cost[0]) / problem.n_residuals
         if not plain.converged[0] or "delay" in problem.calibration or share < EXACT:
             return problem, plain
-        sample, late, end = 1.0 / problem.records[0].sample_rate, problem, plain
+        sample, delayed, end = 1.0 / problem.records[0].sample_rate, problem, plain
         for _ in range(_ALIGNMENTS):
-            step, fall = self._delay_step(late, end.theta[0])
-            residuals = late.split_residuals(late.to_values(end.theta[0]))
-            chance = by_chance(float(end.cost[0]), late.n_residuals, residuals)
-            part = 0.0 if late.delay else _ALIGNED * 2.0 * float(end.cost[0])
+            step, fall = self._delay_step(delayed, end.theta[0])
+            residuals = delayed.split_residuals(delayed.to_values(end.theta[0]))
+            chance = significant_fall(float(end.cost[0]), delayed.n_residuals, residuals)
+            part = 0.0 if delayed.delay else _ALIGNED * 2.0 * float(end.cost[0])
             if not fall > max(chance, part):
                 break
-            if abs(late.delay + step) > _LONGEST_DELAY * sample:
+            if abs(delayed.delay + step) > _LONGEST_DELAY * sample:
                 return problem, plain
-            late = late.delayed(late.delay + step)
-            end = self.descend(late, end.theta[0], STEPS)
+            delayed = delayed.delayed(delayed.delay + step)
+            end = self.descend(delayed, end.theta[0], STEPS)
             if not end.converged[0]:
                 return problem, plain
-        residuals = late.split_residuals(late.to_values(end.theta[0]))
+        residuals = delayed.split_residuals(delayed.to_values(end.theta[0]))
         if not end.cost[0] < plain.cost[0] or correlation(residuals) > SLOW:
             return problem, plain
-        return late, end
+        return delayed, end
 
     def without_noise(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
-        """Return the estimate without the displacement's noise, where the residuals improve by it.
+        """Return the estimate without the displacement's noise, if the residuals become smaller.
 
-        Noise that counts as travel moves the friction where the device rests. The dead band doubles
-        as long as a Gauss-Newton step then leaves smaller residuals, to four times the estimate at
-        most: a correlated noise shows less in differences, but a wider band would be play.
+        Noise that counts as travel changes the friction force where the device rests. The dead band
+        is doubled as long as the residuals after a Gauss-Newton step become smaller, up to four
+        times the estimated noise: correlated noise shows less in differences, but a wider band
+        would be play.
         """
         theta, least = plain.theta[0], float(plain.cost[0])
         noise, before = problem.estimated_noise, least
@@ -264,14 +266,14 @@ class RecordSearch:
             trial = problem.without_noise(noise)
             at = trial.quadratic(theta)
             self.evaluations += 1
-            left = float(at.cost) - 0.5 * float(
+            predicted = float(at.cost) - 0.5 * float(
                 at.gradient @ np.linalg.pinv(at.hessian, hermitian=True) @ at.gradient
             )
-            if not left < least:
+            if not predicted < least:
                 break
-            best, least, noise = trial, left, 2.0 * noise
+            best, least, noise = trial, predicted, 2.0 * noise
         residuals = problem.split_residuals(problem.to_values(theta))
-        chance = by_chance(least, problem.n_residuals, residuals)
+        chance = significant_fall(least, problem.n_residuals, residuals)
         if best is problem or 2.0 * (before - least) < chance:
             return problem, plain
         end = self.descend(best, theta, STEPS)
@@ -282,10 +284,10 @@ class RecordSearch:
     def weighted(self, problem: RecordProblem, plain: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate with residuals weighted by their spectrum, where they are slow.
 
-        Noise in the measured drive makes the plant wander, and plain least squares then takes up
-        the wandering by stiffness. The residuals' spectrum is estimated and the search repeated
-        until both agree. Kept only if it describes the motion at the drive's frequencies no worse:
-        slow residuals may also come from a wrong model, of which plain least squares leaves less.
+        Noise in the measured drive makes the plant drift, which plain least squares explains by
+        stiffness. The spectrum of the residuals is estimated and the search repeated until they
+        agree. The weights are discarded if they make the misfit at the drive's frequencies larger,
+        because slow residuals may also be due to a wrong model.
         """
         residuals = problem.split_residuals(problem.to_values(plain.theta[0]))
         share = 2.0 * float(plain.cost[0]) / problem.n_residuals
@@ -314,7 +316,7 @@ class RecordSearch:
         return white, end
 
     def _delay_step(self, problem: RecordProblem, theta: FloatArray) -> tuple[float, float]:
-        """Return the delay's Gauss-Newton step, s, and by how much the sum of squares falls."""
+        """Return the Gauss-Newton step of the delay, s, and the fall of the sum of squares."""
         residual, jacobian = problem.residuals_and_jacobian(theta)
         waves = problem.delay_slopes(problem.to_values(theta))
         slope = np.concatenate([problem.filtered(wave / -problem.sizes[0]) for wave in waves])
@@ -351,7 +353,7 @@ class RecordSearch:
         return self.optimum(problem, end)
 
     def optimum(self, problem: RecordProblem, end: Minima) -> Optimum:
-        """Return the optimum where a search has ended, with assumed exponents held there."""
+        """Return the optimum at the end of a search, with assumed exponents fixed there."""
         if problem.ranges:
             values = dict(zip(problem.names, problem.to_values(end.theta[0]), strict=True))
             theta = end.theta[:, [name not in problem.ranges for name in problem.names]]
@@ -362,23 +364,22 @@ class RecordSearch:
         rho = loss_named(self.loss, problem.parts)
         return optima(problem, end, self.scale, rho, self.method)[0]
 
-    def freed(self, problem: RecordProblem, held: Minima) -> tuple[RecordProblem, Minima]:
+    def freed(self, problem: RecordProblem, fixed: Minima) -> tuple[RecordProblem, Minima]:
         """Return the estimate with assumed exponents free, their ranges as priors.
 
-        A prior counts as one more sample of the residuals' noise, of which neighbours are alike.
-        The estimate stays as it was where no motion is next to it.
+        The noise with which a prior is weighted accounts for the correlation of the residuals. The
+        estimate is not changed if the search does not converge.
         """
         assumed = [p.name for p in problem.exponents if p.assumed]
-        exact = 2.0 * held.cost[0] < EXACT * problem.n_residuals
-        if not assumed or exact or not held.converged[0]:
-            return problem, held
-        values = problem.to_values(held.theta[0]).tolist()
+        exact = 2.0 * fixed.cost[0] < EXACT * problem.n_residuals
+        if not assumed or exact or not fixed.converged[0]:
+            return problem, fixed
+        values = problem.to_values(fixed.theta[0]).tolist()
         known = {p.name: float(p.value or 0.0) for p in problem.exponents}
         known |= dict(zip(problem.names, values, strict=True))
-        wider, end, last = problem.freed(assumed, 1.0), held, 0.0  # whose rows hold no prior
+        wider, end, last = problem.freed(assumed, 1.0), fixed, 0.0
         theta = wider.to_search([known[name] for name in wider.names])
         for _ in range(_PRIORS):
-            # with derivatives, which the search and what follows it need at the same place
             residuals = wider.split_residuals(wider.to_values(theta))
             noise = noise_power(float(end.cost[0]), problem.n_residuals, residuals) ** 0.5
             if last / _SAME_NOISE < noise < last * _SAME_NOISE:
@@ -386,12 +387,12 @@ class RecordSearch:
             wider, last = problem.freed(assumed, noise), noise
             end = self.descend(wider, theta, STEPS)
             if not end.converged[0]:
-                return problem, held
+                return problem, fixed
             theta = end.theta[0]
         return wider, end
 
     def robust(self, problem: RecordProblem, plain: Minima) -> Minima:
-        """Return the end of searches with a robust loss, the noise's scale estimated with it."""
+        """Return the end of searches with a robust loss, and estimate the noise's scale."""
         self.rho, end = loss_named(self.loss, problem.parts), plain
         dof = problem.n_residuals - plain.theta.shape[1]
 
@@ -406,7 +407,7 @@ class RecordSearch:
         return end
 
     def searched(self, problem: RecordProblem, start: Mapping[str, float]) -> Minima:
-        """Return the best end of searches from automatic starts, some of their values given."""
+        """Return the best end of searches from automatic starts, with the values in `start`."""
         try:
             best = self.best(problem, _changed(record_starts(problem), problem, start))
         except FitError:
@@ -415,30 +416,30 @@ class RecordSearch:
                 raise
             best = self.best(problem, _changed(more, problem, start))
         several = any(len(element.starts) > 1 for element in problem.with_memory)
-        if several or _has_idle(problem, best) or not _leaves_noise(problem, best):
+        if several or _has_idle(problem, best) or not _is_white(problem, best):
             return self.elsewhere(problem, best)
         return best
 
     @np.errstate(all="ignore")  # laws far off may overflow
     def elsewhere(self, problem: RecordProblem, end: Minima) -> Minima:
-        """Return the lowest end that searches from other values of one parameter at a time find.
+        """Return the lowest end of searches from other values of one parameter at a time.
 
-        A wrong minimum is often one in which a parameter has lost its effect: a slip beyond the
-        motion, a Stribeck speed far above it; or one of loads of springs at the first sample, which
-        are moved by kinks. Of other values those with the lowest predicted costs are tried.
+        At a wrong minimum a parameter has often lost its effect, such as a Stribeck speed far above
+        the motion, or the initial loads of springs are wrong. The other values with the lowest
+        predicted costs are tried.
         """
         for _ in range(_ROUNDS):
-            values, places = problem.to_values(end.theta[0]), []
+            values, candidates = problem.to_values(end.theta[0]), []
             for index, value in alternatives(problem, values):
                 other = values.copy()
                 other[index] = value
-                places.append(self._adapted(problem, problem.to_search(other), index))
-            places.sort(key=lambda place: place[0])
-            worth = [theta for cost, theta in places if cost < np.inf][:_WORTH]
-            ends = [self.minimise(problem, theta[None], ROUGH) for theta in worth]
-            lowest = min(ends, key=lambda one: float(one.cost[0]), default=end)
+                candidates.append(self._adapted(problem, problem.to_search(other), index))
+            candidates.sort(key=lambda candidate: candidate[0])
+            starts = [theta for cost, theta in candidates if cost < np.inf][:_WORTH]
+            ends = [self.minimise(problem, theta[None], ROUGH) for theta in starts]
+            lowest = min(ends, key=lambda minimum: float(minimum.cost[0]), default=end)
             residuals = problem.split_residuals(values)
-            chance = by_chance(float(end.cost[0]), problem.n_residuals, residuals)
+            chance = significant_fall(float(end.cost[0]), problem.n_residuals, residuals)
             better = 2.0 * (end.cost[0] - lowest.cost[0]) > chance
             if better or (lowest.cost[0] < end.cost[0] and not end.converged[0]):
                 end = self.descend(problem, lowest.theta[0], STEPS)
@@ -449,7 +450,7 @@ class RecordSearch:
     def _adapted(
         self, problem: RecordProblem, theta: FloatArray, index: int
     ) -> tuple[float, FloatArray]:
-        """Return where a Gauss-Newton step of all coordinates but one leads, and its cost."""
+        """Return predicted cost and theta after a Gauss-Newton step of all coordinates but one."""
         at = problem.quadratic(theta)
         self.evaluations += 1
         if not np.isfinite(at.cost):
@@ -469,18 +470,18 @@ class RecordSearch:
     def best(self, problem: RecordProblem, starts: FloatArray, steps: int = STEPS) -> Minima:
         """Return the end of a search from the start that is lowest after a few steps.
 
-        No further start is tried where one leaves nothing but noise. Where a value has lost its
-        effect at the end, searches from other starts go on as long as they end lower.
+        No further start is tried once the residuals are white noise. If a parameter has lost its
+        effect at the end, searches from the other starts continue as long as they end lower.
         """
-        near = list[Minima]()
-        for one in starts:
-            end = self.minimise(problem, problem.to_search(one)[None], _COMPARED)
+        first_ends = list[Minima]()
+        for start in starts:
+            end = self.minimise(problem, problem.to_search(start)[None], _COMPARED)
             if np.isfinite(end.cost[0]):
-                near.append(end)
-                if len(starts) == 1 or _leaves_noise(problem, end):
-                    near = [end]
+                first_ends.append(end)
+                if len(starts) == 1 or _is_white(problem, end):
+                    first_ends = [end]
                     break
-        if not near:
+        if not first_ends:
             predict = argument("output", "force", option="predicted")
             imposed = f", or, if the exciter imposes the motion, fit the force: {predict}"
             raise FitError(
@@ -488,9 +489,9 @@ class RecordSearch:
                 f"{argument('start')}, or check the units"
                 + (imposed if problem.output == "motion" else "")
             )
-        near.sort(key=lambda end: float(end.cost[0]))
-        best = self.descend(problem, near[0].theta[0], steps)
-        for begin in near[1:]:
+        first_ends.sort(key=lambda end: float(end.cost[0]))
+        best = self.descend(problem, first_ends[0].theta[0], steps)
+        for begin in first_ends[1:]:
             if not _has_idle(problem, best):
                 break
             end = self.descend(problem, begin.theta[0], steps)
@@ -500,8 +501,8 @@ class RecordSearch:
         return best
 
 
-def by_chance(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
-    """Return the fall of the sum of squares that one more value makes by chance."""
+def significant_fall(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
+    """Return the significant fall of the sum of squares due to one more parameter."""
     return _CONFIRMED * noise_power(cost, samples, residuals)
 
 
@@ -517,7 +518,7 @@ def correlation(residuals: Sequence[FloatArray]) -> float:
 
 
 def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
-    """Return all values of a problem, states and offsets fitted, its model's free `values` held."""
+    """Return all values of a problem: the model's free `values`, with fitted states and offsets."""
     held = problem.held(dict(zip(problem.names, values.tolist(), strict=False)))
     begin = held.to_search(started_at(held, []))
     end = RecordSearch("lm", "linear").descend(held, begin, STEPS)
@@ -527,15 +528,15 @@ def hold_model(problem: RecordProblem, values: FloatArray) -> FloatArray:
 
 
 def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, float]) -> FloatArray:
-    """Return starts with some of their values given."""
+    """Return the starts with the values in `start`."""
     for name, value in start.items():
         if name in problem.names:
             starts[:, problem.names.index(name)] = value
     return starts
 
 
-def _leaves_noise(problem: RecordProblem, end: Minima) -> bool:
-    """Return whether the correlations of the residuals are those of white noise, by Box-Pierce."""
+def _is_white(problem: RecordProblem, end: Minima) -> bool:
+    """Return whether the residuals are white noise, by the Box-Pierce test."""
     if 2.0 * end.cost[0] < EXACT * problem.n_residuals:
         return True
     products = np.zeros(_LAGS + 1)
@@ -546,10 +547,9 @@ def _leaves_noise(problem: RecordProblem, end: Minima) -> bool:
 
 
 def _has_idle(problem: RecordProblem, end: Minima) -> bool:
-    """Return whether a value, or friction at a first sample, has hardly an effect on the output.
+    """Return whether a parameter has hardly an effect, or friction starts at a bound.
 
-    That is a value whose logarithm has a standard error above a half, and friction that begins at
-    full slip or beyond.
+    A parameter has hardly an effect if its logarithm has a standard error above 0.5.
     """
     theta, hessian = end.theta[0], end.hessian[0]
     low, high = problem.step_bounds(problem.to_values(theta), of_starts=True)
@@ -560,5 +560,5 @@ def _has_idle(problem: RecordProblem, end: Minima) -> bool:
     size[size == 0.0] = 1.0
     inverse = np.linalg.pinv(hessian / np.outer(size, size), rcond=EXACT, hermitian=True)
     idle = (noise * inverse.diagonal() / size**2 > _IDLE**2) & problem.space.relative
-    idle |= (hessian == np.eye(len(hessian))).all(axis=1)  # as the problem holds what has vanished
+    idle |= (hessian == np.eye(len(hessian))).all(axis=1)  # rows of parameters without effect
     return bool(idle[: len(problem.free)].any())
