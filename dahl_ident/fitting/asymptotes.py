@@ -1,6 +1,6 @@
 r"""Optima at infinity, to which a search tends if the data do not determine a parameter.
 
-A law has limits with fewer parameters. Dahl, for instance, declares
+A law has limits with fewer parameters. Dahl's law, for instance, declares
 
 ==================  ===============================  =====================  =====================
 limit               Z of the element                 runs away              determined
@@ -13,18 +13,17 @@ sharp knee          elastic, then f_max              alpha to 0             f_ma
 no full slip        dF/dx = sigma exp(-s F/phi)      f_max, alpha           phi = f_max/alpha, sigma
 ==================  ===============================  =====================  =====================
 
-and any law may vanish. Of a law that declares none, every direction with a unit
+and any law may vanish. For a law that declares none, every direction with a unit
 (:mod:`dahl_ident.fitting.directions`) is tried far out on either side of the data.
 
-Each lies at the boundary of the model, so the best fit may lie there, and a search would then
-return the arbitrary large number at which it stopped. A limit is searched as a separate problem, in
-a **chart**: coordinates phi that stay finite, mapped to a theta so far out that the model is its
-limit, to five digits or more (three for no full slip). If the sum of squares there is no higher
-than at any finite optimum, the limit is the optimum, and phi gives what is determined, with its
-covariance.
+The best fit may be at such a limit, and a search would then return the arbitrary large number at
+which it stopped. A limit is searched as a separate problem, in a **chart**: coordinates phi that
+stay finite, mapped to a theta so far out that the model agrees with its limit to five digits or
+more (three for no full slip). If the sum of squares there is not higher than at any finite optimum,
+the limit is the optimum, and phi gives the determined quantities and their covariance.
 
-In microslip with a free spring the cost has a long curved valley even where its minimum is
-finite. The chart (kappa, x_c, sigma + stiffness) straightens it; where f_max is given, the chart
+In microslip with a free spring the cost has a long curved valley even if its minimum is finite. The
+chart (kappa, x_c, sigma + stiffness) straightens it; if f_max is given, the chart
 (sigma, sigma + stiffness).
 """
 
@@ -43,22 +42,22 @@ from dahl_ident.fitting.directions import Direction, Directions, directions, fre
 from dahl_ident.fitting.optimum import DeterminedCombination, Status, blanked
 from dahl_ident.problem import TableProblem
 
-# friction's stiffness over the data's, where a limit lets friction vanish: far below rounding
+# friction's stiffness over the data's in a limit without friction: far below rounding
 _NO_FRICTION = 1e-18
-# ln of the scale of friction over that of the data, below which a search has left friction behind
+# ln of the scale of friction over that of the data, below which friction is negligible
 _LEAST_FRICTION = -60.0
-# directions with a unit that a search may reach: times the smallest of their sizes in the data, and
-# times the largest; beyond, the curve is its limit to all digits
+# range of directions with a unit in a search: factors of the smallest and the largest of their
+# sizes in the data; beyond, the curve agrees with its limit to all digits
 _EDGES = (1e-14, 1e8)
-# the upper one where microslip is a limit: there spring and friction already differ by rounding
+# the upper factor if microslip is a limit: spring and friction already differ by rounding only
 _TIED_EDGE = 1e4
-_FASTEST = 1e4  # rates of either sign that a search may reach, times 1/(smallest amplitude)
-# numbers that a search may reach, times the least and the most of those its law starts from
+_FASTEST = 1e4  # range of rates of either sign in a search, times 1/(smallest amplitude)
+# range of numbers in a search: factors of the least and the largest number from which it starts
 _NUMBERS = (1.0 / 250.0, 25.0)
-# lengths in a limit, times the largest amplitude and below the smallest: in slip the stiffness that
-# remains of a law decreases only with the square root of the length
+# lengths in a limit: factors of the largest amplitude, and below the smallest; in slip, the
+# remaining stiffness of a law decreases only with the square root of the length
 _FAR = (1e9, 1e14)
-# weight of determined combinations over that of single coordinates, where phi is found from theta
+# weight of determined combinations over that of single coordinates, to find phi from theta
 _FIRMLY = 1e3
 
 
@@ -72,7 +71,7 @@ class Chart:
     back: FloatArray
     """phi near theta is back (theta - offset), after theta[spring] += exp(theta[sigma])."""
     tied: tuple[int, int] | None = None
-    """Indices of the spring and of sigma, where phi holds their sum in the spring's place."""
+    """Indices of the spring and of sigma, if phi has their sum in place of the spring."""
 
     def theta(self, phi: FloatArray) -> FloatArray:
         """Return the search coordinates at phi, (Q,) or (S, Q)."""
@@ -106,13 +105,13 @@ class Chart:
 
 @dataclass(frozen=True)
 class Limit:
-    """A chart of one limit, with its name and what it says about the parameters."""
+    """A limit: its chart, its meaning, and the values of the parameters."""
 
     names: tuple[str, ...]
     """The names of theta's coordinates."""
     status: Status
     meaning: str
-    """What the element becomes in this limit, where the status does not say it."""
+    """The behaviour of the element in this limit, if the status does not state it."""
     chart: Chart
     extremes: dict[str, float]
     """Values of the parameters that run away."""
@@ -131,30 +130,29 @@ class Limit:
         covariance: FloatArray,
         lost: NDArray[np.bool_],
     ) -> tuple[DeterminedCombination, ...]:
-        """Return what is determined; `slopes` is dtheta/dphi, and the last two are of phi."""
-        determined = []
+        """Return the determined combinations; `slopes` is dtheta/dphi, the last two are of phi."""
+        determined, finite = [], np.where(np.isfinite(covariance), covariance, 0.0)
         for expression, powers in self.kept:
-            by_phi = powers @ slopes
-            if not by_phi.any() or (lost & (np.abs(by_phi) > 0.0)).any():
+            gradient = powers @ slopes
+            if not gradient.any() or (lost & (np.abs(gradient) > 0.0)).any():
                 continue
             value = float(np.exp(powers @ theta))
-            determined.append(
-                DeterminedCombination(expression, value, value * _spread(by_phi, covariance))
-            )
+            std = float(np.sqrt(gradient @ finite @ gradient))
+            determined.append(DeterminedCombination(expression, value, value * std))
         if self.chart.tied is not None:
             spring, sigma = self.chart.tied
-            place = int(np.flatnonzero(self.chart.matrix[spring])[0])
-            error = float(np.sqrt(covariance[place, place]))
+            i = int(np.flatnonzero(self.chart.matrix[spring])[0])
+            error = float(np.sqrt(covariance[i, i]))
             text = f"{self.names[sigma]} + {self.names[spring]}"
-            determined.append(DeterminedCombination(text, float(phi[place]), error))
+            determined.append(DeterminedCombination(text, float(phi[i]), error))
         return tuple(determined)
 
     def spread(
         self, slopes: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
     ) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return the covariance of theta, and which of it is undetermined, from that of phi.
+        """Return the covariance of theta, and which parameters are undetermined, from those of phi.
 
-        `slopes` is dtheta/dphi, (P, Q); `inner` and `lost` are the same two of phi.
+        `slopes` is dtheta/dphi, (P, Q); `inner` and `lost` are the covariance and that of phi.
         """
         covariance = slopes @ np.where(np.isfinite(inner), inner, 0.0) @ slopes.T
         undetermined = np.array([name in self.extremes for name in self.names])
@@ -163,13 +161,8 @@ class Limit:
         return blanked(covariance, undetermined), undetermined
 
 
-def _spread(by_phi: FloatArray, covariance: FloatArray) -> float:
-    finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    return float(np.sqrt(by_phi @ finite @ by_phi))
-
-
 class Reach:
-    """The region where friction is neither at a limit nor negligible; searches stay in it."""
+    """The region of searches, in which friction is neither at a limit nor negligible."""
 
     def __init__(self, problem: TableProblem) -> None:
         view = problem.stiffness_data
@@ -216,7 +209,7 @@ class Reach:
     ) -> NDArray[np.bool_]:
         """Return whether theta is inside, () for (P,), (S,) for (S, P).
 
-        `tables` says which of a batch's tables theta belongs to, all by default.
+        `tables` are the tables of a batch to which theta belongs, all by default.
         """
         least = self._least
         if tables is not None and least.ndim > 1:
@@ -226,16 +219,16 @@ class Reach:
 
 def _tying(element: Element) -> Asymptote | None:
     """Return the limit in which a parameter adds to a free spring, if the law has one."""
-    every = element.asymptotes(1.0, 1.0)
-    return next((a for a in every if a.adds_to_spring is not None), None)
+    asymptotes = element.asymptotes(1.0, 1.0)
+    return next((a for a in asymptotes if a.adds_to_spring is not None), None)
 
 
 def microslip_charts(problem: TableProblem, *, scale_given: bool = False) -> list[Chart]:
     """Return the straightened charts of microslip: each free law that ties a free spring.
 
-    Their coordinates stand in the places of theta's: the determined combination in that of the
-    parameter that adds to the spring, and the logarithm of the ratio that runs away. With
-    `scale_given`, those of laws whose other scale parameter is given: ln sigma, and the sum.
+    Their coordinates replace those of theta: the determined combination, the logarithm of the ratio
+    that runs away, and the sum with the spring. With `scale_given`, the charts are those of laws
+    whose other scale parameter is given: ln sigma, and the sum.
     """
     charts = []
     for element in problem.model.elements:
@@ -262,7 +255,7 @@ def microslip_charts(problem: TableProblem, *, scale_given: bool = False) -> lis
 def limits(problem: TableProblem) -> list[Limit]:
     """Return the limits of every law with a free parameter.
 
-    None where an unknown displacement gain could undo any distance from the amplitudes.
+    There is none with an unknown displacement gain, which could compensate any amplitude.
     """
     if "displacement_gain" in problem.names and "displacement_gain" not in problem.priors:
         return []
@@ -274,8 +267,8 @@ def limits(problem: TableProblem) -> list[Limit]:
         if element.is_linear or not any(p.free for p in element.parameters):
             continue
         declared = [
-            replace(one, meaning=f"the element is {one.meaning}")
-            for one in element.asymptotes(amplitude.min(axis=-1), amplitude.max(axis=-1))
+            replace(asymptote, meaning=f"the element is {asymptote.meaning}")
+            for asymptote in element.asymptotes(amplitude.min(axis=-1), amplitude.max(axis=-1))
         ]
         vanishing = _vanishing(problem, axes) if len(problem.model.elements) > 1 else []
         for asymptote in (*(declared or _far_out(problem, axes)), *vanishing):
@@ -286,9 +279,9 @@ def limits(problem: TableProblem) -> list[Limit]:
 def _limits_of(
     problem: TableProblem, element: Element, asymptote: Asymptote, springs: list[Parameter]
 ) -> list[Limit]:
-    """Return an asymptote's limit, one for each free spring where it needs that.
+    """Return the limits of an asymptote: one for each free spring if it adds to a spring.
 
-    There is none where a parameter that it pins, or that runs away, is not free.
+    There is none if a parameter that it pins, or that runs away, is not free.
     """
     free = {label for label, p in zip(element.labels, element.parameters, strict=True) if p.free}
     if not {*asymptote.pinned, *asymptote.runs_away} <= free:
@@ -336,11 +329,11 @@ def _limits_of(
 
 
 def _vanishing(problem: TableProblem, axes: Directions) -> list[Asymptote]:
-    """Return the limit in which the law has no force: its free scale parameters go to zero."""
+    """Return the limit without friction: the law's free scale parameters tend to zero."""
     view, label = problem.stiffness_data, axes.element.label
     scale = [p for p in (*axes.scale, *axes.linear) if p.free and p.positive]
     pinned: dict[str, Any] = {}
-    for p in scale:  # all together, or the one that is free however large the others are
+    for p in scale:
         ln_size = Direction(p, None, p.dimension).sizes(view)
         middle = ln_size.min(axis=-1) if len(scale) == 1 else ln_size.mean(axis=-1)
         pinned[label(p)] = np.exp(middle) * _NO_FRICTION
@@ -378,13 +371,14 @@ def _far_out(problem: TableProblem, axes: Directions) -> list[Asymptote]:
                 meaning = f"the data lie far {side} {p.name}"
             runs_away, kept = {label(p): value}, []
             if over is not None and over.free:
-                # of two parameters in a fixed ratio, the one with the unit of the limit remains
+                # of two parameters with a fixed ratio, that with the unit of the limit stays finite
                 stays = over if sticks == (over.dimension[1] < p.dimension[1]) else p
                 if stays is p:
                     runs_away = {label(over): np.inf if value == 0.0 else 0.0}
                 kept = [(label(stays), {label(stays): 1.0})]
             elif axes.is_free and axes.reference is not None:
-                # a law that never slips keeps a stiffness, one that always slips a force
+                # a law that never slips has a finite stiffness, one that always slips a finite
+                # force
                 unit, reference = -1 if sticks else 0, label(axes.reference)
                 power = (unit - axes.reference.dimension[1]) / direction.dimension[1]
                 times = "" if power == 1.0 else f"^{power:g}"
@@ -401,7 +395,7 @@ def _far_out(problem: TableProblem, axes: Directions) -> list[Asymptote]:
 
 
 def _powers(element: Element, powers: Mapping[str, float], problem: TableProblem) -> FloatArray:
-    """Return a combination's powers as a row over theta; parameters that are given fall out."""
+    """Return the powers of a combination as a row over theta, without given parameters."""
     row = np.zeros(len(problem.parameters))
     for label, power in powers.items():
         name = element.parameter(label).name
@@ -416,14 +410,14 @@ def _chart(
     follow: tuple[str, str, FloatArray] | None = None,
     kept: Sequence[FloatArray] = (),
 ) -> Chart:
-    """Return theta with some coordinates pinned, and one following another at a distance.
+    """Return the chart with some coordinates pinned, and one at a fixed distance from another.
 
-    The phi near a theta has the same combinations `kept`, rows of powers.
+    The phi near a theta has the same values of the combinations `kept`, rows of powers.
     """
     names = problem.names
-    places = dict(pins) if follow is None else {**pins, follow[0]: follow[2]}
-    offset = np.stack(np.broadcast_arrays(*(places.get(name, 0.0) for name in names)), axis=-1)
-    matrix = np.eye(len(names))[:, [i for i, name in enumerate(names) if name not in places]]
+    offsets = dict(pins) if follow is None else {**pins, follow[0]: follow[2]}
+    offset = np.stack(np.broadcast_arrays(*(offsets.get(name, 0.0) for name in names)), axis=-1)
+    matrix = np.eye(len(names))[:, [i for i, name in enumerate(names) if name not in offsets]]
     columns = matrix.T.copy()
     if follow is not None:
         matrix[names.index(follow[0])] = matrix[names.index(follow[1])]

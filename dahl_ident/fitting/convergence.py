@@ -1,4 +1,4 @@
-"""From the results of searches to optima: covariance, status, and the message for the user."""
+"""Optima from the ends of searches: covariance, status, and the message for the user."""
 
 from __future__ import annotations
 
@@ -24,30 +24,29 @@ def optima(
 ) -> OptimumBatch:
     """Return the optima that searches with residuals divided by `scale` found.
 
-    `scale` is 1 where the optimum does not depend on it; it is estimated here then.
+    If the optimum does not depend on the scale, `scale` is 1, and the scale is estimated here.
     """
     theta, S = end.theta.copy(), len(end.theta)
     at_limit = {table: at for table, at in enumerate(end.limit) if at is not None}
     ordered = problem.in_order(theta)
-    moved = np.zeros(S, dtype=np.bool_)
+    reordered = np.zeros(S, dtype=np.bool_)
     if ordered is not theta:
-        moved = (ordered != theta).any(axis=1)
-        moved[list(at_limit)] = False  # a limit has names
-        theta[moved] = ordered[moved]
+        reordered = (ordered != theta).any(axis=1)
+        reordered[list(at_limit)] = False  # a limit refers to parameters by name
+        theta[reordered] = ordered[reordered]
     dof = problem.n_numbers + len(problem.priors) - end.determined
     final = np.full(S, scale)
     if not problem.scale_known and loss is None and not problem.priors:
         final = estimated_scale(problem, end.cost, dof)
-    if not at_limit and loss is None and not moved.any() and problem.gaussian:
+    if not at_limit and loss is None and not reordered.any() and problem.gaussian:
         inner, lost = inverse(end.hessian)
     elif loss is None:
         inner, lost = inverse(problem.information(theta, scale))
-    else:  # one table
-        one = problem.table(0)
-        inner, lost = inverse(information_of(one, theta[0], scale, loss, int(dof[0]))[None])
+    else:  # there is one table
+        information = information_of(problem.table(0), theta[0], scale, loss, int(dof[0]))
+        inner, lost = inverse(information[None])
     values = problem.to_values(theta)
-    # infinite variances of parameters that no residual determines
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # infinite variances of undetermined parameters
         covariance = inner * (final / scale)[:, None, None] ** 2
     status: list[Status] = []
     combinations: dict[int, tuple[DeterminedCombination, ...]] = {}
@@ -58,16 +57,16 @@ def optima(
         at = at_limit.get(table)
         if at is not None:
             limit, phi, hessian = at
-            one = problem.table(table)
-            chart = limit.chart.derivative(theta[table])
+            slopes = limit.chart.derivative(theta[table])
             information = hessian
             if loss is not None or not problem.gaussian:
-                information = information_of(one, theta[table], scale, loss, int(dof[table]), chart)
-            ratio = (final[table] / scale) ** 2
-            small, gone = inverse(information)
-            small = small * ratio
-            combinations[table] = limit.combinations(theta[table], phi, chart, small, gone)
-            covariance[table], lost[table] = limit.spread(chart, small, gone)
+                information = information_of(
+                    problem.table(table), theta[table], scale, loss, int(dof[table]), slopes
+                )
+            of_phi, phi_lost = inverse(information)
+            of_phi = of_phi * (final[table] / scale) ** 2
+            combinations[table] = limit.combinations(theta[table], phi, slopes, of_phi, phi_lost)
+            covariance[table], lost[table] = limit.spread(slopes, of_phi, phi_lost)
             for name, extreme in limit.extremes.items():
                 values[table, problem.names.index(name)] = extreme
         status.append(

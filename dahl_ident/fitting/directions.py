@@ -37,7 +37,7 @@ class Direction:
         return not any(self.dimension)
 
     def row(self, problem: TableProblem) -> tuple[FloatArray, float]:
-        """Return row and offset of its logarithm, row @ theta + offset."""
+        """Return row and offset with which its logarithm is row @ theta + offset."""
         row = np.zeros(len(problem.parameters))
         offset = 0.0
         for parameter, sign in ((self.parameter, 1.0), (self.over, -1.0)):
@@ -81,10 +81,10 @@ class Directions:
 
     @cached_property
     def lengths(self) -> tuple[Direction, ...]:
-        """The directions with a unit, where all are powers of a length and so scale the curve.
+        """The directions with a unit, if all are powers of a length, so that they scale the curve.
 
-        N over the reference then depends on the amplitude over one of these lengths, their ratios,
-        and numbers.
+        N over the reference then depends only on the amplitude over one of these lengths, their
+        ratios, and numbers.
         """
         with_unit = tuple(d for d in self.nonlinear if not d.is_number)
         fixed = [
@@ -112,7 +112,7 @@ def directions(element: Element) -> Directions:
     for parameter in element.parameters:
         if not parameter.free or parameter in linear or parameter is reference:
             continue
-        if element.is_linear:  # only the user knows how the force depends on it
+        if element.is_linear:  # its dependence on the parameter is unknown
             continue
         over = reference if parameter in scale else None
         force, displacement, time = parameter.dimension
@@ -140,7 +140,7 @@ def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:
 
 
 def free_springs(problem: TableProblem) -> list[Parameter]:
-    """Return the free stiffnesses of linear springs that no bound keeps from any value."""
+    """Return the free stiffnesses of linear springs without a lower bound."""
     return [
         p
         for element in problem.model.elements

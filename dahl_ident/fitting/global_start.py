@@ -631,7 +631,7 @@ def _solve_linear(
 
 
 def _lengths(rows: FloatArray) -> FloatArray:
-    return np.sqrt(np.einsum("...i,...i->...", rows, rows))
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", rows, rows)))
 
 
 def _factors(common: list[FloatArray], target: FloatArray) -> tuple[FloatArray, FloatArray]:

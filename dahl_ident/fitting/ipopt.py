@@ -1,9 +1,9 @@
 r"""Least squares by IPOPT: constraints between parameters, and noise in the drive as well.
 
 The problem is that of :mod:`dahl_ident.fitting.search`, for any law and for exact steady motions:
-the cost and its exact gradient J' r are those of the problem's own residuals. The Hessian is the
-difference of gradients: far from the optimum Gauss and Newton's leads IPOPT astray. From the
-least-squares optimum it takes a few steps.
+the cost and its exact gradient J' r are those of the problem's residuals. The Hessian is computed
+from differences of gradients, because far from the optimum the Gauss-Newton Hessian misleads IPOPT.
+From the least-squares optimum IPOPT takes a few steps.
 
 **Constraints** are comparisons by name. A function takes a mapping of every parameter's name to its
 casadi symbol, in SI units, and returns comparisons::
@@ -13,13 +13,13 @@ casadi symbol, in SI units, and returns comparisons::
         p["pivot_sigma"] == p["seal_sigma"],
     ]
 
-Fixed parameters are there as well, as the numbers at which they are held. ``<`` means ``<=``.
-casadi differentiates them twice. An equality takes away one degree of freedom: the
-covariance is that of the estimate on the constraint. An inequality that holds with equality acts as
-a bound does; the covariance is that without it.
+Fixed parameters are included as numbers. ``<`` means ``<=``. casadi differentiates the constraints
+twice. An equality reduces the number of free parameters by one: the covariance is that of the
+estimate on the constraint. An inequality that holds with equality acts as a bound; the covariance
+is that without it.
 
-**Coordinates.** Search coordinates relative to the start, each in the unit that changes the
-residuals by their own size, so that nothing depends on physical units.
+**Coordinates.** Search coordinates relative to the start, scaled so that a unit step changes the
+residuals by their rms, so that nothing depends on physical units.
 """
 
 from __future__ import annotations
@@ -55,16 +55,13 @@ from dahl_ident.problem import Problem, Quadratic, TableProblem
 if TYPE_CHECKING:
     import casadi as ca
 
-# gradient, over the sum of squares, at which IPOPT ends: a step from there is far below any digit
-# that a report shows
-_TOLERANCE = 1e-11
+_TOLERANCE = 1e-11  # gradient over the sum of squares at which IPOPT ends
 _ITERATIONS = 300  # IPOPT takes ten to thirty steps; a search that needs more does not converge
-# residuals count as at least this share of the largest change that a parameter makes to them, so
-# that units exist for data without noise
+# least rms residual over the largest change by a parameter, for the units of data without noise
 _LEAST_RESIDUAL = 1e-4
-_ACTIVE = 1e-6  # an inequality this near to equality, in units of the step, holds with equality
-_STEP = 1e-4  # of ln p, between gradients whose difference is the Hessian
-_MOST_STARTS = 6  # of the global grid: the lowest minima, and what the user gave
+_ACTIVE = 1e-6  # distance, in units of the step, at which an inequality holds with equality
+_STEP = 1e-4  # of ln p, for differences of gradients
+_MOST_STARTS = 6  # of the global grid and the user
 _SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 _INFEASIBLE = "infeasible problem detected"
 _WORDS = {
@@ -79,17 +76,15 @@ _WORDS = {
 
 
 _Compute = Callable[[bytes, int], FloatArray]
-"""The bytes of a vector, and the order of a derivative of the cost -> that."""
+"""Derivative of the cost, from the bytes of a vector and the order of the derivative."""
 Constraints = Callable[[Mapping[str, "ca.SX"]], Iterable["ca.SX"]]
-"""The user's function of constraints; see the head of this module."""
-
-
+"""The user's function of constraints; see the docstring of this module."""
 _EXAMPLE = "lambda p: [p['f_max'] <= 1e-3 * p['sigma']]"
 
 
 @dataclass(frozen=True)
 class Relations:
-    """The user's constraints: text, and lhs - rhs of all parameters' values."""
+    """The user's constraints: texts, and lhs - rhs as a function of all parameters' values."""
 
     texts: tuple[str, ...]
     equal: tuple[bool, ...]
@@ -97,7 +92,7 @@ class Relations:
 
     @classmethod
     def of(cls, problem: Problem, constraints: Constraints | None) -> Relations:
-        """Read the user's comparisons, or say what they are instead."""
+        """Return the user's comparisons, and refuse anything else."""
         import casadi as ca
 
         if constraints is None:
@@ -105,8 +100,8 @@ class Relations:
         symbols = _Symbols((p.name, ca.SX.sym(p.name)) for p in problem.every_parameter)
         free = ca.vertcat(*(symbols[name] for name in problem.names))
         texts, equal, differences = [], [], []
-        for index, item in enumerate(_called(constraints, symbols)):
-            relation = _is_comparison(item)
+        for index, item in enumerate(_comparisons(constraints, symbols)):
+            relation = _comparison_code(item)
             if relation is None:
                 raise ValidationError(
                     f"constraints[{index}] is {item!r}; expected a comparison with <=, >= or == "
@@ -150,7 +145,7 @@ class _Symbols(dict[str, "ca.SX"]):
         raise ModelError(f"a constraint names {name!r}; the parameters are {', '.join(self)}")
 
 
-def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
+def _comparisons(constraints: Constraints, symbols: _Symbols) -> list[Any]:
     import casadi as ca
 
     if not callable(constraints):
@@ -171,8 +166,8 @@ def _called(constraints: Constraints, symbols: _Symbols) -> list[Any]:
     return list(relations)
 
 
-def _is_comparison(item: Any) -> int | None:
-    """Return casadi's code of the comparison of two scalars that `item` is, else None."""
+def _comparison_code(item: Any) -> int | None:
+    """Return casadi's code of a comparison of two scalars, None for anything else."""
     import casadi as ca
 
     if not isinstance(item, ca.SX) or not item.is_scalar():
@@ -218,11 +213,11 @@ def solve_ipopt(
     if drive_std is not None or drive_covariance is not None:
         problem = _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
-    # a start takes no noise of the drive, which takes many times as long; a cost does
+    # without constraints, the start is that without errors of the drive, which is far quicker
     begin = solve(problem if relations.texts else plain, loss=loss, start=start, tell=tell)
     if begin.status.at_infinity and not relations.texts and problem is plain:
         return replace(begin, method="ipopt")
-    # as the search ended: by a sine where no steady motion exists, freed of a record's delay
+    # as changed by the search: the describing function without a steady motion, a record's delay
     problem = begin.problem if problem is plain else problem.with_steady(begin.problem.steady)
     adapts = not problem.scale_known and bool(loss != "linear" or problem.priors)
     search = _Descent(problem, relations, loss, begin.scale if adapts else 1.0)
@@ -241,12 +236,12 @@ def solve_ipopt(
 
 @dataclass(frozen=True)
 class _End:
-    """Where one run of IPOPT ended."""
+    """The end of one run of IPOPT."""
 
     theta: FloatArray
     cost: float
     failure: str
-    """Why IPOPT has no optimum, in words; empty where it has one."""
+    """Why IPOPT found no optimum, in words; empty if it found one."""
     slopes: FloatArray
     """Derivatives of the constraints' differences with respect to theta, (C, P)."""
     active: tuple[bool, ...]
@@ -275,14 +270,14 @@ class _Descent:
     def best(self, begin: Optimum) -> _End:
         """Return the best end of runs from the least-squares optimum and other starts.
 
-        The optimum is the one start, unless it is not finite or a constraint binds: the minimum on
-        a constraint may lie elsewhere.
+        The optimum is the only start, unless it is not finite or a constraint is active: the
+        minimum on a constraint may be elsewhere.
         """
         ends = []
         if np.isfinite(self.at(begin.theta).cost):
             ends.append(self.descend(begin.theta))
-            held = any(self.relations.equal) or any(ends[0].active)
-            if begin.success and not ends[0].failure and not held:
+            constrained = any(self.relations.equal) or any(ends[0].active)
+            if begin.success and not ends[0].failure and not constrained:
                 return ends[0]
         starts = np.clip(starts_of(self.problem)[:_MOST_STARTS], *self.problem.bounds())
         ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
@@ -298,7 +293,7 @@ class _Descent:
 
         equal, (unit, weight, tolerance, step) = self.relations.equal, self._units(start)
 
-        @lru_cache(maxsize=1)  # IPOPT asks for the cost, and then for the gradient
+        @lru_cache(maxsize=1)  # IPOPT calls for the cost and the gradient in turn
         def at(xi: bytes) -> Quadratic:
             return self.at(start + unit * np.frombuffer(xi))
 
@@ -307,10 +302,10 @@ class _Descent:
                 return 2.0 * weight * (at(xi).gradient * unit if order else at(xi).cost)
             steps = np.vstack([np.zeros(start.size), np.diag(step)])
             near = self.at(start + unit * (np.frombuffer(xi) + steps))
-            half = (near.gradient[1:] - near.gradient[0]) / step[:, None] * unit
-            if not np.isfinite(half).all():
-                half = near.hessian[0] * np.outer(unit, unit)
-            return np.asarray(weight * (half + half.T))
+            hessian = (near.gradient[1:] - near.gradient[0]) / step[:, None] * unit
+            if not np.isfinite(hessian).all():
+                hessian = near.hessian[0] * np.outer(unit, unit)
+            return np.asarray(weight * (hessian + hessian.T))
 
         xi = ca.SX.sym("xi", start.size)
         differences = self.relations.at(self.problem, ca.DM(start) + ca.DM(unit) * xi)
@@ -343,30 +338,30 @@ class _Descent:
         self.evaluations += int(stats["n_call_nlp_f"])
         status = str(stats["return_status"])
         failure = "" if status in _SOLVED else _WORDS.get(status, status.replace("_", " ").lower())
-        end, held = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
-        active = (not e and bool(c > -_ACTIVE) for c, e in zip(held, equal, strict=True))
-        by = np.asarray(slopes(end)) / unit
-        left = 0.5 * float(solution["f"]) / weight
-        return _End(start + unit * end, left, failure, by, tuple(active))
+        end, values = (np.asarray(solution[key]).ravel() for key in ("x", "g"))
+        active = tuple(not e and bool(c > -_ACTIVE) for c, e in zip(values, equal, strict=True))
+        cost_at_end = 0.5 * float(solution["f"]) / weight
+        return _End(
+            start + unit * end, cost_at_end, failure, np.asarray(slopes(end)) / unit, active
+        )
 
     def _units(self, start: FloatArray) -> tuple[FloatArray, float, float, FloatArray]:
-        """Return the units of IPOPT's coordinates xi and of its function.
+        """Return the units of the coordinates xi, the factor of the cost, tolerance, and steps.
 
-        The unit of each coordinate, the factor on the sum of losses, the tolerance of the gradient,
-        and steps of xi for differences of the gradient.
+        The tolerance is that of the gradient, and the steps of xi are for its differences.
         """
         problem, at = self.problem, self.at(start)
         m = problem.n_residuals + len(problem.priors)
-        reach = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms change of the residuals
-        reach = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
-        whole = np.max(reach * np.where(problem.space.positive, 1.0, np.abs(start)))
-        residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(whole))
+        slope = np.sqrt(np.maximum(np.diagonal(at.hessian), 0.0) / m)  # rms of the residuals'
+        slope = np.where((slope > 0.0) & np.isfinite(slope), slope, 1.0)
+        largest = np.max(slope * np.where(problem.space.positive, 1.0, np.abs(start)))
+        residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(largest))
         rounding = float(problem.rounding) / self.scale / residual
-        step = _STEP * np.where(problem.space.positive, 1.0, whole / reach) * reach / residual
-        return residual / reach, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
+        step = _STEP * np.where(problem.space.positive, 1.0, largest / slope) * slope / residual
+        return residual / slope, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
 
     def optimum(self, end: _End, begin: Optimum) -> Optimum:
-        """Return the optimum with status, sentence and covariance."""
+        """Return the optimum with status, message and covariance."""
         problem, relations = self.problem, self.relations
         if end.failure == _INFEASIBLE:
             raise FitError(
@@ -386,7 +381,7 @@ class _Descent:
         return self._constrained(result, end, begin) if relations.texts else result
 
     def _constrained(self, result: Optimum, end: _End, begin: Optimum) -> Optimum:
-        """Return `result` not reordered, with status and covariance on the constraints."""
+        """Return `result` with status and covariance on the constraints, not reordered."""
         problem, relations, scale = self.problem, self.relations, self.scale
         if not problem.scale_known and self.loss is None and not problem.priors:
             scale = float(estimated_scale(problem, end.cost, self.dof))
@@ -422,12 +417,12 @@ class _Descent:
         )
 
     def _constraint_cost(self, end: _End, begin: Optimum) -> ConstraintCost | None:
-        """Return the rise of the cost by the constraints over that of least squares without."""
-        of_one_scale = self.problem.scale_known or not self.problem.priors
-        held = zip(self.relations.texts, self.relations.equal, end.active, strict=True)
-        texts = tuple(text for text, equal, active in held if equal or active)
-        known = self.loss is None and of_one_scale and not begin.is_exact and begin.dof > 0
-        if not known or not texts:
+        """Return the rise of the cost due to the constraints; None if it cannot be judged."""
+        relations = zip(self.relations.texts, self.relations.equal, end.active, strict=True)
+        texts = tuple(text for text, equal, active in relations if equal or active)
+        has_one_scale = self.problem.scale_known or not self.problem.priors
+        noise_known = has_one_scale and not begin.is_exact and begin.dof > 0
+        if self.loss is not None or not noise_known or not texts:
             return None
         rise = 2.0 * max(end.cost - begin.cost, 0.0) / begin.scale**2
         return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
@@ -435,13 +430,13 @@ class _Descent:
 
 @cache
 def _cost_class() -> Any:
-    """Return the class of a casadi function whose derivatives numpy computes as well."""
+    """Return the class of casadi functions whose values and derivatives numpy computes."""
     import casadi as ca
 
     class Computed(ca.Callback):
         """The cost of a vector (order 0), its gradient, a row (1), or its Hessian (2).
 
-        A derivative also takes the values that it is the derivative of, and does not need them.
+        As casadi requires, a derivative also takes the value of its function, and ignores it.
         """
 
         def __init__(self, compute: _Compute, size: int, order: int = 0) -> None:
@@ -482,7 +477,7 @@ def _cost_class() -> Any:
 def _with_drive_error(
     problem: TableProblem, loss: str, std: ArrayLike | None, covariance: ArrayLike | None
 ) -> TableProblem:
-    """Return the problem with the errors of its drives in its data, checked."""
+    """Return the problem with checked errors of the drives in its data."""
     if std is None:
         if covariance is not None:
             raise ValidationError("drive_covariance is given without drive_std")
@@ -502,8 +497,8 @@ def _with_drive_error(
     spread = _for_rows(non_negative_array(std, "drive_std"), "drive_std", (data.n,))
     cross = None
     if covariance is not None:
-        together = finite_array(covariance, "drive_covariance")
-        cross = _for_rows(together, "drive_covariance", (data.n, 2))
+        cross = finite_array(covariance, "drive_covariance")
+        cross = _for_rows(cross, "drive_covariance", (data.n, 2))
     noisy = replace(data, drive_std=spread, drive_covariance=cross)
     return problem.like(data=noisy)
 
@@ -522,8 +517,8 @@ def _on_constraints(
         return inverse(information)
     size = np.sqrt(np.diagonal(information))
     size = np.where(size > 0.0, size, 1.0)
-    along = null_space(slopes / size) / size[:, None]
-    inner, lost = inverse(along.T @ information @ along)
-    undetermined = np.abs(along) @ lost.astype(np.float64) > 0.0
-    covariance = along @ np.where(np.isinf(inner), 0.0, inner) @ along.T
+    allowed = null_space(slopes / size) / size[:, None]
+    inner, lost = inverse(allowed.T @ information @ allowed)
+    undetermined = np.abs(allowed) @ lost.astype(np.float64) > 0.0
+    covariance = allowed @ np.where(np.isinf(inner), 0.0, inner) @ allowed.T
     return blanked(covariance, undetermined), undetermined

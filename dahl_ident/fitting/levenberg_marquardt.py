@@ -1,14 +1,14 @@
 """Levenberg and Marquardt's method for many least-squares problems at once.
 
 Each step solves (H + lambda D) delta = -g with g the gradient of the cost, H its Gauss-Newton
-Hessian and D = diag H, so it does not depend on the parameters' units. lambda starts at almost
-nothing, a Gauss-Newton step; it falls where a step does what H predicted, and rises where the cost
-does not fall. All problems take their steps together; those that have ended drop out.
+Hessian and D = diag H, so it does not depend on the parameters' units. lambda starts almost at
+zero, with a Gauss-Newton step; it falls if the cost falls as H predicts, and rises if the cost does
+not fall. All problems take their steps together, until they end.
 
-A problem has converged where the step after the next, as the steps shrink, would move the residuals
-by less than 1e-8 of their standard deviation, or by no more than what rounding, or the accuracy of
-predictions, leaves of the data; it ends with the next step, which needs no further evaluation.
-`scipy.optimize.least_squares` is the other method, on the same residuals and Jacobian.
+A problem has converged if the step after the next one, extrapolated from the steps' ratio, would
+change the residuals by less than 1e-8 of their standard deviation, or by less than rounding or the
+accuracy of predictions; it ends with the next step, which needs no further evaluation.
+`scipy.optimize.least_squares` is the other method, with the same residuals and Jacobian.
 """
 
 from __future__ import annotations
@@ -31,41 +31,40 @@ if TYPE_CHECKING:
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[FloatArray, IntArray], Quadratic]
-"""(theta (S, P), which of the searches they belong to (S,)) -> cost, gradient, Hessian."""
+"""Cost, gradient and Hessian at theta, (S, P), given the searches' indices, (S,)."""
 Bounds = tuple[FloatArray, FloatArray]
 """Least and largest coordinates, (P,) each, of steps."""
 Fall = Callable[[FloatArray], FloatArray | float]
-"""Costs (S,) -> their falls that are not worth a step."""
+"""Negligible falls of costs (S,)."""
 
 _EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
-_FIRST_DAMPING = 1e-9  # lambda at first: almost nothing, so that the step is Gauss and Newton's
-_GAUSS_NEWTON = 1e-3  # lambda above which a step is short because of it, not near a minimum
-_MOST_DAMPING = 1e12  # lambda at which steps change no digit: the search has failed
+_FIRST_DAMPING = 1e-9  # lambda at first, almost zero for a Gauss-Newton step
+_GAUSS_NEWTON = 1e-3  # lambda above which a short step does not show convergence
+_MOST_DAMPING = 1e12  # lambda above which the search has failed
 _ROUNDING = 1e-12  # rounding errors of a scaled Hessian, some thousand times _EPS
-_LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, within which a quadratic may still hold
+_LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, up to which the cost may be quadratic
 # length of a step, over the residuals' standard deviation, at which a search has converged
 _NOISE_TOLERANCE = 1e-8
-# longest step of a logarithm that may be the last: the Hessian returned is that before it
+# longest last step of a logarithm, as the Hessian returned is that before this step
 _LAST_STEP = 1e-6
 _ALIKE = 0.9  # squared cosine between two steps of a geometric series
-_SLOWEST = 0.99  # their ratio at most: a hundred steps at once
-# change of the residuals, over their size, that a coordinate makes from bound to bound, below which
-# it is held: it has no effect
+_SLOWEST = 0.99  # largest ratio of the series: a hundred steps at once
+# change of the residuals, over their size, by a coordinate from bound to bound, below which it has
+# no effect and is kept fixed
 _FLAT = 1e-3
-_NEAR = 0.01  # longest last step, as a share of the way between the bounds
+_NEAR = 0.01  # longest last step over the distance between the bounds
 _UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
-_OF_ACCURACY = 0.3  # the same over the accuracy of predictions, where that is less than rounding's
-# a search that is still higher ends after so many times the steps of one that has converged
-_OVERTIME = 2.0
+_OF_ACCURACY = 0.3  # the same over the accuracy of predictions, if these are inaccurate
+_OVERTIME = 2.0  # steps of a higher search over those of a converged one, after which it ends
 # relative changes of cost, step and slope at which scipy's searches end: a few hundred times _EPS
 _OF_COST, _OF_STEP, _OF_SLOPE = 1e-13, 1e-10, 1e-14
-_EVALUATIONS = 300  # of scipy's search, which needs about thirty; more mean that it does not end
+_EVALUATIONS = 300  # most evaluations of scipy's search, which needs about thirty
 NEARLY = 1e-4  # relative difference of costs within which a search that has converged is preferred
 
 
 @dataclass(frozen=True)
 class _Searches:
-    """Arrays with a leading axis S, one place for each search."""
+    """Arrays with a leading axis S, for each search."""
 
     def take(self, which: BoolArray | IntArray) -> Self:
         """Return some of the searches."""
@@ -77,7 +76,7 @@ class _Searches:
             getattr(self, f.name)[which] = getattr(other, f.name)
 
     def where(self, wins: BoolArray, other: Self) -> Self:
-        """Return, search by search, the other where it `wins`."""
+        """Return these searches, replaced by `other` where it `wins`."""
         pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
         return type(self)(
             *(np.where(wins.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs)
@@ -97,7 +96,7 @@ class Minima(_Searches):
     """The ends of S searches."""
 
     theta: FloatArray
-    """Search coordinates, (S, P); at a limit so far out that the model is its limit."""
+    """Search coordinates, (S, P); for a limit so far out that the model agrees with its limit."""
     cost: FloatArray
     hessian: FloatArray
     converged: BoolArray
@@ -111,7 +110,7 @@ class Minima(_Searches):
 
     @property
     def determined(self) -> IntArray:
-        """The number of parameters that each optimum has: fewer than P at a limit."""
+        """The number of determined parameters of each optimum: fewer than P at a limit."""
         P = self.theta.shape[1]
         return np.array([P if at is None else len(at.phi) for at in self.limit])
 
@@ -127,7 +126,7 @@ class Minima(_Searches):
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def best(self, owner: IntArray, S: int) -> Minima:
-        """Return the best search of each of S owners: converged ones first if nearly as low."""
+        """Return the best search of each of S owners: a converged one if nearly as low."""
         lowest, most = np.full(S, np.inf), np.zeros(S, dtype=np.intp)
         np.minimum.at(lowest, owner, self.cost)
         np.maximum.at(most, owner, self.evaluations)
@@ -140,16 +139,16 @@ class Minima(_Searches):
         return replace(self.take(first), evaluations=most)
 
     def better(self, other: Minima) -> Minima:
-        """Return, search by search, the other where it is lower or alone has converged."""
+        """Return these searches, replaced by `other` where it is lower or alone has converged."""
         wins = (other.cost < self.cost) & ~(self.converged & ~other.converged)
         wins |= other.converged & ~self.converged
-        every = self.evaluations + other.evaluations
-        return replace(self.where(wins, other), evaluations=every)
+        evaluations = self.evaluations + other.evaluations
+        return replace(self.where(wins, other), evaluations=evaluations)
 
 
 @dataclass(frozen=True)
 class _State(_Searches):
-    """Where each search stands."""
+    """Point, cost and derivatives of each search."""
 
     theta: FloatArray
     cost: FloatArray
@@ -157,7 +156,7 @@ class _State(_Searches):
     hessian: FloatArray
 
     def moved(self, which: BoolArray, step: FloatArray, fall: FloatArray) -> _State:
-        """Return this state with a last short step taken by some."""
+        """Return the state after a last short step of some searches."""
         return replace(
             self,
             theta=self.theta + np.where(which[:, None], step, 0.0),
@@ -184,15 +183,15 @@ def minimise(
 ) -> Minima:
     """Return the minima of the costs that searches from `theta`, shape (S, P), find.
 
-    `logarithmic` says which coordinates are logarithms: their steps have a longest length.
-    Searches that leave the region `inside`, which is called like `evaluate`, end there, not
-    converged; so do those that are still higher after twice the steps in which another one of the
-    same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
-    search has converged; `enough` gives the fall of a cost that is not worth a step, however long:
-    the search ends before it. `accuracy` is that of predictions, relative to the data. No step
-    leads beyond the `bounds` of theta; a coordinate at its bound that would go on stays there. In
-    `restrained` searches a logarithmic step of 1 counts like residuals of one standard deviation:
-    coordinates that hardly have an effect wait where they are until the others have converged.
+    `logarithmic` marks the coordinates that are logarithms, whose steps are limited in length.
+    Searches that leave the region `inside`, which is called like `evaluate`, end without
+    convergence; so do those that are still higher after twice the steps in which another search of
+    the same `owner` has converged. `tolerance_factor` multiplies the length of the step at which a
+    search has converged; `enough` gives the fall of a cost that is negligible, whatever the length
+    of the step: the search ends before it. `accuracy` is that of predictions, relative to the data.
+    Steps end at the `bounds` of theta. In `restrained` searches a logarithmic step of 1 is
+    penalised like residuals of one standard deviation: coordinates with hardly any effect do not
+    move until the others have converged.
     """
     owner = np.arange(len(theta)) if owner is None else owner
     S, P = theta.shape
@@ -215,7 +214,7 @@ def minimise(
         settled &= longest <= tolerance_factor * _LAST_STEP
         settled &= predicted <= at.cost  # a larger fall is rounding
         short = settled
-        if bounds is not None:  # far steps of what hardly has an effect may lead anywhere
+        if bounds is not None:  # coordinates with hardly any effect may take long steps
             short = short & (np.abs(step) <= _NEAR * (bounds[1] - bounds[0])).all(axis=1)
         settled = settled | (enough is not None and predicted < enough(at.cost))
         settled &= damping < _GAUSS_NEWTON
@@ -231,30 +230,30 @@ def minimise(
             np.minimum.at(first, owners[settled], count)
             np.minimum.at(lowest, owners[settled], at.cost[settled])
             ends.assign(active, at.moved(settled & (short | unseen), step, predicted))
-            keep = ~ended
-            active, at = active[keep], at.take(keep)
+            kept = ~ended
+            active, at = active[kept], at.take(kept)
             if not active.size:
                 break
-            step, moves, predicted = step[keep], moves[keep], predicted[keep]
-            damping, growth, last, before = damping[keep], growth[keep], last[keep], before[keep]
-        further = _further(at.hessian, step, before)
+            step, moves, predicted = step[kept], moves[kept], predicted[kept]
+            damping, growth, last, before = damping[kept], growth[kept], last[kept], before[kept]
+        factor = _extrapolation(at.hessian, step, before)
         longest = np.abs(step * logarithmic).max(axis=1)
-        further = np.clip(_LONGEST_STEP / np.maximum(longest, 1e-300), 1.0, further)
-        step = further[:, None] * step
+        factor = np.clip(_LONGEST_STEP / np.maximum(longest, 1e-300), 1.0, factor)
+        step = factor[:, None] * step
         trial = at.theta + step
         new = _State(trial, *evaluate(trial, active))
         evaluations[active] += 1
-        # a fall too small to see next to one enormous row's cost is taken as predicted
+        # a fall that is lost in the rounding of the cost is assumed to be as predicted
         tiny = predicted <= unseen_change * at.cost
         better = (new.cost < at.cost) | (tiny & (new.cost <= (1.0 + unseen_change) * at.cost))
         gain = np.where(tiny, 1.0, at.cost - new.cost) / np.where(tiny, 1.0, predicted)
-        # the damping of the last step is still needed
+        # after a failed step the damping falls slowly
         least = np.where(growth > 2.0, 1.0 / 3.0, 0.05)
-        calmer = np.maximum(damping * np.maximum(least, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
-        damping = np.where(better, calmer, np.maximum(damping * growth, 1e-6))
+        lower = np.maximum(damping * np.maximum(least, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
+        damping = np.where(better, lower, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
         last = np.where(better, moves, 1e-300)
-        before = np.where((better & (further == 1.0))[:, None], step, 0.0)
+        before = np.where((better & (factor == 1.0))[:, None], step, 0.0)
         at = new if better.all() else at.where(better, new)
     ends.assign(active, at)
     return Minima(ends.theta, ends.cost, ends.hessian, converged, evaluations)
@@ -267,9 +266,9 @@ def _step(
     bounds: Bounds | None,
     restraint: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the next step, its squared length, the fall of cost predicted, the longest log step.
+    """Return the next step, its squared length, the predicted fall of cost, the longest log step.
 
-    The length is among residuals.
+    The length is that of the change of the residuals.
     """
     P = at.theta.shape[1]
     size = np.sqrt(at.hessian[:, range(P), range(P)])
@@ -278,46 +277,46 @@ def _step(
     g = at.gradient / size
     if bounds is not None:
         low, high = bounds
-        held = ((at.theta <= low) & (g > 0.0)) | ((at.theta >= high) & (g < 0.0))
-        held |= size * (high - low) <= _FLAT * np.sqrt(at.cost)[:, None]
-        g = np.where(held, 0.0, g)
-        H = np.where(held[:, :, None] | held[:, None, :], np.eye(P), H)
+        fixed = ((at.theta <= low) & (g > 0.0)) | ((at.theta >= high) & (g < 0.0))
+        fixed |= size * (high - low) <= _FLAT * np.sqrt(at.cost)[:, None]
+        g = np.where(fixed, 0.0, g)
+        H = np.where(fixed[:, :, None] | fixed[:, None, :], np.eye(P), H)
     damped = H + (damping[:, None] + restraint / size**2)[:, None] * np.eye(P)
     if not np.isfinite(damped).all():
         bad = ~np.isfinite(damped).all(axis=(1, 2))
         damped[bad], g[bad] = np.eye(P), 0.0
     try:
         delta = -np.linalg.solve(damped, g[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:  # somewhere two columns are alike to rounding
+    except np.linalg.LinAlgError:  # two columns are equal to rounding
         delta = -np.linalg.solve(damped + _ROUNDING * np.eye(P), g[:, :, None])[:, :, 0]
     longest = np.abs(delta / size * logarithmic).max(axis=1)
     if longest.max() > _LONGEST_STEP:
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
     if bounds is not None:
-        wide = delta
-        delta = (np.clip(at.theta + wide / size, low, high) - at.theta) * size
-        cut = delta != wide
-        if cut.any():  # the others' steps are best for those that end at a bound
+        unbounded = delta
+        delta = (np.clip(at.theta + unbounded / size, low, high) - at.theta) * size
+        cut = delta != unbounded
+        if cut.any():  # solve for the other coordinates, given those at bounds
             at_bounds = np.where(cut, delta, 0.0)
-            g_there = np.where(cut, 0.0, g + (damped @ at_bounds[:, :, None])[:, :, 0])
-            free = np.where(cut[:, :, None] | cut[:, None, :], np.eye(P), damped)
-            inner = -np.linalg.solve(free + _ROUNDING * np.eye(P), g_there[:, :, None])[:, :, 0]
-            furthest = np.abs(inner / size * logarithmic).max(axis=1)
-            inner *= np.minimum(1.0, _LONGEST_STEP / np.maximum(furthest, 1e-300))[:, None]
+            g_inner = np.where(cut, 0.0, g + (damped @ at_bounds[:, :, None])[:, :, 0])
+            H_inner = np.where(cut[:, :, None] | cut[:, None, :], np.eye(P), damped)
+            inner = -np.linalg.solve(H_inner + _ROUNDING * np.eye(P), g_inner[:, :, None])[:, :, 0]
+            longest_inner = np.abs(inner / size * logarithmic).max(axis=1)
+            inner *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest_inner, 1e-300))[:, None]
             delta = (np.clip(at.theta + (at_bounds + inner) / size, low, high) - at.theta) * size
-            longest = np.maximum(longest, furthest)
+            longest = np.maximum(longest, longest_inner)
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     predicted = -(delta * g).sum(axis=1) - 0.5 * moves
     return delta / size, moves, np.maximum(predicted, 1e-300), longest
 
 
-def _further(hessian: FloatArray, step: FloatArray, before: FloatArray) -> FloatArray:
-    """Return the factor that lengthens a step to the sum of the geometric series it continues.
+def _extrapolation(hessian: FloatArray, step: FloatArray, before: FloatArray) -> FloatArray:
+    """Return the factor of a step that continues a geometric series, to reach its sum at once.
 
-    Where a model is curved and misses the data by much, each step of Gauss and Newton's is the same
-    share of the one `before`.
+    If a model is curved and its misfit large, the ratio of each Gauss-Newton step to the one
+    `before` is constant.
     """
-    along, past = ((hessian @ each[:, :, None])[:, :, 0] for each in (step, before))
+    along, past = ((hessian @ delta[:, :, None])[:, :, 0] for delta in (step, before))
     product, squares = (step * past).sum(axis=1), (before * past).sum(axis=1)
     ratio = product / np.maximum(squares, 1e-300)
     alike = product**2 > _ALIKE * squares * (step * along).sum(axis=1)
@@ -325,7 +324,7 @@ def _further(hessian: FloatArray, step: FloatArray, before: FloatArray) -> Float
 
 
 def _tolerance(at: _State, logarithmic: BoolArray, n_residuals: int, accuracy: float) -> FloatArray:
-    """Return the squared length of a step that no longer matters."""
+    """Return the squared length of a negligible step."""
     P = at.theta.shape[1]
     noise = 2.0 * at.cost / max(n_residuals - P, 1)
     lever = np.where(logarithmic, 1.0, at.theta)
@@ -342,7 +341,7 @@ def minimise_by_scipy(
     """
     from scipy import optimize
 
-    last: dict[bytes, FloatArray] = {}  # scipy asks for residuals, and then for their Jacobian
+    last: dict[bytes, FloatArray] = {}  # scipy calls for residuals, and then for their Jacobian
 
     def rows(theta: FloatArray) -> FloatArray:
         key = theta.tobytes()
@@ -359,7 +358,7 @@ def minimise_by_scipy(
         if loss is not None:
             at = bend(at, m, loss, problem.parts)
         if not np.isfinite(at).all():
-            at[0] = np.nan  # a step that scipy takes back
+            at[0] = np.nan  # scipy then rejects the step
         return at
 
     def residuals(at: FloatArray) -> FloatArray:
@@ -376,7 +375,9 @@ def minimise_by_scipy(
                 x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
             )  # fmt: skip
         theta, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
-    there = problem.quadratic(theta, scale, loss)
-    cost = float(there.cost) if nfev > 1 or converged else np.inf
-    counts = np.array([converged]), np.array([nfev])
-    return Minima(theta[None], np.array([cost]), there.hessian[None], *counts)
+    minimum = problem.quadratic(theta, scale, loss)
+    cost = float(minimum.cost) if nfev > 1 or converged else np.inf
+    return Minima(
+        theta[None], np.array([cost]), minimum.hessian[None], np.array([converged]),
+        np.array([nfev]),
+    )  # fmt: skip

@@ -2,7 +2,7 @@
 
 Given the nonlinear parameters of its laws, a model's force is linear in mass, damping, stiffness
 and one scale for each law. So the nonlinear ones are scanned, and the linear ones solved for: from
-the measured force where that is the output; where the motion is, from the force balance with the
+the measured force if that is the output; if it is the motion, from the force balance with the
 measured motion, differentiated within the drive's band.
 """
 
@@ -22,15 +22,15 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
 _SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
-_LONGEST = 8192  # samples that the scan looks at
-_COMBINATIONS = 100  # on the grid: each costs nearly as much as a step of a search
+_LONGEST = 8192  # most samples of a record in the scan
+_COMBINATIONS = 100  # most nodes of the grid: each takes nearly as long as a step of a search
 STARTS = 4
-"""Starts that are tried at first."""
+"""Number of starts that are tried first."""
 MORE_STARTS = 24
-"""Where no motion from those is finite: a contact too stiff for the samples' interval is one."""
-_LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: at rest, or nearly slipping
-_DECAY = 1e-3  # of the largest decay's amplitude in its spectrum: below, there is none
-_BAND = 1e-5  # of the drive's largest power: below, it has none
+"""Number if no motion from those is finite, such as with too stiff a contact."""
+_LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: none, or nearly slipping
+_DECAY = 1e-3  # least amplitude in the spectrum of a free decay, over the largest
+_BAND = 1e-5  # least power of the drive in its band, over the largest
 
 
 def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
@@ -43,11 +43,11 @@ def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
 
 
 def alternatives(problem: RecordProblem, values: FloatArray) -> Iterator[tuple[int, float]]:
-    """Yield the places and other values of parameters that the output is not linear in.
+    """Yield indices and other values of parameters in which the output is not linear.
 
-    Those of the scan, in proportion to the size that the law has, and loads at first samples.
+    The values are those of the scan, in proportion to the law's size, and loads at first samples.
     """
-    scan, place = _Scan(problem), 0
+    scan, index = _Scan(problem), 0
     for element in problem.model.elements:
         size = 1.0
         grids = zip(element.labels, element.parameters, scan.grids(element), strict=True)
@@ -56,12 +56,12 @@ def alternatives(problem: RecordProblem, values: FloatArray) -> Iterator[tuple[i
                 continue
             scales = bool(label in element.scale_parameters and parameter.dimension[0])
             if len(grid) > 1:
-                yield from ((place, value * size if scales else value) for value in grid)
+                yield from ((index, value * size if scales else value) for value in grid)
             elif scales:
-                size = float(values[place])
-            place += 1
+                size = float(values[index])
+            index += 1
     low, high = problem.step_bounds(values, of_starts=True)
-    for i in range(place, values.size):
+    for i in range(index, values.size):
         if np.isfinite(high[i] - low[i]):
             yield from ((i, 0.5 * (low[i] + high[i] + s * (high[i] - low[i]))) for s in _LOADS)
 
@@ -73,8 +73,8 @@ class _Start(NamedTuple):
     """Whether no mass, damping, stiffness or scale is negative."""
 
 
-def _passive(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution of normal equations, none of it negative."""
+def _non_negative(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the non-negative solution of normal equations."""
     from scipy.optimize import nnls
 
     sizes, vectors = np.linalg.eigh(matrix)
@@ -82,6 +82,11 @@ def _passive(matrix: FloatArray, right: FloatArray) -> FloatArray:
     root = np.sqrt(sizes[kept])
     rows = root[:, None] * vectors[:, kept].T
     return np.asarray(nnls(rows, (vectors[:, kept].T @ right) / root)[0])
+
+
+def _differ(first: list[float], second: list[float]) -> bool:
+    a, b = np.array(first), np.array(second)
+    return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
 
 
 class _Scan:
@@ -94,7 +99,7 @@ class _Scan:
         self.time = 1.0 / rate if rate > 0.0 else 1.0
 
     def _histories(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return displacement, velocity, acceleration and force of a record's liveliest part."""
+        """Return displacement, velocity, acceleration and force of a record's fastest part."""
         problem, record = self.problem, self.problem.records[number]
         if problem.output == "force":
             x, v, a = problem.motions[number]
@@ -136,15 +141,11 @@ class _Scan:
         kept: dict[tuple[int, bool], list[float]] = {}
         for start in begin:
             rank = ranks[start.passive]
-            if rank < count and all(self._apart(start.values, one) for one in kept.values()):
-                kept[rank, not start.passive] = start.values  # by turns, passive ones first
+            if rank < count and all(_differ(start.values, other) for other in kept.values()):
+                kept[rank, not start.passive] = start.values  # in turn, passive ones first
                 ranks[start.passive] += 1
         chosen = [kept[place] for place in sorted(kept)][:count]
         return np.array([started_at(self.problem, values) for values in chosen])
-
-    def _apart(self, first: list[float], second: list[float]) -> bool:
-        a, b = np.array(first), np.array(second)
-        return bool(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-300)) > 0.3)
 
     def grids(self, element: Element) -> list[list[float]]:
         """Return values of an element's parameters at which its force is to be computed.
@@ -153,15 +154,15 @@ class _Scan:
         lengths and times: with 1 N/m, a force is the length at which a spring exerts it.
         """
         grids: list[list[float]] = []
-        one: tuple[int, int, int] | None = None  # dimension of the parameter that is 1
+        unit_dimension: tuple[int, int, int] | None = None  # of the parameter that is 1
         for label, parameter in zip(element.labels, element.parameters, strict=True):
             fixed = [] if parameter.value is None else [float(parameter.value)]
             if label in element.linear_parameters:
                 grids.append([1.0] if parameter.free else fixed)
-                one = parameter.dimension
-            elif parameter.free and label in element.scale_parameters and one is None:
+                unit_dimension = parameter.dimension
+            elif parameter.free and label in element.scale_parameters and unit_dimension is None:
                 grids.append([1.0])
-                one = parameter.dimension
+                unit_dimension = parameter.dimension
             elif fixed:
                 grids.append(fixed)
             elif isinstance(element, LinearSystem):
@@ -176,10 +177,13 @@ class _Scan:
                 unit = self.length**length * self.time**time
                 if force:
                     size = self._force_size() ** force
-                    if one is not None and one[0]:
+                    if unit_dimension is not None and unit_dimension[0]:
                         # the power of the unit parameter that has the dimension of a force
-                        share = force / one[0]
-                        length, time = length - share * one[1], time - share * one[2]
+                        share = force / unit_dimension[0]
+                        length, time = (
+                            length - share * unit_dimension[1],
+                            time - share * unit_dimension[2],
+                        )
                         size = self.time**time
                     lengths = [size * (self.length * s) ** length for s in _LENGTHS]
                     grids.append(list(dict.fromkeys(lengths)))
@@ -194,7 +198,7 @@ class _Scan:
         return max(float(np.std(h[3])) for h in self.histories)
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
-        """Return the force along each record; none where one has no motion at these values."""
+        """Return the force along each record; none if one has no motion at these values."""
         records = zip(self.problem.records, self.histories, strict=True)
         try:
             return [
@@ -210,13 +214,13 @@ class _Scan:
         shapes: list[tuple[float, ...]],
         sets: list[list[FloatArray]],
     ) -> list[_Start]:
-        """Return starts with the linear parameters solved for: best, and best of those above 0."""
+        """Return starts with the best linear parameters, and the best non-negative ones."""
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal: FloatArray | None = None
         for i, (_, _, _, force) in enumerate(self.histories):
-            rows = [self._weighed(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
+            rows = [self._weighted(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
             remaining = force - sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
-            rows.append(self._weighed(i, remaining))
+            rows.append(self._weighted(i, remaining))
             block = np.array(rows)
             product_ = np.real(block.conj() @ block.T)
             normal = product_ if normal is None else normal + product_
@@ -226,7 +230,7 @@ class _Scan:
         matrix = normal[:-1, :-1] / np.outer(size, size)
         right = normal[:-1, -1] / size
         free = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
-        solutions = [free] if (free >= 0.0).all() else [free, _passive(matrix, right)]
+        solutions = [free] if (free >= 0.0).all() else [free, _non_negative(matrix, right)]
         begin = []
         for solution in solutions:
             values = self._values(elements, shapes, scaled, solution / size)
@@ -244,19 +248,20 @@ class _Scan:
         scaled: list[bool],
         solution: FloatArray,
     ) -> list[float] | None:
-        """Return the free values, scaled by what was solved for; None where one is impossible."""
+        """Return the free values, scaled by the solution; None if one is impossible."""
         factors = iter(solution)
         values: list[float] = []
         for element, shape, scales in zip(elements, shapes, scaled, strict=True):
             factor = float(next(factors)) if scales else 1.0
-            for place, (parameter, value) in enumerate(zip(element.parameters, shape, strict=True)):
+            rows = zip(element.labels, element.parameters, shape, strict=True)
+            for label, parameter, value in rows:
                 if not parameter.free:
                     continue
-                label = element.labels[place]
-                jointly = label in element.scale_parameters and parameter.dimension[0]
-                new = value * factor if jointly and parameter.value is None else value
+                new = value
                 if parameter.value is not None:
                     new = float(parameter.value)
+                elif label in element.scale_parameters and parameter.dimension[0]:
+                    new = value * factor
                 if parameter.lower == 0.0 and new <= 0.0:
                     return None
                 values.append(float(np.clip(new, parameter.lower, parameter.upper)))
@@ -272,8 +277,8 @@ class _Scan:
             and (label in element.linear_parameters or label in element.scale_parameters)
         )
 
-    def _weighed(self, number: int, force: FloatArray) -> FloatArray:
-        """Return a force as residuals are counted: as it is, or as motion within the band."""
+    def _weighted(self, number: int, force: FloatArray) -> FloatArray:
+        """Return a force as weighted in residuals: detrended, or as motion within the band."""
         if self.problem.output == "force":
             t = np.linspace(-1.0, 1.0, force.size)
             level, slope = force.mean(), (force @ t) / (t @ t)
@@ -283,7 +288,7 @@ class _Scan:
         return np.asarray(spectrum * self._weight(number))
 
     def _weight(self, number: int) -> FloatArray:
-        """Return a smooth receptance, zero outside the band: forces weighed as displacements."""
+        """Return a smooth receptance, zero outside the band, from forces to displacements."""
         x, _, _, force = self.histories[number]
         window = np.hanning(x.size)
         X, F = (np.abs(np.fft.rfft(window * (w - w.mean()))) for w in (x, force))
@@ -297,7 +302,7 @@ class _Scan:
 
 
 def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
-    """Return all values from those of the model, free ones: states and offsets are started."""
+    """Return all values of a problem from the model's free ones: with states and offsets."""
     full = np.zeros(len(problem.parameters))
     full[: len(values)] = values
     for number, measured in enumerate(problem.measured):
@@ -313,7 +318,7 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
 
 
 def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None:
-    """Load the springs of a law that has several, to match the record's first samples."""
+    """Set the initial loads of laws with several springs to match the record's first samples."""
     of_record, place = problem.own(full, number), 2 if problem.output == "motion" else 0
 
     def misfit() -> float:
