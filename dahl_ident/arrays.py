@@ -27,6 +27,11 @@ def quotient(
         return np.where(denominator != 0.0, numerator / denominator, 0.0)
 
 
+def interleaved(values: ComplexArray) -> FloatArray:
+    """Return real and imaginary parts, interleaved in the last axis."""
+    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
+
+
 def real_array(value: ArrayLike, name: str) -> FloatArray:
     """Return `value` as a float array, or raise an error that names the argument."""
     refuse_masked(value, name)

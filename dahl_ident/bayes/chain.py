@@ -1,4 +1,4 @@
-"""Markov chains with emcee, which run until they converge and can be stopped and resumed.
+"""Markov chains with emcee that run until they converge, and can be stopped and resumed.
 
 The chain depends only on the density, the seed and the settings. Walkers and the state of the
 random generator are carried from step to step, so the number of pieces in which the chain is run
@@ -24,12 +24,12 @@ from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.moves import moves_for
 from dahl_ident.errors import ValidationError
 
-_LEAST_STEPS = 20  # with fewer no autocorrelation can be estimated
-_FIRST_CHECK = 200  # steps at the first check: three times WARM_UP and LENGTH where tau is 1
-_GROWTH = 1.25  # ratio of steps from check to check: a quarter more than needed at most
-_ROUND = 50  # checks are at multiples of so many steps
+_LEAST_STEPS = 20  # fewest steps for an autocorrelation time
+_FIRST_CHECK = 200  # steps at the first check: three times WARM_UP and LENGTH for tau = 1
+_GROWTH = 1.25  # ratio of steps between checks: at most a quarter more than needed
+_ROUND = 50  # checks are at multiples of this number of steps
 _PIECE = 50  # fewest steps between two calls of the listeners
-_PIECES = 20  # a long chain calls them after each twentieth of its length
+_PIECES = 20  # pieces between the calls for a long chain
 _PARTS = 8  # parts into which the points of one call are split for a pool
 
 Pool = Any
@@ -38,14 +38,14 @@ Pool = Any
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """How a chain of so many parameters is run, as :func:`dahl_ident.posterior` takes it."""
+    """Settings of a chain, as given to :func:`dahl_ident.posterior`."""
 
-    dims: int
-    ensembles: int  # independent ones
-    walkers: Any  # in all ensembles together; None for enough of them
-    seed: Any  # None draws one
-    steps: int | None  # in total; None runs until convergence
-    max_steps: int  # where to stop without convergence
+    dims: int  # number of coordinates
+    ensembles: int  # independent ensembles of walkers
+    walkers: Any  # in all ensembles; None for a sufficient number
+    seed: Any  # None for a random one
+    steps: int | None  # in total; None to run until convergence
+    max_steps: int  # limit without convergence
     ess: float  # effective draws of every parameter
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class Chain:
 
 
 Listener = Callable[[Chain, "Convergence | None"], None]
-"""Called after each piece with the last convergence verdict."""
+"""Function that is called after each piece with the chain and the last verdict."""
 
 
 def run(
@@ -164,12 +164,12 @@ def _continued(sampler: Any, chain: Chain, steps: int) -> Chain:
     return replace(chain, points=points, log_density=log_density, random_state=last.random_state)
 
 
-# window of the autocorrelation over tau: a shorter one cuts tau off, a longer one adds noise;
-# as in emcee
+# window of the autocorrelation over tau, as in emcee: a shorter one truncates tau, a longer one
+# adds noise
 WINDOW = 5.0
 WARM_UP = 10.0  # autocorrelation times after which a chain is independent of its start
-LENGTH = 50.0  # autocorrelation times from which tau is estimated well enough (emcee)
-R_HAT = 1.01  # limit of Vehtari et al. (2021); the older 1.1 passes chains that differ
+LENGTH = 50.0  # autocorrelation times for a sufficient estimate of tau, as in emcee
+R_HAT = 1.01  # limit of Vehtari et al. (2021); the older 1.1 accepts chains that differ
 
 
 @dataclass(frozen=True)
@@ -178,42 +178,42 @@ class Convergence:
 
     steps: int  # of the whole chain
     discard: int  # steps of warm-up
-    # (D,) integrated autocorrelation time after the warm-up, steps; NaN where nothing moved
+    # (D,) integrated autocorrelation time after the warm-up, steps; NaN if walkers never moved
     tau: FloatArray
     ess: FloatArray  # (D,) effective number of independent draws
     r_hat: FloatArray  # (D,) split R-hat across ensembles
-    wanted: float  # number of draws asked for
+    required: float  # effective number of draws asked for
 
     @property
     def usable(self) -> bool:
-        """Whether tau could be estimated at all."""
+        """Whether tau could be estimated."""
         return bool(np.isfinite(self.tau).all())
 
     @property
-    def lacks(self) -> list[str]:
+    def unmet(self) -> list[str]:
         """The criteria that are not met, in words; empty for a converged chain."""
         if not self.usable:
             return ["some walkers never moved"]
         kept = self.steps - self.discard
-        lacks = []
+        unmet = []
         if kept < LENGTH * self.tau.max():
-            lacks.append(
+            unmet.append(
                 f"{kept} steps after warm-up are {kept / self.tau.max():.0f} autocorrelation "
                 f"times, expected {LENGTH:.0f}"
             )
         if not self.r_hat.max() < R_HAT:
-            lacks.append(f"R-hat is {self.r_hat.max():.3f}, expected below {R_HAT}")
-        if self.ess.min() < self.wanted:
-            lacks.append(f"{self.ess.min():.0f} effective draws, expected {self.wanted:.0f}")
-        return lacks
+            unmet.append(f"R-hat is {self.r_hat.max():.3f}, expected below {R_HAT}")
+        if self.ess.min() < self.required:
+            unmet.append(f"{self.ess.min():.0f} effective draws, expected {self.required:.0f}")
+        return unmet
 
     @property
     def reached(self) -> bool:
         """Whether all criteria are met."""
-        return not self.lacks
+        return not self.unmet
 
 
-def judge(chain: FloatArray, ensembles: int, wanted: float) -> Convergence:
+def judge(chain: FloatArray, ensembles: int, required: float) -> Convergence:
     """Return the verdict on a chain of shape (steps, walkers, D), walkers by ensemble."""
     steps = len(chain)
     first = autocorrelation_time(chain[steps // 2 :])
@@ -222,7 +222,7 @@ def judge(chain: FloatArray, ensembles: int, wanted: float) -> Convergence:
     kept = chain[discard:]
     tau = autocorrelation_time(kept)
     ess = kept.shape[0] * kept.shape[1] / tau
-    return Convergence(steps, discard, tau, ess, r_hat(kept, ensembles), wanted)
+    return Convergence(steps, discard, tau, ess, r_hat(kept, ensembles), required)
 
 
 def autocorrelation_time(chain: FloatArray) -> FloatArray:

@@ -5,26 +5,26 @@ S(theta) the sum of squared residuals of n rows, two residuals each,
 
     ln p(x) = ln p(theta) - n ln(2 pi s^2) - S(theta)/(2 s^2) + constants,
 
-the prior 1/s of the scale being flat in ln s. Integrated over s, the same is
+with the prior 1/s of the scale, flat in ln s. Integrated over s, it is
 
     ln p(theta) + ln Gamma(n) - n ln(pi S(theta)) - ln 2 + constants.
 
-Where rows share errors, :mod:`dahl_ident.bayes.row_errors` takes the place of S. For outliers a row
-may count as Student's t in two dimensions with nu = 4 instead, of density
+If rows share errors, :mod:`dahl_ident.bayes.row_errors` replaces S. For data with outliers, rows
+may have Student's t distribution in two dimensions with nu = 4 instead, with the density
 (1 + |y|^2/(nu s^2))^-(nu/2 + 1) / (2 pi s^2).
 
-**Records.** States, offsets and drifts are linear in the output, nearly: the residuals e are
-projected off their derivatives, so that only the model's parameters theta are coordinates. With S
-the sum of squares that is left, nu the effective degrees of freedom of the residuals and P
-parameters, the unknown scale of the noise integrated out,
+**Records.** The output is nearly linear in states, offsets and drifts: the residuals e are
+projected onto the complement of their derivatives, so that only the model's parameters theta are
+coordinates. With S the remaining sum of squares, nu the effective degrees of freedom of the
+residuals and P parameters, the density integrated over the scale of the noise is
 
     ln p(theta) + constants - (nu + P)/2 ln(1 + (S(theta*) - S(t))/(nu s^2)),    s^2 = S(t)/n.
 
-Residuals of neighbouring samples are correlated, so S counts too many samples, of some parameters
-more than of others. It is therefore taken at theta* = t + C (theta - t), t the least-squares
-estimate and C such that the curvature at t is the inverse of the estimate's covariance, in which
-the correlation is accounted for (curvature adjustment of a composite likelihood: Ribatet, Cooley
-and Davison, Statistica Sinica 22 (2012) 813-845).
+Residuals of neighbouring samples are correlated, so S has too much information, more on some
+parameters than on others. It is therefore evaluated at theta* = t + C (theta - t), with t the
+least-squares estimate and C such that the curvature at t is the inverse of the estimate's
+covariance, which accounts for the correlation (curvature adjustment of a composite likelihood:
+Ribatet, Cooley and Davison, Statistica Sinica 22 (2012) 813-845).
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
-TAIL_DOF = 4.0  # degrees of freedom of Student's t: tails of outliers, yet a finite variance
-_FARTHEST = 300.0  # largest ln s: its square is still a number
+TAIL_DOF = 4.0  # degrees of freedom of Student's t: heavy tails, but a finite variance
+_FARTHEST = 300.0  # largest ln s, against overflow of s^2
 Sums = Callable[[FloatArray], FloatArray]
-_COLUMNS = (  # of a table: what its likelihood depends on
+_COLUMNS = (  # of a table, on which its likelihood depends
     "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
     "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance", "harmonic",
     "controlled",
@@ -66,8 +66,8 @@ class LogDensity(ABC):
     problem: Any
     prior: JointPrior
     likelihood: str = "gaussian"
-    counted: tuple[str, ...]  # the sources of error that the likelihood counts
-    normalised: bool = True  # whether it is the density of the data, and not only up to a factor
+    counted: tuple[str, ...]  # the sources of error in the likelihood
+    normalised: bool = True  # whether the likelihood is known, and not only up to a factor
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
         """Return the log-prior of theta, (S, P); -inf outside its support."""
@@ -87,7 +87,7 @@ class LogDensity(ABC):
         return self.added(self.residuals(theta))
 
     def added(self, residuals: FloatArray) -> FloatArray:
-        """Return sums of squares of residuals, (S, K): (S, M); infinite where there are none."""
+        """Return sums of squares of residuals, (S, K): (S, M); infinite for NaN residuals."""
         with np.errstate(invalid="ignore", over="ignore"):
             squares = residuals**2
             single = self.weights.shape == (1, 1)
@@ -98,7 +98,7 @@ class LogDensity(ABC):
     def marginal(self, theta: FloatArray, sums: Sums | None = None) -> FloatArray:
         """Return the log-density of theta, (S, P), an unknown scale integrated out.
 
-        Another function may take the place of :meth:`sums`.
+        `sums` replaces :meth:`sums`.
         """
 
     @abstractmethod
@@ -112,12 +112,12 @@ class LogDensity(ABC):
 
     @property
     def decorrelation(self) -> Decorrelation:
-        """Coordinates in which ridges are straight, where there are some."""
+        """Coordinates in which ridges of the density are straight."""
         return STRAIGHT
 
     @property
     def around(self) -> tuple[FloatArray, FloatArray] | None:
-        """Centre and covariance of the density, where they are known."""
+        """Centre and covariance of the density; None if they are not known."""
         return None
 
     @property
@@ -180,7 +180,7 @@ class Density(LogDensity):
 
     @property
     def counted(self) -> tuple[str, ...]:  # type: ignore[override]  # others keep it
-        """The sources of error that the likelihood counts."""
+        """The sources of error in the likelihood."""
         return ("noise",) if self.errors is None else tuple(self.errors.counted)
 
     @property
@@ -306,7 +306,7 @@ class Density(LogDensity):
             return float(0.5 * np.sum(y**2)), by @ by.T
 
     def _exponents(self, squares: FloatArray) -> FloatArray:
-        """Return ln of the likelihood but for constants, an unknown scale integrated out."""
+        """Return ln of the likelihood up to a constant, an unknown scale integrated out."""
         if not self.has_scale:
             return -0.5 * squares
         with np.errstate(divide="ignore"):
@@ -322,18 +322,17 @@ class Density(LogDensity):
     def quick(self) -> TableProblem:
         """The problem for very many evaluations.
 
-        Exact steady motions are taken to second order in the distance from the least-squares
-        optimum.
+        Exact steady motions are expanded to second order about the least-squares optimum.
         """
         problem = self.problem
         if not problem.is_exact:
             return problem
-        alone = problem.like(sensors=problem.sensors.with_free(list(problem.priors)))
-        return problem.near(solve(alone).theta)
+        without_priors = problem.like(sensors=problem.sensors.with_free(list(problem.priors)))
+        return problem.near(solve(without_priors).theta)
 
     @property
     def _constant(self) -> float:
-        """The Gaussian log-likelihood at s = 1 less its exponent."""
+        """The Gaussian log-likelihood at s = 1 without its exponent."""
         return float(self.problem.log_area - 0.5 * self.problem.n_residuals * np.log(2.0 * np.pi))
 
 
@@ -343,7 +342,7 @@ class RecordDensity(LogDensity):
 
     problem: RecordProblem
     values: FloatArray  # the least-squares estimate: P parameters, then states and offsets
-    covariance: FloatArray  # (P, P) of the parameters, by the sources of error that are counted
+    covariance: FloatArray  # (P, P) of the parameters, from the sources `counted`
     dof: float  # effective degrees of freedom of the residuals
     counted: tuple[str, ...]
     prior: JointPrior
@@ -381,11 +380,11 @@ class RecordDensity(LogDensity):
     def facts(self) -> dict[str, str | Sequence[object]]:
         """Samples and estimate."""
         samples = [(r.time, r.motion_samples, r.force_samples) for r in self.problem.records]
-        return {"data": [part for one in samples for part in one], "estimate": [self.values]}
+        return {"data": [wave for waves in samples for wave in waves], "estimate": [self.values]}
 
     @cached_property
     def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Orthonormal d/d(states and offsets), and d/d(theta), of each record."""
+        """For each record, orthonormal derivatives by states and offsets, and those by theta."""
         count = len(self.names)
         per_record = self.problem.per_record
         parts = []
@@ -401,16 +400,16 @@ class RecordDensity(LogDensity):
         return float(np.sum(self._residuals(self.centre) ** 2))
 
     @cached_property
-    def _bend(self) -> FloatArray:
-        """C, symmetric in coordinates in which the covariance is the unit matrix."""
+    def _adjustment(self) -> FloatArray:
+        """The matrix C, symmetric in coordinates in which the covariance is the unit matrix."""
         hessian = np.zeros((len(self.names),) * 2)
         for basis, by in self._nuisance:
             unexplained = by - basis @ (basis.T @ by)
             hessian += unexplained.T @ unexplained
         noise = self._least / self.problem.n_residuals
         values, vectors = np.linalg.eigh(self.root.T @ hessian @ self.root / noise)
-        shrunk = vectors @ np.diag(1.0 / np.sqrt(values)) @ vectors.T
-        return np.asarray(self.root @ shrunk @ np.linalg.inv(self.root))
+        inverse_root = vectors @ np.diag(1.0 / np.sqrt(values)) @ vectors.T
+        return np.asarray(self.root @ inverse_root @ np.linalg.inv(self.root))
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the log-density, (S, D) -> (S,); -inf outside the prior's support."""
@@ -430,8 +429,8 @@ class RecordDensity(LogDensity):
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Return the residuals at theta*, (S, P) -> (S, n), states and offsets projected out."""
-        bent = self.centre + (theta - self.centre) @ self._bend.T
-        return np.array([self._residuals(one) for one in bent])
+        adjusted = self.centre + (theta - self.centre) @ self._adjustment.T
+        return np.array([self._residuals(t) for t in adjusted])
 
     def _residuals(self, theta: FloatArray) -> FloatArray:
         full = self.values.copy()

@@ -1,29 +1,29 @@
 r"""Proposals for several independent ensembles, all evaluated in one call.
 
 Each ensemble of walkers is split at random into halves; one half moves with the other as its guide,
-then they exchange roles (as in emcee, whose sampler runs these moves). A density that takes many
-points at once costs least when the halves of all ensembles go into one call.
+then they exchange roles (as in emcee, whose sampler runs these moves). The halves of all ensembles
+are evaluated in one call, which is fastest.
 
 - `differential_evolution`: a walker moves along the difference of two of the other half, by
-  2.38/(2 D)^(1/2) of it, now and then by all of it, which leads from mode to mode (ter Braak,
+  2.38/(2 D)^(1/2) of it, sometimes by all of it, which leads from mode to mode (ter Braak,
   Statistics and Computing 16, 2006; Nelson et al., ApJS 210, 2014).
 - `snooker`: along the line to a walker of the other half, by the projected difference of two more
   (ter Braak and Vrugt, Statistics and Computing 18, 2008).
 - `independent`: to a draw from Student's t around the mean of the other half, shaped by its
   covariance; in few dimensions many draws are accepted, successive positions are nearly
-  independent, and heavy tails are reached from the centre.
+  independent, and heavy tails are reached.
 
 Decorrelated coordinates, in which the posterior ridges of plants are straight.
 
-The data determine the sum of the stiffnesses of a spring and of friction in parallel. Where they do
-not determine f_max and sigma, the stiffness depends on these along a curve, which straight steps
-leave. The dependence of the linear parameters l on friction is estimated by weighted least squares
-of the describing function N(p), of any law with parameters p, on the columns of spring, damper and
-mass, at the amplitudes and with the weights of the data:
+The data determine the sum of the stiffnesses of a spring and of friction in parallel. If they do
+not determine f_max and sigma, the density has a curved ridge, which straight steps leave. The
+dependence of the linear parameters l on friction is estimated by weighted least squares of the
+describing function N(p), of any law with parameters p, on the columns of spring, damper and mass,
+at the amplitudes and with the weights of the data:
 
     phi = l + W N(p),    W = (G' w^2 G)^-1 G' w^2.
 
-phi is the combination that the data determine. For given friction it is a shift of l, so volumes
+phi is the combination that the data determine. For given friction it is l with a shift, so volumes
 are preserved and the density over phi equals the density over l.
 """
 
@@ -36,28 +36,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import FloatArray, interleaved
 from dahl_ident.elements import Element
 from dahl_ident.problem import TableProblem
 
 Random = np.random.RandomState  # emcee's
 Proposal = Callable[[FloatArray, FloatArray, Random], tuple[FloatArray, FloatArray]]
-"""Half and guide, each (ensembles, W/2, D) -> places proposed and ln of the Hastings factor."""
+"""From half and guide, (ensembles, W/2, D), to proposed points and ln of the Hastings factor."""
 
-_JITTER = 1e-5  # relative scatter of a step, which keeps walkers off a lattice
-_JUMP = 0.1  # share of the steps that go the whole way between two walkers
-_TAIL = 2.0  # degrees of freedom of the independent proposals: few, to reach far tails
+_JITTER = 1e-5  # relative scatter of a step, against lattices of walkers
+_JUMP = 0.1  # share of the steps of the full difference of two walkers
+_TAIL = 2.0  # degrees of freedom of the independent proposals: few, for heavy tails
 _SNOOKER = 1.7  # length of a snooker step: the mean of ter Braak and Vrugt's range, as in emcee
-
-
-_FARTHEST = 1e300  # stands for a shift that is not finite; no prior reaches it
+_FARTHEST = 1e300  # replaces a shift that is not finite; outside any prior
 
 
 @dataclass(frozen=True)
 class Decorrelation:
     """The shift of the linear parameters; made by :func:`decorrelation_of`."""
 
-    problem: TableProblem | None  # whose theta, (S, P), come first in the points moved, (S, D)
+    problem: TableProblem | None  # its theta, (S, P), is first in the points, (S, D)
     friction: tuple[Element, ...]  # the nonlinear elements with free parameters
     linear: NDArray[np.intp]  # (L,) coordinates in which the force of linear elements is linear
     projection: FloatArray  # (2 n, L) from Re N and Im N at every row to the shift
@@ -86,18 +84,18 @@ class Decorrelation:
                 )
                 for e in self.friction
             )
-            shift = _parts(np.asarray(N)) @ self.projection
+            shift = interleaved(np.asarray(N)) @ self.projection
         moved[:, self.linear] += sign * np.where(np.isfinite(shift), shift, _FARTHEST)
         return moved
 
 
 STRAIGHT = Decorrelation(None, (), np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
-"""Leaves all coordinates as they are."""
+"""No change of the coordinates."""
 
 
 @dataclass(frozen=True)
 class EnsembleMove:
-    """One kind of proposal, applied to every ensemble by itself; a move of emcee's sampler.
+    """A move of emcee's sampler: one kind of proposal, applied to each ensemble separately.
 
     With a decorrelation, positions are proposed in coordinates in which ridges are straight.
     """
@@ -109,25 +107,25 @@ class EnsembleMove:
     def propose(self, model: Any, state: Any) -> tuple[Any, Any]:
         """Return the state after one proposal to every walker, and which were accepted."""
         walkers, dims = state.coords.shape
-        each = walkers // self.ensembles
+        size = walkers // self.ensembles
         random = model.random
-        order = random.uniform(size=(self.ensembles, each)).argsort(axis=1)
-        order += each * np.arange(self.ensembles)[:, None]
+        order = random.uniform(size=(self.ensembles, size)).argsort(axis=1)
+        order += size * np.arange(self.ensembles)[:, None]
         accepted = np.zeros(walkers, dtype=bool)
         straight = self.decorrelation.decorrelated(state.coords)
-        halves = (order[:, : each // 2], order[:, each // 2 :])
+        halves = (order[:, : size // 2], order[:, size // 2 :])
         for half, guide in (halves, halves[::-1]):
             proposed, factor = self.proposal(straight[half], straight[guide], random)
-            who, proposed = half.ravel(), proposed.reshape(-1, dims)
-            places = self.decorrelation.original(proposed)
-            log_density, _ = model.compute_log_prob_fn(places)
-            gain = factor.ravel() + log_density - state.log_prob[who]
-            moves = gain > np.log(random.uniform(size=who.size))
-            who = who[moves]
-            straight[who] = proposed[moves]
-            state.coords[who] = places[moves]
-            state.log_prob[who] = log_density[moves]
-            accepted[who] = True
+            moved, proposed = half.ravel(), proposed.reshape(-1, dims)
+            points = self.decorrelation.original(proposed)
+            log_density, _ = model.compute_log_prob_fn(points)
+            gain = factor.ravel() + log_density - state.log_prob[moved]
+            accept = gain > np.log(random.uniform(size=moved.size))
+            moved = moved[accept]
+            straight[moved] = proposed[accept]
+            state.coords[moved] = points[accept]
+            state.log_prob[moved] = log_density[accept]
+            accepted[moved] = True
         return state, accepted
 
 
@@ -153,13 +151,13 @@ def snooker(half: FloatArray, guide: FloatArray, random: Random) -> tuple[FloatA
     origin, first, second = _partners(half, guide, random, 3)
     line = half - origin
     length2 = np.sum(line**2, axis=-1)
-    # a walker at the position of its partner has no direction to move in and stays
+    # a walker at the position of its partner has no direction, and stays
     along = np.sum(line * (second - first), axis=-1) / np.where(length2 > 0.0, length2, 1.0)
-    places = half + _SNOOKER * along[..., None] * line
+    points = half + _SNOOKER * along[..., None] * line
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.log(np.sum((places - origin) ** 2, axis=-1)) - np.log(length2)
+        ratio = np.log(np.sum((points - origin) ** 2, axis=-1)) - np.log(length2)
     factor = 0.5 * (half.shape[-1] - 1) * ratio
-    return places, np.where(length2 > 0.0, factor, -np.inf)
+    return points, np.where(length2 > 0.0, factor, -np.inf)
 
 
 def independent(
@@ -176,9 +174,9 @@ def independent(
     normal = random.standard_normal(half.shape)
     chi = np.sqrt(random.chisquare(_TAIL, size=half.shape[:-1]) / _TAIL)
     draws = normal / chi[..., None]
-    places = mean + size * (draws @ root.swapaxes(1, 2))
-    here = np.linalg.solve(root, ((half - mean) / size).swapaxes(1, 2)).swapaxes(1, 2)
-    return places, _log_t(here) - _log_t(draws)
+    points = mean + size * (draws @ root.swapaxes(1, 2))
+    current = np.linalg.solve(root, ((half - mean) / size).swapaxes(1, 2)).swapaxes(1, 2)
+    return points, _log_t(current) - _log_t(draws)
 
 
 def _log_t(z: FloatArray) -> FloatArray:
@@ -191,7 +189,7 @@ def _partners(half: FloatArray, guide: FloatArray, random: Random, count: int) -
     ensembles, n, _ = half.shape
     size = guide.shape[1]
     chosen = [random.randint(size, size=(ensembles, n))]
-    for k in range(1, count):  # a draw among those left, shifted past those taken
+    for k in range(1, count):  # a draw among the others, shifted past those taken
         index = random.randint(size - k, size=(ensembles, n))
         for taken in np.sort(np.stack(chosen), axis=0):
             index = index + (index >= taken)
@@ -201,7 +199,7 @@ def _partners(half: FloatArray, guide: FloatArray, random: Random, count: int) -
 
 
 def decorrelation_of(problem: TableProblem) -> Decorrelation | None:
-    """Return the coordinates of a problem; None where friction or a linear element is not free."""
+    """Return the decorrelation of a problem; None without free friction and linear elements."""
     view = problem.stiffness_data
     free = set(problem.names)
     elements = [e for e in problem.model.elements if any(p.name in free for p in e.parameters)]
@@ -216,13 +214,9 @@ def decorrelation_of(problem: TableProblem) -> Decorrelation | None:
     if not friction or not linear:
         return None
     weights = np.repeat(view.weights, 2)
-    columns = np.stack([_parts(view.of(e, [np.ones(())])) for e, _ in linear], axis=-1)
+    columns = np.stack([interleaved(view.of(e, [np.ones(())])) for e, _ in linear], axis=-1)
     weighted = columns * weights[:, None]
     size = np.sqrt((weighted**2).sum(axis=0))
     projection = np.linalg.pinv(weighted / size) * weights / size[:, None]
     at = [problem.names.index(name) for _, name in linear]
     return Decorrelation(problem, friction, np.array(at), projection.T)
-
-
-def _parts(values: ComplexArray) -> FloatArray:
-    return np.ascontiguousarray(values).view(np.float64)

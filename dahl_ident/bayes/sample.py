@@ -1,11 +1,11 @@
 """A posterior as weighted draws: of a Markov chain, or at importance points.
 
-Both have coordinates theta with weights, whether they can be used, and why not.
+Both kinds have coordinates theta with weights, and a message on their convergence.
 
 Walkers start around the least-squares optimum, wider than the posterior. The optimum is moved
-inside the prior's support. Its covariance is the inverse of the Fisher information plus the prior's
-own precision, so that directions that the data leave undetermined start as wide as the prior, and
-walkers draw from Student's t with twice that spread.
+inside the prior's support. Its covariance is the inverse of the Fisher information plus the
+precision of the prior, so that directions that the data leave undetermined start as wide as the
+prior; walkers start from normal draws with twice that spread.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from dahl_ident.fitting.record_search import Tell
 from dahl_ident.problem import Problem
 from dahl_ident.sensors import Sensors
 
-_MOST_AXES = 3  # most parameters of a grid: the number of points is a power of theirs
+_MOST_AXES = 3  # most parameters of a grid: the number of points rises exponentially with it
 
 Start = Callable[[int, np.random.Generator], FloatArray]
-"""Returns as many points of finite density as there are walkers."""
+"""Return points of finite density, given the number of walkers and a random generator."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class ChainSample:
             kept = f"{steps - warm_up} steps of {self.settings.walkers} walkers"
             return f"Converged: {kept} after {warm_up} of warm-up."
         return (
-            f"NOT CONVERGED after {steps} steps: {'; '.join(self.convergence.lacks)}. The "
+            f"NOT CONVERGED after {steps} steps: {'; '.join(self.convergence.unmet)}. The "
             "numbers are provisional: run more steps, or give narrower priors."
         )
 
@@ -87,11 +87,11 @@ class ChainSample:
         return {"mcse": std / np.sqrt(ess), "ess": ess, "r_hat": self.convergence.r_hat}
 
     def check(self, names: Sequence[str], result: Any) -> None:
-        """Raise where nothing can be said of the chain; the error carries the result."""
-        still = ~np.isfinite(self.convergence.tau)
-        if not still.any():
+        """Raise an error, with the result, if walkers never moved."""
+        moving = np.isfinite(self.convergence.tau)
+        if moving.all():
             return
-        stuck = [name for name, there in zip(names, still, strict=True) if there]
+        stuck = [name for name, moves in zip(names, moving, strict=True) if not moves]
         raise SamplingError(
             f"some walkers never moved in {', '.join(stuck)} over {self.chain.steps} steps, so "
             "that nothing is known about the chain; it is in this error's `posterior`. Run more "
@@ -102,7 +102,7 @@ class ChainSample:
 
 @dataclass(frozen=True)
 class PointSample:
-    """Importance points: the same at every call, with the error of every probability."""
+    """Deterministic importance points, with the error of every probability."""
 
     density: LogDensity
     integral: WeightedPoints
@@ -119,7 +119,7 @@ class PointSample:
 
     @property
     def converged(self) -> bool:
-        """Whether the error is as small as was asked for."""
+        """Whether the error is within the tolerance."""
         return self.integral.error <= self.tolerance
 
     @property
@@ -145,7 +145,7 @@ class PointSample:
 
     @property
     def facts(self) -> Mapping[str, Any]:
-        """The evidence, where there is one, the error, and the number of points."""
+        """The evidence, if there is one, the error, and the number of points."""
         names = (*["log_evidence"] * self.density.normalised, "error", "evaluations")
         return {name: getattr(self.integral, name) for name in names}
 
@@ -168,7 +168,7 @@ def sample_chain(
     pool: Pool | None = None,
     listeners: Sequence[Listener] = (),
 ) -> ChainSample:
-    """Run a chain, from its file and into it where there is one.
+    """Run a chain; with `resume`, continue the one in that file and store it there.
 
     The seed of a file is kept; a `seed` that differs from it is refused.
     """
@@ -198,8 +198,8 @@ def sample_points(
 ) -> PointSample:
     """Integrate a density of few parameters.
 
-    `begin` returns a centre and a covariance, (P,) and (P, P); `given` names the parameters that
-    were left free by the user; `tell` takes the number of points so far.
+    `begin` returns a centre and a covariance, (P,) and (P, P); `given` are the names of parameters
+    that the user left free; `tell` is called with the number of points so far.
     """
     names = density.prior.names
     if len(names) > _MOST_AXES:
@@ -241,29 +241,29 @@ def sample_points(
 def _with_scale(density: Density, sums_of: Function, points: WeightedPoints) -> FloatArray:
     """Return theta of the points with ln s as their last coordinate, (N, P + 1).
 
-    At fixed parameters with sum of squares S over n rows, s^2 follows the inverse gamma
-    distribution with shape n and scale S/2. Each point gets one quantile of it. Points in order of
-    S take the probabilities of a sequence that fills the square evenly together with that order,
-    so that the mixture over the points is followed far more closely than by random draws.
+    At fixed parameters with sum of squares S over n rows, s^2 has the inverse gamma distribution
+    with shape n and scale S/2. Each point has one quantile of it. The probabilities of these
+    quantiles, with the points in order of S, are a low-discrepancy sequence, which represents the
+    mixture over the points far better than random draws.
     """
     from scipy.stats import qmc
 
     sums = in_blocks(sums_of, points.theta)
     uniform = qmc.Halton(2, scramble=False).random(len(sums) + 1)[1:]  # the first is zero
     uniform = uniform[np.argsort(np.argsort(np.log(sums).mean(axis=1)))]
-    below = np.cumsum(density.probabilities(sums), axis=1)
-    size = np.sum(uniform[:, 1:] * below[:, -1:] > below, axis=1, keepdims=True)
+    cumulative = np.cumsum(density.probabilities(sums), axis=1)
+    size = np.sum(uniform[:, 1:] * cumulative[:, -1:] > cumulative, axis=1, keepdims=True)
     squares = np.take_along_axis(sums, size, axis=1)[:, 0]
     rows = density.problem.n_residuals // 2
     ln_s = 0.5 * np.log(0.5 * squares / gammainccinv(rows, uniform[:, 0]))
     return np.column_stack([points.theta, ln_s])
 
 
-_WIDER = 2.0  # spread of the starts over the posterior's: R-hat needs it wider
-_TRIES = 60  # draws of a start, each 0.8 as wide as the last: to a millionth of the posterior
+_WIDER = 2.0  # spread of the starts over that of the posterior, above 1 for R-hat
+_TRIES = 60  # most draws of a start, each 0.8 as wide as the last
 _INSIDE = 1e-3  # distance of a centre from the prior's ends, over its width
-_PRIOR_DRAWS = 4096  # draws of the prior: 98 % find a region that holds 1e-3 of it
-_POSITIONS = 5  # places tried of a parameter that left its prior, each with a fit of the others
+_PRIOR_DRAWS = 4096  # draws of the prior: 98 % probability to hit a region of 1e-3 of it
+_POSITIONS = 5  # values tried for a parameter outside its prior, each with a fit of the others
 _EXACT = 1e-13  # relative noise below which residuals are rounding
 
 
@@ -313,7 +313,7 @@ def starting_points(
 def centre_and_covariance(
     density: LogDensity, optimum: Optimum | None, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return theta near the posterior's centre, and about its covariance."""
+    """Return approximate centre and covariance of the posterior."""
     if density.around is not None:
         return density.around
     assert isinstance(density, Density)
@@ -322,10 +322,10 @@ def centre_and_covariance(
     if density.likelihood != "none":
         scale = _scale(density, theta)
         if density.errors is None:
-            known = _with_normal_priors(density.problem).information(theta, scale)
+            information = _with_normal_priors(density.problem).information(theta, scale)
         else:
-            known = density.curvature(theta)[1] / scale**2
-        precision = precision + known
+            information = density.curvature(theta)[1] / scale**2
+        precision = precision + information
     size = 1.0 / np.sqrt(np.diagonal(precision))
     return theta, np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
 
@@ -333,21 +333,21 @@ def centre_and_covariance(
 def _centre_and_root(
     density: LogDensity, theta: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the centre and a root of the covariance, ln s included where it is sampled."""
+    """Return the centre and a root of the covariance, with ln s if it is sampled."""
     P = len(theta)
     std = np.sqrt(np.diagonal(covariance))
     root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
     if not density.has_scale:
         return theta, root
     assert isinstance(density, Density)
-    wider = np.zeros((P + 1, P + 1))
-    wider[:P, :P] = root
-    wider[P, P] = 1.0 / np.sqrt(2.0 * (density.problem.n_residuals - P))
-    return np.append(theta, np.log(_scale(density, theta))), wider
+    with_scale = np.zeros((P + 1, P + 1))
+    with_scale[:P, :P] = root
+    with_scale[P, P] = 1.0 / np.sqrt(2.0 * (density.problem.n_residuals - P))
+    return np.append(theta, np.log(_scale(density, theta))), with_scale
 
 
 def _inside(density: Density, optimum: Optimum | None, random: np.random.Generator) -> FloatArray:
-    """Return the optimum moved inside the prior's support, or else the best of many prior draws."""
+    """Return the optimum, moved inside the prior's support, or the best of many prior draws."""
     if optimum is not None and density.likelihood != "none":
         nearest = _moved_inside(density, optimum)
         if np.isfinite(density.highest(nearest[None])).all():
@@ -363,10 +363,10 @@ def _inside(density: Density, optimum: Optimum | None, random: np.random.Generat
 
 
 def _moved_inside(density: Density, optimum: Optimum) -> FloatArray:
-    """Return the optimum, or if it is outside the bulk of the prior, the likeliest point nearby.
+    """Return the optimum, or the likeliest of nearby points if it is outside the prior's bulk.
 
-    That may still be the optimum, or a point with the offending parameter moved inside the prior:
-    in microslip, for example, sigma and the spring have to follow an f_max that cannot be infinite.
+    Such a point has the first parameter outside moved inside, and the others fitted again: in
+    microslip, for example, sigma and the spring have to follow a finite f_max.
     """
     problem = density.problem
     low, high = _narrowed(*np.transpose([part.bulk for part in density.prior.priors]))

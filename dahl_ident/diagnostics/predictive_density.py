@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import FloatArray, interleaved
 from dahl_ident.diagnostics.estimate import tests_of
 from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.record_sources import blocks_of
@@ -85,15 +85,15 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     if not np.isfinite(deviation).all():
         raise FitError("the search ended where the model has no finite response")
     fundamental = reference == np.arange(data.n)
-    y = _parts(deviation)
+    y = interleaved(deviation)
     J = problem.prediction_jacobian(optimum.theta) / size[:, None]
     known = np.isfinite(J).all(axis=0) & (np.abs(J) > 0.0).any(axis=0)
-    X = orthonormal(_parts(J[:, known].T).T, _RANK)
+    X = orthonormal(interleaved(J[:, known].T).T, _RANK)
     scatter: list[FloatArray] = []
     if run.max() > 0:
         relative = predicted / size
         members = run == np.arange(run.max() + 1)[:, None]
-        scatter = [_parts(members * x).T for x in (relative, 1j * data.harmonic * relative)]
+        scatter = [interleaved(members * x).T for x in (relative, 1j * data.harmonic * relative)]
     stated, group = _stated_variances(optimum, size), np.repeat(~fundamental, 2).astype(np.intp)
     zero = np.repeat(data.harmonic == 0, 2) & (np.arange(y.size) % 2 == 1)  # of a mean
     kept = np.flatnonzero(~zero)
@@ -154,10 +154,6 @@ def _log_density(squares: float, volume: float, size: int, *, robust: bool) -> f
     if robust:
         squares = (_HEAVY + size) * float(np.log1p(squares / _HEAVY))
     return 0.5 * (volume - squares)
-
-
-def _parts(values: ComplexArray) -> FloatArray:
-    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
 
 
 def _stated_variances(optimum: Optimum, size: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, interleaved
 from dahl_ident.elements import Element, Friction, Parameter
 from dahl_ident.elements.held_motion import form_of
 from dahl_ident.errors import FitError, argument
@@ -207,16 +207,17 @@ class _Grid:
         for index, curves in enumerate(self.curves):
             chosen = self.nodes[:, index]
             columns += [
-                _parts(column.curve[..., chosen, :] * self.weights[..., None, :])
+                interleaved(column.curve[..., chosen, :] * self.weights[..., None, :])
                 for column in curves.columns
             ]
             if curves.known is not None:
                 target = target - curves.known[..., chosen, :] * self.weights[..., None, :]
         shape = np.broadcast_shapes(target.shape, (len(self.nodes), 1))
         common = [
-            _parts(np.broadcast_to(c.curve * self.weights, self.target.shape)) for c in self.common
+            interleaved(np.broadcast_to(c.curve * self.weights, self.target.shape))
+            for c in self.common
         ]
-        return _parts(np.broadcast_to(target, shape)), common, columns
+        return interleaved(np.broadcast_to(target, shape)), common, columns
 
     def of_tables(self, tables: IntArray) -> _Grid:
         """Return the grid of some tables of a batch, for use of `theta` only."""
@@ -654,11 +655,6 @@ def _projected(rows: FloatArray, Q: FloatArray) -> FloatArray:
     for _ in range(2 if Q.shape[-1] else 0):
         rows = rows - (rows @ Q) @ Q.swapaxes(-1, -2)
     return rows
-
-
-def _parts(values: ComplexArray) -> FloatArray:
-    """Return real and imaginary parts, interleaved in the last axis."""
-    return np.ascontiguousarray(values).view(np.float64)
 
 
 def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]:

@@ -1,9 +1,9 @@
-"""Levels that can be measured within the limits of the bench, their information and their time.
+"""Levels within the limits of the bench, their information and their time.
 
 A candidate is an amplitude of displacement, or of drive where force is controlled, at a frequency.
-It is possible if 95 % of the draws stay within every limit there. Where force is controlled, a
-point is left out if any draw has no steady amplitude or several. The time is that of settling in
-the order of the levels, of measured cycles and of change-over.
+It is possible if 95 % of the draws stay within every limit. If force is controlled, it is left out
+if any draw has no steady amplitude or several. The time is that of settling in the order of the
+levels, of measured cycles and of change-over.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from dahl_ident.planning.trajectories import PlannedMotion
 
 CONTROLLED = ("displacement", "force")
 _CERTAIN = 0.95  # fraction of the draws that must stay within a limit
-_FREQUENCIES = 12  # at most: six in each decade of the default range
-_BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee where no limit is given
+_FREQUENCIES = 12  # most frequencies: six in each decade of the default range
+_BELOW, _ABOVE = 0.03, 30.0  # range of amplitudes over the knee, if no limit is given
 _SOFTEST = 3e-3  # smallest drive as a fraction of the largest
 _CHECKED_DRAWS = 25  # draws at which the number of steady amplitudes is counted
-_OF_DRAWS = ("amplitude", "force", "rows", "variance")
+_OF_DRAWS = ("amplitude", "force", "rows", "variance")  # fields with an axis of draws
 LEAST_CYCLES = 2  # measured at each level: a single cycle does not show its noise
-_LEAST_SETTLING = 1  # cycles: no change of level is instant
+_LEAST_SETTLING = 1  # cycles before measuring
 _SLOW = 0.9  # quantile of the draws by which the motion must have settled
 _STEP = 1e-4  # relative step of frequency in differences: truncation error 1e-8, rounding 1e-12
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Levels and frequencies with all data that the search needs."""
+    """Levels and frequencies with the data for the search."""
 
-    controlled: str  # {"displacement", "force"} what `level` is an amplitude of
+    controlled: str  # {"displacement", "force"} quantity of which `level` is an amplitude
     level: FloatArray  # (K,) SI
     frequency_hz: FloatArray
     amplitude: FloatArray  # (S, K) of displacement and of force, at every draw
@@ -48,12 +48,12 @@ class Candidates:
     # (S, K, m, P) derivatives of the whitened residuals of one cycle with respect to the parameters
     rows: FloatArray
     variance: FloatArray  # (S, K) of ln gain and phase in one cycle
-    # motions in time whose periods the cycles are; empty for sines
+    # motions in time, whose periods are the cycles; empty for sines
     motions: tuple[PlannedMotion, ...] = ()
 
     @property
     def count(self) -> int:
-        """K."""
+        """Number of candidates, K."""
         return len(self.level)
 
     @property
@@ -65,7 +65,7 @@ class Candidates:
     def offsets(self) -> FloatArray:
         """Derivatives with respect to the gain and phase of a run, (S, K, m, 2).
 
-        Of the fundamental's two rows, which are the first ones; harmonics have errors of their own.
+        They are those of the fundamental's two rows, the first ones; harmonics have other errors.
         """
         return np.asarray(np.eye(self.rows.shape[2], 2) * self.weight)
 
@@ -98,8 +98,8 @@ def grid(question: PlanRequest, limits: BenchLimits, count: int) -> tuple[FloatA
     if question.knowledge.model.rate_independent and not by_force:
         with np.errstate(divide="ignore"):
             by_speed = limits.speed[1] / (2.0 * np.pi * levels)
-            by_pull = np.sqrt(limits.acceleration[1] / levels) / (2.0 * np.pi)
-        return levels, np.minimum(f_high, np.minimum(by_speed, by_pull))
+            by_acceleration = np.sqrt(limits.acceleration[1] / levels) / (2.0 * np.pi)
+        return levels, np.minimum(f_high, np.minimum(by_speed, by_acceleration))
     if f_low == f_high:
         return levels, np.full(levels.size, f_high)
     n = min(_FREQUENCIES, max(count // 4, 1))
@@ -111,7 +111,7 @@ def grid(question: PlanRequest, limits: BenchLimits, count: int) -> tuple[FloatA
 
 
 def level_range(question: PlanRequest, limits: BenchLimits) -> tuple[float, float]:
-    """Return the lowest and the highest level: the limits, or what the knee suggests."""
+    """Return the lowest and the highest level: the limits, or multiples of the knee."""
     low, high = getattr(limits, question.controlled)
     if question.controlled == "force":
         if not np.isfinite(high):
@@ -135,10 +135,10 @@ def evaluate(
     knowledge, by_force = question.knowledge, question.controlled == "force"
     problem = knowledge.problem_at(level, frequency_hz, question.controlled)
     predicted, changes = problem.prediction_and_jacobian(knowledge.theta)
-    held = np.broadcast_to(level, predicted.shape)
+    controlled = np.broadcast_to(level, predicted.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
-        amplitude = held / np.abs(predicted) if by_force else held
-    force = held if by_force else held * np.abs(predicted)
+        amplitude = controlled / np.abs(predicted) if by_force else controlled
+    force = controlled if by_force else controlled * np.abs(predicted)
     omega = 2.0 * np.pi * frequency_hz
     sizes = {
         "displacement": amplitude,
@@ -202,25 +202,24 @@ def _single_valued(
 
 @dataclass(frozen=True)
 class BenchTime:
-    """The time that visiting candidates takes.
+    """The time of measuring candidates.
 
-    A transient starts as the fraction abs(F - F')/F of the friction force F, where F' is that of
-    the previous level, and shrinks by `decay` per cycle; measuring starts when it is below
-    `settled`.
+    A transient starts with the size abs(F - F')/F relative to the friction force F, with F' that of
+    the previous level, and is multiplied by `decay` in each cycle; measuring starts when it is
+    below `settled`.
     """
 
-    # (K,) frequency, factor by which a transient shrinks in a cycle, and friction force
-    frequency_hz: FloatArray
-    decay: FloatArray
-    force: FloatArray
+    frequency_hz: FloatArray  # (K,)
+    decay: FloatArray  # (K,) factor of a transient in a cycle
+    force: FloatArray  # (K,) friction force
     change_over: float  # seconds from one level to the next
-    settled: float  # share of the friction force
+    settled: float  # transient over the friction force
     between_runs: float = 0.0  # seconds that a run takes in addition to its levels
-    least_settling: float = _LEAST_SETTLING  # cycles before measuring, at least
+    least_settling: float = _LEAST_SETTLING  # fewest cycles before measuring
 
     @classmethod
     def of(cls, candidates: Candidates, knowledge: Knowledge, **costs: float) -> BenchTime:
-        """Return the bench time of the candidates, so that the slowest tenth of the draws settles.
+        """Return the bench time of the candidates, in which the slowest 10 % of the draws settle.
 
         `costs` are change_over, settled and between_runs, s.
         """
@@ -243,8 +242,7 @@ class BenchTime:
     def order(self, levels: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the levels, (..., m), in order of rising friction force.
 
-        In this order no transient starts larger than the friction force itself; the transient of a
-        level that follows a larger one would.
+        In this order no transient is larger than the friction force.
         """
         chosen = np.asarray(levels, dtype=np.intp)
         rising = np.lexsort((self.frequency_hz[chosen], self.force[chosen]), axis=-1)
@@ -282,9 +280,9 @@ class BenchTime:
 def _ring_down(
     model: Model, values: Sequence[FloatArray], A: FloatArray, omega: FloatArray
 ) -> FloatArray:
-    """Return the factor by which free vibration of the plant shrinks in one cycle of the drive.
+    """Return the factor of the plant's free vibration in one cycle of the drive.
 
-    exp(-pi Im Z/(m omega^2)) with the mass m = -d Re Z/d(omega^2), at the steady amplitude.
+    It is exp(-pi Im Z/(m omega^2)) with the mass m = -d Re Z/d(omega^2), at the steady amplitude.
     """
     w = omega + 0.0 * A
     Z = model.stiffness(values, A, w)

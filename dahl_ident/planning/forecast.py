@@ -1,9 +1,9 @@
 """Uncertainties after measurements at candidates, in addition to earlier data.
 
 The model error of an earlier fit (:mod:`dahl_ident.diagnostics.prediction_error`) enters as W more
-parameters, shared by earlier and later levels: a level close to a measured one then teaches
-little, however long it is measured. Parameters that may be needed although the model fixes or omits
-them are forecast in a larger model.
+parameters, shared by earlier and later levels: a level close to a measured one then has little
+information, however long it is measured. Parameters that may be needed although the model fixes or
+omits them are forecast in a larger model.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from dahl_ident.planning.knowledge import Knowledge, spread, units_of
 from dahl_ident.planning.question import RESPONSE, PlanRequest, is_expanded, least_factor, powers_of
 from dahl_ident.units import DEFINITIONS
 
-NOTHING = 1e-8  # information added, so that a parameter without any still has a finite uncertainty
-_ROUNDING = 1e-14  # fraction of a parameter's information; less is rounding and could cancel
-_NONE = 1e12  # information that holds departures at zero if they are left out
+NOTHING = 1e-8  # information added, so that every parameter has a finite uncertainty
+_ROUNDING = 1e-14  # fraction of a parameter's information that is rounding
+_NONE = 1e12  # information with which departures are zero
 SEARCHED = 24  # draws that the search for levels averages over
-_SEARCHED_WITH_DEPARTURES = 2  # draws likewise: more parameters, near the fit's estimate
+_SEARCHED_WITH_DEPARTURES = 2  # the same with departures: more parameters, close to the estimate
 _PLACES = 24  # candidates over which the uncertainty of the response is averaged
 _UNKNOWN = 1e-2  # information for the search: a suspected parameter is known within a decade or so
 
@@ -36,9 +36,9 @@ _UNKNOWN = 1e-2  # information for the search: a suspected parameter is known wi
 class Expected:
     """Predicted relative standard uncertainty of a quantity; of ``"U(...)"`` the expanded one."""
 
-    value: float  # as the fit or posterior states it, or the middle of ranges; NaN of the response
-    # relative standard uncertainty from the earlier data, and with the plan's data; inf where
-    # nothing is known. Geometric mean over the draws
+    value: float  # of the fit or posterior, or the middle of ranges; NaN for the response
+    # relative standard uncertainty from the earlier data, and with the plan's data: the geometric
+    # mean over the draws; inf without any information
     before: float
     after: float
     low: float  # tenth and ninetieth percentile of `after` over the draws
@@ -48,23 +48,23 @@ class Expected:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Candidates, the information before them, and the uncertainties after some of them."""
+    """Candidates, and the uncertainties after measuring some of them, given earlier data."""
 
     knowledge: Knowledge  # before the plan
-    # with derivatives with respect to scaled parameters and W departures, Q together
+    # with derivatives with respect to scaled parameters and W departures, Q in all
     candidates: Candidates
-    before: FloatArray  # (S, Q, Q) information of the earlier data as their fit judges it
+    before: FloatArray  # (S, Q, Q) information of the earlier data as in their fit
     # (S, Q, Q) the same for the choice of levels: with ranges, and an assumed model error
     searched: FloatArray
     # (S, Q, c) relative changes of each quantity; the squares of several columns are added
     directions: Mapping[str, FloatArray]
     scatter: float  # standard deviation of ln gain and phase between runs
     model_error: str  # {"none", "assumed", "estimated"} of the earlier fit
-    departures: int  # W
+    departures: int  # number of departures, W
 
     @classmethod
     def of(cls, question: PlanRequest, candidates: Candidates) -> Forecast:
-        """Return the forecast of candidates and of the quantities asked for."""
+        """Return the forecast of a question's quantities for candidates."""
         knowledge, units = question.knowledge, question.knowledge.units
         rows, square = candidates.rows * units, np.outer(units, units)
         known = knowledge.information * square
@@ -129,16 +129,15 @@ class Forecast:
     def after(self, design: Design) -> tuple[dict[str, FloatArray], dict[str, float]]:
         """Return every quantity's uncertainty at every draw, and the share of scatter in it.
 
-        Expanded uncertainties have the coverage factor of the runs' degrees of freedom; noise has
-        many.
+        Expanded uncertainties have the coverage factor of the runs' degrees of freedom.
         """
         after = self.uncertainty(self.covariance(design, self.scatter))
         shares = dict.fromkeys(after, 0.0)
         if self.scatter > 0.0:
-            quiet = self.uncertainty(self.covariance(design, 0.0))
-            for name, least in quiet.items():
+            by_noise = self.uncertainty(self.covariance(design, 0.0))
+            for name, u in by_noise.items():
                 if np.isfinite(typical(after[name])):
-                    shares[name] = max(0.0, 1.0 - (typical(least) / typical(after[name])) ** 2)
+                    shares[name] = max(0.0, 1.0 - (typical(u) / typical(after[name])) ** 2)
         for name, share in shares.items():
             if is_expanded(name):
                 dof = max(design.runs - 1, 1) / share**2 if share > 0.0 else np.inf
@@ -169,20 +168,20 @@ def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | No
     errors = knowledge.errors
     if errors is None:
         return None
-    places = [errors.names.index(name) for name in knowledge.names]
+    indices = [errors.names.index(name) for name in knowledge.names]
     problem = knowledge.problem_at(candidates.level, candidates.frequency_hz, candidates.controlled)
-    predicted, changes = problem.prediction_and_jacobian(errors.theta[places])
+    predicted, changes = problem.prediction_and_jacobian(errors.theta[indices])
     amplitude = candidates.level
     if candidates.controlled == "force":
         amplitude = amplitude / np.abs(predicted)
-    # earlier responses that are receptances rise where the stiffness falls
+    # a receptance rises as the stiffness falls
     sign = DEFINITIONS[errors.problem.data.quantity].exponent
     slopes = np.zeros((candidates.count, len(errors.names)), dtype=np.complex128)
-    slopes[:, places] = sign * changes / predicted[:, None]
+    slopes[:, indices] = sign * changes / predicted[:, None]
     error = departures(errors, slopes, amplitude, 2.0 * np.pi * candidates.frequency_hz, predicted)
     if error is None:
         return None
-    kept = [*places, *range(len(errors.names), len(error.information))]
+    kept = [*indices, *range(len(errors.names), len(error.information))]
     return error._replace(
         columns=sign * error.columns, information=error.information[np.ix_(kept, kept)]
     )
@@ -191,9 +190,9 @@ def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | No
 def _joint(
     known: FloatArray, searched: FloatArray, error: Departures, units: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the information of parameters and departures: as the fit has it, and for the search.
+    """Return the information on parameters and departures: as in the fit, and for the search.
 
-    A model error that is only assumed is left out of the first.
+    The first does not include a model error that is only assumed.
     """
     P, W = len(units), error.columns.shape[-1]
     scale = np.concatenate([units, np.ones(W)])
@@ -209,19 +208,18 @@ def _joint(
 
 
 def _response(candidates: Candidates) -> FloatArray:
-    """Return changes of ln gain and phase, whose squares add up to their mean over places."""
+    """Return changes of ln gain and phase, whose summed squares are their mean over levels."""
     order = np.argsort(np.median(candidates.force, axis=0), kind="stable")
     part = candidates.only(order[spread(candidates.count, _PLACES)])
-    S, places, _, Q = part.rows.shape
-    changes = (part.rows / part.weight).reshape(S, -1, Q) / np.sqrt(2.0 * places)
+    S, levels, _, Q = part.rows.shape
+    changes = (part.rows / part.weight).reshape(S, -1, Q) / np.sqrt(2.0 * levels)
     return np.asarray(np.linalg.qr(changes, mode="r")).swapaxes(-1, -2)
 
 
 def covariance_of(M: FloatArray) -> FloatArray:
-    """Return the inverse of the information; unknown directions get a very large variance.
+    """Return the inverse of the information; undetermined directions have a very large variance.
 
-    In units in which the diagonal is 1, so that much information on one parameter does not hide
-    that there is none on another.
+    It is computed in units in which the diagonal is 1, against rounding.
     """
     size = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1) + NOTHING)
     units = size[..., :, None] * size[..., None, :]
@@ -230,7 +228,7 @@ def covariance_of(M: FloatArray) -> FloatArray:
 
 
 def typical(u: FloatArray) -> float:
-    """Return the geometric mean over draws, inf where nothing is known."""
+    """Return the geometric mean over draws, inf without any information."""
     return _shown(float(np.exp(np.mean(np.log(np.maximum(u, 1e-300))))))
 
 
@@ -241,15 +239,15 @@ def _shown(u: float) -> float:
 def forecast_of_suspects(
     question: PlanRequest, knowledge: Knowledge, candidates: Candidates
 ) -> Forecast:
-    """Return the forecast of suspected parameters in the larger model, at the draws given.
+    """Return the forecast of suspected parameters in the larger model, at the draws of `knowledge`.
 
-    Where displacement is controlled, the second harmonic counts in addition to the fundamental,
-    because only it shows asymmetry; the noise of a harmonic's force is that of the fundamental's.
+    If displacement is controlled, the second harmonic is included, because only it shows asymmetry;
+    the noise of a harmonic's force is that of the fundamental's.
     """
     larger, suspects = question.larger, question.suspects
     assert larger is not None
-    places = candidates.level, candidates.frequency_hz, candidates.controlled
-    problem = knowledge.problem_at(*places, model=larger)
+    levels = candidates.level, candidates.frequency_hz, candidates.controlled
+    problem = knowledge.problem_at(*levels, model=larger)
     drawn = dict(zip(knowledge.names, knowledge.values.T, strict=True))
     S, names, columns = len(knowledge.theta), problem.names, []
     for p in problem.parameters:
@@ -265,9 +263,9 @@ def forecast_of_suspects(
     even = candidates.controlled == "displacement" and any(e.answers(2) for e in larger.elements)
     rows = []
     for k in (1, 2) if even else (1,):
-        one = knowledge.problem_at(*places, model=larger, harmonic=k, noise="absolute")
+        harmonic_problem = knowledge.problem_at(*levels, model=larger, harmonic=k, noise="absolute")
         with np.errstate(divide="ignore", invalid="ignore"):
-            relative = one.prediction_jacobian(theta) / fundamental
+            relative = harmonic_problem.prediction_jacobian(theta) / fundamental
         relative[~np.isfinite(relative)] = 0.0  # within a gap there is no response
         parts = np.stack([relative.real, relative.imag], axis=2)
         rows.append(parts * units * candidates.weight)

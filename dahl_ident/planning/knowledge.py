@@ -1,6 +1,6 @@
 """Prior knowledge for a plan, from a model with ranges, a fit, or a posterior.
 
-All in search coordinates: the logarithm of positive parameters, the number itself for others.
+All in search coordinates: the logarithm of positive parameters, the value of others.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from dahl_ident.problem.space import Space
 from dahl_ident.sensors import Sensors
 from dahl_ident.units import Motion
 
-# Least relative standard deviation that the search takes from a range. The fit will not have the
-# range: levels chosen with it do not determine what the fit then has to.
-_LEANED_ON = 100.0
-_MANY = 2000  # draws for the covariance of a posterior: 3 % error of each uncertainty (two sigma)
+# Least relative standard deviation of a range in the search: the later fit does not have the range,
+# so levels must determine the parameters without it.
+_WIDEST = 100.0
+_MANY = 2000  # draws for the covariance of a posterior: each uncertainty is known to 3 %
 _NORMAL_RANGE = 2.0 * 1.959964  # width of a 95 % range in standard deviations
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -38,31 +38,30 @@ Ranges = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Knowledge:
-    """Draws of the free parameters and the information that earlier data hold on them."""
+    """Draws of the free parameters, and the information of earlier data on them."""
 
-    model: Model  # what is measured, and through what
-    parameters: tuple[Parameter, ...]  # the free ones, P of them
+    model: Model
+    parameters: tuple[Parameter, ...]  # the P free ones
     theta: FloatArray  # (S, P) draws, search coordinates
-    stated: FloatArray  # (P,) values that the source states, of ranges the middle; NaN without any
-    # (S, P, P) of the data measured before, at each draw, and of assumed values such as the
-    # exponent of ``Dahl()``, which are parameters here as they are in a fit's uncertainty
+    stated: FloatArray  # (P,) values of the source, or middles of ranges; NaN without any
+    # (S, P, P) of the earlier data, at each draw, and of assumed values such as the exponent of
+    # ``Dahl()``, which are parameters here as in the uncertainty of a fit
     information: FloatArray
-    # (P,) information of the ranges, each taken as very wide: it keeps the search defined where a
-    # parameter cannot be determined, and a predicted uncertainty does not include it
+    # (P,) information of the ranges, each taken as very wide: the search needs it if a parameter
+    # cannot be determined; predicted uncertainties do not include it
     prior: FloatArray
     assumed: tuple[str, ...] = ()  # names of the assumed parameters
     sensors: Sensors | None = None
     motion: Motion = "translation"
     # standard deviation of ln gain and of phase of a row of earlier data
     row_noise: float | None = None
-    row_cycles: float = 1.0  # cycles that such a row averages, if the data state it; else 1
+    row_cycles: float = 1.0  # cycles averaged in such a row, if the data state it
     problem: TableProblem | None = None  # of the earlier data
     scatter: float = 0.0  # standard deviation of ln gain and phase between runs in the earlier data
     errors: ErrorModel | None = None  # of an earlier fit
     # standard deviation of a sample of force in earlier records, N
     sample_noise: float | None = None
-    # {"exact", "describing function"} how the response to a force that is held is predicted
-    steady: Steady = "exact"
+    steady: Steady = "exact"  # how responses to a controlled force are predicted
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +80,7 @@ class Knowledge:
 
     @property
     def units(self) -> FloatArray:
-        """Scale of each search coordinate: 1 for logarithms, else the size of its draws, (P,)."""
+        """Scale of each search coordinate, (P,): 1 for logarithms, the size of draws for others."""
         return units_of(self.parameters, self.theta)
 
     def only(self, draws: NDArray[np.intp]) -> Knowledge:
@@ -89,7 +88,7 @@ class Knowledge:
         return replace(self, theta=self.theta[draws], information=self.information[draws])
 
     def thinned(self, most: int) -> Knowledge:
-        """Return the knowledge at no more than `most` of the draws, evenly spread."""
+        """Return the knowledge at `most` of the draws at most, evenly spread."""
         return self.only(spread(len(self.theta), most))
 
     def problem_at(
@@ -102,18 +101,18 @@ class Knowledge:
         harmonic: int = 1,
         noise: str = "relative",
     ) -> TableProblem:
-        """Return the problem of levels whose response is not yet measured."""
-        held: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
+        """Return the problem of levels whose responses are not measured yet."""
+        level: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
         data = FrequencyResponse(
             frequency_hz, np.ones(len(levels)), controlled=controlled, motion=self.motion,
-            harmonic=harmonic, **held,
+            harmonic=harmonic, **level,
         )  # fmt: skip
         return TableProblem(
             data, model or self.model, noise=noise, sensors=self.sensors, steady=self.steady
         )
 
     def model_values(self) -> list[FloatArray]:
-        """Return every parameter of the model at every draw, shape (S, 1) each, or ()."""
+        """Return every parameter of the model at every draw, (S, 1), or () if it is fixed."""
         drawn = dict(zip(self.names, self.values.T, strict=True))
         return [
             drawn[p.name][:, None] if p.free else np.asarray(p.value) for p in self.model.parameters
@@ -150,7 +149,7 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
             source, source.draws(_MANY, seed) if sampled else None, ranges, draws, rng
         )
     centre, std = _moments(problem.parameters, ranges)
-    prior = _leaned_on(problem.parameters, centre, std)
+    prior = _of_ranges(problem.parameters, centre, std)
     if sampled:
         values, P = np.asarray(source.draws(draws, seed)), len(problem.names)
         scale: Any = values[:, P] if values.shape[1] > P else np.ones(draws)
@@ -171,7 +170,6 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
             return _of_errors(source, prior, draws, rng)
         at = np.where(finite, at, centre)
         scale = optimum.scale if np.isfinite(optimum.scale) else 1.0
-        # a range counts only where the data say nothing; elsewhere the estimate is the centre
         covariance = np.linalg.inv(problem.information(at, scale) + np.diag(1.0 / std**2))
         drawn = _drawn(rng, at, covariance, draws, problem.parameters)
     model, assumed = _with_assumed(problem.model)
@@ -209,7 +207,7 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
         model, parameters, _among(parameters, names, theta),
         Space(parameters).to_values(_among(parameters, names, centre)),
         _repeated(_of_assumed(parameters, assumed), draws),
-        _among(parameters, names, _leaned_on(free, centre, std), 0.0), tuple(assumed),
+        _among(parameters, names, _of_ranges(free, centre, std), 0.0), tuple(assumed),
     )  # fmt: skip
 
 
@@ -259,9 +257,9 @@ def _of_records(
             raise ValidationError("plan: the fit does not determine its parameters; give the model")
         theta = _drawn(rng, space.to_search(best), covariance, draws, parameters)
     else:
-        every = space.to_search(values[:, :P])
-        covariance = np.atleast_2d(np.cov(every, rowvar=False))
-        theta = _within(every[rng.integers(len(every), size=draws)], parameters)
+        posterior = space.to_search(values[:, :P])
+        covariance = np.atleast_2d(np.cov(posterior, rowvar=False))
+        theta = _within(posterior[rng.integers(len(posterior), size=draws)], parameters)
     return Knowledge(
         problem.model, parameters, theta, _stated(source, parameters),
         _repeated(np.linalg.inv(covariance), draws), np.zeros(P),
@@ -279,7 +277,7 @@ def _drawn(
 
 
 def _within(theta: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
-    """Return draws moved into the parameters' bounds."""
+    """Return draws clipped to the parameters' bounds."""
     return np.clip(theta, *Space(parameters).bounds)
 
 
@@ -289,7 +287,7 @@ def _repeated(information: Any, draws: int) -> FloatArray:
 
 
 def _stated(source: Any, parameters: Sequence[Parameter]) -> FloatArray:
-    """Return the values that a fit or a posterior states, (P,); NaN where they are at a limit."""
+    """Return the values of a fit or posterior, (P,); NaN at a limit."""
     values = np.array([source.params[p.name].value for p in parameters])
     return np.where(np.isfinite(values), values, np.nan)
 
@@ -314,16 +312,19 @@ def _among(
     part: FloatArray,
     others: float | None = None,
 ) -> FloatArray:
-    """Return numbers of all parameters, (..., P), from those of some; the others' coordinates."""
-    every = np.array([np.log(p.value or 1.0) if others is None else others for p in parameters])
-    every = every * np.ones((*part.shape[:-1], 1))
-    every[..., [[p.name for p in parameters].index(name) for name in names]] = part
-    return every
+    """Return numbers of all parameters, (..., P), from those of some.
+
+    The others have the number `others`, or else the logarithm of their value.
+    """
+    numbers = np.array([np.log(p.value or 1.0) if others is None else others for p in parameters])
+    numbers = numbers * np.ones((*part.shape[:-1], 1))
+    numbers[..., [[p.name for p in parameters].index(name) for name in names]] = part
+    return numbers
 
 
-def _leaned_on(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
-    """Return the information of ranges, none taken as narrower than `_LEANED_ON`."""
-    least = _LEANED_ON * np.where(Space(parameters).positive, 1.0, np.abs(centre))
+def _of_ranges(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
+    """Return the information of ranges, none of them narrower than `_WIDEST`."""
+    least = _WIDEST * np.where(Space(parameters).positive, 1.0, np.abs(centre))
     return np.asarray(1.0 / np.maximum(std, least) ** 2)
 
 
@@ -352,7 +353,7 @@ def _moments(parameters: Sequence[Parameter], ranges: Ranges) -> tuple[FloatArra
 
 
 def _row_noise(problem: TableProblem, scale: float) -> tuple[float, float]:
-    """Return the relative noise of a row of the data, and the cycles that it averages."""
+    """Return the relative noise of a row of the data, and the number of cycles averaged in it."""
     data, size = problem.data, np.abs(problem.data.response)
     if problem.noise == "relative":
         return scale, 1.0

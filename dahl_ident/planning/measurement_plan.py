@@ -1,4 +1,4 @@
-"""A plan: levels in the order of the run, what they will determine, and what prevents the rest."""
+"""A plan: levels in the order of the run, predicted uncertainties, and limits that prevent more."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
     from dahl_ident.plots import Axes
 
-_CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the picture
+_CURVE = (0.25, 0.5, 1.0, 2.0, 4.0)  # multiples of the plan's time, in the plot
 _UNDETERMINED = 0.25  # relative standard uncertainty above which a parameter is not determined
 _FEW_LEVELS = 60  # candidates from which the effect of a wider limit is computed
-_NEARLY = 0.99  # fraction of the longest time that counts as all: whole cycles leave some over
-_RELAXED = 10.0  # factor by which a limit is widened to see whether it prevents anything
+_NEARLY = 0.99  # fraction of the longest time that counts as all of it, because cycles are whole
+_RELAXED = 10.0  # factor by which a limit is widened to find its effect
 _MODEL_ERROR = {
     "none": "the model is right",
     "estimated": "the model errs as the earlier data show",
@@ -49,11 +49,10 @@ class PlanStep:
 
     level: float  # amplitude of displacement (m) or drive (N), zero to peak
     frequency_hz: float  # hz; one over the period of a motion
-    settling_cycles: int  # cycles before measuring, and measured: the repeats of a motion
-    measured_cycles: int
+    settling_cycles: int  # cycles before measuring
+    measured_cycles: int  # of a motion, its repeats
     seconds: float  # change-over, settling and measuring
-    # the motion in time that is repeated, None for a sine
-    motion: trajectories.PlannedMotion | None = None
+    motion: PlannedMotion | None = None  # the motion in time that is repeated, None for a sine
 
 
 @dataclass(frozen=True)
@@ -65,21 +64,21 @@ class Plan:
     Attributes
     ----------
     controlled : {"displacement", "force"}
-        What the levels are amplitudes of.
+        Quantity of which the levels are amplitudes.
     steps : tuple of PlanStep
-        One run, in its order.
+        Levels or motions of one run, in order.
     runs : int
         Number of equal runs.
     seconds : float
-        Time of everything.
+        Total time.
     expected : mapping of str to Expected
         Predicted uncertainty of every parameter and target; the ranges are not used.
     target : mapping of str to float
-        Relative uncertainties that were wanted; empty where time was given.
+        Relative uncertainties that were asked for; empty if time was given.
     reached : bool
-        Whether all of them, and those of suspected parameters, are predicted to be reached.
+        Whether all targets, and those of suspected parameters, are predicted to be reached.
     undetermined : tuple of str
-        What the plan does not determine, and which limit prevents it.
+        Quantities that the plan does not determine, and the limit that prevents it.
     assumptions : tuple of str
         Assumptions of the prediction.
 
@@ -113,7 +112,7 @@ class Plan:
         Returns
         -------
         pandas.DataFrame
-            One row a level or motion, in the order of the run.
+            One row for each level or motion, in the order of the run.
         """
         import pandas as pd
 
@@ -129,7 +128,7 @@ class Plan:
         """
         import pandas as pd
 
-        rows = {name: vars(one) for name, one in self.expected.items()}
+        rows = {name: vars(expected) for name, expected in self.expected.items()}
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("quantity")
 
     def to_dict(self) -> dict[str, Any]:
@@ -139,7 +138,7 @@ class Plan:
             "runs": self.runs,
             "seconds": self.seconds,
             "steps": [_row(step) for step in self.steps],
-            "expected": {name: dict(vars(one)) for name, one in self.expected.items()},
+            "expected": {name: dict(vars(e)) for name, e in self.expected.items()},
             "target": dict(self.target),
             "reached": self.reached,
             "undetermined": list(self.undetermined),
@@ -173,22 +172,22 @@ class Plan:
         path : path
             Ending in ``.csv``.
         sample_rate : float
-            Samples a second; at least ten a cycle of the highest frequency, or ten in the time
-            of a trapezoid from end to end.
+            Samples a second: at least ten in a cycle of the highest frequency, or in a stroke of
+            a trapezoid.
         overwrite : bool, default False
-            Replace a file that is there already.
+            Replace an existing file.
 
         Returns
         -------
         Path
-            The file. ``time [s]``, then the displacement (m) or the drive (N), then the number of
-            the step, from 1, and 1 where the sample is meant to be measured.
+            The file, with ``time [s]``, the displacement (m) or the drive (N), the number of the
+            step, from 1, and 1 for samples to be measured, otherwise 0.
 
         Raises
         ------
         ValidationError
-            If there are fewer than ten samples a cycle, or the move to a motion's start takes more
-            speed or acceleration than the limits allow.
+            If there are fewer than ten samples a cycle, or the move to the start of a motion
+            exceeds the limits of speed or acceleration.
         """
         import pandas as pd
 
@@ -205,7 +204,7 @@ class Plan:
         if motions:
             self._check_moves(motions)
             time = np.arange(int(np.floor(self.seconds * rate + 1e-6)) + 1) / rate
-            repeats = [one.measured_cycles for one in self.steps]
+            repeats = [step.measured_cycles for step in self.steps]
             value, step, measured = trajectories.course(motions, repeats, self.change_over, time)
         else:
             wave = self.waveform()
@@ -215,8 +214,8 @@ class Plan:
             for i, window in enumerate(wave.windows, start=1):
                 measured[(time >= window.start) & (time < window.stop)] = True
                 step[time >= window.stop] = min(i + 1, len(wave.windows))
-        what = "drive" if self.controlled == "force" else "displacement"
-        columns = {"time [s]": time, f"{what} [{self._unit}]": value, "step": step}
+        quantity = "drive" if self.controlled == "force" else "displacement"
+        columns = {"time [s]": time, f"{quantity} [{self._unit}]": value, "step": step}
         frame = pd.DataFrame(columns | {"measured": measured.astype(int)})
         place = place_of(path, "a waveform", (".csv",))
         write_whole(place, frame.to_csv(index=False).encode(), overwrite=overwrite)
@@ -224,11 +223,11 @@ class Plan:
 
     def _check_moves(self, motions: list[trajectories.PlannedMotion]) -> None:
         """Check that the moves to the motions' starts are within the limits of the exciter."""
-        limits, place = self.search.question.limits, 0.0
+        limits, position = self.search.question.limits, 0.0
         for i, motion in enumerate(motions, start=1):
             start = float(motion.displacement(np.zeros(1))[0])
             least = trajectories.seconds_of_move(
-                abs(start - place), limits.speed[1], limits.acceleration[1]
+                abs(start - position), limits.speed[1], limits.acceleration[1]
             )
             if self.change_over < least:
                 raise ValidationError(
@@ -236,7 +235,7 @@ class Plan:
                     f"{i} takes {least:.3g} s within the limits of speed and acceleration; plan "
                     "with a longer change_over"
                 )
-            place = start
+            position = start
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the plan as JSON.
@@ -246,7 +245,7 @@ class Plan:
         path : path
             Ending in ``.json``.
         overwrite : bool, default False
-            Replace a file that is there already.
+            Replace an existing file.
 
         Returns
         -------
@@ -260,30 +259,29 @@ class Plan:
     def curves(self) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
         """Return time, uncertainty by plans and by a logarithmic grid, for each quantity.
 
-        The quantities are the targets, or all parameters where time was given. The grid has ten
-        levels with equal cycles; NaN where the time is too short. At the plan's own time, its
-        uncertainties are those of the plan.
+        The quantities are the targets, or all parameters if time was given. The grid has ten levels
+        with equal cycles; uncertainties are NaN if the time is too short.
         """
         times = self.seconds * np.array(_CURVE)
         search = self.search
         planned = [self.expected if t == self.seconds else search.expected_after(t) for t in times]
-        even = [search.expected_after(t, grid=True) for t in times]
+        gridded = [search.expected_after(t, grid=True) for t in times]
 
         def after(name: str, plans: Sequence[Mapping[str, Expected]]) -> FloatArray:
             return np.array([e[name].after if e else np.nan for e in plans])
 
         return {
-            name: (times, after(name, planned), after(name, even))
+            name: (times, after(name, planned), after(name, gridded))
             for name in self.target or self.expected
         }
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the predicted uncertainty against bench time, next to that of a logarithmic grid.
+        """Plot the predicted uncertainty over bench time, and that of a logarithmic grid.
 
         Parameters
         ----------
         ax : matplotlib Axes, optional
-            New where left out.
+            Created if left out.
 
         Returns
         -------
@@ -329,13 +327,13 @@ class Plan:
         )
 
     def _spare(self) -> list[str]:
-        """Return what the remaining time would gain, and what to use it for."""
+        """Return the gain if the remaining time is used, and how to use it."""
         time = self.search.question.limits.time
         if not (self.reached and self.seconds < 0.5 * time < np.inf):
             return []
-        whole = self.search.expected_after(time)
-        bought = ", ".join(f"{name} {percent(whole[name].after, 3)}" for name in self.target)
-        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {bought}."]
+        with_all = self.search.expected_after(time)
+        gain = ", ".join(f"{name} {percent(with_all[name].after, 3)}" for name in self.target)
+        lines = [f"{time - self.seconds:.4g} s are left; the whole time would give {gain}."]
         if self.runs == 1:
             lines.append(
                 f"Repeat the plan in {min(5, int(time // self.seconds))} runs, each a new "
@@ -370,7 +368,7 @@ class Plan:
 
 
 def _aligned(rows: Sequence[Sequence[str]], first: int, widths: Sequence[int]) -> list[str]:
-    """Return rows of text, the first column to the left."""
+    """Return rows of text, with the first column left-aligned."""
     return [
         f"{row[0]:{first}}" + "".join(f"{t:>{w}}" for t, w in zip(row[1:], widths, strict=True))
         for row in rows
@@ -378,7 +376,7 @@ def _aligned(rows: Sequence[Sequence[str]], first: int, widths: Sequence[int]) -
 
 
 def _row(step: PlanStep) -> dict[str, Any]:
-    """Return the fields of a step; of a motion what describes it."""
+    """Return the fields of a step; for a motion, its kind and parameters."""
     fields = dict(vars(step))
     motion = fields.pop("motion")
     if motion is None:
@@ -395,7 +393,7 @@ def options_of(
     count: int = _FEW_LEVELS,
     lasting: float | None = None,
 ) -> Candidates:
-    """Return the candidates of a question within limits; motions repeated for `lasting` s."""
+    """Return the candidates within limits; motions are repeated for `lasting` s."""
     q = question
     if q.recorded is None:
         return evaluate(q, limits, *grid(q, limits, count))
@@ -432,33 +430,33 @@ def undetermined(
 
 
 def _prevented_by(search: Search, name: str) -> str:
-    """Return which limit, ten times wider, would help a quantity most."""
-    q, most = search.question, {}
+    """Return the limit that, ten times wider, would reduce an uncertainty most."""
+    q, widened = search.question, {}
     if name not in search.forecast.directions:
         return "give more time or wider limits"
-    base = _within_reach(q, name, q.limits)
+    base = _least_uncertainty(q, name, q.limits)
     for limit in q.limits.stated:
         low, high = getattr(q.limits, limit)
         wider: dict[str, Any] = {limit: (low / _RELAXED, high * _RELAXED)}
         with suppress(ValidationError):
-            most[limit] = _within_reach(q, name, replace(q.limits, **wider))
+            widened[limit] = _least_uncertainty(q, name, replace(q.limits, **wider))
     if np.isfinite(q.limits.time):
-        most["time"] = base / np.sqrt(_RELAXED)
-    if not most:
+        widened["time"] = base / np.sqrt(_RELAXED)
+    if not widened:
         return "no limit was stated that prevents it"
-    helps = min(most, key=most.__getitem__)
-    if not most[helps] < 0.8 * base:
+    best = min(widened, key=widened.__getitem__)
+    if not widened[best] < 0.8 * base:
         if search.forecast.model_error == "estimated":
             return "no limit alone prevents it: use a model that describes the data better"
         return "no limit alone prevents it: reduce the noise, or fix a parameter"
     return (
-        f"the limit of {helps.removesuffix('_hz')} prevents it: ten times wider, it would be "
-        f"{base / most[helps]:.2g} times smaller"
+        f"the limit of {best.removesuffix('_hz')} prevents it: ten times wider, it would be "
+        f"{base / widened[best]:.2g} times smaller"
     )
 
 
-def _within_reach(question: PlanRequest, name: str, limits: BenchLimits) -> float:
-    """Return the uncertainty of one quantity by the best continuous design."""
+def _least_uncertainty(question: PlanRequest, name: str, limits: BenchLimits) -> float:
+    """Return the uncertainty of a quantity with the best continuous design."""
     options = options_of(question, limits)
     few = Forecast.of(question, options).thinned()
     term = few.term({name: 1.0}, few.before + NOTHING * np.eye(few.before.shape[-1]))
@@ -478,7 +476,7 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
             f"{q.recorded.sample_rate:g} samples a second; a record of each motion is fitted "
             "with its initial state, offset and drift",
         )
-        within = [f"{name} within the range that a fit assumes" for name in known.assumed]
+        ranges = [f"{name} within the range that a fit assumes" for name in known.assumed]
     else:
         noise = (
             f"noise of one cycle: {percent(q.noise.relative, 3)} of the response"
@@ -490,14 +488,14 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
             if q.scatter
             else "no scatter between runs",
         )
-        within = [
+        ranges = [
             f"{', '.join(known.assumed)} within the range that a fit assumes (fix it in the model "
             "to plan without)"
         ] * bool(known.assumed)
-    most = design.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time)
+    is_longest = design.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time)
     return (
-        *noise, *within, _MODEL_ERROR[search.forecast.model_error], "calibrations are exact",
-        *["no plan takes more than 30 days unless a time is given"] * most,
+        *noise, *ranges, _MODEL_ERROR[search.forecast.model_error], "calibrations are exact",
+        *["no plan takes more than 30 days unless a time is given"] * is_longest,
     )  # fmt: skip
 
 

@@ -23,13 +23,13 @@ _EXPANDED = re.compile(r"U\((?P<quantity>.+)\)")
 
 
 def limit(name: str) -> str:
-    """Return how a limit of the bench is given, for messages."""
+    """Return how the user gives a limit of the bench, for messages."""
     return spelled(f"limits[{name!r}]", f"--{name.removesuffix('_hz')}")
 
 
 @dataclass(frozen=True)
 class BenchLimits:
-    """Lowest and highest values, zero-to-peak, SI, and the seconds for everything."""
+    """Lowest and highest values, zero-to-peak, SI units, and the total time, s."""
 
     displacement: tuple[float, float] = (0.0, np.inf)
     force: tuple[float, float] = (0.0, np.inf)
@@ -55,7 +55,7 @@ class BenchLimits:
         checked: dict[str, Any] = {}
         for name, value in limits.items():
             if name == "time":
-                checked[name] = positive_number(value, limit("time"))
+                checked[name] = positive_number(value, limit(name))
                 continue
             ends = positive_array(value, limit(name))
             pair = [0.0, float(ends)] if ends.ndim == 0 else ends.tolist()
@@ -68,7 +68,7 @@ class BenchLimits:
 
     @property
     def stated(self) -> tuple[str, ...]:
-        """Names of the limits that were given, time aside."""
+        """Names of the limits that were given, except time."""
         return tuple(n for n, e in vars(self).items() if n != "time" and e != (0.0, np.inf))
 
 
@@ -97,10 +97,10 @@ class RecordedForce:
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """The arguments of a plan in checked form; `recorded` and `motions` of motions in time.
+    """The checked arguments of a plan; `recorded` and `motions` are those of motions in time.
 
-    `target` has the standard uncertainty of each quantity, 1 where only names were given;
-    `has_numbers` says which it is.
+    `target` has the standard uncertainty of each quantity, or 1 if only names were given, in which
+    case `has_numbers` is False.
     """
 
     knowledge: Knowledge
@@ -164,22 +164,21 @@ def recorded_force(
 
 
 def motions_among(candidates: Any) -> str | tuple[PlannedMotion, ...]:
-    """Return the motions in time among the candidates' forms, empty for sines."""
+    """Return the motions in time that `candidates` has; empty for sines."""
     if isinstance(candidates, int):
         return ()
-    named = isinstance(candidates, str)
-    if named and candidates in KINDS:
-        return str(candidates)
-    if named or not np.iterable(candidates):
+    if isinstance(candidates, str) and candidates in KINDS:
+        return candidates
+    if isinstance(candidates, str) or not np.iterable(candidates):
         raise ValidationError(
             f"candidates is {candidates!r}; expected a number, pairs of level and frequency, a "
             f"list of motions, or one of {', '.join(KINDS)}"
         )
     listed = tuple(candidates)
-    moving = [isinstance(one, PlannedMotion) for one in listed]
-    if any(moving) and not all(moving):
+    are_motions = [isinstance(candidate, PlannedMotion) for candidate in listed]
+    if any(are_motions) and not all(are_motions):
         raise ValidationError("candidates holds motions and others; plan one or the other")
-    return listed if any(moving) else ()
+    return listed if any(are_motions) else ()
 
 
 def target_of(target: Any) -> tuple[dict[str, float], bool]:
@@ -226,7 +225,7 @@ def is_expanded(name: str) -> bool:
 
 
 def least_factor(name: str) -> float:
-    """Return the coverage factor of many degrees of freedom for an expanded uncertainty, else 1."""
+    """Return the least coverage factor of an expanded uncertainty; 1 for others."""
     return coverage_factor(np.inf) if is_expanded(name) else 1.0
 
 
@@ -236,7 +235,7 @@ def powers_of(expression: str, names: tuple[str, ...]) -> FloatArray:
     expanded = _EXPANDED.fullmatch(text)
     product = expanded["quantity"] if expanded else text
     powers = np.zeros(len(names))
-    for place, part in enumerate(product.split("/")):
+    for i, part in enumerate(product.split("/")):
         for factor in part.split("*"):
             match = _POWER.fullmatch(factor)
             if match is None:
@@ -250,5 +249,5 @@ def powers_of(expression: str, names: tuple[str, ...]) -> FloatArray:
                     f"target names {name!r}; expected a product of powers, such as 'f_max/sigma', "
                     f"of {choices(names, name)}"
                 )
-            powers[names.index(name)] += float(match["power"] or 1.0) * (-1.0 if place else 1.0)
+            powers[names.index(name)] += float(match["power"] or 1.0) * (-1.0 if i else 1.0)
     return powers
