@@ -95,7 +95,7 @@ class TestStill:
         data = di.FrequencyResponse.concatenate(tests)
         return fit(data.select(rows=data.harmonic <= harmonics), di.Dahl())
 
-    @pytest.mark.parametrize("harmonics", [1, 3])
+    @pytest.mark.parametrize("harmonics", [pytest.param(1, marks=pytest.mark.long), 3])
     def test_when_a_test_is_left_out(self, tests, harmonics):
         whole = self.of(tests, harmonics)
         others = [self.of([*tests[:i], *tests[i + 1 :]], harmonics) for i in range(len(tests))]

@@ -88,7 +88,9 @@ def test_magneto_rheological_dampers_ask_for_a_power_law(pattern, most):
             "ensaio.A.*.mat", False, ("f_max", "sigma", "alpha", "damping"), marks=pytest.mark.long
         ),
         # the test of two rows holds most of what tells friction from damping
-        ("ensaio.vali.*.mat", True, ("f_max", "sigma", "damping")),
+        pytest.param(
+            "ensaio.vali.*.mat", True, ("f_max", "sigma", "damping"), marks=pytest.mark.long
+        ),
     ],
 )
 def test_no_test_left_out_lets_an_estimate_jump(pattern, labelled, names):

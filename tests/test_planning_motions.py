@@ -113,7 +113,9 @@ class TestPlan:
         assert plan.seconds <= time
         assert own <= best + 0.03  # 1.5 % of a standard uncertainty
 
-    @pytest.mark.parametrize("kind", ["trapezoid", "multisine"])
+    @pytest.mark.parametrize(
+        "kind", ["trapezoid", pytest.param("multisine", marks=pytest.mark.long)]
+    )
     def test_a_target_is_reached_within_every_limit(self, kind):
         plan = _plan(kind, {"force": 0.11, "speed": 0.03}, target={"f_max": 0.002, "sigma": 0.003})
         assert plan.reached

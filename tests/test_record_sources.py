@@ -398,7 +398,7 @@ OTHER_LAWS = {
 }
 
 
-@pytest.mark.parametrize("samples", [300, 600])
+@pytest.mark.parametrize("samples", [pytest.param(300, marks=pytest.mark.long), 600])
 @pytest.mark.parametrize("other", OTHER_LAWS)
 def test_a_short_record_of_another_law_is_not_trusted(other, samples):
     """Most residuals are below 3 % rms, and slow: worth 13 to 80 samples.
