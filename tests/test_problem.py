@@ -344,6 +344,26 @@ def test_rates_of_either_sign_are_numbers_near_zero_and_logarithms_far_off(chann
         assert problem.to_values(problem.to_search(values)) == pytest.approx(values)
 
 
+@pytest.mark.parametrize(
+    ("noise", "scale"), [("relative", 0.02), ("absolute", 0.3), ("measured", 1.0)]
+)
+def test_repetitions_scatter_as_the_noise_does(noise, scale):
+    problem = TableProblem(data(), FREE, noise=noise)
+    theta = problem.to_search(TRUE)
+    draws = problem.draw(theta, scale, 4000, np.random.default_rng(6))
+    error = draws - problem.predict(theta)
+    if noise == "relative":
+        error = np.log(draws / problem.predict(theta))
+    covariance = np.broadcast_to(scale**2 * np.eye(2), (n, 2, 2))
+    if noise == "measured":
+        covariance = data().covariance
+    parts = np.stack([error.real, error.imag], axis=-1)
+    found = np.einsum("ski,skj->kij", parts, parts) / len(parts)
+    size = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    near = 6.0 / len(parts) ** 0.5  # of 18 numbers, one is farther off once in a million times
+    assert (np.abs(found - covariance) < near * size[:, :, None] * size[:, None, :]).all()
+
+
 def test_profiled_likelihood_is_its_maximum_over_the_scale():
     problem = TableProblem(data(), FREE, noise="relative")
     theta = problem.to_search(np.array(TRUE) * 1.05)
