@@ -101,7 +101,7 @@ def test_an_unknown_name_lists_those_there_are():
 def test_a_changed_or_missing_file_is_not_loaded(tmp_path, monkeypatch):
     for name in ("noisy.json", "noisy.csv"):
         (tmp_path / name).write_bytes((FOLDER / name).read_bytes())
-    monkeypatch.setattr(shipped, "_PLACES", (tmp_path / "nowhere", tmp_path, FOLDER))
+    monkeypatch.setattr(shipped, "_FOLDERS", (tmp_path / "nowhere", tmp_path, FOLDER))
     assert loaded_table("noisy").n == 30  # the first place that is there
     with (tmp_path / "noisy.csv").open("a") as file:
         file.write("\n")
@@ -113,7 +113,7 @@ def test_a_changed_or_missing_file_is_not_loaded(tmp_path, monkeypatch):
 
 
 def test_sets_that_are_nowhere_are_missed_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(shipped, "_PLACES", (tmp_path / "a", tmp_path / "b"))
+    monkeypatch.setattr(shipped, "_FOLDERS", (tmp_path / "a", tmp_path / "b"))
     with pytest.raises(DataError, match="the synthetic data sets are in none of"):
         load_dataset("noisy")
 

@@ -1,10 +1,11 @@
-"""From what the forms say to the commands, and the Python, that do it."""
+"""Conversion of the entries of the forms to commands, and to the equivalent Python program."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -38,24 +39,24 @@ _LAWS: tuple[tuple[str, str, Any], ...] = (
     ("LuGre", "friction that depends on the speed", LuGre(0.7, 3.0, 1.4, 0.2, 0.05, 0.05)),
     ("power damper", "damping force as a power of the speed", PowerDamper(0.7, 0.3)),
 )  # fmt: skip
-"""Name and use of each law, and one whose loop is drawn over a displacement of amplitude 1."""
+"""Name and use of each law, and an element whose loop is drawn for an amplitude of 1."""
 LINEAR = {"mass": Mass, "damping": Damper, "stiffness": Spring}
 """The options of elements without friction, and their classes."""
-OF_TABLES = ("quantity", "amplitude", "frequency", "sweep", "level_from_name", "controlled")
-OF_RECORDS = ("sample_rate",)
-OF_BOTH = ("drive", "drive_factor")
+TABLE_OPTIONS = ("quantity", "amplitude", "frequency", "sweep", "level_from_name", "controlled")
+RECORD_OPTIONS = ("sample_rate",)
+COMMON_OPTIONS = ("drive", "drive_factor")
 ROLES = (
     "", "time", "displacement", "velocity", "acceleration", "force", "drive", "frequency",
     "amplitude", "response", "real", "imag", "gain", "gain_db", "phase", "level", "run",
     "controlled", "harmonic",
 )  # fmt: skip
-"""What a channel can mean; "" is what its name says, or nothing."""
+"""Possible roles of a channel; "" is that of its name, or none."""
 _COLUMNS, _REPORT = "columns.toml", "report.toml"
 REPORTS = ("report.html", "report.pdf")
 
 
 def laws(files: Sequence[str]) -> list[dict[str, str]]:
-    """Return the laws that can be chosen, those of the user's files included."""
+    """Return the laws that can be chosen, including those in the user's files."""
     known = [{"kind": e.kind, "name": name, "use": use, "drawn": "yes"} for name, use, e in _LAWS]
     for file in files:
         load_laws(Path(file))
@@ -67,15 +68,15 @@ def laws(files: Sequence[str]) -> list[dict[str, str]]:
 
 
 @cache
-def loop_of(kind: str) -> str | None:
-    """Return a loop of a law as SVG, None where it has no picture."""
+def loop_picture(kind: str) -> str | None:
+    """Return a picture of a law's loop as SVG, None for laws of the user."""
     element = next((element for _, _, element in _LAWS if element.kind == kind), None)
     if element is None:
         return None
-    turns = 2.0 * np.pi * np.linspace(0.0, 2.25, 451)
+    theta = 2.0 * np.pi * np.linspace(0.0, 2.25, 451)
     values = [np.asarray(parameter.value) for parameter in element.parameters]
-    force = element.force_history(values, np.sin(turns), np.cos(turns))[100:]
-    x, y = 50.0 + 42.0 * np.sin(turns[100:]), 34.0 - 28.0 * force / np.abs(force).max()
+    force = element.force_history(values, np.sin(theta), np.cos(theta))[100:]
+    x, y = 50.0 + 42.0 * np.sin(theta[100:]), 34.0 - 28.0 * force / np.abs(force).max()
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
     return (
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 68" width="100" height="68">'
@@ -86,7 +87,7 @@ def loop_of(kind: str) -> str | None:
 
 @dataclass(frozen=True)
 class JobStep:
-    """A command of a job: what it does, and its words after ``dahl-ident``."""
+    """A command of a job: its title, and its words after ``dahl-ident``."""
 
     title: str
     words: tuple[str, ...]
@@ -94,17 +95,21 @@ class JobStep:
 
 def fit_steps(work: Mapping[str, Any], folder: Path, run: str, *, metadata: bool) -> list[JobStep]:
     """Return the commands of a fit and its report, in the folder of the work."""
-    source, before = _source(work, folder, run)
-    laws = [word for file in work["laws"] for word in ("--laws", file)]
-    known = ["--metadata", _REPORT] if metadata else []
-    reports = [word for name in REPORTS for word in ("-o", f"{run}/{name}")]
+    source, extraction = _source(work, folder, run)
+    laws = _law_options(work["laws"])
+    report_data = ["--metadata", _REPORT] if metadata else []
+    outputs = [word for name in REPORTS for word in ("-o", f"{run}/{name}")]
     saved = f"{run}/fit.json"
-    fit = ("fit", *source, *laws, *_model_words(work["model"]), *known, "--save", saved)
+    fit = ("fit", *source, *laws, *_model_words(work["model"]), *report_data, "--save", saved)
     return [
-        *before,
+        *extraction,
         JobStep("Fit", fit),
-        JobStep("Report", ("report", saved, *laws, *known, *reports)),
+        JobStep("Report", ("report", saved, *laws, *report_data, *outputs)),
     ]
+
+
+def _law_options(files: Sequence[str]) -> list[str]:
+    return [word for file in files for word in ("--laws", file)]
 
 
 def compare_step(steps: Sequence[Mapping[str, Any]]) -> JobStep:
@@ -113,32 +118,32 @@ def compare_step(steps: Sequence[Mapping[str, Any]]) -> JobStep:
     return JobStep("Comparison", (*fit[: fit.index("--save")], "--compare"))
 
 
-def plan_step(run: str, form: Mapping[str, str], place: str, laws: Sequence[str]) -> JobStep:
+def plan_step(run: str, form: Mapping[str, str], folder: str, laws: Sequence[str]) -> JobStep:
     """Return the command that plans the next measurement from a saved fit."""
-    words = ["plan", f"{run}/fit.json", *(word for file in laws for word in ("--laws", file))]
+    words = ["plan", f"{run}/fit.json", *_law_options(laws)]
     words += _options(form, ("frequency", "displacement", "force", "time", "controlled"))
     for target in form.get("target", "").split():
         words += ["--target", target]
-    words += ["--table", f"{place}/plan.csv", "--picture", f"{place}/plan.png"]
+    words += ["--table", f"{folder}/plan.csv", "--picture", f"{folder}/plan.png"]
     if form.get("sample_rate"):
-        words += ["--sample-rate", form["sample_rate"], "--waveform", f"{place}/waveform.csv"]
+        words += ["--sample-rate", form["sample_rate"], "--waveform", f"{folder}/waveform.csv"]
     return JobStep("Plan", tuple(words))
 
 
 def _source(work: Mapping[str, Any], folder: Path, run: str) -> tuple[list[str], list[JobStep]]:
-    """Return files with the options for reading them, and an extraction that comes before."""
+    """Return the files and their options for the fit, and the step of extraction if needed."""
     reading = work["reading"]
     kind = reading.get("kind", "")
     files = [str(file["stored"]) for file in work["files"]]
     columns = ["--columns", _COLUMNS] if (folder / _COLUMNS).exists() else []
-    common = [*columns, *_options(reading, OF_BOTH)]
+    common = [*columns, *_options(reading, COMMON_OPTIONS)]
     if kind == "extract":
-        words = ["extract", *files, *common, *_options(reading, (*OF_RECORDS, "controlled"))]
+        words = ["extract", *files, *common, *_options(reading, (*RECORD_OPTIONS, "controlled"))]
         points = f"{run}/points.csv"
         return [points], [JobStep("Extraction", (*words, "-o", points))]
     if kind == "record":
-        return [*files, "--record", *common, *_options(reading, OF_RECORDS)], []
-    return [*files, *common, *_options(reading, OF_TABLES)], []
+        return [*files, "--record", *common, *_options(reading, RECORD_OPTIONS)], []
+    return [*files, *common, *_options(reading, TABLE_OPTIONS)], []
 
 
 def _model_words(model: Mapping[str, str]) -> list[str]:
@@ -151,11 +156,11 @@ def _model_words(model: Mapping[str, str]) -> list[str]:
 
 
 def _linear(model: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Yield the elements without friction that the model has: name, and value or "free"."""
+    """Yield option and value (or "free") of each linear element of the model."""
     for name in LINEAR:
-        how = model.get(name, "none")
-        if how != "none":
-            yield name, "free" if how == "free" else model.get(f"{name}_value", "").strip()
+        choice = model.get(name, "none")
+        if choice != "none":
+            yield name, "free" if choice == "free" else model.get(f"{name}_value", "").strip()
 
 
 def _options(form: Mapping[str, str], names: Sequence[str]) -> list[str]:
@@ -164,15 +169,14 @@ def _options(form: Mapping[str, str], names: Sequence[str]) -> list[str]:
 
 
 def as_python(work: Mapping[str, Any], folder: Path, *, metadata: bool) -> str:
-    """Return a program that does the same."""
+    """Return a Python program that is equivalent to the commands."""
     reading, model = work["reading"], work["model"]
     kind = reading.get("kind", "")
     is_table = kind in ("", "table")
-    names = (*OF_BOTH, *(OF_TABLES if is_table else OF_RECORDS))
-    how = {name: reading[name] for name in names if reading.get(name)}
-    if (folder / _COLUMNS).exists():
-        how = {"columns": _COLUMNS, **how}
-    options = "".join(f", {name}={value!r}" for name, value in how.items())
+    names = (*COMMON_OPTIONS, *(TABLE_OPTIONS if is_table else RECORD_OPTIONS))
+    keywords = {"columns": _COLUMNS} if (folder / _COLUMNS).exists() else {}
+    keywords |= {name: reading[name] for name in names if reading.get(name)}
+    options = "".join(f", {name}={value!r}" for name, value in keywords.items())
     files = [str(file["stored"]) for file in work["files"]]
     data = f"di.read_frequency_response({files!r}{options})"
     if not is_table:
@@ -180,26 +184,26 @@ def as_python(work: Mapping[str, Any], folder: Path, *, metadata: bool) -> str:
     data = f"di.extract({data})" if kind == "extract" else data
     law = class_named(model["law"])
     name = law.__name__ if law is not None else model["law"]
-    of_user = law is None or not law.__module__.startswith("dahl_ident.")
-    element = f"{'' if of_user else 'di.'}{name}({model['known'].strip()})"
+    of_package = law is not None and law.__module__.startswith("dahl_ident.")
+    element = f"{'di.' if of_package else ''}{name}({model['known'].strip()})"
     element = f"di.Backlash({element})" if model["play"] else element
     for option, value in _linear(model):
         element += f" + di.{LINEAR[option].__name__}({_in_si(value, option)})"
-    known = f", metadata={_REPORT!r}" if metadata else ""
+    report_data = f", metadata={_REPORT!r}" if metadata else ""
     sensors = f", sensors=di.Sensors.from_metadata({_REPORT!r})" if metadata else ""
     return (
         f"import dahl_ident as di\n\ndata = {data}\nfit = di.fit(data, {element}{sensors})\n"
-        f"print(fit.verdict)\nfit.save('fit.json')\ndi.report(fit, 'report.html'{known})\n"
+        f"print(fit.verdict)\nfit.save('fit.json')\ndi.report(fit, 'report.html'{report_data})\n"
     )
 
 
 def _in_si(text: str, option: str) -> str:
-    """Return a quantity as a number in SI units, as a program states it; "" if it is free."""
+    """Return a quantity as a number in SI units for a program; "" if it is free."""
     unit = LINEAR[option].parameters[0].unit
     kinds = tuple(kind for kind, both in SI_UNITS.items() if unit in both)
     try:
         return "" if text == "free" else f"{parse_quantity(text, kinds, option)[0]:.12g}"
-    except DahlIdentError:  # the command says what is wrong with it
+    except DahlIdentError:  # the command reports the error
         return text
 
 
@@ -220,7 +224,7 @@ def columns_toml(form: Mapping[str, str]) -> str:
 
 
 def report_toml(form: Mapping[str, str]) -> str:
-    """Return the metadata of the report that the form states, empty fields left out."""
+    """Return the metadata of the report from the form, without empty fields."""
     entries = {name: text.strip() for name, text in form.items() if text.strip()}
     stated: dict[str, Any] = {
         name.removeprefix("meta_"): text
@@ -229,22 +233,18 @@ def report_toml(form: Mapping[str, str]) -> str:
     }
     for channel in ("force", "displacement", "delay"):
         fields = ("name", "serial", "calibration", "uncertainty", "k")
-        one: dict[str, Any] = {
+        instrument: dict[str, Any] = {
             f: entries[f"{channel}_{f}"] for f in fields if f"{channel}_{f}" in entries
         }
-        if set(one) - {"k"}:
-            one = {"channel": channel, "name": f"{channel} channel".capitalize(), **one}
-            if _is_number(one.get("k", "")):
-                one["k"] = float(one["k"])
-            stated.setdefault("instruments", []).append(one)
+        if set(instrument) - {"k"}:
+            instrument = {
+                "channel": channel, "name": f"{channel} channel".capitalize(), **instrument
+            }  # fmt: skip
+            with suppress(ValueError):
+                if math.isfinite(k := float(instrument.get("k", ""))):
+                    instrument["k"] = k
+            stated.setdefault("instruments", []).append(instrument)
     return toml_text(stated)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
 
 
 def _text(text: str) -> str:

@@ -1,7 +1,7 @@
-"""What files hold, as numbers for a page: channels, problems, points or loops.
+"""Contents of files as data for a page: channels, errors, and pictures of points or loops.
 
-Run in a child process, ``python -m dahl_ident.app.preview``, because a file of another may be of
-any size and form: it reads the state of a work on standard input and prints JSON.
+It runs in a child process, ``python -m dahl_ident.app.preview``, because an uploaded file may have
+any size and content: it reads the state of a work from standard input and prints JSON.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.app.commands import OF_BOTH, OF_TABLES
+from dahl_ident.app.commands import COMMON_OPTIONS, TABLE_OPTIONS
 from dahl_ident.data import read_frequency_response, read_record
 from dahl_ident.data.readers import open_source
 from dahl_ident.data.readers.inspection import contents
@@ -27,73 +27,75 @@ from dahl_ident.errors import DahlIdentError
 from dahl_ident.reporting.document import Picture
 from dahl_ident.units import parse_quantity
 
-NOTHING_FOUND: Mapping[str, Any] = {
+EMPTY: Mapping[str, Any] = {
     "channels": [], "notes": [], "pictures": [],
     "error": "", "kind": "", "summary": "", "format": "", "sampling": "",
 }  # fmt: skip
-_SHOWN = 300  # points in a channel's picture
-_DRAWN = 6  # records that are drawn
+_CURVE_POINTS = 300  # in a channel's picture
+_MOST_PICTURES = 6  # records that are drawn
 
 
 def preview(state: dict[str, Any]) -> dict[str, Any]:
-    """Return channels of the first file, what could be read, and what could not."""
-    shown: dict[str, Any] = dict(NOTHING_FOUND, channels=[], notes=[])
+    """Return the channels of the first file, a summary of all data, and errors and warnings."""
+    result: dict[str, Any] = dict(EMPTY, channels=[], notes=[])
     files = [str(file["stored"]) for file in state["files"]]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _describe(files[0], shown)
-            _read(files, state["reading"], shown)
+            _add_channels(files[0], result)
+            _add_data(files, state["reading"], result)
         except (DahlIdentError, ValueError, OSError) as exc:
-            shown["error"] = str(exc)
-    shown["notes"] += list(dict.fromkeys(str(one.message) for one in caught))
-    return shown
+            result["error"] = str(exc)
+    result["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
+    return result
 
 
-def _describe(file: str, shown: dict[str, Any]) -> None:
+def _add_channels(file: str, result: dict[str, Any]) -> None:
     source = open_source(file)
     summary = contents(source)
-    place = Path("columns.toml")
-    text = place.read_text("utf-8") if place.exists() else summary.column_map
+    path = Path("columns.toml")
+    text = path.read_text("utf-8") if path.exists() else summary.column_map
     roles: dict[str, Any] = tomllib.loads(text)
     by_column = {e["column"]: (r, e) for r, e in roles.items() if isinstance(e, dict)}
-    shown["format"], shown["sampling"] = summary.format, summary.sampling
-    shown["notes"] += [*summary.gaps, *summary.notes]
+    result["format"], result["sampling"] = summary.format, summary.sampling
+    result["notes"] += [*summary.gaps, *summary.notes]
     for channel, line in zip(source.channels, summary.channels, strict=True):
         role, entry = by_column.get(channel.name, ("", {}))
         curve = _thumbnail(channel.values) if channel.kind in "fiu" else []
-        shown["channels"].append(
+        result["channels"].append(
             {**asdict(line), "role": role, "curve": curve, "sign": entry.get("sign", 1),
              "unit": entry.get("unit") or channel.unit or ""}
         )  # fmt: skip
 
 
-def _read(files: Sequence[str], reading: dict[str, str], shown: dict[str, Any]) -> None:
-    """Read the files as the commands will, and add what they show."""
-    how: dict[str, Any] = {n: reading[n] for n in OF_BOTH if reading.get(n)}
+def _add_data(files: Sequence[str], reading: dict[str, str], result: dict[str, Any]) -> None:
+    """Read the files as the commands do, and add a summary and pictures."""
+    common: dict[str, Any] = {n: reading[n] for n in COMMON_OPTIONS if reading.get(n)}
     if Path("columns.toml").exists():
-        how["columns"] = "columns.toml"
+        common["columns"] = "columns.toml"
     kind = reading.get("kind", "")
     if kind in ("", "table"):
-        options: dict[str, Any] = {n: reading[n] for n in OF_TABLES if reading.get(n)}
+        options: dict[str, Any] = {n: reading[n] for n in TABLE_OPTIONS if reading.get(n)}
         if "frequency" in options:
             options["frequency"] = _hertz(options["frequency"], "frequency")
         try:
-            table = read_frequency_response(list(files), **how, **options)
+            table = read_frequency_response(list(files), **common, **options)
         except WaveformsError:
             if kind == "table":
                 raise
         else:
-            shown |= {"kind": "table", "summary": repr(table), "pictures": [_drawn(table.plot)]}
+            result |= {"kind": "table", "summary": repr(table), "pictures": [_picture(table.plot)]}
             return
     if reading.get("sample_rate"):
-        how["sample_rate"] = _hertz(reading["sample_rate"], "sample_rate")
-    records = [read_record(file, **how) for file in files]
-    shown |= {"kind": kind or "record", "summary": "\n".join(map(repr, records))}
-    shown["pictures"] = [_drawn(partial(record.plot, "loops")) for record in records[:_DRAWN]]
+        common["sample_rate"] = _hertz(reading["sample_rate"], "sample_rate")
+    records = [read_record(file, **common) for file in files]
+    result |= {"kind": kind or "record", "summary": "\n".join(map(repr, records))}
+    loops = (partial(record.plot, "loops") for record in records[:_MOST_PICTURES])
+    result["pictures"] = [_picture(loop) for loop in loops]
 
 
-def _drawn(draw: Callable[[], Any]) -> str:
+def _picture(draw: Callable[[], Any]) -> str:
+    """Return a plot as the address of a PNG image, to be used in HTML."""
     return Picture("", "", "", draw).address("png")
 
 
@@ -105,13 +107,13 @@ def _hertz(text: str, what: str) -> float:
 
 
 def _thumbnail(values: Any) -> list[list[float]]:
-    """Return a channel in the unit square; lowest and highest of many samples at each place."""
+    """Return a curve in the unit square; of many samples, the extremes of successive parts."""
     y = np.asarray(values, dtype=np.float64).ravel()
     y = y[np.isfinite(y)]
     if y.size < 2:
         return []
-    if y.size > _SHOWN:
-        parts = np.array_split(y, _SHOWN // 2)
+    if y.size > _CURVE_POINTS:
+        parts = np.array_split(y, _CURVE_POINTS // 2)
         y = np.array([v for part in parts for v in (part.min(), part.max())])
     height = (y - y.min()) / (np.ptp(y) or 1.0)
     points: list[list[float]] = np.column_stack([np.linspace(0.0, 1.0, y.size), height]).tolist()

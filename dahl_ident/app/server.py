@@ -36,8 +36,8 @@ from starlette.staticfiles import StaticFiles
 
 from dahl_ident import reporting
 from dahl_ident.app import commands
-from dahl_ident.app.commands import JobStep, laws, loop_of
-from dahl_ident.app.preview import NOTHING_FOUND
+from dahl_ident.app.commands import JobStep, laws, loop_picture
+from dahl_ident.app.preview import EMPTY
 from dahl_ident.app.work import Jobs, Work, new_folder, output
 from dahl_ident.data.storage import save_frame
 from dahl_ident.errors import DahlIdentError
@@ -212,18 +212,23 @@ class App:
         if child.returncode:
             last = child.stderr.decode(errors="replace").strip().splitlines()[-1:]
             error = " ".join(["The files could not be read.", *last])
-            return {**NOTHING_FOUND, "error": error}
+            return {**EMPTY, "error": error}
         preview: dict[str, Any] = json.loads(child.stdout)
         for name in ("error", "summary"):
-            preview[name] = work.in_users_words(preview[name])
-        preview["notes"] = [work.in_users_words(note) for note in preview["notes"]]
+            preview[name] = work.with_uploaded_names(preview[name])
+        preview["notes"] = [work.with_uploaded_names(note) for note in preview["notes"]]
         return preview
 
     async def save_data(self, request: Request) -> Response:
         """Store what the channels are; then continue, or show the preview again."""
         work, form = self._work(request), await _form(request)
         work.write("columns.toml", commands.columns_toml(form))
-        names = ("kind", *commands.OF_TABLES, *commands.OF_RECORDS, *commands.OF_BOTH)
+        names = (
+            "kind",
+            *commands.TABLE_OPTIONS,
+            *commands.RECORD_OPTIONS,
+            *commands.COMMON_OPTIONS,
+        )
         reading = {name: form.get(name, "") for name in names}
         if form.get("next"):  # the user has confirmed the detected kind
             reading["kind"] = reading["kind"] or form.get("found", "")
@@ -269,14 +274,14 @@ class App:
         parts = []
         for part in sorted(folder.glob("*-[0-9]*"), key=lambda p: p.stat().st_mtime):
             state = self.jobs.state(part)
-            text = work.in_users_words(output(part, len(state["steps"]) - 1))
+            text = work.with_uploaded_names(output(part, len(state["steps"]) - 1))
             parts.append((part.name, state, text, self._files(part)))
         return self._page(
             "run", work=work, state=work.state, folder=folder, job=job, parts=parts,
             report=report.partition("<main>")[2].partition("</main>")[0],
             typed=_typed([JobStep(step["title"], tuple(step["words"])) for step in job["steps"]]),
             program=(folder / "program.py").read_text("utf-8"), files=self._files(folder),
-            failed=work.in_users_words(job["error"]), exports=_EXPORTS,
+            failed=work.with_uploaded_names(job["error"]), exports=_EXPORTS,
             is_table=_is_table(folder), busy=self.jobs.is_running(folder),
         )  # fmt: skip
 
@@ -306,9 +311,9 @@ class App:
                 self.jobs.cancel(part)
         elif what in ("compare", "plan") and not self.jobs.is_running(folder):
             part = new_folder(folder, what)
-            place = f"{folder.name}/{part.name}"
+            target = f"{folder.name}/{part.name}"
             step = (
-                commands.plan_step(folder.name, form, place, self.laws)
+                commands.plan_step(folder.name, form, target, self.laws)
                 if what == "plan"
                 else commands.compare_step(self.jobs.state(folder)["steps"])
             )
@@ -351,7 +356,7 @@ class App:
 
     async def law(self, request: Request) -> Response:
         """Return the picture of a law's loop."""
-        text = await run_in_threadpool(loop_of, request.path_params["kind"])
+        text = await run_in_threadpool(loop_picture, request.path_params["kind"])
         if text is None:
             raise HTTPException(404, "There is no picture of this law.")
         return Response(text, media_type="image/svg+xml")

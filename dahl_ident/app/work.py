@@ -1,23 +1,22 @@
-"""The files of a piece of work, and its jobs: what was uploaded, what was said of it, every run.
+"""The files of a piece of work (uploads, form entries, runs), and the jobs that fill them.
 
 ::
 
     2026-11-24-1/
-      work.json       title, names of the files as uploaded, what the forms say
+      work.json       title, names of the files as uploaded, entries of the forms
       data/           the files
-      columns.toml    what their columns are
+      columns.toml    column map of these files
       report.toml     laboratory, instruments, calibrations
       run-1/          job.json, output of each step, fit.json, report.html, report.pdf, ...
 
-Nothing is replaced but the forms' own files: a new fit is a new run. What takes time is a job:
-commands one after the other in child processes, which can be stopped.
+Only the files of the forms are ever replaced: a new fit is a new run. A task that takes time is a
+job: successive commands in child processes, which can be stopped.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
-import math
 import os
 import re
 import shutil
@@ -37,15 +36,15 @@ from dahl_ident.errors import DataError
 _LONGEST = 60  # letters of a stored name
 _ENDING = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,2}$")
 _IDENTITY = re.compile(r"\d{4}-\d\d-\d\d-\d+")
-_USABLE = (0, 3)  # exit status of commands whose output says whether the result may be used
+_SUCCESS = (0, 3)  # exit status of commands with a result; 3: not to be used, as the output says
 _RUNNING, _ENDED, _FAILED, _CANCELLED = "running", "ended", "failed", "cancelled"
 
 
 def new_folder(root: Path, stem: str, first: int = 1) -> Path:
-    """Make and return the next free folder of a name and a number."""
+    """Make and return the folder with the next free number."""
     for number in itertools.count(first):
         folder = root / f"{stem}-{number}"
-        with suppress(FileExistsError):  # of an earlier one, or of another tab
+        with suppress(FileExistsError):  # made earlier, or by another tab
             folder.mkdir()
             break
     return folder
@@ -59,13 +58,13 @@ class Work:
 
     @classmethod
     def all(cls, root: Path) -> list[Work]:
-        """Return what is in a folder, the newest first."""
+        """Return all pieces of work in a folder, the newest first."""
         folders = [path for path in root.iterdir() if (path / "work.json").is_file()]
         return [cls(path) for path in sorted(folders, key=lambda p: -p.stat().st_mtime)]
 
     @classmethod
     def named(cls, root: Path, name: str) -> Work | None:
-        """Return a piece of work by its folder's name; None where there is none."""
+        """Return a piece of work by the name of its folder; None if there is none."""
         if not _IDENTITY.fullmatch(name) or not (root / name / "work.json").is_file():
             return None
         return cls(root / name)
@@ -86,26 +85,26 @@ class Work:
 
     @property
     def state(self) -> dict[str, Any]:
-        """What ``work.json`` holds."""
+        """The content of ``work.json``."""
         stored: dict[str, Any] = json.loads((self.folder / "work.json").read_text("utf-8"))
         return stored
 
     def save(self, **changes: Any) -> None:
-        """Write changes of the state."""
-        place = self.folder / "work.json"
-        state = (self.state if place.exists() else {}) | changes
-        write_whole(place, json.dumps(state, indent=1).encode(), overwrite=True)
+        """Save changes of the state."""
+        path = self.folder / "work.json"
+        state = (self.state if path.exists() else {}) | changes
+        write_whole(path, json.dumps(state, indent=1).encode(), overwrite=True)
 
     def write(self, name: str, text: str) -> None:
-        """Write a file that a form fills; without text there is none."""
+        """Write the file of a form; remove it if the text is empty."""
         if text:
             write_whole(self.folder / name, text.encode(), overwrite=True)
         else:
             (self.folder / name).unlink(missing_ok=True)
 
     def add(self, name: str, content: IO[bytes]) -> None:
-        """Store an uploaded file; one of the same name is kept as well."""
-        stored = self._free_place(name)
+        """Store an uploaded file; an earlier one of the same name is kept."""
+        stored = self._free_path(name)
         with stored.open("xb") as out:
             shutil.copyfileobj(content, out, 1 << 20)
         state = self.state
@@ -115,17 +114,17 @@ class Work:
         files = [*state["files"], entry]
         self.save(files=files, title=state["title"] or name)
 
-    def _free_place(self, name: str) -> Path:
-        """Return where a file is stored: under what of its name is letters and digits."""
+    def _free_path(self, name: str) -> Path:
+        """Return a new path for a file, whose stem has only letters and digits of its name."""
         last = re.split(r"[/\\]", name)[-1]
-        ending = _ENDING.search(last)
-        stem = last[: ending.start()] if ending else last
-        plain = re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-")[:_LONGEST] or "file"
-        kept = ending.group() if ending else ""
+        match = _ENDING.search(last)
+        ending = match.group() if match else ""
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", last.removesuffix(ending)).strip("_-")
+        stem = stem[:_LONGEST] or "file"
         for number in range(1, 10_000):
-            place = self.folder / "data" / f"{plain}{f'_{number}' * (number > 1)}{kept}"
-            if not place.exists():
-                return place
+            path = self.folder / "data" / f"{stem}{f'_{number}' * (number > 1)}{ending}"
+            if not path.exists():
+                return path
         raise DataError(f"there are too many files of the name {name!r}; begin another work")
 
     @property
@@ -133,15 +132,15 @@ class Work:
         """The stored files, relative to the folder."""
         return [str(file["stored"]) for file in self.state["files"]]
 
-    def in_users_words(self, text: str) -> str:
-        """Return a text of a command with the files' names as they were uploaded."""
+    def with_uploaded_names(self, text: str) -> str:
+        """Return the output of a command with the names of the files as uploaded."""
         shown = {Path(file["stored"]).name: str(file["name"]) for file in self.state["files"]}
         names = "|".join(re.escape(name) for name in sorted(shown, key=len, reverse=True))
         pattern = rf"(?<![\w./-])(?:data/)?({names})(?!\w)"
         return re.sub(pattern, lambda match: shown[match[1]], text) if names else text
 
     def runs(self) -> list[Path]:
-        """Return the folders of the runs, the last one first."""
+        """Return the folders of the runs, the latest first."""
         runs = [path for path in self.folder.glob("run-*") if (path / "job.json").is_file()]
         return sorted(runs, key=lambda path: -int(path.name[4:]))
 
@@ -161,7 +160,7 @@ class Jobs:
         self._seconds: dict[tuple[str, ...], float] = {}
 
     def start(self, folder: Path, steps: Sequence[JobStep], directory: Path) -> None:
-        """Begin the commands of a job, in a directory; what becomes of them stands in a folder."""
+        """Start the commands of a job in a directory; their output is written to a folder."""
         job = {
             "status": _RUNNING, "step": 0, "began": time.time(), "error": "",
             "steps": [{"title": step.title, "words": step.words} for step in steps],
@@ -187,10 +186,10 @@ class Jobs:
                 status = child.wait()
             if job["status"] != _RUNNING:
                 break
-            if status not in _USABLE:
+            if status not in _SUCCESS:
                 job["status"], job["error"] = _FAILED, _text(errors)
                 break
-            self._seconds[_like(step)] = time.time() - job["step_began"]
+            self._seconds[_timing_key(step)] = time.time() - job["step_began"]
         else:
             job["status"] = _ENDED
         job["seconds"] = time.time() - job["began"]
@@ -200,7 +199,7 @@ class Jobs:
             self._children.pop(folder, None)
 
     def cancel(self, folder: Path) -> None:
-        """Stop a job, if it runs."""
+        """Stop a job if it is running."""
         with self._lock:
             job, child = self._running.get(folder), self._children.get(folder)
             if job is not None:
@@ -214,36 +213,37 @@ class Jobs:
             self.cancel(folder)
 
     def state(self, folder: Path) -> dict[str, Any]:
-        """Return what became of a job; one that an earlier server left has been interrupted."""
+        """Return the state of a job; one left running by an earlier server was interrupted."""
         job = self._running.get(folder)
         if job is None:
             job = json.loads((folder / "job.json").read_text("utf-8"))
             if job["status"] == _RUNNING:
                 job |= {"status": _CANCELLED, "error": "The server was stopped meanwhile."}
             return {**job, "left": None}
-        return {**job, "seconds": time.time() - job["began"], "left": self._left(job)}
+        return {**job, "seconds": time.time() - job["began"], "left": self._remaining_time(job)}
 
-    def _left(self, job: dict[str, Any]) -> float | None:
-        """Return the time left if the steps take as long as before; None where one is new."""
-        took = [self._seconds.get(_like(step)) for step in job["steps"][job["step"] :]]
-        if None in took:
-            return None
-        spent: float = time.time() - job.get("step_began", job["began"])
-        return max(0.0, math.fsum(one for one in took if one is not None) - spent)
+    def _remaining_time(self, job: dict[str, Any]) -> float | None:
+        """Return the remaining time if the steps take as long as before; None if one is new."""
+        remaining: float = job.get("step_began", job["began"]) - time.time()
+        for step in job["steps"][job["step"] :]:
+            if (key := _timing_key(step)) not in self._seconds:
+                return None
+            remaining += self._seconds[key]
+        return max(0.0, remaining)
 
     def is_running(self, folder: Path) -> bool:
-        """Return whether a job runs in a folder, or in one below."""
+        """Return whether a job is running in a folder, or in one below it."""
         return any(folder == one or folder in one.parents for one in list(self._running))
 
 
-def _like(step: dict[str, Any]) -> tuple[str, ...]:
-    """Return what steps that take about the same time have in common: the command and files."""
+def _timing_key(step: dict[str, Any]) -> tuple[str, ...]:
+    """Return command and files of a step: steps with the same take about the same time."""
     words = [word for word in step["words"] if not word.startswith("run-")]
     return tuple(words[: words.index("--element")] if "--element" in words else words)
 
 
 def output(folder: Path, number: int) -> str:
-    """Return what a step of a job printed."""
+    """Return the output of a step of a job."""
     return _text(folder / f"{number}.out")
 
 

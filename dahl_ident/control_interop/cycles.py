@@ -312,11 +312,11 @@ def _crossings(first: ComplexArray, second: ComplexArray) -> list[tuple[int, int
 
 
 def _refine(linear: Model, friction: Model, amplitude: float, omega: float) -> LimitCycle | None:
-    """Return the limit cycle near a crossing, by Newton's method; None where there is none."""
+    """Return the limit cycle near a crossing, by Newton's method; None if there is none."""
     low, high = known_range(linear)
-    place = np.log([amplitude, omega])
+    point = np.log([amplitude, omega])
     for _ in range(_NEWTON_STEPS):
-        A, w = np.exp(place[:1]), np.clip(np.exp(place[1:]), low, high)
+        A, w = np.exp(point[:1]), np.clip(np.exp(point[1:]), low, high)
         N, slope = (v[0] for v in friction_and_slope(friction, A))
         L, L_slope = stiffness_of(linear, w)[0], stiffness_slope(linear, w)[0]
         residual = np.log(-L / N)
@@ -327,7 +327,7 @@ def _refine(linear: Model, friction: Model, amplitude: float, omega: float) -> L
         step = np.linalg.solve(jacobian, [-residual.real, -residual.imag])
         if np.max(np.abs(step)) < 1e-10:
             break
-        place = place + step * min(1.0, 0.5 / np.max(np.abs(step)))
+        point = point + step * min(1.0, 0.5 / np.max(np.abs(step)))
     if abs(residual) > _RESIDUAL:
         return None
     return LimitCycle(float(A[0]), float(w[0] / (2.0 * np.pi)), float((slope / L_slope).imag))
@@ -337,8 +337,8 @@ def _distinct(cycles: Iterable[LimitCycle]) -> tuple[LimitCycle, ...]:
     """Return the cycles by rising amplitude, each once."""
     distinct: list[LimitCycle] = []
     for cycle in sorted(cycles, key=lambda c: (c.amplitude, c.frequency_hz)):
-        place = cycle.amplitude, cycle.frequency_hz
+        point = cycle.amplitude, cycle.frequency_hz
         others = ((c.amplitude, c.frequency_hz) for c in distinct)
-        if not any(np.allclose(place, other, rtol=1e-6, atol=0.0) for other in others):
+        if not any(np.allclose(point, other, rtol=1e-6, atol=0.0) for other in others):
             distinct.append(cycle)
     return tuple(distinct)

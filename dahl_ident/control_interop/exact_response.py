@@ -117,7 +117,7 @@ def exact_motions(
     continues = ~is_unique
     follow(rows, starts, cycles=_CYCLES)  # leads to stable motions
     follow(rows, starts, again=False)
-    continues = np.array([bool(m) and not any(one.stable for one in m) for m in motions])
+    continues = np.array([bool(m) and not any(orbit.stable for orbit in m) for m in motions])
     if shooting.system.odd:
         follow(np.flatnonzero(continues), None, one_sided=True, stable=True)
     for at_point in motions:

@@ -126,11 +126,11 @@ class _Loop:
         self, y: FloatArray, period: float, slope: FloatArray, near: tuple[float, float]
     ) -> FreeMotion | None:
         """Return size, frequency and stability of a motion; None if it is far from `near`."""
-        whole = period * 2 / self.half_periods
-        times = np.linspace(0.0, whole, _SAMPLES + 1)
+        full_period = period * 2 / self.half_periods
+        times = np.linspace(0.0, full_period, _SAMPLES + 1)
         x = march(self.system, times[[0, -1]], np.zeros((1, 1)), times, y, self._values).output
         X = 2.0 * np.fft.rfft(x[:-1])[: _HIGHEST + 1] / _SAMPLES
-        amplitude, omega = abs(X[1]), 2.0 * np.pi / whole
+        amplitude, omega = abs(X[1]), 2.0 * np.pi / full_period
         distance = np.abs(np.log([max(amplitude, 1e-300) / near[0], omega / near[1]]))
         if distance.max() > _FARTHEST:
             return None

@@ -66,7 +66,7 @@ def one_of(value: str, name: str, allowed: tuple[str, ...]) -> str:
 
 def set_checked(instance: Any, check: Callable[[Any, str], Any], *names: str) -> None:
     """Replace fields of a frozen dataclass by checked values; a default of None remains."""
-    optional = {one.name for one in fields(instance) if one.default is None}
+    optional = {f.name for f in fields(instance) if f.default is None}
     for name in names:
         value = getattr(instance, name)
         if value is not None or name not in optional:

@@ -101,8 +101,8 @@ def is_force_controlled(data: Table) -> bool:
 
 def held_amplitude(data: Table) -> FloatArray:
     """Return the controlled amplitude, or the other one if that is unknown."""
-    both = [data.amplitude, data.drive][:: -1 if is_force_controlled(data) else 1]
-    return np.asarray(next(amplitude for amplitude in both if amplitude is not None))
+    amplitudes = [data.amplitude, data.drive][:: -1 if is_force_controlled(data) else 1]
+    return np.asarray(next(size for size in amplitudes if size is not None))
 
 
 def held_label(data: Table) -> str:

@@ -38,23 +38,22 @@ _IRREGULAR = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "sock
 
 def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a table in the format of the path's extension."""
-    place = Path(path)
-    packed = place.suffix.lower() == ".gz" and Path(place.stem).suffix.lower() in (".csv", ".tsv")
-    table = Path(place.stem) if packed else place_of(place, "a table", (*_WRITERS, ".csv.gz"))
+    path = Path(path)
+    packed = path.suffix.lower() == ".gz" and Path(path.stem).suffix.lower() in (".csv", ".tsv")
+    table = Path(path.stem) if packed else place_of(path, "a table", (*_WRITERS, ".csv.gz"))
     content = _WRITERS[table.suffix.lower()](frame)
-    write_whole(place, gzip.compress(content, mtime=0) if packed else content, overwrite=overwrite)
-    return place
+    write_whole(path, gzip.compress(content, mtime=0) if packed else content, overwrite=overwrite)
+    return path
 
 
 def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
     """Return the path; raise if it has none of the endings."""
-    place = Path(path)
-    if place.suffix.lower() not in endings:
+    path = Path(path)
+    if path.suffix.lower() not in endings:
         raise ValidationError(
-            f"{place}: {what} is written as {', '.join(endings)}; got "
-            f"{place.suffix or 'no ending'!r}"
+            f"{path}: {what} is written as {', '.join(endings)}; got {path.suffix or 'no ending'!r}"
         )
-    return place
+    return path
 
 
 def regular(path: str | Path, what: str = "the file") -> Path:

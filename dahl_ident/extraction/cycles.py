@@ -280,10 +280,10 @@ def sine_in_each(
     middle = 0.5 * float(y.min() + y.max()) if y.size else 0.0
     y = y - middle
     rotor = np.exp(-1j * theta)
-    one, two, with_y = (_sums(v, bounds) for v in (rotor, rotor * rotor, rotor * y))
+    first, second, with_y = (_sums(v, bounds) for v in (rotor, rotor * rotor, rotor * y))
     total, power = _sums(y, bounds), _sums(y * y, bounds)
-    c, s = one.real, -one.imag
-    cc, ss, cs = 0.5 * (n + two.real), 0.5 * (n - two.real), -0.5 * two.imag
+    c, s = first.real, -first.imag
+    cc, ss, cs = 0.5 * (n + second.real), 0.5 * (n - second.real), -0.5 * second.imag
     normal = np.array([[n, c, s], [c, cc, cs], [s, cs, ss]]).transpose(2, 0, 1)
     right = np.array([total, with_y.real, -with_y.imag]).T
     normal += 1e-9 * n[:, None, None] * np.eye(3)

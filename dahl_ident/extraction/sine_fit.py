@@ -145,9 +145,7 @@ class Segment:
         """Return block means, about 64 per cycle, if there are at least twice as many samples."""
         if self.sample_phase > np.pi / _BLOCKS_PER_CYCLE:
             return self
-        block = np.floor((self.theta - self.theta[0]) * (_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
-        starts = np.flatnonzero(np.diff(block, prepend=-1.0))
-        counts = np.diff(starts, append=self.theta.size)
+        starts, counts = _phase_blocks(self.theta, _BLOCKS_PER_CYCLE)
         means = np.add.reduceat(self.channels, starts, axis=1) / counts
         return self.with_samples(np.add.reduceat(self.time, starts) / counts, means)
 
@@ -486,13 +484,18 @@ def _block_sums(
     theta: FloatArray, residual: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return phases, sums of the residual and numbers of samples of about 128 blocks per cycle."""
-    block = np.floor((theta - theta[0]) * (_NOISE_BLOCKS_PER_CYCLE / (2.0 * np.pi)))
-    starts = np.flatnonzero(np.diff(block, prepend=-1.0))
+    starts, counts = _phase_blocks(theta, _NOISE_BLOCKS_PER_CYCLE)
     if 2 * starts.size > theta.size:
         return theta, residual, np.ones(theta.size)
-    counts = np.diff(starts, append=theta.size).astype(np.float64)
     middle = np.add.reduceat(theta, starts) / counts
     return middle, np.add.reduceat(residual, starts, axis=1), counts
+
+
+def _phase_blocks(theta: FloatArray, per_cycle: int) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return the first sample and the number of samples of blocks of equal phase."""
+    block = np.floor((theta - theta[0]) * (per_cycle / (2.0 * np.pi)))
+    starts = np.flatnonzero(np.diff(block, prepend=-1.0))
+    return starts, np.diff(starts, append=theta.size).astype(np.float64)
 
 
 def powers(rotor: ComplexArray, highest: int) -> ComplexArray:

@@ -60,19 +60,19 @@ def plot_residuals(
     'residual [standard deviations]'
     """
     axis = style.axes(ax)
-    where = np.asarray(x)
+    x = np.asarray(x)
     axis.axhspan(-2.0, 2.0, color=style.GREY, alpha=0.12, lw=0)
     axis.axhline(0.0, color=style.GREY, lw=0.8)
     for y, name, colour, marker in zip(
         (first, second), names, style.SERIES, style.MARKERS, strict=False
     ):
-        axis.plot(where, y, marker, color=colour, label=name)
-        for part in _curves(where, group):
-            axis.plot(where[part], np.asarray(y)[part], lw=0.6, color=colour)
+        axis.plot(x, y, marker, color=colour, label=name)
+        for part in _curves(x, group):
+            axis.plot(x[part], np.asarray(y)[part], lw=0.6, color=colour)
     for index in np.asarray(suspicious, dtype=int):
         for y in (first, second):
-            axis.plot(where[index], np.asarray(y)[index], "o", mfc="none", mec=style.PURPLE, ms=10)
-    if where.min() > 0.0 and where.max() > 5.0 * where.min():
+            axis.plot(x[index], np.asarray(y)[index], "o", mfc="none", mec=style.PURPLE, ms=10)
+    if x.min() > 0.0 and x.max() > 5.0 * x.min():
         axis.set_xscale("log")
         style.readable_log_ticks(axis)
     axis.set(xlabel=x_label, ylabel="residual [standard deviations]")
@@ -198,18 +198,18 @@ def plot_information(
     (['f_max'], '80 %')
     """
     axis = style.axes(ax, size=(4.6, 1.2 + 0.5 * len(shares)))
-    where = np.asarray(x, dtype=float)
+    x = np.asarray(x, dtype=float)
     parts = [np.nan_to_num(np.asarray(share, dtype=float)) for share in shares.values()]
     area = _LARGEST_DISC / (max(float(part.max()) for part in parts) or 1.0)
     for line, (part, colour) in enumerate(zip(parts, itertools.cycle(style.SERIES), strict=False)):
         axis.scatter(
-            where, np.full(where.size, line), s=area * part, color=colour, alpha=0.6,
+            x, np.full(x.size, line), s=area * part, color=colour, alpha=0.6,
             edgecolor=style.BLACK, lw=0.5, zorder=3,
         )  # fmt: skip
         largest = int(np.argmax(part))
         if part[largest] > 0.0:
             axis.annotate(
-                f"{100.0 * part[largest]:.0f} %", (where[largest], line), (0, 10),
+                f"{100.0 * part[largest]:.0f} %", (x[largest], line), (0, 10),
                 textcoords="offset points", ha="center", fontsize=7,
             )  # fmt: skip
     axis.set(xlabel=x_label, xscale="log", ylim=(len(shares) - 0.4, -0.8))
@@ -498,8 +498,8 @@ def plot_trace(
 def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:
     """Return which axes are logarithmic: the requested ones, if their range is wide."""
     low, high = np.quantile(values, [0.001, 0.999], axis=0)
-    wanted = list(log) or [False] * values.shape[1]
-    return [bool(w and b > _WIDE * a) for w, a, b in zip(wanted, low, high, strict=True)]
+    requested = list(log) or [False] * values.shape[1]
+    return [bool(r and b > _WIDE * a) for r, a, b in zip(requested, low, high, strict=True)]
 
 
 def _edges(values: Any, log: bool) -> Any:

@@ -1,4 +1,4 @@
-"""Responses over amplitude or frequency, in the complex plane, and margins of control loops."""
+"""Responses over amplitude, over frequency and in the complex plane; margins of control loops."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Band = tuple[FloatArray, FloatArray] | None
 
 @dataclass(frozen=True)
 class Curve:
-    """A model's response along an axis, with its band where known.
+    """The response of a model along an axis, with its band if known.
 
     Parameters
     ----------
     x : ndarray, shape (m,)
         Amplitude or frequency, increasing.
     response : ndarray of complex, shape (m,)
-        In the unit of the gain.
+        Complex response in the unit of the gain.
     gain_band, phase_band : tuple of two ndarrays, shape (m,), optional
-        Lower and upper limits, in the unit of the gain and rad.
+        Lower and upper limits, in the unit of the gain and in rad.
     label : str
         For the legend.
     """
@@ -41,7 +41,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Points:
-    """Measured responses along an axis, with standard deviations (phase in rad) where known."""
+    """Measured responses along an axis, with standard deviations (phase in rad) if known."""
 
     x: ArrayLike
     response: ArrayLike
@@ -49,7 +49,7 @@ class Points:
     phase_std: ArrayLike | None = None
 
     def draw(self, axes: Sequence[Axes], **look: Any) -> None:
-        """Draw the points with error bars, in order of their place."""
+        """Draw the points with error bars, in order of their abscissa."""
         order = np.argsort(np.asarray(self.x))
         x, R = np.asarray(self.x)[order], np.asarray(self.response)[order]
         errors = [
@@ -65,8 +65,8 @@ class Points:
         order = np.argsort(np.asarray(self.x))
         measured = _degrees(np.asarray(self.response)[order])
         phase = _degrees(curve.response)
-        away = measured - np.interp(np.asarray(self.x)[order], curve.x, phase)
-        phase = phase + 360.0 * float(np.round(np.median(away) / 360.0))
+        difference = measured - np.interp(np.asarray(self.x)[order], curve.x, phase)
+        phase = phase + 360.0 * float(np.round(np.median(difference) / 360.0))
         axes[0].plot(curve.x, np.abs(curve.response), **look)
         axes[1].plot(curve.x, phase, **look)
         band: dict[str, Any] = {"color": look.get("color"), "alpha": 0.2, "lw": 0}
@@ -83,13 +83,13 @@ def _degrees(response: ComplexArray) -> FloatArray:
 
 
 def _decibels(gain: ArrayLike) -> FloatArray:
-    """Return 20 lg of a gain; minus infinity where it is zero."""
+    """Return 20 lg of a gain; minus infinity if it is zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20.0 * np.log10(np.asarray(gain, dtype=np.float64)))
 
 
 def _label_pair(top: Axes, bottom: Axes, *, x_label: str, wide: bool = True, **of_top: Any) -> None:
-    """Name the axes of gain above phase, over a logarithm where the places span a wide range."""
+    """Label the axes of gain above phase; the abscissa is logarithmic over a wide range."""
     scale = "log" if wide else "linear"
     top.set(xscale=scale, **of_top)
     bottom.set(xscale=scale, xlabel=x_label)
@@ -108,10 +108,10 @@ def plot_frequency_response(
     marker: str = "",
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
-    """Draw gain and phase against frequency, one curve a level.
+    """Draw gain and phase against frequency, one curve per level.
 
-    The points of a level are joined where no two of them share a position; repeated measurements
-    are drawn as points.
+    The points of a level are joined by lines unless some have the same frequency; repeated
+    measurements are drawn as single points.
 
     Parameters
     ----------
@@ -120,11 +120,11 @@ def plot_frequency_response(
     errors : sequence of (gain_std, phase_std), optional
         Standard deviations of each level's points, in the gain's unit and in rad.
     fitted : sequence of Curve, optional
-        The model's curves, one a level; the levels are then drawn as points.
+        The model's curves, one per level; the levels are then drawn as points.
     gain_label, x_label : str
-        Axis labels with units; the abscissa may be an amplitude as well.
-    marker : str, default no marker
-        A matplotlib marker at the points of a joined level.
+        Axis labels with units; the abscissa may also be an amplitude.
+    marker : str, default ""
+        A matplotlib marker for the points of a joined level.
 
     Examples
     --------
@@ -138,13 +138,13 @@ def plot_frequency_response(
     with_errors = [*errors, *[(None, None)] * (len(levels) - len(errors))]
     points = [Points(x, R, *std) for (_, x, R), std in zip(levels, with_errors, strict=True)]
     for i, part in enumerate(points):
-        joined = not fitted and np.unique(part.x).size == np.size(part.x)  # no two share a position
+        joined = not fitted and np.unique(part.x).size == np.size(part.x)
         look = lines[i] | ({"marker": marker} if marker else {}) if joined else markers[i]
         part.draw(pair, label=names[i], **look)
     for curve, part, look in zip(fitted, points, lines, strict=False):
         part.draw_fitted(pair, curve, **look)
-    places = np.concatenate([np.ravel(np.asarray(x)) for _, x, _ in levels])
-    wide = bool(places.max() > 3.0 * places.min())
+    x = np.concatenate([np.ravel(np.asarray(x)) for _, x, _ in levels])
+    wide = bool(x.max() > 3.0 * x.min())
     bottom.set(ylabel="phase [degrees]")
     _label_pair(top, bottom, x_label=x_label, wide=wide, yscale="log", ylabel=gain_label)
     if any(names):
@@ -217,14 +217,14 @@ def plot_backbone(
 def plot_nyquist(
     levels: Sequence[tuple[str, ArrayLike]], *, label: str = "response", ax: Axes | None = None
 ) -> Axes:
-    """Draw complex responses in the complex plane, to one scale, one curve a level.
+    """Draw complex responses in the complex plane, with equal scales, one curve per level.
 
     Parameters
     ----------
     levels : sequence of (label, complex response)
         In the order of the levels; colours run from dark to light.
     label : str
-        What is drawn, with its unit.
+        The quantity drawn, with its unit.
 
     Examples
     --------
@@ -243,14 +243,14 @@ def plot_nyquist(
 def plot_nichols(
     levels: Sequence[tuple[str, ArrayLike]], *, gain_label: str = "gain", ax: Axes | None = None
 ) -> Axes:
-    """Draw gain in dB over phase in degrees, one curve a level.
+    """Draw gain in dB over phase in degrees, one curve per level.
 
     Parameters
     ----------
     levels : sequence of (label, complex response)
-        In the order of the levels, each over rising frequency.
+        In the order of the levels, each with increasing frequency.
     gain_label : str
-        Name of the gain; the label adds "dB", and the reference of 0 dB if the name ends in a unit:
+        Name of the gain, to which "dB" is added, with the reference of 0 dB if it ends in a unit:
         ``"receptance [m/N]"`` becomes "receptance [dB re m/N]".
 
     Examples
@@ -269,7 +269,7 @@ def plot_nichols(
 def _levels(
     levels: Sequence[tuple[str, ArrayLike]],
 ) -> Iterator[tuple[ComplexArray, dict[str, Any]]]:
-    """Yield the response of each level with its look."""
+    """Yield the response of each level with its line style."""
     names = style.level_names([label for label, _ in levels])
     for (_, R), name, look in zip(levels, names, style.level_lines(len(levels)), strict=True):
         yield np.asarray(R, dtype=np.complex128), {**look, "label": name}
@@ -291,15 +291,15 @@ def plot_margins(
     phase_band: Band = None,
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
-    """Draw the margins of a loop against the amplitude of its displacement.
+    """Draw the stability margins of a loop against the amplitude of its displacement.
 
     Parameters
     ----------
     amplitude : array_like, shape (m,)
         m.
     gain_margin, phase_margin_deg : array_like, shape (m,)
-        A factor > 0, drawn in dB, and degrees. Where one is infinite (no gain or phase reaches -1)
-        the top of the axes is marked.
+        A factor > 0, drawn in dB, and an angle in degrees. Infinite margins (no crossover) are
+        marked at the top of the axes.
     gain_band, phase_band : tuple of two ndarrays, shape (m,), optional
         Lower and upper limits.
 

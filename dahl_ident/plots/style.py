@@ -1,6 +1,6 @@
-"""The style of all plots: readable for colour-blind readers, in print, and at 400 px.
+"""The style of all plots: readable for colour-blind readers, in print, and at a width of 400 px.
 
-Every colour of a line or marker has a contrast of at least 3 to 1 against white paper. Series also
+Every colour of a line or marker has a contrast of at least 3:1 against white paper. Series also
 differ in marker, so that they can be distinguished in a greyscale print. Levels, which have an
 order, use a sequential map from dark to bright, with alternating line styles and markers.
 """
@@ -31,8 +31,8 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LINE_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 FIT = BLACK
 GREY = "#767676"
-_MOST_IN_A_ROW = 4  # entries of a legend
-_LEVEL_COLOURS = (0.05, 0.66)  # of the map inferno; brighter ones fall below 3 to 1 on white
+_MOST_LABELS, _MOST_IN_A_ROW = 8, 4  # entries of a legend
+_LEVEL_COLOURS = (0.05, 0.66)  # of the map inferno; brighter ones have less contrast than 3:1
 
 RC: dict[Any, Any] = {
     "axes.grid": True,
@@ -57,9 +57,8 @@ RC: dict[Any, Any] = {
 def house_style() -> Iterator[None]:
     """Draw in the package's style, and restore the user's settings afterwards.
 
-    Only the settings that the style changes are restored: the first figure of a session loads the
-    backend, and the settings of the backend (a notebook shows figures only while interactive) have
-    to remain.
+    Only the settings changed by the style are restored, because the first figure of a session loads
+    the backend, whose settings must remain (a notebook shows figures only in interactive mode).
     """
     before = {name: mpl.rcParams[name] for name in RC}
     mpl.rcParams.update(RC)
@@ -83,18 +82,16 @@ def axes(ax: Axes | None, *, size: tuple[float, float] = (4.6, 3.4)) -> Axes:
     return cast("Axes", new_axes(1, 1, size=size, sharex=False)[0, 0])
 
 
-def axes_pair(
-    ax: Sequence[Axes] | None, *, size: tuple[float, float] = (4.6, 5.0)
-) -> tuple[Axes, Axes]:
+def axes_pair(ax: Sequence[Axes] | None) -> tuple[Axes, Axes]:
     """Return the two given axes, or two new ones, one above the other, that share x."""
-    top, bottom = axes_column(ax, 2, size=size)
+    top, bottom = axes_column(ax, 2, size=(4.6, 5.0))
     return top, bottom
 
 
 def axes_column(
     ax: Sequence[Axes] | None, count: int, *, size: tuple[float, float]
 ) -> NDArray[Any]:
-    """Return so many axes, those given or new ones, one above the other, that share x."""
+    """Return `count` axes, those given or new ones, one above the other, that share x."""
     if ax is None:
         return np.asarray(new_axes(count, 1, size=size, sharex=True)[:, 0])
     column = np.ravel(np.asarray(ax, dtype=object))
@@ -120,9 +117,9 @@ def level_markers(count: int) -> list[dict[str, Any]]:
     return [{"color": colour, "marker": mark, "linestyle": "none"} for colour, mark in looks]
 
 
-def level_names(labels: Sequence[str], most: int = 8) -> list[str | None]:
-    """Return the labels of levels for the legend; of many some, evenly spread, and the ends."""
-    labelled = set(np.linspace(0, len(labels) - 1, most).round().astype(int).tolist())
+def level_names(labels: Sequence[str]) -> list[str | None]:
+    """Return the labels of levels for the legend; of many levels, some evenly spread ones."""
+    labelled = set(np.linspace(0, len(labels) - 1, _MOST_LABELS).round().astype(int).tolist())
     return [label if label and i in labelled else None for i, label in enumerate(labels)]
 
 
@@ -137,7 +134,7 @@ def legend_above(axis: Axes) -> None:
 
 
 def readable_log_ticks(axis: Axes) -> None:
-    """Label logarithmic axes of less than two decades with plain numbers, without crowding."""
+    """Label logarithmic axes of less than two decades with a few plain numbers."""
     for scale, line in ((axis.get_xscale(), axis.xaxis), (axis.get_yscale(), axis.yaxis)):
         low, high = sorted(line.get_view_interval())
         if scale == "log" and 0.0 < low < high < 100.0 * low:
@@ -159,7 +156,7 @@ class _FewLogTicks(Locator):
         self.most = most
 
     def __call__(self) -> Any:
-        assert self.axis is not None  # set by the axis that takes the locator
+        assert self.axis is not None  # set by the axis that uses the locator
         return self.tick_values(*self.axis.get_view_interval())
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
@@ -177,5 +174,5 @@ class _FewLogTicks(Locator):
 
 
 def on_two_lines(label: str) -> str:
-    """Return a label with its unit below, for panels that are smaller than the label is long."""
+    """Return a label with its unit on a second line, for small panels."""
     return label.replace(" [", "\n[", 1)

@@ -1,4 +1,4 @@
-"""Waveforms against time, cycles of an extraction, hysteresis loops, friction in its plane."""
+"""Waveforms over time, cycles of an extraction, hysteresis loops, friction in the complex plane."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dahl_ident.plots import style
 
 
 def _draw_measured(axis: Axes, x: ArrayLike, samples: ArrayLike, fitted: ArrayLike | None) -> None:
-    """Draw samples, and over them what a model predicts."""
+    """Draw samples and the prediction of a model."""
     axis.plot(x, samples, color=style.BLUE, lw=0.8, label="measured")
     if fitted is not None:
         axis.plot(x, fitted, "--", color=style.VERMILION, lw=1.0, label="fit")
@@ -28,7 +28,7 @@ def plot_waveforms(
     fitted: Sequence[ArrayLike | None] = (),
     ax: Sequence[Axes] | None = None,
 ) -> NDArray[Any]:
-    """Draw channels against time, one above the other, each on axes of its own.
+    """Draw channels against time on separate axes, one above the other.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def plot_waveforms(
     channels : sequence of (label, samples)
         Labels with units; samples have shape (n,).
     fitted : sequence of array_like or None, optional
-        What a model predicts for each channel, drawn over it; None where it predicts nothing.
+        Prediction of a model for each channel, drawn over it; None for channels without one.
 
     Examples
     --------
@@ -64,12 +64,12 @@ def plot_recorded_loops(
     force_label: str = "force [N]",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw recorded force against motion, with the force that a fit gives over it.
+    """Draw recorded force against motion, and over it the force predicted by a fit.
 
     Parameters
     ----------
     displacement, force : array_like, shape (n,)
-        Samples; the motion may be a velocity or an acceleration as well.
+        Samples; the motion may also be a velocity or an acceleration.
     fitted : array_like, shape (n,), optional
         The model's force at these samples.
     displacement_label, force_label : str
@@ -96,7 +96,7 @@ def plot_sample_residuals(
     channel: str = "force",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the residuals of a record, sample by sample, with their root mean square as title.
+    """Draw the residuals of a record's samples, with their root mean square as title.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def plot_sample_residuals(
     x_label : str
         Axis label with unit.
     channel : str, default "force"
-        What was fitted.
+        The fitted channel.
 
     Examples
     --------
@@ -130,18 +130,18 @@ def plot_cycles(
     mean_std: float | None = None,
     ax: Sequence[Axes] | None = None,
 ) -> tuple[Axes, Axes]:
-    """Draw how one point settled: its response off the median, and mean force, cycle by cycle.
+    """Draw how one point settled: deviation of the response, and mean force, cycle by cycle.
 
     Parameters
     ----------
     response : array_like of complex, shape (n,)
         Dynamic stiffness of each cycle, N/m.
     force_mean : array_like, shape (n,)
-        Mean force of each cycle, N; its decay is the first sign of unsettled friction.
+        Mean force of each cycle, N; if it decays, friction has not settled.
     left_out : int, default 0
         Leading cycles that were left out, shaded.
     response_std, mean_std : float, optional
-        Standard deviation of one cycle's value, drawn as a band around the median.
+        Standard deviation of the value of one cycle, drawn as a band around the median.
 
     Examples
     --------
@@ -153,9 +153,9 @@ def plot_cycles(
     R, mean = np.asarray(response), np.asarray(force_mean)
     cycle = np.arange(1, R.size + 1)
     middle = np.median(R[left_out:].real) + 1j * np.median(R[left_out:].imag)
-    away = 100.0 * (R - middle) / np.abs(middle)
-    top.plot(cycle, away.real, "o-", color=style.BLUE, lw=0.8, label="real part")
-    top.plot(cycle, away.imag, "s-", color=style.VERMILION, lw=0.8, label="imaginary part")
+    deviation = 100.0 * (R - middle) / np.abs(middle)
+    top.plot(cycle, deviation.real, "o-", color=style.BLUE, lw=0.8, label="real part")
+    top.plot(cycle, deviation.imag, "s-", color=style.VERMILION, lw=0.8, label="imaginary part")
     bottom.plot(cycle, mean, "o-", color=style.GREEN, lw=0.8)
     for axis, centre, half in (
         (top, 0.0, response_std and 200.0 * response_std / np.abs(middle)),
@@ -187,7 +187,7 @@ def plot_loops(
     loops : sequence of (displacement, force, label)
         The model's loops.
     measured : sequence of (displacement, force), optional
-        Measured points, drawn as markers in the colour of the corresponding loop.
+        Measured points, drawn as markers in the colour of their loop.
     displacement_label, force_label : str
         Axis labels with units.
 
@@ -238,7 +238,7 @@ def plot_universal_curve(
     axis.plot(N.real, N.imag, "o", color=style.BLUE, label="data / sigma", zorder=3)
     for beta, value in marked_beta:
         axis.plot(value.real, value.imag, "|", color=style.FIT, markersize=9)
-        inwards = 0.5 + 0.1j - value  # clear of the data
+        inwards = 0.5 + 0.1j - value  # away from the data
         inwards *= 18.0 / abs(inwards)
         axis.annotate(
             f"{beta:g}", (value.real, value.imag), (inwards.real, inwards.imag), fontsize=7,

@@ -4,15 +4,13 @@ A channel stores, at its nominal sampling times t,
 
     clip(quantise(gain y(t + jitter - delay) + offset + drift t + hum + white + 1/f noise))
 
-where y is the true signal after a first-order anti-alias filter. Jitter is common to the
-channels, since one clock samples both; noise is not.
+where y is the true signal after a first-order anti-alias filter. Jitter is common to the channels,
+because one clock samples both; noise is not.
 
-Random numbers that depend only on a seed and a purpose.
-
-Every effect of the synthetic laboratory has its own stream, so that adding an effect does not
-change the others. The bits come from PCG64, and normal numbers from the inverse of their
-distribution: no draw is ever rejected, so platform differences in the last digit cannot shift a
-stream.
+Every effect has its own stream of random numbers, which depends only on the seed and the purpose,
+so that adding an effect does not change the others. The bits come from PCG64, and normal numbers
+from the inverse of their distribution: no draw is ever rejected, so platform differences in the
+last digit cannot shift a stream.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from dahl_ident.elements.driven_motion import STEADY, Steady
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic.mechanism import Signal
 
-_FILTER_OVERSAMPLING = 16  # points for each sample; the signal is linear between them
+_FILTER_OVERSAMPLING = 16  # points per sample; the signal is linear between them
 _WAVEFORM_FAULTS = (
     "noise_std", "flicker_std", "hum_amplitude", "offset", "drift", "resolution", "limit",
 )  # fmt: skip
@@ -44,7 +42,7 @@ _WAVEFORM_FAULTS = (
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor; by default an ideal one.
+    """One sensor, by default ideal.
 
     Parameters
     ----------
@@ -69,7 +67,7 @@ class Channel:
     resolution : float, default 0
         Step of the quantiser, in the channel's unit; 0 for none.
     limit : float, optional
-        Values beyond plus or minus this are clipped to it.
+        Values above this or below minus this are clipped.
 
     Raises
     ------
@@ -102,20 +100,20 @@ class Channel:
 
     def response(self, omega: FloatArray) -> ComplexArray:
         """Return measured over true phasor at angular frequencies: gain, filter and delay."""
-        shown = self.gain * np.exp(-1j * omega * self.delay)
+        response = self.gain * np.exp(-1j * omega * self.delay)
         if self.antialias_hz is not None:
-            shown = shown / (1.0 + 1j * omega / (2.0 * np.pi * self.antialias_hz))
-        return np.asarray(shown)
+            response = response / (1.0 + 1j * omega / (2.0 * np.pi * self.antialias_hz))
+        return np.asarray(response)
 
     def measure(
         self, signal: Signal, time: FloatArray, jitter: FloatArray, draws: Draws, name: str
     ) -> FloatArray:
-        """Return what the channel called `name` stores at its nominal sampling times."""
-        seen = self._filtered(signal, time[0], time[-1], time[1] - time[0])
-        y = self.gain * seen(time + jitter - self.delay) + self.offset + self.drift * time
+        """Return the values that the channel `name` stores at its nominal sampling times."""
+        filtered = self._filtered(signal, time[0], time[-1], time[1] - time[0])
+        y = self.gain * filtered(time + jitter - self.delay) + self.offset + self.drift * time
         if self.hum_amplitude > 0.0:
-            turn = draws.uniform(f"{name} hum", 1)
-            y = y + self.hum_amplitude * np.sin(2.0 * np.pi * (self.hum_hz * time + turn))
+            cycle = draws.uniform(f"{name} hum", 1)
+            y = y + self.hum_amplitude * np.sin(2.0 * np.pi * (self.hum_hz * time + cycle))
         if self.noise_std > 0.0:
             y = y + self.noise_std * draws.normal(f"{name} noise", time.size)
         if self.flicker_std > 0.0:
@@ -131,14 +129,14 @@ class Channel:
 
         if self.antialias_hz is None:
             return signal
-        early = start - abs(self.delay) - step
-        grid = np.arange(early, stop + abs(self.delay) + 2.0 * step, step / _FILTER_OVERSAMPLING)
+        first = start - abs(self.delay) - step
+        grid = np.arange(first, stop + abs(self.delay) + 2.0 * step, step / _FILTER_OVERSAMPLING)
         y = signal(grid)
         d = 2.0 * np.pi * self.antialias_hz * (grid[1] - grid[0])
         pole = np.exp(-d)
-        late = 1.0 + np.expm1(-d) / d  # weight of a cell's later end, first-order hold
-        taps = [late, 1.0 - pole - late]
-        filtered, _ = lfilter(taps, [1.0, -pole], y, zi=[y[0] * (1.0 - late)])
+        weight = 1.0 + np.expm1(-d) / d  # of the newer sample, first-order hold
+        taps = [weight, 1.0 - pole - weight]
+        filtered, _ = lfilter(taps, [1.0, -pole], y, zi=[y[0] * (1.0 - weight)])
         return CubicSpline(grid, filtered)
 
 
@@ -149,13 +147,13 @@ class Acquisition:
     Parameters
     ----------
     sample_rate_hz : float, optional
-        Samples per second; by default 64 in the shortest period of the excitation.
+        Samples per second; by default 64 per shortest period of the excitation.
     displacement, force : Channel
-        The sensors; their unit is m (rad) and N (N m).
+        The sensors, with units m (rad) and N (N m).
     jitter_std : float, default 0
-        Standard deviation of the sampling instants about the stored times, s.
+        Standard deviation of the sampling instants from the stored times, s.
     dropped_fraction : float, default 0
-        Share of the samples, chosen at random, that are missing from the record.
+        Fraction of the samples, chosen at random, that are missing from the record.
 
     Raises
     ------
@@ -199,7 +197,7 @@ class Acquisition:
         Raises
         ------
         ValidationError
-            If the rate is not above two samples a period.
+            If the rate is not above two samples per period.
         """
         rate = self.sample_rate_hz if self.sample_rate_hz is not None else 64.0 * highest_hz
         if rate <= 2.0 * highest_hz:
@@ -227,23 +225,23 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Table:
-    """Request for a table of response with given errors.
+    """Request for a table of responses with given errors.
 
     Parameters
     ----------
     displacement_std, force_std : float, default 0
-        Relative standard deviation of the real and of the imaginary part of each phasor; of
-        the fundamental's size for higher harmonics.
+        Standard deviation of the real and of the imaginary part of each phasor, relative to the
+        size of its fundamental.
     harmonics : sequence of int, default (1,)
-        Harmonics that get a row: of the force where displacement is controlled, of the
-        displacement, up to 9, where the force is.
+        Harmonics that get a row: of the force if the displacement is controlled; of the
+        displacement, up to 9, if the force is controlled.
     outlier_fraction : float, default 0
-        Share of the rows, chosen at random, with a gross error.
+        Fraction of the rows, chosen at random, with a gross error.
     outlier_size : float, default 0.5
         That error relative to the response, in a random direction of the complex plane.
     steady : {"exact", "describing function"}, default "exact"
-        Where force is controlled: the motion of the plant, or what the paper's describing function
-        makes of it, which no plant does.
+        If the force is controlled: the exact motion of the plant, or the approximation by the
+        paper's describing function.
 
     Raises
     ------
@@ -264,8 +262,8 @@ class Table:
     steady: Steady = "exact"
 
     def __post_init__(self) -> None:
-        shares = ("displacement_std", "force_std", "outlier_fraction", "outlier_size")
-        set_checked(self, non_negative_number, *shares)
+        names = ("displacement_std", "force_std", "outlier_fraction", "outlier_size")
+        set_checked(self, non_negative_number, *names)
         one_of(self.steady, "steady", STEADY)
         if self.outlier_fraction > 1.0:
             raise ValidationError(
@@ -277,7 +275,7 @@ class Table:
         object.__setattr__(self, "harmonics", harmonics)
 
     def outlier_rows(self, rows: int, draws: Draws) -> list[int]:
-        """Return the rows that get a gross error, rising."""
+        """Return the rows that get a gross error, in increasing order."""
         count = round(self.outlier_fraction * rows)
         return sorted(draws.permutation("outlier rows", rows)[:count])
 
@@ -289,7 +287,7 @@ class Draws:
         self._seed = seed
 
     def uniform(self, purpose: str, n: int) -> FloatArray:
-        """Return `n` numbers between 0 and 1, both excluded."""
+        """Return `n` numbers between 0 and 1, excluding both."""
         key = np.random.SeedSequence(self._seed, spawn_key=tuple(purpose.encode()))
         bits = np.random.PCG64(key).random_raw(n)
         return np.asarray(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
@@ -299,12 +297,12 @@ class Draws:
         return np.asarray(ndtri(self.uniform(purpose, n)))
 
     def complex_normal(self, purpose: str, n: int) -> ComplexArray:
-        """Return `n` complex numbers of standard normal parts."""
+        """Return `n` complex numbers with standard normal real and imaginary parts."""
         parts = (self.normal(f"{purpose}, {part}", n) for part in ("real", "imaginary"))
         return np.asarray(next(parts) + 1j * next(parts))
 
     def flicker(self, purpose: str, n: int) -> FloatArray:
-        """Return `n` numbers of 1/f noise: power falling as 1/f, mean 0, expected variance 1."""
+        """Return `n` numbers of noise with a power of 1/f, mean 0 and expected variance 1."""
         spectrum = np.fft.rfft(self.normal(purpose, n))
         weight = np.zeros(spectrum.size)
         weight[1:] = np.arange(1, spectrum.size) ** -0.5

@@ -23,14 +23,14 @@ Spacing = Literal["linear", "log"]
 
 @dataclass(frozen=True)
 class SteppedSine:
-    """A sine at every frequency and level of a grid: ramp, settle, measure; rest if wanted.
+    """A sine at every frequency and level of a grid: ramp, settle, measure, and optionally rest.
 
     Parameters
     ----------
     levels : sequence of float
         Zero-to-peak amplitudes, m (rad) or N (N m).
     frequencies_hz : sequence of float, default (1.0,)
-        Hz. All levels are run at one frequency before the next.
+        Hz. All levels are measured at one frequency before the next.
     controlled : {"displacement", "force"}
         What the levels are amplitudes of.
     order : {"given", "ascending", "descending", "random"}
@@ -42,7 +42,7 @@ class SteppedSine:
     ramp_periods : float, default 2
         Periods of the smooth transition to the next level and frequency; 0 is a jump.
     rest : float, default 0
-        Seconds at rest between the steps, which are then ramped down and up; 0 for no rest.
+        Seconds at rest between the steps, with ramps down and up; 0 for no rest.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class SteppedSine:
 
 @dataclass(frozen=True)
 class FrequencySweep:
-    """A frequency that moves steadily from start to stop, at one level or several in turn.
+    """A frequency that changes steadily from start to stop, at one level or several in turn.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class FrequencySweep:
     controlled : {"displacement", "force"}
         What the level is an amplitude of.
     ramp_periods : float, default 2
-        Periods of the first frequency in which level and frequency are reached.
+        Duration of the initial ramp in periods of the first frequency.
 
     Raises
     ------
@@ -139,10 +139,10 @@ class FrequencySweep:
         several = isinstance(self.level, Sequence)
         if several:
             set_checked(self, _numbers, "level")
-        _check_passage(self, *["level"][several:], "start_hz", "stop_hz", "duration")
+        _check_sweep(self, *["level"][several:], "start_hz", "stop_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
-        """Return a ramp and the sweep, for each level."""
+        """Return a ramp and the sweep for each level."""
         run = WaveformBuilder(self.start_hz)
         for level in self.level if isinstance(self.level, Sequence) else (self.level,):
             run.go_to(level, self.start_hz, self.ramp_periods / self.start_hz)
@@ -152,7 +152,7 @@ class FrequencySweep:
 
 @dataclass(frozen=True)
 class AmplitudeRamp:
-    """One frequency, with a level that moves steadily from start to stop.
+    """A sine of constant frequency with a level that changes steadily from start to stop.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class AmplitudeRamp:
     controlled : {"displacement", "force"}
         What the levels are amplitudes of.
     ramp_periods : float, default 2
-        Periods in which the first level is reached.
+        Duration of the initial ramp in periods.
 
     Raises
     ------
@@ -190,7 +190,7 @@ class AmplitudeRamp:
     ramp_periods: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_passage(self, "start_level", "stop_level", "frequency_hz", "duration")
+        _check_sweep(self, "start_level", "stop_level", "frequency_hz", "duration")
 
     def waveform(self, seed: int) -> Waveform:
         """Return the smooth start and the ramp."""
@@ -208,12 +208,12 @@ def _numbers(numbers: Sequence[float], name: str) -> tuple[float, ...]:
     return tuple(values.tolist())
 
 
-def _check_passage(passage: FrequencySweep | AmplitudeRamp, *positive: str) -> None:
-    """Check a steady sweep, and turn its numbers into floats."""
-    set_checked(passage, positive_number, *positive)
-    one_of(passage.spacing, "spacing", get_args(Spacing))
-    one_of(passage.controlled, "controlled", get_args(Controlled))
-    set_checked(passage, non_negative_number, "ramp_periods")
+def _check_sweep(sweep: FrequencySweep | AmplitudeRamp, *positive: str) -> None:
+    """Check a sweep or ramp, and convert its numbers to floats."""
+    set_checked(sweep, positive_number, *positive)
+    one_of(sweep.spacing, "spacing", get_args(Spacing))
+    one_of(sweep.controlled, "controlled", get_args(Controlled))
+    set_checked(sweep, non_negative_number, "ramp_periods")
 
 
 Excitation = SteppedSine | FrequencySweep | AmplitudeRamp

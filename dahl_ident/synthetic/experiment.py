@@ -1,7 +1,7 @@
 """Description of an experiment: mechanism, excitation, sensors and requested data.
 
-The description is frozen, prints as TOML, and can be converted to JSON or TOML and back. Together
-with a seed it determines every number of the data.
+The description is immutable, prints as TOML, and can be converted to JSON or TOML and back.
+Together with a seed it determines every number of the data.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ class Experiment:
     Parameters
     ----------
     plant : Element
-        The mechanism, every parameter with a value: friction alone, such as ``Dahl(0.1, 30)``,
+        The mechanism, with a value for every parameter: only friction, such as ``Dahl(0.1, 30)``,
         or a sum.
     excitation : SteppedSine, FrequencySweep or AmplitudeRamp
-        What drives it.
+        The excitation.
     acquisition : Acquisition
         Sensors and recorder; ideal ones by default. Their gain, delay and anti-alias filter also
         affect a table.
     table : Table, optional
-        Ask for a table of response with these errors; None: a record of waveforms.
+        Request for a table of responses with these errors; None for a record of waveforms.
     motion : {"translation", "rotation"}
-        Whether displacement is m or rad.
+        Whether displacement is in m or rad.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class Experiment:
                 "has one response for each step: leave table out to record waveforms"
             )
         orders = table.harmonics
-        highest = 9 if table.steady == "exact" else 1  # the describing function has no more
+        highest = 9 if table.steady == "exact" else 1
         if excitation.controlled == "force" and (1 not in orders or max(orders) > highest):
             raise ValidationError(
                 f"harmonics is {orders} where force is controlled; expected 1 among them, and none "
@@ -106,7 +106,7 @@ class Experiment:
 
     @property
     def truth(self) -> dict[str, float]:
-        """The value of every parameter, by name; of the sensors those that are not ideal."""
+        """The value of every parameter by name, including sensor parameters that are not ideal."""
         values = {p.name: float(p.value) for p in self.plant.parameters if p.value is not None}
         x, F = self.acquisition.displacement, self.acquisition.force
         sensors = {
@@ -130,12 +130,12 @@ class Experiment:
 
     @classmethod
     def from_dict(cls, description: Mapping[str, Any]) -> Experiment:
-        """Return the experiment that :meth:`to_dict` described; missing values have their defaults.
+        """Return the experiment described by :meth:`to_dict`; missing values have their defaults.
 
         Raises
         ------
         DataError
-            If a key is unknown or missing; it names those that are known.
+            If a key is unknown or missing.
         """
         values = _checked(description, cls, "the experiment")
         excitation = dict(values["excitation"])
@@ -162,7 +162,7 @@ class Experiment:
 
     @classmethod
     def from_json(cls, text: str) -> Experiment:
-        """Return the experiment that a JSON text describes.
+        """Return the experiment described by a JSON text.
 
         Raises
         ------
@@ -177,7 +177,7 @@ class Experiment:
 
     @classmethod
     def from_toml(cls, text: str) -> Experiment:
-        """Return the experiment that a TOML text describes.
+        """Return the experiment described by a TOML text.
 
         Raises
         ------
@@ -195,15 +195,15 @@ class Experiment:
         DataError
             If the file cannot be read, or holds no experiment.
         """
-        place = Path(path)
+        path = Path(path)
         readers = {".toml": cls.from_toml, ".json": cls.from_json}
-        if place.suffix not in readers:
-            raise DataError(f"{place}: expected an experiment in .toml or .json")
-        text = read_text(place)
+        if path.suffix not in readers:
+            raise DataError(f"{path}: expected an experiment in .toml or .json")
+        text = read_text(path)
         try:
-            return readers[place.suffix](text)
+            return readers[path.suffix](text)
         except DahlIdentError as exc:
-            raise DataError(f"{place}: {exc}") from exc
+            raise DataError(f"{path}: {exc}") from exc
 
     def __str__(self) -> str:
         return self.to_toml()
@@ -225,21 +225,21 @@ def _parsed(loads: Callable[[str], Any], text: str, form: str) -> Any:
 
 
 def _built(cls: type[_T], entries: Mapping[str, Any], where: str) -> _T:
-    """Return the dataclass that plain data describe."""
+    """Return the dataclass described by plain data."""
     return cls(**_checked(entries, cls, where))
 
 
 def _checked(entries: Any, cls: type[Any], where: str) -> dict[str, Any]:
-    """Return plain data as arguments of a dataclass, or name the keys that do not fit."""
+    """Return plain data as arguments of a dataclass; refuse unknown or missing keys."""
     if not isinstance(entries, Mapping):
         raise DataError(f"{where} is {entries!r}; expected a table of named values")
-    known = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
-    unknown = [key for key in entries if key not in known]
-    missing = [key for key, required in known.items() if required and key not in entries]
+    required = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
+    unknown = [key for key in entries if key not in required]
+    missing = [key for key in required if required[key] and key not in entries]
     if unknown or missing:
         faults = [f"the unknown {', '.join(unknown)}"] if unknown else []
         faults += [f"no {', '.join(missing)}"] if missing else []
-        raise DataError(f"{where} has {' and '.join(faults)}; expected {', '.join(known)}")
+        raise DataError(f"{where} has {' and '.join(faults)}; expected {', '.join(required)}")
     return dict(entries)
 
 
@@ -253,7 +253,7 @@ def _plain(value: Any) -> Any:
 
 
 def toml_text(data: Mapping[str, Any], prefix: str = "") -> str:
-    """Return nested plain data without None as TOML, which the standard library only reads."""
+    """Return nested plain data without None as TOML, which the standard library cannot write."""
     lines, tables = [], []
     for key, value in data.items():
         name = f"{prefix}{key}"
@@ -261,9 +261,9 @@ def toml_text(data: Mapping[str, Any], prefix: str = "") -> str:
             tables.append(f"\n[{name}]\n{toml_text(value, f'{name}.')}")
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             tables += [f"\n[[{name}]]\n{toml_text(entry, f'{name}.')}" for entry in value]
-        else:  # JSON writes strings, booleans, finite numbers and lists of them as TOML does
+        else:  # strings, booleans, finite numbers and lists of them are the same in JSON and TOML
             text = json.dumps(value, ensure_ascii=False, allow_nan=False)
-            text = text.replace("\x7f", "\\u007f")  # which JSON leaves as it is
+            text = text.replace("\x7f", "\\u007f")  # not escaped by JSON
             wide = isinstance(value, list) and len(text) > _WIDTH
             rows = textwrap.wrap(text, _WIDTH) if wide else [text]
             lines.append(f"{key} = {_INDENT.join(rows)}\n")

@@ -19,7 +19,7 @@ from dahl_ident.synthetic.experiment import Experiment
 from dahl_ident.synthetic.mechanism import Mechanism, Progress, Signal
 
 GENERATOR = "dahl_ident.synthetic 3"
-"""Raised whenever the same experiment and seed would give other values."""
+"""Version of the generator; it changes whenever an experiment and seed would give other values."""
 
 
 def simulate(
@@ -30,23 +30,23 @@ def simulate(
     Parameters
     ----------
     experiment : Experiment
-        Mechanism, excitation, sensors, and whether a record or a table is wanted.
+        Mechanism, excitation, sensors, and whether a record or a table is requested.
     seed : int
         Whole number >= 0. The same seed gives the same values to 1e-10 on every platform.
     progress : callable, optional
-        Called from time to time with the completed fraction, while a plant is simulated.
+        Called from time to time with the completed fraction of the simulation of a plant.
 
     Returns
     -------
     Record or FrequencyResponse
-        A table where the experiment asks for one, else waveforms. Its provenance holds the
+        A table if the experiment requests one, otherwise waveforms. Its provenance holds the
         experiment, the seed, the true parameters and, for a stepped sine, the measured windows.
 
     Raises
     ------
     ModelError
-        If the motion in time of the plant is not available, it has no steady state, or its motion
-        grows without bound.
+        If the motion of the plant over time cannot be computed, it has no steady state, or its
+        motion grows without bound.
     ValidationError
         If `experiment` is not an Experiment, `seed` is not a whole number, or the sampling rate is
         too low.
@@ -54,10 +54,10 @@ def simulate(
     Notes
     -----
     The friction of a displacement-controlled mechanism is exact (Eqn. 3 from turning point to
-    turning point). The equation of motion of a force-controlled plant (Eqn. 53) is integrated to
-    about 1e-11 of its motion, reversals located; the describing function is not used. Tables of it
-    contain the exact steady motion, :func:`dahl_ident.response`, unless the table asks for the
-    describing function.
+    turning point). The equation of motion of a force-controlled plant (Eqn. 53) is integrated with
+    an error of about 1e-11 of its motion, with located reversals; the describing function is not
+    used. Tables contain the exact steady motion, :func:`dahl_ident.response`, unless they request
+    the describing function.
 
     Examples
     --------
@@ -103,75 +103,76 @@ def simulate(
 def _table(
     experiment: Experiment, table: Table, grid: FloatArray, draws: Draws
 ) -> tuple[FrequencyResponse, list[int]]:
-    """Return the table of a stepped sine, a row for every step and harmonic, and its outliers."""
-    # With relative errors e of the phasors the table holds A (1 + e_A) over H (1 + e_H), A of what
-    # answers and H of what was held. The covariance is of the true response: one that followed
-    # each row's error would bias every fit.
+    """Return the table of a stepped sine, one row per step and harmonic, and its outliers."""
+    # The table holds output (1 + e_out) over input (1 + e_in) with relative errors e; the input is
+    # the controlled quantity. The covariance is that of the true response: one computed from the
+    # erroneous response of each row would bias every fit.
     level, frequency_hz = grid.T
     steps, harmonics = np.arange(level.size), np.array(table.harmonics)
     step, k = (g.ravel() for g in np.meshgrid(steps, harmonics, indexing="ij"))
     omega = 2.0 * np.pi * frequency_hz[step]
     forced = experiment.excitation.controlled == "force"
     sensors = (experiment.acquisition.displacement, experiment.acquisition.force)
-    of_held, of_answer = sensors[::-1] if forced else sensors
+    in_sensor, out_sensor = sensors[::-1] if forced else sensors
     errors = {"displacement": table.displacement_std, "force": table.force_std}
-    (held_name, held_std), (name, std) = sorted(errors.items(), reverse=forced)
+    (in_name, in_std), (out_name, out_std) = sorted(errors.items(), reverse=forced)
     if forced:
         with warnings.catch_warnings():  # they are an error here
             warnings.simplefilter("ignore", NoSteadyMotionWarning)
             steady = response(experiment.plant, frequency_hz, level, steady=table.steady)
         if not steady.found.all():
             raise ModelError(steady.message)
-        every = np.asarray(steady.harmonics)
-        answer, fundamental = every[step, k], every[step, 1]
+        phasors = np.asarray(steady.harmonics)
+        output, fundamental = phasors[step, k], phasors[step, 1]
     else:
         plant, A = experiment.plant, level[step]
-        fundamental, answer = plant.dynamic_stiffness(A, omega) * A, np.zeros(k.size, complex)
+        fundamental, output = plant.dynamic_stiffness(A, omega) * A, np.zeros(k.size, complex)
         for harmonic in harmonics.tolist():
             rows = k == harmonic
             stiffness = plant.dynamic_stiffness(A[rows], omega[rows], harmonic=harmonic)
-            answer[rows] = stiffness * A[rows]
-    held = level[step] * of_held.response(omega)
-    answer = answer * of_answer.response(k * omega)
-    size = np.abs(fundamental * of_answer.response(omega))
-    true = _referred(answer, held, k)
-    one_a_step = draws.complex_normal(f"{held_name} phasor", steps.size)[step]
-    noisy_held = held * (1.0 + held_std * one_a_step)
-    turned = np.exp(1j * np.angle(answer)) * draws.complex_normal(f"{name} phasor", answer.size)
-    noisy = answer + std * size * turned
-    measured = _referred(noisy, noisy_held, k)
+            output[rows] = stiffness * A[rows]
+    true_input = level[step] * in_sensor.response(omega)
+    output = output * out_sensor.response(k * omega)
+    size = np.abs(fundamental * out_sensor.response(omega))
+    true = _ratio(output, true_input, k)
+    in_error = in_std * draws.complex_normal(f"{in_name} phasor", steps.size)[step]
+    noisy_input = true_input * (1.0 + in_error)
+    direction = np.exp(1j * np.angle(output)) * draws.complex_normal(f"{out_name} phasor", k.size)
+    noisy_output = output + out_std * size * direction
+    measured = _ratio(noisy_output, noisy_input, k)
     outliers = table.outlier_rows(k.size, draws)
     angle = 2.0 * np.pi * draws.uniform("outlier direction", k.size)[outliers]
     measured[outliers] *= 1.0 + table.outlier_size * np.exp(1j * angle)
-    amplitude, drive, shared, of_amplitude = np.abs(noisy_held), None, -true, np.abs(held)
+    amplitude, drive, change, true_amplitude = np.abs(noisy_input), None, -true, np.abs(true_input)
     if forced:
-        drive, of_amplitude = amplitude, size
-        amplitude = np.abs(noisy)[np.flatnonzero(k == 1)[step]]
-        shared = np.where(k == 1, true, 0.0)
-    known: dict[str, Any] = {}
+        drive, true_amplitude = amplitude, size
+        amplitude = np.abs(noisy_output)[np.flatnonzero(k == 1)[step]]
+        change = np.where(k == 1, true, 0.0)
+    stated: dict[str, Any] = {}
     if table.displacement_std > 0.0 or table.force_std > 0.0:
-        # the response changes with the size of what was held, and with its phase
-        with_held = held_std**2 * (_outer(true) + _outer(1j * k * true))
-        shared = table.displacement_std**2 * of_amplitude * shared
-        known = {
-            "covariance": with_held + (std * size / np.abs(held))[:, None, None] ** 2 * np.eye(2),
+        # the response changes with the size of the input, and with its phase
+        by_input = in_std**2 * (_outer(true) + _outer(1j * k * true))
+        by_output = (out_std * size / np.abs(true_input))[:, None, None] ** 2 * np.eye(2)
+        cross = table.displacement_std**2 * true_amplitude * change
+        stated = {
+            "covariance": by_input + by_output,
             "dof": np.inf,
-            "amplitude_std": table.displacement_std * of_amplitude,
-            "amplitude_covariance": np.column_stack([shared.real, shared.imag]),
+            "amplitude_std": table.displacement_std * true_amplitude,
+            "amplitude_covariance": np.column_stack([cross.real, cross.imag]),
         }
     data = FrequencyResponse(
         frequency_hz[step], measured, amplitude, drive, level=level[step], harmonic=k,
-        controlled=held_name, quantity="receptance" if forced else "dynamic_stiffness", **known,
+        controlled=in_name, quantity="receptance" if forced else "dynamic_stiffness", **stated,
     )  # fmt: skip
     return data, outliers
 
 
-def _referred(answer: ComplexArray, held: ComplexArray, k: NDArray[np.int64]) -> ComplexArray:
-    """Return a harmonic over the size of what was held, turned by k times its phase."""
-    return np.asarray(answer / np.abs(held) * np.exp(-1j * k * np.angle(held)))
+def _ratio(output: ComplexArray, held: ComplexArray, k: NDArray[np.int64]) -> ComplexArray:
+    """Return harmonic k over the size of the controlled phasor, relative to k times its phase."""
+    return np.asarray(output / np.abs(held) * np.exp(-1j * k * np.angle(held)))
 
 
 def _outer(v: ComplexArray) -> FloatArray:
-    """Return the (n, 2, 2) products of a complex vector's parts with each other."""
+    """Return the (n, 2, 2) products of the real and imaginary parts with each other."""
     parts = np.column_stack([v.real, v.imag])
     return np.asarray(parts[:, :, None] * parts[:, None, :])

@@ -1,9 +1,9 @@
-"""Write the shipped data sets anew: ``python -m dahl_ident.synthetic.regenerate``.
+"""Generate the shipped data sets again: ``python -m dahl_ident.synthetic.regenerate``.
 
-Each is a data file, a JSON file that declares it, to which its truth and SHA-256 are added, and a
-row of the README's table. A new one begins as a JSON file with name, experiment, seed, teaches,
-identifiable, not_identifiable and caution. On one platform and version the files come out the same
-to the byte; anywhere, their values agree to 1e-12.
+Each consists of a data file, a JSON file that declares it, to which the true parameters and the
+SHA-256 are added, and a row in the table of the README. To add one, write a JSON file with name,
+experiment, seed, teaches, identifiable, not_identifiable and caution. On one platform and version
+the files are reproduced to the byte; on any platform their values agree to 1e-12.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from dahl_ident.synthetic.lab import simulate
 from dahl_ident.synthetic.shipped import DataSet, data_sets, datasets_directory
 
 
-def make(one: DataSet) -> Record | FrequencyResponse:
-    """Return the data set of an experiment and its seed."""
-    return simulate(one.experiment, seed=one.seed)
+def make(data_set: DataSet) -> Record | FrequencyResponse:
+    """Return the data of a data set from its experiment and seed."""
+    return simulate(data_set.experiment, seed=data_set.seed)
 
 
-def write(one: DataSet, directory: Path) -> None:
-    """Write the data file and its sidecar."""
-    data = make(one)
+def write(data_set: DataSet, directory: Path) -> None:
+    """Write the data file and its JSON file."""
+    data = make(data_set)
     provenance = dict(data.provenance or {})
-    bare = replace(data, provenance={"dataset": one.name})
-    file = bare.save(directory / one.file, overwrite=True)
+    bare = replace(data, provenance={"dataset": data_set.name})
+    file = bare.save(directory / data_set.file, overwrite=True)
     names = ("teaches", "identifiable", "not_identifiable", "caution")
-    sidecar = {name: getattr(one, name) for name in ("name", "kind", "file")}
+    sidecar = {name: getattr(data_set, name) for name in ("name", "kind", "file")}
     sidecar["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    sidecar |= {name: getattr(one, name) for name in names} | provenance
+    sidecar |= {name: getattr(data_set, name) for name in names} | provenance
     text = json.dumps(sidecar, indent=1, ensure_ascii=False) + "\n"
-    (directory / f"{one.name}.json").write_text(text, encoding="utf-8")
+    (directory / f"{data_set.name}.json").write_text(text, encoding="utf-8")
 
 
 def readme() -> str:
-    """Return the README of the data sets, with a row for each."""
+    """Return the README of the data sets, with one row for each."""
     rows = [
-        f"| `{one.name}` | {one.kind.replace('_', ' ')} | {one.teaches} "
-        f"| {', '.join(one.identifiable)} | {', '.join(one.not_identifiable) or '-'} "
-        f"| {one.caution or '-'} |"
-        for one in data_sets().values()
+        f"| `{s.name}` | {s.kind.replace('_', ' ')} | {s.teaches} "
+        f"| {', '.join(s.identifiable)} | {', '.join(s.not_identifiable) or '-'} "
+        f"| {s.caution or '-'} |"
+        for s in data_sets().values()
     ]
     return _README.format(rows="\n".join(rows))
 
@@ -70,8 +70,8 @@ this page.
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write all data sets, or those named, into a directory."""
-    parser = argparse.ArgumentParser(description="Write the synthetic data sets anew.")
+    """Write all data sets, or the named ones, into a directory."""
+    parser = argparse.ArgumentParser(description="Generate the synthetic data sets again.")
     parser.add_argument("names", nargs="*", help="all, if none is named")
     parser.add_argument("--directory", type=Path, default=None, help="where to write them")
     parsed = parser.parse_args(arguments)

@@ -1,6 +1,6 @@
-"""The data sets that ship: what each teaches, how it was made, and what it can determine.
+"""The shipped data sets: what each teaches, how it was made, and what it can determine.
 
-Each is a file of data and a JSON file that declares it.
+Each consists of a data file and a JSON file that declares it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dahl_ident.errors import DataError, choices
 from dahl_ident.synthetic.experiment import Experiment
 
 _PACKAGE = Path(__file__).parents[1]  # the folder dahl_ident
-_PLACES = (_PACKAGE / "datasets" / "synthetic", _PACKAGE.parent / "datasets" / "synthetic")
+_FOLDERS = (_PACKAGE / "datasets" / "synthetic", _PACKAGE.parent / "datasets" / "synthetic")
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class DataSet:
     """One shipped data set, as its JSON file declares it.
 
     `identifiable` are the parameters that the data determine (standard deviation of the logarithm
-    below 0.25), `not_identifiable` those that they do not: a fit has to say so. `caution` is the
-    flaw of the data that an analysis has to report, or an empty string.
+    below 0.25), `not_identifiable` the others, which a fit must report. `caution` is the flaw of
+    the data that an analysis must report, or an empty string.
     """
 
     name: str
@@ -46,7 +46,7 @@ class DataSet:
 
     @property
     def kind(self) -> str:
-        """What the set holds: "frequency_response" or "record"."""
+        """Kind of data: "frequency_response" or "record"."""
         return "record" if self.experiment.table is None else "frequency_response"
 
     @property
@@ -60,7 +60,7 @@ def data_sets() -> dict[str, DataSet]:
     """Return every shipped data set by its name, in the order of their seeds."""
     files = sorted(datasets_directory().glob("*.json"))
     sets = [DataSet.of(json.loads(file.read_text(encoding="utf-8"))) for file in files]
-    return {one.name: one for one in sorted(sets, key=lambda one: one.seed)}
+    return {data_set.name: data_set for data_set in sorted(sets, key=lambda s: s.seed)}
 
 
 def load_dataset(name: str) -> FrequencyResponse | Record:
@@ -90,13 +90,13 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
     >>> data.n, data.provenance["truth"]["f_max"]
     (30, 0.1)
     """
-    place = datasets_directory()
-    sidecar_file = place / f"{name}.json"
+    folder = datasets_directory()
+    sidecar_file = folder / f"{name}.json"
     if not sidecar_file.is_file():
-        known = choices(sorted(p.stem for p in place.glob("*.json")), name)
+        known = choices(sorted(p.stem for p in folder.glob("*.json")), name)
         raise DataError(f"there is no data set {name!r}; there are {known}")
     sidecar: dict[str, Any] = json.loads(sidecar_file.read_text(encoding="utf-8"))
-    file = place / sidecar["file"]
+    file = folder / sidecar["file"]
     content = file.read_bytes() if file.is_file() else b""
     if hashlib.sha256(content).hexdigest() != sidecar["sha256"]:
         raise DataError(
@@ -109,11 +109,11 @@ def load_dataset(name: str) -> FrequencyResponse | Record:
 
 
 def datasets_directory() -> Path:
-    """Return where the data sets lie: in an installed package, else next to a checkout's."""
-    for place in _PLACES:
-        if place.is_dir():
-            return place
+    """Return the folder of the data sets: in an installed package, or beside it in a checkout."""
+    for folder in _FOLDERS:
+        if folder.is_dir():
+            return folder
     raise DataError(
-        f"the synthetic data sets are in none of {', '.join(map(str, _PLACES))}; install the "
+        f"the synthetic data sets are in none of {', '.join(map(str, _FOLDERS))}; install the "
         "package again"
     )

@@ -1,9 +1,9 @@
-"""Smooth excitation waveforms: sines whose amplitude and frequency move from step to step.
+"""Smooth excitation waveforms: sines whose amplitude and frequency change from step to step.
 
-A waveform is a chain of segments, each a(t) sin(phi(t)) with continuous phase, so value,
-velocity and acceleration are known in closed form at every instant. A level or a frequency
-changes along the quintic 10 tau^3 - 15 tau^4 + 6 tau^5, whose first two derivatives vanish at
-both ends: the acceleration has no jumps.
+A waveform is a sequence of segments a(t) sin(phi(t)) with continuous phase, so that value,
+velocity and acceleration are known in closed form at every instant. Amplitude and frequency change
+along the quintic 10 tau^3 - 15 tau^4 + 6 tau^5, whose first two derivatives are zero at both ends:
+the acceleration has no jumps.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import FloatArray
 
 Course = Literal["smooth", "linear", "log"]
+_GRID_PER_PERIOD, _BISECTIONS = 64, 44  # for turning points
 
 
 class WaveValues(NamedTuple):
-    """A waveform's value with its first and second derivative in time."""
+    """Value of a waveform, and its first and second derivative with respect to time."""
 
     value: FloatArray
     velocity: FloatArray
@@ -29,7 +30,7 @@ class WaveValues(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The whole periods of one step that are meant to be measured."""
+    """The time of the whole periods of one step that are to be measured."""
 
     level: float
     frequency_hz: float
@@ -39,7 +40,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class SineStep:
-    """a(t) sin(phi(t)) from `start` for `duration` s; amplitude and frequency take one `course`."""
+    """a(t) sin(phi(t)) from `start` for `duration` s; amplitude and frequency follow a `course`."""
 
     start: float
     duration: float
@@ -69,21 +70,21 @@ class SineStep:
         )
 
     def phase_at(self, tau: FloatArray) -> FloatArray:
-        """Return the phase, rad, as tau goes from 0 to 1."""
+        """Return the phase, rad, at tau from 0 (start) to 1 (stop)."""
         cycles = self.duration * _integral(*self.frequency_hz, self.course, tau)
         return np.asarray(self.phase + 2.0 * np.pi * cycles)
 
 
 @dataclass(frozen=True)
 class Waveform:
-    """Segments that follow each other without a gap, and the windows meant to be measured."""
+    """Consecutive segments without gaps, and the windows to be measured."""
 
     segments: tuple[SineStep, ...]
     windows: tuple[Window, ...] = ()
 
     @property
     def duration(self) -> float:
-        """End of the last segment, s; the first begins at 0."""
+        """End of the last segment, s; the first starts at 0."""
         return self.segments[-1].stop
 
     @property
@@ -92,21 +93,21 @@ class Waveform:
         return max(max(s.frequency_hz) for s in self.segments)
 
     def motion(self, time: FloatArray) -> WaveValues:
-        """Return value and derivatives at any times; constant outside, at the end values."""
+        """Return value and derivatives at any times; the value is constant outside the segments."""
         parts = np.zeros((3, *np.shape(time)))
-        for i, here, t in self.by_segment(time):
-            parts[:, here] = self.segments[i].motion(t)
+        for i, inside, t in self.by_segment(time):
+            parts[:, inside] = self.segments[i].motion(t)
         outside = (np.asarray(time) < 0.0) | (np.asarray(time) > self.duration)
         parts[1:, outside] = 0.0
         return WaveValues(*parts)
 
     def by_segment(self, time: FloatArray) -> Iterator[tuple[int, NDArray[np.bool_], FloatArray]]:
-        """Yield the number of each segment, which times it covers, and these, within the whole."""
+        """Yield the number of each segment, a mask of the times in it, and these times."""
         t = np.clip(np.asarray(time), 0.0, self.duration)
         starts = np.array([s.start for s in self.segments])
-        which = np.searchsorted(starts, t, side="right") - 1
-        for i in np.unique(which).tolist():
-            yield i, which == i, t[which == i]
+        segment = np.searchsorted(starts, t, side="right") - 1
+        for i in np.unique(segment).tolist():
+            yield i, segment == i, t[segment == i]
 
     def value(self, time: FloatArray) -> FloatArray:
         """Return the waveform at any times."""
@@ -120,7 +121,7 @@ class Waveform:
 
 
 class WaveformBuilder:
-    """Appends segments at the phase, amplitude and frequency where the last one ended."""
+    """Appends segments that continue the phase, amplitude and frequency of the last one."""
 
     def __init__(self, frequency_hz: float) -> None:
         self._segments: list[SineStep] = []
@@ -131,7 +132,7 @@ class WaveformBuilder:
     def go_to(
         self, amplitude: float, frequency_hz: float, duration: float, course: Course = "smooth"
     ) -> None:
-        """Move to an amplitude and a frequency within `duration`; at once where that is 0."""
+        """Change amplitude and frequency within `duration`; at once if that is 0."""
         if duration > 0.0:
             amplitudes, frequencies = (self._amplitude, amplitude), (self._frequency, frequency_hz)
             segment = SineStep(self._time, duration, amplitudes, frequencies, self._phase, course)
@@ -158,7 +159,7 @@ class WaveformBuilder:
 def _between(
     q0: float, q1: float, course: Course, tau: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the course from q0 to q1, with two derivatives with respect to tau."""
+    """Return the course from q0 to q1, and its first two derivatives with respect to tau."""
     step = q1 - q0
     if course == "linear" or step == 0.0:
         return q0 + step * tau, np.full_like(tau, step), np.zeros_like(tau)
@@ -174,7 +175,7 @@ def _between(
 
 
 def _integral(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArray:
-    """Return the integral of the course from q0 to q1, from 0 to tau."""
+    """Return the integral from 0 to tau of the course from q0 to q1."""
     step = q1 - q0
     if step == 0.0:
         return q0 * tau
@@ -186,15 +187,15 @@ def _integral(q0: float, q1: float, course: Course, tau: FloatArray) -> FloatArr
     return q0 * tau + step * tau**4 * (2.5 - tau * (3.0 - tau))
 
 
-def _turning_times(segment: SineStep, per_period: int = 64, halvings: int = 44) -> FloatArray:
-    """Return where the velocity changes sign: bracketed on a grid, then bisected."""
-    cells = int(np.ceil(segment.duration * max(segment.frequency_hz) * per_period)) + 1
+def _turning_times(segment: SineStep) -> FloatArray:
+    """Return the times at which the velocity changes sign: bracketed on a grid, then bisected."""
+    cells = int(np.ceil(segment.duration * max(segment.frequency_hz) * _GRID_PER_PERIOD)) + 1
     grid = np.linspace(segment.start, segment.stop, cells + 1)
     sign = np.sign(segment.motion(grid).velocity)
     turns = np.flatnonzero(sign[1:] * sign[:-1] < 0.0)
     exact = grid[1:-1][(sign[1:-1] == 0.0) & (sign[:-2] * sign[2:] < 0.0)]
     low, high, before = grid[turns], grid[turns + 1], sign[turns]
-    for _ in range(halvings):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         same = np.sign(segment.motion(middle).velocity) == before
         low, high = np.where(same, middle, low), np.where(same, high, middle)

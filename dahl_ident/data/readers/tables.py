@@ -486,14 +486,14 @@ def header(above: Sequence[Sequence[str]], width: int, filled: int | None = None
 
 
 def contradict(
-    one: Sequence[tuple[str, str | None]], other: Sequence[tuple[str, str | None]]
+    first: Sequence[tuple[str, str | None]], second: Sequence[tuple[str, str | None]]
 ) -> bool:
     """Return whether two lines name the same columns in another order or with other units."""
-    names = [plain(name) for name, _ in one]
-    others = [plain(name) for name, _ in other]
+    names = [plain(name) for name, _ in first]
+    others = [plain(name) for name, _ in second]
     if sorted(filter(None, names)) != sorted(filter(None, others)) or len(set(names)) < 2:
         return False
-    units = [(a, b) for (_, a), (_, b) in zip(one, other, strict=True) if a and b and a != b]
+    units = [(a, b) for (_, a), (_, b) in zip(first, second, strict=True) if a and b and a != b]
     return names != others or any(_differ(*pair) for pair in units)
 
 
