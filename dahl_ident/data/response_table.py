@@ -58,7 +58,7 @@ class WaveformsError(DataError):
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """What the user states for a whole table; see :func:`read_frequency_response`."""
+    """Statements of the user for a whole table; see :func:`read_frequency_response`."""
 
     frequency: float | None = None
     amplitude: str | None = None
@@ -72,7 +72,7 @@ class ResponseOptions:
 def response_from(
     source: RawFile, columns: ColumnMap, options: ResponseOptions
 ) -> FrequencyResponse:
-    """Return the frequency response that a source holds, all its levels in one table."""
+    """Return the frequency response in a source, with all its levels in one table."""
     source = replace(source, channels=tuple(map(_as_gain, source.channels)))
     source, options = _with_stated(source, columns, options)
     whole = Binding(source, columns, RESPONSE_COLUMNS)
@@ -80,8 +80,9 @@ def response_from(
         whole.warn(f"the header is repeated in the file: read as {len(source.runs) + 1} runs")
     if source.format == TRACE and not {"gain", "phase"} & columns.roles.keys():
         first, second = map(source.numbers, source.channels[:2])
-        reach = np.abs(second).max()  # above zero, and degrees
-        if (first > 0.0).all() and _DEGREES < reach <= 360.0 and reach > 10.0 * first.max():
+        largest = np.abs(second).max()
+        in_degrees = _DEGREES < largest <= 360.0 and largest > 10.0 * first.max()
+        if in_degrees and (first > 0.0).all():
             gain, phase = {"column": "real", "unit": ANY}, {"column": "imag", "unit": "deg"}
             polar = column_map_of({"gain": gain, "phase": phase})
             whole.warn(
@@ -119,7 +120,7 @@ def _as_gain(channel: RawChannel) -> RawChannel:
 def _with_stated(
     source: RawFile, columns: ColumnMap, options: ResponseOptions
 ) -> tuple[RawFile, ResponseOptions]:
-    """Take the level that the file's header states, where neither a column nor the user does."""
+    """Add the level stated in the file's header if neither a column nor the user gives one."""
     levels = {role: RESPONSE_COLUMNS[role] for role in ("drive", "amplitude")}
     stated: dict[str, Any] = dict(source.stated)
     if "amplitude" in stated:
@@ -298,7 +299,7 @@ class _TableBinding(Binding):
         )
 
     def _peaks(self, role: str) -> tuple[Any, str]:
-        """Return a column of amplitudes and their kind, and note what is assumed of them."""
+        """Return a column of amplitudes and their kind, and note the assumptions."""
         channel = self.channel(role)
         if channel is None:
             return None, ""
@@ -373,10 +374,10 @@ class _TableBinding(Binding):
         return complete[0] if complete else None
 
     def _factor(self, role: str) -> tuple[Quantity, float, bool]:
-        """Return which quantity a column's unit makes it, its factor, and whether it is in dB."""
+        """Return the quantity given by a column's unit, the SI factor, and whether it is in dB."""
         unit = self.unit(role, self.required(role))
         per_drive = _per_drive(unit.text) if self.map.drive_factor is not None else None
-        if per_drive is not None:  # such as m/V, made m/N by the factor in N/V
+        if per_drive is not None:  # such as m/V, converted to m/N by the factor in N/V
             drive_kind, text, power = per_drive
             kind, factor = self.kind(role, parse_unit(text))
             value, self.factor_uncertainty = self.force_per(drive_kind)
@@ -409,7 +410,7 @@ class _TableBinding(Binding):
         return values * factor
 
     def _errors(self, quantity: Quantity, response: ComplexArray) -> dict[str, Any]:
-        """Return the constructor's arguments on errors that the table has columns for."""
+        """Return the columns of errors as arguments of the constructor."""
         dof, form = self.channel("dof"), self._form(_ERROR_FORMS)
         errors: dict[str, Any] = {
             "covariance": None if form is None else self._covariance(form, quantity, response),
@@ -433,10 +434,10 @@ class _TableBinding(Binding):
             case ("real_std", "imag_std"):
                 rr, ii = columns[0] ** 2, columns[1] ** 2
             case ("gain_std", "phase_std"):
-                along, across = columns[0] ** 2, (np.abs(response) * columns[1]) ** 2
+                radial, tangential = columns[0] ** 2, (np.abs(response) * columns[1]) ** 2
                 c, s = np.cos(np.angle(response)), np.sin(np.angle(response))
-                rr, ii = along * c**2 + across * s**2, along * s**2 + across * c**2
-                ri = (along - across) * c * s
+                rr, ii = radial * c**2 + tangential * s**2, radial * s**2 + tangential * c**2
+                ri = (radial - tangential) * c * s
             case _:
                 rr, ri, ii = columns
         return np.stack([np.stack([rr, ri], -1), np.stack([ri, ii], -1)], -2)
@@ -471,7 +472,7 @@ class _TableBinding(Binding):
         return controlled
 
     def _quality(self, n: int) -> dict[str, NDArray[Any]]:
-        """Return columns without a role, as covariates: those of an earlier save in their types."""
+        """Return columns without a role as covariates, with the types of an earlier save."""
         kinds = self.source.metadata.get("quality", {})
         covariates = {
             name: _typed(self.source.find(name).values, kind) for name, kind in kinds.items()
@@ -488,7 +489,7 @@ class _TableBinding(Binding):
 
 
 def _per_drive(text: str) -> tuple[str, str, int] | None:
-    """Return the drive's kind, the unit with N for V or A, and the factor's power in it."""
+    """Return kind of drive, unit with N instead of V or A, and power of the drive factor."""
     forms = [("", text, 0)]
     for kind, symbol in (("voltage", "V"), ("current", "A")):
         forms += [(kind, f"({text})*{symbol}/N", -1), (kind, f"({text})*N/{symbol}", 1)]

@@ -124,7 +124,7 @@ def write_whole(path: Path, content: bytes, *, overwrite: bool = False) -> None:
 def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool = True) -> None:
     """Write a file under another name, flush it to the disk, and rename it when complete.
 
-    `write` gets the path to write to; whatever it raises leaves `path` alone. Of several writers
+    `write` gets the path to write to; if it raises, `path` is unchanged. Of several writers
     without `overwrite`, all but the first get a FileExistsError.
     """
     # not by tempfile, whose files other users cannot read
@@ -152,7 +152,7 @@ def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool
 
 @contextlib.contextmanager
 def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
-    """Hold the lock ``<file>.lock`` (not on Windows); raise `error` where another process does."""
+    """Hold the lock ``<file>.lock`` (not on Windows); raise `error` if another process holds it."""
     if sys.platform == "win32":
         yield
         return
@@ -189,12 +189,12 @@ def _is_same_file(path: Path, file: IO[str]) -> bool:
 
 
 def inert(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table in which texts that a spreadsheet would run begin with an apostrophe."""
+    """Return a table in which texts that are formulas to a spreadsheet start with an apostrophe."""
     return _with_texts(frame, lambda text: f"'{text}" if _is_formula(text) else text)
 
 
 def as_before_inert(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the table that :func:`inert` was given."""
+    """Return the table before :func:`inert`."""
 
     def without_apostrophe(text: str) -> str:
         return text[1:] if text[:1] == "'" and _is_formula(text) else text
@@ -203,7 +203,7 @@ def as_before_inert(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _is_formula(text: str) -> bool:
-    """Return whether a spreadsheet would run a text without the apostrophes before it."""
+    """Return whether a text, without leading apostrophes, is a formula to a spreadsheet."""
     bare = text.lstrip("'")
     try:
         float(bare)
@@ -244,7 +244,7 @@ def digest(value: Any) -> str:
 
 
 def read_metadata(text: Any) -> dict[str, Any]:
-    """Return what an earlier save of this package wrote together with a table."""
+    """Return the metadata that an earlier save of this package wrote with a table."""
     try:
         content = json.loads(text)
         valid = isinstance(content, dict) and all(
@@ -266,7 +266,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_provenance(value: Any) -> bool:
-    """Return whether a value is provenance of the form that this package writes, or None."""
+    """Return whether a value is provenance as written by this package, or None."""
     if not isinstance(value, dict):
         return value is None
     parts = value.get("parts", [])

@@ -42,7 +42,7 @@ def as_html(title: str, lines: Lines) -> str:
 
 
 def extent(values: FloatArray, unit: str) -> str:
-    """Return "smallest to largest unit", or the one value."""
+    """Return "smallest to largest unit", or the value if all are equal."""
     low, high = float(values.min()), float(values.max())
     numbers = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
     return f"{numbers} {unit}".rstrip()
@@ -63,7 +63,7 @@ def distinct(values: NDArray[Any]) -> list[Any]:
 
 
 def noted(provenance: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Return lines with the files, the warnings, and what was assumed on reading."""
+    """Return lines with the files, the warnings, and the assumptions made when reading."""
     if provenance is None:
         return []
     parts = provenance.get("parts", [provenance])
@@ -129,7 +129,7 @@ class Tabular(ABC):
         return partial(type(self), **arguments), ()
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write a file that the package reads again, with nothing lost.
+        """Write a file that the package can read again without loss.
 
         :func:`~dahl_ident.read_frequency_response` reads points,
         :func:`~dahl_ident.read_record` samples.
@@ -139,7 +139,7 @@ class Tabular(ABC):
         path : path
             Ending in ``.csv``, ``.csv.gz``, ``.tsv``, ``.parquet``, ``.h5`` or ``.hdf5``.
         overwrite : bool, default False
-            Replace a file that is there already.
+            Replace an existing file.
 
         Returns
         -------
@@ -151,7 +151,7 @@ class Tabular(ABC):
         ValidationError
             If the path has another ending.
         DataError
-            If a file is there already, or the place cannot be written to.
+            If the file exists, or cannot be written.
 
         Examples
         --------

@@ -8,8 +8,8 @@ With the phasors X of displacement and F of force and their errors e_X, e_F,
     N_0 = F_0/A                       dN_0 = e_F0/A - N_0 dA/A,   real
 
 A velocity or an acceleration is divided by ``j k omega`` once or twice. If the force was controlled
-and harmonics of the displacement are wanted, X and F change places. The channel in the denominator
-is called `held` here, the other one the answer.
+and harmonics of the displacement are requested, X and F are exchanged. The channel in the
+denominator is called the reference here, the other one the output.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _ALIASED = 0.01  # alias as a fraction of the fundamental above which it is repo
 _RESIDUAL_SAMPLES = 10_000  # most samples from which the residual is computed
 _FEW_STEPS = 10.0  # amplitude in steps of the sensor below which rounding matters
 Row = tuple[complex, FloatArray, FloatArray, float]
-"""A response, its covariance, its covariance with the held size, and degrees of freedom."""
+"""A response, its covariance, its covariance with the reference's size, and degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Settings:
 
     @property
     def integrations(self) -> int:
-        """How often the motion channel has to be integrated."""
+        """Number of integrations from the motion channel to displacement."""
         return ("displacement", "velocity", "acceleration").index(self.motion_channel)
 
     @property
@@ -115,7 +115,7 @@ class Settings:
 class Phasors:
     """Displacement and force of one segment with their noise.
 
-    `fit` excludes the transient if that is significant; `transient_phasors` is what it adds to the
+    `fit` excludes the transient if that is significant; `transient_phasors` are its part in the
     phasors of its channel. `steps` are the resolutions of the two sensors, 0 if there is none.
     """
 
@@ -140,7 +140,7 @@ class Phasors:
         *,
         sweep: bool = False,
     ) -> Phasors:
-        """Fit a segment without its transient, which is not noise, and estimate the noise."""
+        """Fit a segment without its transient, and estimate the noise from the residual."""
         fit = sine_fit(without(transient, segment, settings), trend=sweep)
         orders = [1, *sorted({*settings.harmonics, *EVEN} - {1})]
         orders = [k for k in orders if k <= fit.orders]
@@ -153,7 +153,7 @@ class Phasors:
         return [k for k in self.settings.harmonics if k <= self.fit.orders]
 
     @property
-    def held(self) -> int:
+    def reference(self) -> int:
         """The channel in the denominator of responses: 0 is the motion, 1 the force."""
         return int(self.settings.of_displacement)
 
@@ -183,10 +183,10 @@ class Phasors:
         residual = np.sqrt(fit.residual_variance)  # of single samples
         if segment.block > 1:
             time = scattered(self.samples.time, _RESIDUAL_SAMPLES)
-            some = segment.with_samples(time, scattered(self.samples.channels, _RESIDUAL_SAMPLES))
+            chosen = segment.with_samples(time, scattered(self.samples.channels, _RESIDUAL_SAMPLES))
             tau = (time - segment.centre) / segment.half_width
-            sine = fit.coefficients.T @ columns(some.theta, tau, fit.orders, fit.trending)
-            errors = without(self.transient, some, self.settings).channels - sine
+            sine = fit.coefficients.T @ columns(chosen.theta, tau, fit.orders, fit.trending)
+            errors = without(self.transient, chosen, self.settings).channels - sine
             residual = np.sqrt(np.mean(errors**2, axis=1))
         amplitudes = np.abs(fit.phasors(1))
         samples = self.samples.time.size
@@ -213,9 +213,9 @@ class Phasors:
 
     @cached_property
     def distorted(self) -> float:
-        """The harmonics of the held channel, in excess of their noise, over its fundamental."""
-        # each adds about its size times the response to the same harmonic of the answer
-        power, channel = 0.0, self.held
+        """Harmonics of the reference channel, corrected for noise, over its fundamental."""
+        # each adds about its size times the response to the same harmonic of the output
+        power, channel = 0.0, self.reference
         for k in (k for k in self.noise if k > 1):
             scale = abs(self.integrator(k) / self.integrator(1))[channel] ** 2
             size, variance = abs(self.fit.phasors(k)[channel]), float(self.variance(k)[channel])
@@ -223,35 +223,35 @@ class Phasors:
                 power += (size**2 - variance) * scale
         return float(np.sqrt(power) / abs(self.fit.phasors(1)[channel]))
 
-    def forgotten(self, harmonic: int) -> float:
-        """Return the standard deviation of the answer due to that of the transient's size."""
-        if self.settings.transient_channel == self.held or self.transient.departure == 0.0:
+    def transient_std(self, harmonic: int) -> float:
+        """Return the standard deviation of the output due to that of the transient's size."""
+        if self.settings.transient_channel == self.reference or self.transient.departure == 0.0:
             return 0.0
         added = complex(self.transient_phasors[harmonic])
         size = abs(added) if harmonic else abs(added.real)
         return size * self.transient.departure_std / abs(self.transient.departure)
 
     @property
-    def held_variance(self) -> float:
-        """Variance of the size of the held fundamental."""
-        return 0.5 * float(np.sum(np.abs(self.errors[self.held]) ** 2))
+    def reference_variance(self) -> float:
+        """Variance of the size of the reference's fundamental."""
+        return 0.5 * float(np.sum(np.abs(self.errors[self.reference]) ** 2))
 
-    def referred(self, answer: complex, harmonic: int) -> complex:
-        """Return a phasor over the size of the held fundamental, turned back by k of its phases."""
-        H = complex(self.fundamentals[self.held])
-        return complex(answer * (abs(H) / H) ** harmonic / abs(H))
+    def ratio(self, output: complex, harmonic: int) -> complex:
+        """Return harmonic k over the reference's size, relative to k times its phase."""
+        H = complex(self.fundamentals[self.reference])
+        return complex(output * (abs(H) / H) ** harmonic / abs(H))
 
     def response(self, harmonic: int) -> complex:
         """Return the response at a harmonic."""
-        answers = self.phasors(harmonic) * self.integrator(harmonic)
-        return self.referred(complex(answers[1 - self.held]), harmonic)
+        phasors = self.phasors(harmonic) * self.integrator(harmonic)
+        return self.ratio(complex(phasors[1 - self.reference]), harmonic)
 
     def changed(self, changes: dict[int, ComplexArray]) -> ComplexArray:
         """Return the changes of the responses due to `changes` of both channels' phasors."""
-        relative = complex(changes[1][self.held] / self.phasors(1)[self.held])
+        relative = complex(changes[1][self.reference] / self.phasors(1)[self.reference])
         return np.array(
             [
-                self.referred(complex((changes[k] * self.integrator(k))[1 - self.held]), k)
+                self.ratio(complex((changes[k] * self.integrator(k))[1 - self.reference]), k)
                 - self.response(k) * complex(relative.real, k * relative.imag)
                 for k in self.harmonics
             ]
@@ -294,53 +294,54 @@ class Phasors:
     @property
     def fundamental(self) -> Row:
         """The row of the fundamental."""
-        H, N = complex(self.fundamentals[self.held]), self.response(1)
-        e_H, e_answer = self.errors[self.held], self.errors[1 - self.held]
-        e_N = (e_answer - N * e_H) / H
+        H, N = complex(self.fundamentals[self.reference]), self.response(1)
+        e_H, e_output = self.errors[self.reference], self.errors[1 - self.reference]
+        e_N = (e_output - N * e_H) / H
         variance = float(np.sum(np.abs(e_N) ** 2))
-        with_held = 0.5 * complex(e_N @ e_H.conj()) * H / abs(H)
-        cross = np.array([with_held.real, with_held.imag])
+        product = 0.5 * complex(e_N @ e_H.conj()) * H / abs(H)
+        cross = np.array([product.real, product.imag])
         return N, 0.5 * variance * np.eye(2), cross, self.noise[1].dof
 
     def harmonic(self, k: int, distorted: float) -> Row:
         """Return the row of a higher harmonic, or of the mean."""
         noise = self.noise[k]
-        A, N = abs(self.fundamentals[self.held]), self.response(k)
-        along = np.array([N.real, N.imag])
-        across = np.array([-N.imag, N.real])
-        relative = self.held_variance / A**2
-        scale = abs(self.integrator(k)[1 - self.held]) / A
-        answer = float(self.variance(k)[1 - self.held]) * scale**2
+        A, N = abs(self.fundamentals[self.reference]), self.response(k)
+        radial = np.array([N.real, N.imag])
+        tangential = np.array([-N.imag, N.real])
+        relative = self.reference_variance / A**2
+        scale = abs(self.integrator(k)[1 - self.reference]) / A
+        of_output = float(self.variance(k)[1 - self.reference]) * scale**2
         if k == 0:
-            answer += (self.forgotten(0) * scale) ** 2
-        answer += (distorted * abs(self.response(1))) ** 2
-        part = 0.5 * answer * np.eye(2) if k else np.diag([answer, 0.0])
-        covariance = part + relative * (np.outer(along, along) + k**2 * np.outer(across, across))
-        referred = relative * (1.0 + k**2) * abs(N) ** 2
-        share = answer / max(answer + referred, TINY)
+            of_output += (self.transient_std(0) * scale) ** 2
+        of_output += (distorted * abs(self.response(1))) ** 2
+        covariance = 0.5 * of_output * np.eye(2) if k else np.diag([of_output, 0.0])
+        outer = np.outer(radial, radial) + k**2 * np.outer(tangential, tangential)
+        covariance = covariance + relative * outer
+        of_reference = relative * (1.0 + k**2) * abs(N) ** 2
+        share = of_output / max(of_output + of_reference, TINY)
         dof = 1.0 / (share**2 / noise.dof + (1.0 - share) ** 2 / self.noise[1].dof)
-        return N, covariance, -along * relative * A, dof
+        return N, covariance, -radial * relative * A, dof
 
     def rows(self, distorted: float) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Return the responses, their joint covariance with the held size, and dof."""
+        """Return the responses, their joint covariance with the reference's size, and dof."""
         rows = [self.fundamental if k == 1 else self.harmonic(k, distorted) for k in self.harmonics]
         response, covariance, cross, dof = (np.array(column) for column in zip(*rows, strict=True))
         joint = np.empty((len(rows), 3, 3))
-        joint[:, 0, 0] = self.held_variance
+        joint[:, 0, 0] = self.reference_variance
         joint[:, 0, 1:] = joint[:, 1:, 0] = cross
         joint[:, 1:, 1:] = covariance
         return response, joint, dof
 
     @property
     def asymmetry(self) -> float:
-        """The force's even harmonics over its fundamental where they are significant."""
+        """Even harmonics of the force over its fundamental; 0 if they are not significant."""
         fit = self.fit
         if fit.trending or self.settings.controlled == "force":
             return 0.0
         even = [k for k in EVEN if k <= fit.orders]
         motion, force = np.array([fit.phasors(k) for k in [1, *even]]).T
-        # the transient has even harmonics too: what its error leaves of these counts as noise
-        variance = [float(self.variance(k)[1]) + self.forgotten(k) ** 2 for k in even]
+        # the transient has even harmonics too, and their error counts as noise
+        variance = [float(self.variance(k)[1]) + self.transient_std(k) ** 2 for k in even]
         orders = np.array(even, dtype=np.float64)
         return asymmetry(
             orders,
@@ -386,10 +387,10 @@ class Phasors:
         if aliased.any() or has_unmeasured_aliases(fit, self.cycles):
             samples = 2.0 * np.pi / fit.segment.sample_phase * fit.segment.block
             objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
-        held = ("displacement", "force")[self.held]  # assumed to be a sine
-        distorted = quality[f"{held}_distortion"]
+        reference = ("displacement", "force")[self.reference]  # assumed to be a sine
+        distorted = quality[f"{reference}_distortion"]
         if distorted > _DISTORTED:
-            objections.append(f"{held} distorted {percent(distorted)}")
+            objections.append(f"{reference} distorted {percent(distorted)}")
         for name in ("displacement", "force"):
             steps, clipped = quality[f"{name}_steps"], quality[f"{name}_clipped"]
             if steps < _FEW_STEPS:

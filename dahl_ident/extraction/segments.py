@@ -1,13 +1,13 @@
 """Segments: the samples of a record's spans, with their phase.
 
-Each span gets its frequency, and the cycles next to it that the same sine fits. Where a ramp begins
-or ends, cycles deviate by a percent. The m cycles inside show how far is too far: the part Q_i of
-each cycle's residual that a fundamental explains scatters with the noise, and with h the error of
-the sine
+The frequency of each span is estimated, and adjacent cycles that fit the same sine are added. At
+the start or end of a ramp, cycles deviate by a percent. The limit follows from the m cycles inside
+the span: the part Q_i of each cycle's residual that is a fundamental scatters with the noise, and
+with h the relative error of the sine
 
     s^2 = sum_i Q_i / (2 m - 4),      F = Q / (2 (1 + h) s^2)
 
-follows F(2, 2 m - 4) for a cycle that belongs.
+follows F(2, 2 m - 4) for a cycle of the same sine.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from dahl_ident.extraction.sine_fit import (
 )
 
 _PLATEAU_CYCLES = 3  # least cycles of a plateau; if no plateau has so many, fewer are allowed ...
-_NO_CHANCE = 0.1  # ... where they are this share of all cycles: noise makes two alike at times
-_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude up to which crossings are found safely
-_WELL_COVERED = 0.5  # share of a record in plateaus from which crossings are believed
+_NO_CHANCE = 0.1  # ... if they are this fraction of all cycles, as two may be alike by chance
+_QUIET_CROSSINGS = 0.01  # noise of a cycle's log amplitude up to which crossings are reliable
+_WELL_COVERED = 0.5  # fraction of a record in plateaus above which crossings are trusted
 _SWEEP_DEGREE = 3  # degree of the polynomial of the phase in a window
-_DRIFTED = 0.2  # rad over a segment: costs 0.2 % of the amplitude, and more of harmonics
-_EVENLY = 0.5  # largest difference of the turn in both halves, as a fraction of its sum
+_DRIFTED = 0.2  # rad over a segment; it reduces the amplitude by 0.2 %, harmonics by more
+_EVENLY = 0.5  # largest difference of the drifts in both halves, as a fraction of their sum
 _FEWEST_IN_HALF = 2  # cycles in each half, which show a slope
-_BY_CHANCE = 1e-6  # share of segments without a drift that are said to have one
+_BY_CHANCE = 1e-6  # fraction of segments without a drift in which one is detected
 _PADDED = 16  # spectral lines for each cycle, so that one lies near any peak
-_FEWEST_SAMPLES = 4  # samples in a cycle, more than its sine and offset have numbers
-_STRAY_BY_CHANCE = 1e-3  # share of the cycles that belong to a segment but are called stray
+_FEWEST_SAMPLES = 4  # samples in a cycle, one more than sine and offset have parameters
+_STRAY_BY_CHANCE = 1e-3  # fraction of the cycles of a sine that are called stray
 _NEGLIGIBLE = 1e-4  # fraction of the amplitude that a cycle may stray in any case
-_UNJUDGED = 2  # cycles at either end that are not part of the reference ...
-_CYCLES_PER_UNJUDGED = 5  # ... but at most one in this many of all
+_END_CYCLES = 2  # cycles at either end that are not part of the reference ...
+_CYCLES_PER_END_CYCLE = 5  # ... but at most one in this many of all
 _SOLVABLE = 1e8  # largest condition number of normal equations
 _STRAYING = 0.005  # fraction of the amplitude that a further cycle may stray from the sine
 _MOST_CYCLES_MORE = 2  # cycles by which a segment may grow on either side
@@ -70,9 +70,9 @@ def record_spans(
     mode: Mode,
     window: int | None,
 ) -> list[Span]:
-    """Return the spans of a record in order of time, each with the ends of its neighbours.
+    """Return the spans of a record in order of time, each with the bounds of its neighbours.
 
-    In noise that drowns the crossings, periods of the strongest line are tried as well.
+    If noise makes the crossings unreliable, periods of the strongest line are tried as well.
     """
     noise = [float(np.median(run.noise)) for run in runs if len(run)]
     for fewest in (_PLATEAU_CYCLES, FEWEST_CYCLES):
@@ -85,11 +85,11 @@ def record_spans(
         moving = sum(float(np.sum(run.stop - run.start)) for run in runs)
         if spans and (fewest == _PLATEAU_CYCLES or _covered(spans) > _NO_CHANCE * moving):
             ordered = sorted(spans, key=lambda s: s.start)
-            ends = [-np.inf, *(s.stop for s in ordered[:-1])]
-            begins = [*(s.start for s in ordered[1:]), np.inf]
+            earliest = [-np.inf, *(s.stop for s in ordered[:-1])]
+            latest = [*(s.start for s in ordered[1:]), np.inf]
             return [
-                replace(span, earliest=end, latest=begin)
-                for span, end, begin in zip(ordered, ends, begins, strict=True)
+                replace(span, earliest=low, latest=high)
+                for span, low, high in zip(ordered, earliest, latest, strict=True)
             ]
     if frequency is not None and mode != "sweep" and len(runs):
         return [Span(float(time[0]), float(time[-1]), frequency)]
@@ -108,7 +108,7 @@ def _covered(spans: Sequence[Span]) -> float:
 
 
 def _strongest_line(time: FloatArray, motion: FloatArray) -> float:
-    """Return the frequency with most power, samples taken as evenly spaced."""
+    """Return the frequency with the most power, assuming evenly spaced samples."""
     spectrum = np.abs(np.fft.rfft(motion - motion.mean()))
     line = int(np.argmax(spectrum[1:])) + 1
     return line / float((time[-1] - time[0]) * time.size / (time.size - 1))
@@ -159,35 +159,35 @@ def _refuse_drift(segment: Segment) -> None:
     phasors[cycle] = phasor
     power = np.abs(np.fft.fft(phasors, _PADDED * counts.size)) ** 2 / cycle.size
     peak = int(np.argmax(power))
-    turns = float(np.fft.fftfreq(power.size)[peak])
-    phases = np.angle(phasor * np.exp(-2j * np.pi * turns * cycle))
+    slip = float(np.fft.fftfreq(power.size)[peak])  # relative deviation of the frequency
+    phases = np.angle(phasor * np.exp(-2j * np.pi * slip * cycle))
     evenly = True
     if cycle.size >= 2 * _FEWEST_IN_HALF:
         n = cycle.size // 2
         parts = (slice(None, n), slice(n, None))
         halves = [float(np.polyfit(cycle[half], phases[half], 1)[0]) for half in parts]
-        evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * turns)
-    turns += float(np.polyfit(cycle, phases, 1)[0]) / (2.0 * np.pi)
-    drift = 2.0 * np.pi * turns * counts.size
+        evenly = abs(halves[1] - halves[0]) < _EVENLY * abs(sum(halves) + 4.0 * np.pi * slip)
+    slip += float(np.polyfit(cycle, phases, 1)[0]) / (2.0 * np.pi)
+    drift = 2.0 * np.pi * slip * counts.size
     remainder = float(np.sum(np.abs(phasor) ** 2)) - power[peak]
     clear = (power[peak] - power[0]) * dof > 2.0 * _highest_by_chance(_BY_CHANCE, dof) * remainder
     if clear and evenly and abs(drift) > _DRIFTED:
         stated = segment.omega / (2.0 * np.pi)
-        shown = stated * (1.0 + turns)
+        measured = stated * (1.0 + slip)
         raise ExtractionError(
-            f"the motion around t = {segment.centre:.6g} s has {shown:.6g} Hz, not the given "
+            f"the motion around t = {segment.centre:.6g} s has {measured:.6g} Hz, not the given "
             f"{stated:.6g} Hz: its phase drifts by {drift:.3g} rad in {counts.size} cycles; "
             f"expected less than {_DRIFTED:g} rad: give "
-            f"{argument('frequency', Placeholder(f'{shown:.6g}'))}, or leave it out"
+            f"{argument('frequency', Placeholder(f'{measured:.6g}'))}, or leave it out"
         )
 
 
 def _steady_part(
     time: FloatArray, motion: FloatArray, segment: Segment, part: slice, room: slice
 ) -> slice:
-    """Return the part of a record without cycles at its ends that stray, or with more that fit.
+    """Return the part of a record without stray cycles at its ends, or with more that fit.
 
-    `segment` is the part with the phase of a steady sine, `room` where it may grow.
+    `segment` is the part with the phase of a steady sine; `room` bounds its growth.
     """
     edges = _cycle_edges(segment)
     start, stop = part.start, part.stop
@@ -206,7 +206,7 @@ def _steady_part(
         start, stop = (second if early else start), (last if late else stop)
         edges = edges[int(early) : edges.size - int(late)]
         fewer += [early, late]
-    if inside is not None:  # enough cycles remain: those next to strays deviate a little as well
+    if inside is not None:  # enough cycles remain; those next to stray ones deviate as well
         start = int(np.searchsorted(time, edges[1])) if start > part.start else start
         stop = int(np.searchsorted(time, edges[-2])) if stop < part.stop else stop
     room = slice(
@@ -216,7 +216,7 @@ def _steady_part(
 
 
 def _highest_by_chance(share: float, dof: int) -> float:
-    """Return what F(2, dof) exceeds in this share of all cases."""
+    """Return the value that F(2, dof) exceeds with this probability."""
     return float(0.5 * dof * (share ** (-2.0 / dof) - 1.0))
 
 
@@ -229,7 +229,7 @@ def _cycle_edges(segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Inside:
-    """The sine of the cycles inside, which may change linearly, and the variance about it."""
+    """The sine of the inner cycles, which may change linearly, and the variance about it."""
 
     segment: Segment
     coefficients: FloatArray
@@ -238,15 +238,15 @@ class _Inside:
     dof: int
 
     def strays(self, time: FloatArray, motion: FloatArray) -> bool:
-        """Return whether samples of the record depart from the sine by more than by chance."""
+        """Return whether samples of the record deviate significantly from the sine."""
         tau = (time - self.segment.centre) / self.segment.half_width
         basis = columns(np.asarray(self.segment.phase(tau)), tau, 1, 1)
         sine = basis[2:4] - basis[2:4].mean(axis=1, keepdims=True)  # the mean may wander
         inverse = np.linalg.pinv(sine @ sine.T)
         products = sine @ (motion - self.coefficients @ basis)
         explained = float(products @ inverse @ products)
-        onto = sine @ basis.T
-        fitted = 0.5 * float(np.trace(inverse @ onto @ self.inverse @ onto.T))
+        cross = sine @ basis.T
+        fitted = 0.5 * float(np.trace(inverse @ cross @ self.inverse @ cross.T))
         bound = _highest_by_chance(_STRAY_BY_CHANCE, self.dof)
         amplitude = float(np.hypot(*self.coefficients[2:4]))
         least = 0.5 * time.size * (_NEGLIGIBLE * amplitude) ** 2
@@ -254,11 +254,11 @@ class _Inside:
 
 
 def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
-    """Return the sine of all but the cycles at the ends, None where too few are left."""
-    unjudged = min(_UNJUDGED, (edges.size - 1) // _CYCLES_PER_UNJUDGED)
-    if unjudged == 0:
+    """Return the sine of all cycles except those at the ends, None if too few remain."""
+    excluded = min(_END_CYCLES, (edges.size - 1) // _CYCLES_PER_END_CYCLE)
+    if excluded == 0:
         return None
-    cuts = np.searchsorted(segment.time, edges[unjudged:-unjudged])
+    cuts = np.searchsorted(segment.time, edges[excluded:-excluded])
     within = slice(int(cuts[0]), int(cuts[-1]))
     blocks = column_blocks(segment.theta[within], segment.tau[within], 1, 1)
     normal, right = normal_equations(segment.channels[:1, within], 6, blocks)
@@ -294,7 +294,7 @@ def _extended(
     time: FloatArray, motion: FloatArray, segment: Segment, part: slice, room: slice,
     inside: _Inside | None,
 ) -> slice:  # fmt: skip
-    """Return the slice with the cycles before and after it that the segment's sine fits as well."""
+    """Return the slice extended by adjacent cycles that fit the segment's sine."""
     thinned = segment.thinned()
     basis = columns(thinned.theta, thinned.tau, 1)
     fitted = checked_inverse(basis @ basis.T, thinned) @ (basis @ thinned.channels[0])

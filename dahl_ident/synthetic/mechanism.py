@@ -113,8 +113,8 @@ class Mechanism:
 def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equations:
     """Return the motion of laws with a spring, a damper or both, without a mass.
 
-    ``k v + c dv/dt + (rate of the laws' force) = du/dt``, driven by du/dt. Without a damper the
-    force u is prescribed as a displacement is elsewhere, because everything turns where u turns.
+    ``k v + c dv/dt + (rate of the laws' force) = du/dt``, driven by du/dt. Without a damper, the
+    force u is prescribed in place of a displacement, because displacement and u reverse together.
     """
     import casadi as ca
 
@@ -139,7 +139,7 @@ def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equa
 
 
 class EngineMotion:
-    """The solution of equations of motion along a waveform, from rest, at any times within it."""
+    """The solution of equations of motion under a waveform, from rest, at any times within it."""
 
     def __init__(
         self,
@@ -166,12 +166,12 @@ class EngineMotion:
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the output at any times; outside the waveform, that at its ends."""
         output = np.empty(np.shape(time))
-        for i, within, t in self._waveform.by_segment(time):
-            output[within], _ = self._along(self._waveform.segments[i], self._first[i], t)
+        for i, inside, t in self._waveform.by_segment(time):
+            output[inside], _ = self._along(self._waveform.segments[i], self._first[i], t)
         return output
 
     def _jump(self, before: SineStep, after: SineStep, damping: float) -> None:
-        """Continue the states at the start of a segment over the jump of the force there."""
+        """Apply the jump of the force at the start of a segment to the states."""
         at = np.array([before.stop])
         value = before.motion(at).value
         jump = after.motion(at).value - value
@@ -202,7 +202,7 @@ class EngineMotion:
 
 
 def _law_force(element: Element, displacement: Waveform) -> Signal:
-    """Return the force of any law under a prescribed displacement, at any times from its start."""
+    """Return the force of a law under a prescribed displacement, at any times from its start."""
     turns = displacement.turning_times()
 
     def force(time: FloatArray) -> FloatArray:

@@ -374,9 +374,9 @@ def refuse_repeated(sources: Sequence[Any]) -> None:
     seen: set[Path] = set()
     for source in sources:
         if isinstance(source, (str, Path)):
-            if (place := Path(source).resolve()) in seen:
+            if (resolved := Path(source).resolve()) in seen:
                 raise DataError(f"{source}: the file is named twice; expected each file once")
-            seen.add(place)
+            seen.add(resolved)
 
 
 def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-_WIDEST = 64  # a matrix with more columns and more rows is a map or a picture
+_WIDEST = 64  # a matrix with more columns and more rows is a map or an image
 _SECONDS, _BYTES_PER_SECOND = 5, 10_000_000  # time limit for a MATLAB file: constant, and by size
 # The same for a check of an HDF5 file. Most take some milliseconds; one of many small objects takes
 # 0.2 ms for each 300 bytes.
@@ -103,8 +103,8 @@ def read_npz(file: File) -> RawFile:
         refuse_many(file.name, len(names), "arrays")
         arrays = {name: content[name] for name in names}
     if len(arrays) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DataError(f"{file.name}: two arrays are called {twice!r}; expected one")
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise DataError(f"{file.name}: two arrays are called {repeated!r}; expected one")
     leaves = (leaf for name, array in arrays.items() for leaf in _fields(name, array))
     return tree_source(file, "NumPy .npz", leaves)
 
@@ -180,7 +180,7 @@ def read_hdf5(file: File) -> RawFile:
     h5py = library("h5py")
     _refuse_fatal(file, h5py)
     root = h5py.File(file.stream(), "r")  # stays open until its arrays have been read
-    # Bytes that were added have shifted others; h5py itself refuses a file that is too short.
+    # Added bytes have shifted others; h5py itself refuses a file that is too short.
     # (HDF5 File Format Specification, II.A: the superblock)
     with file.opened() as content:
         content.seek(root.userblock_size)
@@ -207,14 +207,14 @@ def _refuse_fatal(file: File, h5py: Any) -> None:
     def visit() -> None:  # pragma: no cover
         with contextlib.suppress(Exception), h5py.File(file.stream(), "r") as root:
             dict(root.attrs)  # the reader will meet an error again, and report it
-            left = _CHECKED_BYTES
+            remaining = _CHECKED_BYTES
             for _, item in _Tree(file, root, h5py).all_items(root, 0):
                 with contextlib.suppress(Exception):
                     dict(item.attrs)
                 if isinstance(item, h5py.Dataset) and item.chunks is not None:
                     with contextlib.suppress(Exception):
-                        _ = item[()] if item.nbytes < left else (item[:1], item[-1:])
-                    left -= min(item.nbytes, left)
+                        _ = item[()] if item.nbytes < remaining else (item[:1], item[-1:])
+                    remaining -= min(item.nbytes, remaining)
 
     error = in_child_process(
         visit, seconds=_CHECK_SECONDS + file.length // _CHECK_BYTES_PER_SECOND
@@ -282,7 +282,7 @@ class _Tree:
     def stored(
         self, item: Any, path: str, dtype: Any, convert: Any, *, transposed: bool = False
     ) -> Stored:
-        """Return an array that is read when it is used."""
+        """Return an array that is read when needed."""
 
         def read(rows: slice) -> NDArray[Any]:
             self.refuse(item, path)
@@ -339,7 +339,7 @@ class _Tree:
 
 
 def _unpacked(attributes: Any, array: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the values that NetCDF packed as these numbers; missing ones are NaN."""
+    """Return the values from numbers packed by NetCDF; missing ones are NaN."""
     values = array * float(np.squeeze(attributes.get("scale_factor", 1.0)))
     values = np.asarray(values + float(np.squeeze(attributes.get("add_offset", 0.0))))
     for name in ("_FillValue", "missing_value"):

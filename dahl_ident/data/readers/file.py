@@ -137,13 +137,13 @@ class File:
         return self.size if self.content is None else len(self.content)
 
     def stream(self) -> Any:
-        """Return what a library opens: the file's path, or its bytes."""
+        """Return the path of the file, or a stream of its bytes, for a library to open."""
         return self.path if self.content is None else io.BytesIO(self.content)
 
     def opened(self) -> IO[bytes]:
         """Return the bytes as an open file."""
-        place = self.stream()
-        return place.open("rb") if isinstance(place, Path) else place
+        stream = self.stream()
+        return stream.open("rb") if isinstance(stream, Path) else stream
 
     @property
     def limit(self) -> int:
@@ -193,20 +193,20 @@ def open_file(path: str | Path) -> File:
         data = sys.stdin.buffer.read()
         digest = hashlib.sha256(data).hexdigest()
         return _recognised(File(None, "standard input", len(data), digest, "", data))
-    place = regular(path)
-    # a file's name may hold bytes that are not UTF-8, which could not be written into a report
-    name = str(place).encode(errors="backslashreplace").decode()
+    path = regular(path)
+    # bytes in a name that are not UTF-8 could not be written into a report
+    name = str(path).encode(errors="backslashreplace").decode()
     try:
-        with place.open("rb") as stream:
+        with path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
             size = stream.tell()
-        return _recognised(File(place, name, size, digest, ""))
+        return _recognised(File(path, name, size, digest, ""))
     except OSError as exc:
         raise DataError(f"{name}: the file cannot be read: {exc.strerror or exc}") from exc
 
 
 def _recognised(file: File) -> File:
-    """Return the file with its format, unpacked where it is packed."""
+    """Return the file with its format, unpacked if it is compressed."""
     suffix = file.path.suffix.lower() if file.path else ""
     head = file.head
     for magic, opener, ending in _PACKED:
@@ -224,7 +224,7 @@ def _recognised(file: File) -> File:
         raise DataError(f"{file.name}: the file is empty")
     name = _format(file, head, suffix)
     actual = FORMATS[name]
-    allowed = [one for one in FORMATS.values() if suffix and suffix in one.extensions.split()]
+    allowed = [f for f in FORMATS.values() if suffix and suffix in f.extensions.split()]
     if allowed and actual not in allowed:
         raise DataError(
             f"{file.name}: the extension {suffix} says {allowed[0].name}, the content is "

@@ -1,7 +1,7 @@
 """Text tables: any delimiter, decimal comma, comments, several header lines, a row of units.
 
-Delimiter and decimal mark are those under which the longest run of lines reads as numbers; the
-lines above it with as many fields are the header.
+Delimiter and decimal mark are those for which the longest run of lines can be read as numbers; the
+lines above it with the same number of fields are the header.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ _COMMENT = re.compile(r"\s*(?:#|%|//|!)")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//|!)[^\r\n]*", re.MULTILINE)
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _BEFORE_BRACKET = re.compile(r"(?<=[^\s\])])[ \t]+(?=[\[(])")  # "time [s]" is one field
-# what stands in brackets is bounded, so that a line of brackets takes linear time
+# the length of text in brackets is limited, so that a line of brackets takes linear time
 _BLANK_SEPARATED = re.compile(r"(?:\[[^\]]{0,60}\]|\([^)]{0,60}\)|\S)+")
-_HEAD_BYTES = 1 << 15  # read from the first numbers on: hundreds of lines show the format
-_HEAD_LINES = 4  # lines of numbers that are read at least, however wide
-_LONGEST_LINE = 1 << 18  # bytes: 10,000 columns and more; beyond, it is not a text table
+_HEAD_BYTES = 1 << 15  # from the first numbers; hundreds of lines are enough for the format
+_HEAD_LINES = 4  # least number of lines, whatever their length
+_LONGEST_LINE = 1 << 18  # bytes, for more than 10,000 columns
 _MOST_COMMENTS = 20_000  # lines, before the first numbers or among them, to limit the time
-_MANY_LINES = 50  # with as many, decimals of one length are a format, not chance
-_FOOTER_LINES = 20  # lines that are left out at most; more text after the numbers is an error
+_MANY_LINES = 50  # with so many, an equal number of decimals is a format, not chance
+_FOOTER_LINES = 20  # most lines left out; more text after the numbers is an error
 _ERROR_VALUE = re.compile(r"\s*#(?:N/A|DIV/0!|[A-Z]{2,9}[!?])\s*")  # a spreadsheet's error
-# the number of points above pairs of numbers, as the SR785 and SR780 write a trace
+# the number of points above pairs of numbers, as in traces of the SR785 and SR780
 _TRACE = re.compile(
     rb"[ \t]*(\d{1,9})[ \t]*(?:\r\n|\n|\r)"
     rb"(?=[ \t]*[-+.\d][^\s,;]*(?:[ \t]*,[ \t]*|[ \t]+)[-+.\d][^\s,;]*[ \t]*[\r\n])"
 )
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
-_SMALL = 1 << 16  # bytes, at most, of a table that is read without pandas
+_SMALL = 1 << 16  # most bytes of a table that is read without pandas
 _LIKE_DATA = (
     "the line begins as a comment, yet its cells look like data, {!r}; expected a measured number "
     "in each. Delete the line, or put a number there"
@@ -71,15 +71,15 @@ _DIALECTS = (
     ("\t", ".,"), (";", ".,"), (",", ".,"), ("|", ".,"), (None, ".,"), ("\t", ",."), (";", ",."),
     ("|", ",."),
 )  # fmt: skip
-_LAST_DIALECTS = ((":", "."), (":", ","))  # a colon also stands in times of day
+_LAST_DIALECTS = ((":", "."), (":", ","))  # tried last, as times of day contain colons
 
 
 @dataclass(frozen=True)
 class _Layout:
     """Delimiter (None: blanks), decimal mark, first line of numbers, fields in it, header.
 
-    `repeated` is the line above the numbers, by which a second header in the file is known;
-    `comments` are all lines above them where the header is in comments.
+    `repeated` is the line above the numbers, which identifies a second header in the file;
+    `comments` are all lines above them if the header is in comments.
     """
 
     delimiter: str | None
@@ -185,13 +185,12 @@ def _layout(lines: list[str], name: str) -> _Layout:
     skipped = [not text.strip() or _COMMENT.match(text) is not None for text in lines]
     texts = [text for text, skip in zip(lines, skipped, strict=True) if not skip]
     for dialects in (_DIALECTS, _LAST_DIALECTS):
-        tried = (
+        trials = (
             _in_dialect(lines, skipped, delimiter, mark)
             for delimiter, mark in _possible(dialects, texts)
         )
-        candidates = [candidate for candidate in tried if candidate is not None]
-        # a header that fits the columns counts more than another number
-        best = max(candidates, key=lambda candidate: candidate[0], default=None)
+        # a header that fits the columns has precedence over the number of numbers
+        best = max(filter(None, trials), key=lambda trial: trial[0], default=None)
         if best is not None and best[0] > (False, 0):
             return best[1]
     raise DataError(
@@ -203,7 +202,7 @@ def _layout(lines: list[str], name: str) -> _Layout:
 def _possible(
     dialects: Iterable[tuple[str | None, str]], texts: list[str]
 ) -> Iterator[tuple[str | None, str]]:
-    """Yield the dialects whose delimiter, and a comma where it is a mark, occur in the lines."""
+    """Yield the dialects whose delimiter, and decimal comma if any, occur in the lines."""
     text = "\n".join(texts)
     blanks = any(len(_BEFORE_BRACKET.sub("", line).split(None, 1)) > 1 for line in texts)
     for delimiter, mark in dialects:
@@ -230,7 +229,7 @@ def _in_dialect(
             return None
     start = run.start
     repeated = lines[start - 1].strip() if start and not skipped[start - 1] else ""
-    if repeated:  # the same header may stand further up: the numbers then begin there
+    if repeated:  # the numbers begin below the first of several equal headers
         first = next(i for i, text in enumerate(lines) if text.strip() == repeated)
         later = next((i for i in range(first + 1, start + 1) if not skipped[i]), start)
         row = rows[later]
@@ -254,7 +253,7 @@ def _commented(lines: Iterable[str], delimiter: str | None) -> list[list[str]]:
 
 
 def _metadata(lines: Iterable[str], name: str) -> Mapping[str, Any]:
-    """Return what an earlier save of this package wrote into a comment line."""
+    """Return the metadata that an earlier save of this package wrote into a comment line."""
     for i, text in enumerate(lines):
         comment = re.match(rf"\s*#\s*{METADATA_MARK}(.*)", text)
         if comment:
@@ -269,7 +268,7 @@ def _metadata(lines: Iterable[str], name: str) -> Mapping[str, Any]:
 
 
 def _body(data: bytes, offset: int, layout: _Layout, file: File) -> tuple[bytes, list[int]]:
-    """Return the lines of numbers, all else blanked, and the rows at which a run begins."""
+    """Return the lines of numbers, with all others blanked, and the first rows of the runs."""
     body = data[offset:]
     above = _LINE_END.split(data[:offset])[:-1]
     for i in range(len(above) - 1, -1, -1):  # upwards through the comments directly above
@@ -313,7 +312,7 @@ def _refuse_odd_comments(body: bytes, layout: _Layout, name: str) -> None:
 
 
 def _looks_like_data(text: str, layout: _Layout) -> bool:
-    """Return whether a line that begins as a comment has an error value or numbers in its cells."""
+    """Return whether the cells of an apparent comment hold an error value or numbers."""
     cells = _split(text, layout.delimiter)
     if len(cells) > 1 and _ERROR_VALUE.fullmatch(cells[0]):
         return True
@@ -323,7 +322,7 @@ def _looks_like_data(text: str, layout: _Layout) -> bool:
 
 
 def _is_another_header(text: str, layout: _Layout) -> bool:
-    """Return whether a comment is a header, and none of those above the numbers."""
+    """Return whether a comment is a header that does not occur above the numbers."""
     if text.strip() in layout.comments:
         return False
     cells = next(iter(_commented([text], layout.delimiter)), [""])
@@ -342,7 +341,7 @@ def _without_footers(body: bytes, layout: _Layout) -> tuple[bytes, list[str]]:
         start = max(body.rfind(b"\n", 0, end), body.rfind(b"\r", 0, end)) + 1
         text = body[start:end].decode("utf-8", "replace")
         cells = _split(text, layout.delimiter)
-        if any(cell.strip() for cell in cells):  # else a spreadsheet's empty rows, of delimiters
+        if any(cell.strip() for cell in cells):  # otherwise an empty row of a spreadsheet
             numbers = any(CELL[layout.mark].fullmatch(cell) for cell in cells)
             summary = cells[0].strip(" \"':.").casefold() in _SUMMARIES
             words_first = _FOOTER.match(text) and cells[0].strip() not in _MISSING
@@ -407,7 +406,7 @@ def _is_row(line: bytes) -> bool:
 
 
 def _places(body: bytes) -> list[int]:
-    """Return the line of each row below the first, past blank lines and comments."""
+    """Return the line of each row, counted from the first, past blank lines and comments."""
     return [i for i, text in enumerate(_LINE_END.split(body)) if _is_row(text)]
 
 
@@ -451,7 +450,7 @@ def _parse(
         return small
     import pandas as pd
 
-    # pandas 3.1 reads to the last digit by default, earlier ones have to be asked
+    # pandas 3.1 reads to the last digit by default, earlier versions only on request
     exact = tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
     precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
 
