@@ -20,7 +20,7 @@ def run(*arguments):
     return code if isinstance(code, int) else 0
 
 
-@pytest.mark.parametrize("steps", [40, pytest.param(None, marks=pytest.mark.long)])
+@pytest.mark.parametrize("steps", [60, pytest.param(None, marks=pytest.mark.long)])
 def test_demo_recovers_the_plant_and_tells_machines_its_steps_on_standard_error(
     tmp_path, monkeypatch, capsys, steps
 ):
