@@ -76,13 +76,13 @@ class TextTable:
 class Picture:
     """A figure, which is drawn when a writer needs it."""
 
-    name: str  # for a file
+    name: str  # of a file
     caption: str
-    alt: str  # for readers who cannot see it: the kind of plot and its result
-    draw: Callable[[], Any]  # draws on new axes, and returns them
+    alt: str  # alternative text: the kind of plot and its result
+    draw: Callable[[], Any]  # function that plots on new axes, and returns them
 
     def rendered(self, kind: str) -> bytes:
-        """Return the picture as "svg" or "png"; the same each time."""
+        """Return the picture as "svg" or "png", reproducibly."""
         import matplotlib as mpl
         import matplotlib.pyplot as plt
 
@@ -95,7 +95,7 @@ class Picture:
         return buffer.getvalue()
 
     def address(self, kind: str) -> str:
-        """Return the picture as an address that holds it, for an HTML page."""
+        """Return the picture as a data URL, for an HTML page."""
         media = {"svg": "image/svg+xml", "png": "image/png"}[kind]
         return f"data:{media};base64,{base64.b64encode(self.rendered(kind)).decode()}"
 
@@ -129,8 +129,8 @@ class Document:
     verdict: tuple[str, ...]  # the result, and the objections to it
     sections: tuple[Section, ...]  # in reading order, details last
     header: tuple[tuple[str, tuple[str, ...]], ...] = ()  # specimen, model, data and so on
-    facts: Mapping[str, Any] = field(default_factory=dict)  # the same for machines
-    identity: str = ""  # number and data of the report, for every page
+    facts: Mapping[str, Any] = field(default_factory=dict)  # the content of the JSON file
+    identity: str = ""  # number and data of the report, on every page
     signatory: tuple[str, ...] = ()  # name and role; empty to be filled in by hand
 
     @property
@@ -152,8 +152,8 @@ class Document:
     def finished(self, title: str, progress: Callable[[int, int], None] | None) -> Document:
         """Return the document with a title and numbers before captions of figures and tables.
 
-        Pictures of one name, such as those of two fits, get numbers after it too; each tells
-        `progress` when it is drawn for the first time.
+        Pictures of one name, such as those of two fits, get numbers as well. `progress` is called
+        with the numbers of pictures drawn and in all.
         """
         counts = {Picture: 0, TextTable: 0}
         names: dict[str, int] = {}
@@ -168,8 +168,8 @@ class Document:
             caption = f"{kind} {counts[type(block)]}. {block.caption}"
             if isinstance(block, TextTable):
                 return replace(block, caption=caption)
-            names[block.name] = same = names.get(block.name, 0) + 1
-            name = f"{block.name}_{same}" if same > 1 else block.name
+            names[block.name] = count = names.get(block.name, 0) + 1
+            name = f"{block.name}_{count}" if count > 1 else block.name
 
             def draw() -> Any:
                 axes = block.draw()
@@ -190,16 +190,16 @@ def words(*texts: str) -> tuple[Cell, ...]:
 
 
 def number(value: float, digits: int = 4) -> Cell:
-    """Return a number with so many digits; all of them are kept for copying."""
+    """Return a number shown with some digits, and stored with all of them."""
     return Cell(f"{value:.{digits}g}", float(value))
 
 
 def estimated(value: float, text: str, *, struck: bool = False) -> Cell:
-    """Return an estimate as text; one that ran away has none."""
+    """Return an estimate as text; "none finite" for an infinite one."""
     return Cell(text, value, struck) if np.isfinite(value) else Cell("none finite")
 
 
 def figure_of(axes: Any) -> Figure:
-    """Return the figure that holds some axes."""
+    """Return the figure of some axes."""
     figure: Figure = np.ravel(np.asarray(axes, dtype=object))[0].figure
     return figure

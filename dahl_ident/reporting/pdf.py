@@ -1,4 +1,4 @@
-"""A PDF on A4, made by fpdf2, which is pure Python and installed by pip.
+"""Reports as PDF on A4, by fpdf2, which is pure Python and installed by pip.
 
 It uses the DejaVu fonts that are shipped with matplotlib, which have Greek letters and accents.
 """
@@ -35,11 +35,11 @@ _FONT = "DejaVu"
 _FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
 _FACES = {"": "DejaVuSans.ttf", "B": "DejaVuSans-Bold.ttf", "I": "DejaVuSans-Oblique.ttf"}
 _PICTURE_WIDTH, _GAP, _CAPTION_HEIGHT = 86.0, 6.0, 16.0  # mm
-_HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; space kept below a heading or a caption
-_LONGEST = 60  # letters of a title at the foot of a page
-_WHOLE = 20.0  # mm; a lower paragraph is not divided between pages
+_HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; of a heading, and of the text kept below it
+_LONGEST = 60  # most letters of a title at the foot of a page
+_WHOLE = 20.0  # mm; paragraphs up to this height are not divided between pages
 _SIGNATURE = 26.0  # mm, height of the fields for date and signature
-_WIDEST = 75.0  # mm, width of a column of a table
+_WIDEST = 75.0  # mm, largest width of a column of a table
 _PADDING = 3.5  # mm, on both sides of a column's text
 _NAME_WIDTH = 38.0  # mm, width of the fields' names in the header
 _COLOURS = {
@@ -52,7 +52,7 @@ _STRUCK = FontFace(emphasis="STRIKETHROUGH", color=(110, 110, 110))
 
 
 def pdf(document: Document) -> bytes:
-    """Return the whole file."""
+    """Return the content of a PDF file."""
     page = _page(document)
     _heading(page, document.title, 1)
     page.ln(2)
@@ -81,7 +81,7 @@ def pdf(document: Document) -> bytes:
                 below = _beginning(page, table, _widths(page, table))
             case _:
                 below = _BEGINNING
-        _turn_unless_room(page, _HEADING_HEIGHT + below)
+        _keep_together(page, _HEADING_HEIGHT + below)
         page.start_section(section.title)
         _heading(page, section.title, 2)
         for block in section.blocks:
@@ -97,7 +97,7 @@ def _page(document: Document) -> FPDF:
     identity = " \u00b7 ".join(text for text in (title, document.identity) if text)
 
     class Page(FPDF):
-        """A page that shows characters missing from its font, which fpdf2 would leave out."""
+        """A page that shows codes for characters that its font lacks, which fpdf2 would omit."""
 
         def normalize_text(self, text: str) -> str:
             return super().normalize_text(_printable(text))
@@ -124,7 +124,7 @@ def _heading(page: FPDF, text: str, level: int) -> None:
     """Print a heading, tagged for screen readers."""
     page.set_font(_FONT, "B", 17 if level == 1 else 12)
     height = 8 if level == 1 else 6
-    _turn_unless_room(page, 3.0 * height)  # a marked sequence must not cross pages
+    _keep_together(page, 3.0 * height)  # a marked sequence must not cross pages
     with page._marked_sequence(title=text) as element:  # the only way in fpdf2
         element.s = Name(f"H{level}")
         page.multi_cell(0, height, text, new_x="LMARGIN", new_y="NEXT")
@@ -148,7 +148,7 @@ def _header(page: FPDF, document: Document) -> None:
 
 
 def _signature(page: FPDF, signatory: Sequence[str]) -> None:
-    _turn_unless_room(page, _SIGNATURE)
+    _keep_together(page, _SIGNATURE)
     page.ln(12)
     page.set_font(_FONT, "", 8)
     width = (page.epw - 2 * _GAP) / 3.0
@@ -178,11 +178,11 @@ def _block(page: FPDF, block: Block) -> None:
 
 
 def _text(page: FPDF, text: str) -> None:
-    """Print a paragraph; one of a few lines is not divided between pages."""
+    """Print a paragraph; a short one is not divided between pages."""
     height = page.multi_cell(0, 5, text, align="L", dry_run=True, output="HEIGHT")
     assert isinstance(height, float | int)
     if height <= _WHOLE:
-        _turn_unless_room(page, height)
+        _keep_together(page, height)
     page.multi_cell(0, 5, text, align="L", new_x="LMARGIN", new_y="NEXT")
     page.ln(1)
 
@@ -201,7 +201,7 @@ class _Drawn:
 
 def _pictures(page: FPDF, row: Sequence[_Drawn]) -> None:
     """Draw up to two pictures side by side, their captions below."""
-    _turn_unless_room(page, _row_height(row))
+    _keep_together(page, _row_height(row))
     top, ends = page.get_y(), []
     for i, drawn in enumerate(row):
         x = page.l_margin + i * (_PICTURE_WIDTH + _GAP)
@@ -217,15 +217,15 @@ def _row_height(row: Sequence[_Drawn]) -> float:
     return max(drawn.height for drawn in row) + _CAPTION_HEIGHT
 
 
-def _turn_unless_room(page: FPDF, height: float) -> None:
-    """Begin a new page if this height does not fit below."""
+def _keep_together(page: FPDF, height: float) -> None:
+    """Begin a new page if this height does not fit on the current one."""
     if page.get_y() + height > page.h - page.b_margin:
         page.add_page()
 
 
 def _table(page: FPDF, table: TextTable) -> None:
     widths = _widths(page, table)
-    _turn_unless_room(page, _beginning(page, table, widths))
+    _keep_together(page, _beginning(page, table, widths))
     page.set_font(_FONT, "B", 9.5)
     _text(page, table.caption)
     page.set_font(_FONT, "", 7.5)
@@ -246,7 +246,7 @@ def _table(page: FPDF, table: TextTable) -> None:
 
 
 class _TaggedTable(fpdf_table.Table):
-    """A table whose cells are marked for programs that read the page aloud."""
+    """A table whose cells are tagged for screen readers."""
 
     def render(self) -> None:
         self._marked: set[tuple[int, int]] = set()
@@ -271,7 +271,7 @@ class _TaggedTable(fpdf_table.Table):
 
 
 class _Structure(StructureTreeBuilder):
-    """What stands on the pages, with cells in rows and rows in tables; fpdf2 keeps a flat list."""
+    """The tags of the pages, with cells in rows and rows in tables; fpdf2 has a flat list."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -310,17 +310,17 @@ def _beginning(page: FPDF, table: TextTable, widths: Sequence[float]) -> float:
 
 
 def _height(page: FPDF, row: Sequence[Cell], widths: Sequence[float]) -> float:
-    """Return about how high a row becomes where its texts are wrapped."""
+    """Return the approximate height of a row with wrapped texts."""
     page.set_font(_FONT, "B", 7.5)
-    room = (page.epw * width / sum(widths) - _PADDING for width in widths)
-    lines = (page.get_string_width(c.text) / wide for c, wide in zip(row, room, strict=True))
+    inner = (page.epw * width / sum(widths) - _PADDING for width in widths)
+    lines = (page.get_string_width(c.text) / width for c, width in zip(row, inner, strict=True))
     return 4.0 * (1 + int(max(lines))) + 1.0
 
 
 def _widths(page: FPDF, table: TextTable) -> list[float]:
-    """Return the widths of columns: no word is broken where all words of a row fit on the page."""
+    """Return the widths of columns, such that words are not broken if they fit on the page."""
     texts = [tuple(cell.text for cell in row) for row in table.rows]
-    least, wanted = [], []
+    least, preferred = [], []
     for name, *column in zip(table.header, *texts, strict=True):
         page.set_font(_FONT, "B", 7.5)
         widest = max((page.get_string_width(word) for word in name.split()), default=0.0)
@@ -329,11 +329,13 @@ def _widths(page: FPDF, table: TextTable) -> list[float]:
         longest = max((page.get_string_width(word) for word in words_of), default=0.0)
         whole = max(map(page.get_string_width, column), default=0.0)
         least.append(min(max(widest, longest), _WIDEST) + _PADDING)
-        wanted.append(max(widest, longest, min(whole, _WIDEST)) + _PADDING)
-    room, more = page.epw - sum(least), sum(wanted) - sum(least)
-    if room >= more or room <= 0.0:
-        return wanted if room >= more else least  # in proportion
-    return [low + (want - low) * room / more for low, want in zip(least, wanted, strict=True)]
+        preferred.append(max(widest, longest, min(whole, _WIDEST)) + _PADDING)
+    room, more = page.epw - sum(least), sum(preferred) - sum(least)
+    if room >= more:
+        return preferred
+    if room <= 0.0:
+        return least  # scaled down by the table
+    return [low + (high - low) * room / more for low, high in zip(least, preferred, strict=True)]
 
 
 @cache
@@ -344,6 +346,6 @@ def _known_characters() -> frozenset[int]:
 
 
 def _printable(text: str) -> str:
-    """Return text with codes in place of characters that the font lacks."""
+    """Return text with codes for characters that the font lacks."""
     known = _known_characters()
     return "".join(c if ord(c) in known or c.isspace() else f"<U+{ord(c):04X}>" for c in text)

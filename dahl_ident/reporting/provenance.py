@@ -26,18 +26,18 @@ Provenances = Iterable[Mapping[str, Any] | None]
 """Provenance of a table, or of each record."""
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
 _LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes", "warnings"}
-_USUAL = {
+_DEFAULTS = {
     "f_max": None, "sigma": None, "alpha": 1.0,
     "force_gain": 1.0, "displacement_gain": 1.0, "delay": 0.0,
 }  # fmt: skip
-"""Values of options that are left out; None where the parameter is then estimated."""
+"""Values of parameters whose options are left out; None if they are then estimated."""
 _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
-"""Parameters with an option of their own; other elements are written with --element."""
+"""Parameters with an option; elements with other parameters are written with --element."""
 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file that the data came from; `read` is false for the original of such a file."""
+    """A source of the data; `read` is false for the original of a file that was read."""
 
     file: str
     sha256: str
@@ -47,9 +47,9 @@ class SourceFile:
 def sources(provenances: Provenances) -> Iterator[SourceFile]:
     """Yield every file that was read, each followed by its originals."""
     for part in parts(provenances):
-        for i, one in enumerate(_with_origins(part)):
-            if "file" in one:
-                yield SourceFile(str(one["file"]), str(one.get("sha256", "")), read=i == 0)
+        for i, origin in enumerate(_with_origins(part)):
+            if "file" in origin:
+                yield SourceFile(str(origin["file"]), str(origin.get("sha256", "")), read=i == 0)
 
 
 def notes(provenances: Provenances) -> list[str]:
@@ -60,22 +60,22 @@ def notes(provenances: Provenances) -> list[str]:
 
 
 def options(provenances: Provenances) -> list[tuple[str, str]]:
-    """Return how the data were made, key by key, if stated and not the default."""
+    """Return names and values of the options with which the data were read or extracted."""
     stated: dict[str, str] = {}
-    for part in (one for whole in parts(provenances) for one in _with_origins(whole)):
-        given_keys = {k: v for k, v in part.items() if k not in _LISTED_ELSEWHERE}
+    for origin in (origin for part in parts(provenances) for origin in _with_origins(part)):
+        entries = {k: v for k, v in origin.items() if k not in _LISTED_ELSEWHERE}
         for name in ("options", "extraction"):
-            inner = given_keys.pop(name, None)
-            entries = inner if isinstance(inner, Mapping) else {"": inner}
-            given_keys |= {f"{name} {key}".strip(): value for key, value in entries.items()}
-        for key, value in given_keys.items():
+            inner = entries.pop(name, None)
+            group = inner if isinstance(inner, Mapping) else {"": inner}
+            entries |= {f"{name} {key}".strip(): value for key, value in group.items()}
+        for key, value in entries.items():
             if not isinstance(value, Mapping) and value not in (None, [], ()):
                 stated.setdefault(key, str(value))
     return list(stated.items())
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of this package and of those that it computes with."""
+    """Return the versions of Python, of this package and of its dependencies."""
     python = {"dahl_ident": __version__, "python": platform.python_version()}
     return python | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
@@ -87,7 +87,7 @@ def today() -> str:
 
 def parts(provenances: Provenances) -> list[Mapping[str, Any]]:
     """Return the provenance of each record, and of each table that was joined."""
-    return [part for one in provenances for part in (one or {}).get("parts", [one or {}])]
+    return [part for p in provenances for part in (p or {}).get("parts", [p or {}])]
 
 
 def _with_origins(part: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
@@ -124,8 +124,8 @@ def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
     """Return the preceding commands, and the files with the options for reading them."""
     all_parts = parts([data.provenance])
     first = all_parts[0]
-    options, made = _options_of(first), _extraction_of(first)
-    alike = all((_options_of(p), _extraction_of(p)) == (options, made) for p in all_parts)
+    options, extraction = _options_of(first), _extraction_of(first)
+    alike = all((_options_of(p), _extraction_of(p)) == (options, extraction) for p in all_parts)
     if not alike or "file" not in first:
         return None
     files = [str(part["file"]) for part in all_parts]
@@ -133,9 +133,9 @@ def _source(data: FrequencyResponse) -> tuple[list[str], list[str]] | None:
     if "generator" in first:  # a shipped data set, which has no path
         before.append(f"dahl-ident datasets {first['name']} -o -")
         files = ["-"]
-    if not made:
+    if not extraction:
         return before, [*files, *_words(options)]
-    words = ["extract", *files, *_words(options), *_words(made)]
+    words = ["extract", *files, *_words(options), *_words(extraction)]
     words += ["--controlled", str(data.controlled[0])]
     if (data.quality["verdict"] == "good").all():
         words.append("--good-only")
@@ -146,18 +146,18 @@ def _options_of(part: Mapping[str, Any]) -> Mapping[str, Any]:
     options = part.get("options")
     if not isinstance(options, Mapping):
         return {}
-    kept = options.get("frequency_hz")
-    where = None if kept is None else f"{kept[0]} <= frequency_hz <= {kept[1]}"
+    band = options.get("frequency_hz")
+    where = None if band is None else f"{band[0]} <= frequency_hz <= {band[1]}"
     return {**options, "frequency_hz": None, "where": where}
 
 
 def _extraction_of(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of an extraction as typed; none if there was no extraction."""
-    made = part.get("extraction")
-    if not isinstance(made, Mapping):
+    """Return the options of an extraction as typed; empty without an extraction."""
+    options = part.get("extraction")
+    if not isinstance(options, Mapping):
         return {}
-    harmonics = ",".join(map(str, made["harmonics"]))
-    return {k: v for k, v in made.items() if k != "refused"} | {"harmonics": harmonics}
+    harmonics = ",".join(map(str, options["harmonics"]))
+    return {k: v for k, v in options.items() if k != "refused"} | {"harmonics": harmonics}
 
 
 def _words(options: Mapping[str, Any]) -> list[str]:
@@ -166,20 +166,20 @@ def _words(options: Mapping[str, Any]) -> list[str]:
 
 
 def _has_text(element: Element) -> bool:
-    """Return whether --element can describe an element: by its declared parameters alone."""
+    """Return whether --element can describe an element, by its declared parameters alone."""
     described = set(element.describe()) - {"kind", "name"}
     known = is_of_package(type(element)) or source_path(type(element)) is not None
     return known and described == set(element.labels)
 
 
 def _as_text(element: Element) -> str:
-    """Return an element as --element takes it, what is usual left out."""
-    usual = {p.name: p for p in type(element).parameters}
+    """Return an element as the argument of --element, without defaults."""
+    declared = {p.name: p for p in type(element).parameters}
     values = [f"name={element.name}"] if element.name else []
     for label, parameter in zip(element.labels, element.parameters, strict=True):
         if not parameter.free and not parameter.assumed:
             values.append(f"{label}={parameter.value!r}")
-        elif parameter.free and not (label in usual and usual[label].free):
+        elif parameter.free and not (label in declared and declared[label].free):
             values.append(f"{label}=free")
     return f"{element.kind}({', '.join(values)})" if values else element.kind
 
@@ -209,7 +209,7 @@ def _sample(posterior: Posterior) -> list[str]:
 
 
 def _model(problem: TableProblem) -> list[str]:
-    """Return the options of elements and sensors that differ from the usual ones."""
+    """Return the options of elements and sensors that are not defaults."""
     model = problem.model
     names = {p.name for p in model.parameters}
     laws = own_laws(model.elements)
@@ -230,13 +230,13 @@ def _parameter(parameter: Parameter, problem: TableProblem) -> Iterator[str]:
     elif name not in problem.names:
         value = repr(parameter.value)
         stated = parameter.prior is not None and not parameter.assumed
-        if parameter.value == _USUAL.get(name) and not stated:
+        if parameter.value == _DEFAULTS.get(name) and not stated:
             return
-    elif name in _USUAL and _USUAL[name] is None:
+    elif name in _DEFAULTS and _DEFAULTS[name] is None:
         return
     yield from (f"--{name.replace('_', '-')}", value)
 
 
 def _changed(**options: tuple[str, str]) -> list[str]:
-    changed = {name: value for name, (value, usual) in options.items() if value != usual}
+    changed = {name: value for name, (value, default) in options.items() if value != default}
     return _words(changed)

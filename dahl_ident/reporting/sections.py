@@ -1,6 +1,6 @@
 """Sections of a report, in this order: result, budget, assumptions, figures, details.
 
-Fits on different data stand side by side, with the significance of their changes.
+Fits of different data are shown side by side, with the significance of their changes.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ _OF_CHAIN = (
     "mcse is the Monte Carlo standard error of the mean, ess the effective number of draws, r_hat "
     "compares independent ensembles and is 1 if they agree."
 )
-_MOST_FILES = 4  # lines for them before the signature
+_MOST_FILES = 4  # most lines of files before the signature
 _FACTS = {"table": "fits", "records": "record_fits"}  # names of fits in JSON, by kind of data
-_FRONT = ("response", "residuals", "record")  # first words of pictures before the details
+_FRONT = ("response", "residuals", "record")  # beginnings of names of the first pictures
 _RANK = list(MARKS).index
-"""The place of a status in the order from good to bad."""
+"""Rank of a status, from good to bad."""
 
 
 def document(
@@ -67,7 +67,7 @@ def document(
 ) -> Document:
     """Return the report on fits and posteriors of one table, of records, or of both.
 
-    `apart` are fits of several tables, which are only compared.
+    With `apart`, the results are fits of several tables, which are only compared.
     """
     known = metadata or Metadata()
     tables_first = sorted(results, key=lambda result: result.problem.response is None)
@@ -75,15 +75,15 @@ def document(
         content = _of_several_tables(results, known)
     else:
         content = _of_one_table(tables_first, known, record)
-        repeated = command or provenance.equivalent_command(results)
-        origin = tuple(_origin(tables_first, repeated, typed=command is not None))
+        typed = command is not None
+        command = command or provenance.equivalent_command(results)
+        origin = tuple(_origin(tables_first, command, typed=typed))
         sections = (*content.sections, Section("Origin", origin, details=True))
         content = replace(content, sections=sections)
-        command = repeated
     files = _files(tables_first)
-    of_first = (s for s in provenance.sources(tables_first[0].provenances) if s.read and s.sha256)
     identity = [f"Report {known.number}"] if known.number else []
-    if read := list(of_first):
+    sources = provenance.sources(tables_first[0].provenances)
+    if read := [source for source in sources if source.read and source.sha256]:
         more = f" and {len(read) - 1} more" if len(read) > 1 else ""
         identity.append(f"{Path(read[0].file).name}, SHA-256 {_short(read[0].sha256)}{more}")
     return replace(
@@ -104,51 +104,52 @@ def document(
 
 def _of_one_table(results: Sequence[Result], known: Metadata, record: Record | None) -> Document:
     """Return the report on fits and posteriors of one table, of records, or of both."""
-    drawn = [result for result in results if isinstance(result, Posterior)]
-    around = [one.fit for one in drawn if one.fit is not None and one.problem.around_optimum]
+    posteriors = [result for result in results if isinstance(result, Posterior)]
+    around = [p.fit for p in posteriors if p.fit is not None and p.problem.around_optimum]
     fits = list(dict.fromkeys([*(r for r in results if isinstance(r, FitResult)), *around]))
     compared = comparison_of(fits)
     front = list(compared.sections)
     details = list[Section]()
     for fit in fits:
-        of = _of(fit, fits)
+        suffix = _suffix(fit, fits)
         determined = tuple(f"Determined: {c}" for c in fit.identifiability.combinations)
         answer = (tables.answer(fit), Bullets(determined), Paragraph(RELATES))
-        front.append(Section(f"Result{of}", answer))
+        front.append(Section(f"Result{suffix}", answer))
         if (stated := _stated(fit)) is not None:
             combined = (tables.uncertainty(stated), Paragraph(COVERAGE))
-            front.append(Section(f"Expanded uncertainty{of}", combined))
-        front.append(Section(f"What was assumed{of}", (Bullets(tuple(_assumed(fit))),)))
-        details += _details(fit, drawn, of)
-    for one in drawn:
-        if not fits or one.problem.around_optimum:
-            priors = tuple(f"Prior of {name}: {text}" for name, text in one.priors.items())
-            front.append(Section("Posterior", (tables.posterior_summary(one), Bullets(priors))))
-        details += _posterior_details(one)
+            front.append(Section(f"Expanded uncertainty{suffix}", combined))
+        front.append(Section(f"What was assumed{suffix}", (Bullets(tuple(_assumed(fit))),)))
+        details += _details(fit, posteriors, suffix)
+    for posterior in posteriors:
+        if not fits or posterior.problem.around_optimum:
+            priors = tuple(f"Prior of {name}: {text}" for name, text in posterior.priors.items())
+            summary = tables.posterior_summary(posterior)
+            front.append(Section("Posterior", (summary, Bullets(priors))))
+        details += _posterior_details(posterior)
     if (data := results[0].problem.response) is not None:
         details += _extraction(data, record)
         details.append(Section("Data", (tables.measured(data),), details=True))
     verdict = [*compared.verdict, *(line for fit in fits for line in _verdict(fit, fits))]
-    for one in drawn:
-        verdict += [f"Posterior: {one.findings[0]}", *map(str, one.findings[1:])]
-    parts = (p for one in results[:1] for p in provenance.parts(one.provenances) if "file" in p)
-    files = [Path(str(part["file"])).name for part in parts]
+    for posterior in posteriors:
+        verdict += [f"Posterior: {posterior.findings[0]}", *map(str, posterior.findings[1:])]
+    parts = provenance.parts(results[0].provenances)
+    files = [Path(str(part["file"])).name for part in parts if "file" in part]
     return Document(
         title=f"Friction identified{f' from {files[0]}' if len(files) == 1 else ''}",
-        status=max((*(str(r.status) for r in (*fits, *drawn)), *compared.status), key=_RANK),
+        status=max((*(str(r.status) for r in (*fits, *posteriors)), *compared.status), key=_RANK),
         verdict=tuple(dict.fromkeys(verdict)),
         header=_header(results, known),
         sections=tuple(section for section in (*front, *details) if section.blocks),
         facts={
             **{name: list(map(_fit_facts, of_kind(kind, fits))) for kind, name in _FACTS.items()},
-            "posteriors": [one.to_dict() for one in drawn],
+            "posteriors": [posterior.to_dict() for posterior in posteriors],
             **compared.facts,
         },
     )
 
 
 def _of_several_tables(results: Sequence[Result], known: Metadata) -> Document:
-    """Return the comparison of fits on different tables, each with the one before it."""
+    """Return the comparison of fits of different tables, each with the one before it."""
     fits = [result for result in results if isinstance(result, FitResult)]
     if len(fits) < len(results):
         raise ValidationError(
@@ -166,9 +167,10 @@ def _of_several_tables(results: Sequence[Result], known: Metadata) -> Document:
     names = numbered(named)
     headers = [dict(_header([fit], known)) for fit in fits]
     rows = dict(headers[0])
-    rows["Model"] = tuple(dict.fromkeys(line for one in headers for line in one["Model"]))
-    of_each = zip(names, headers, strict=True)
-    rows["Data"] = tuple(f"{name}: {'; '.join(one['Data'])}" for name, one in of_each)
+    rows["Model"] = tuple(dict.fromkeys(line for header in headers for line in header["Model"]))
+    rows["Data"] = tuple(
+        f"{name}: {'; '.join(header['Data'])}" for name, header in zip(names, headers, strict=True)
+    )
     compared = side_by_side(names, fits)
     return Document(
         title=f"Comparison of {', '.join(names)}",
@@ -184,8 +186,8 @@ def _of_several_tables(results: Sequence[Result], known: Metadata) -> Document:
     )
 
 
-def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
-    """Return the text that distinguishes a fit from the others of a report, for headings."""
+def _suffix(fit: FitResult, fits: Sequence[FitResult]) -> str:
+    """Return the end of headings that distinguishes a fit from the others of a report."""
     alike = of_kind(fit.problem.kind, fits)
     parts = [repr(fit.problem.model)] if len(alike) > 1 else []
     if len(alike) < len(fits):
@@ -194,14 +196,14 @@ def _of(fit: FitResult, fits: Sequence[FitResult]) -> str:
 
 
 def _short(sha256: str) -> str:
-    """Return the beginning of a hash; the whole one stands under the origin."""
+    """Return the beginning of a hash, which the section on the origin shows in full."""
     return f"{sha256[:12]}..." if sha256 else "unknown"
 
 
 def _files(results: Sequence[Result]) -> list[provenance.SourceFile]:
     """Return every file once, in the order of the results."""
-    every = (source for one in results for source in provenance.sources(one.provenances))
-    return list(dict.fromkeys(every))
+    files = (source for r in results for source in provenance.sources(r.provenances))
+    return list(dict.fromkeys(files))
 
 
 def _header(
@@ -228,7 +230,7 @@ def _header(
 
 
 def in_words(model: Element) -> Iterator[str]:
-    """Yield the model in words, then an equation for each of its elements."""
+    """Yield the names of the model's elements, then their equations."""
     elements = as_model(model).elements
     kinds = [element.kind.replace("_", " ") or type(element).__name__ for element in elements]
     names = [
@@ -243,7 +245,7 @@ def in_words(model: Element) -> Iterator[str]:
 
 
 def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
-    """Yield a fit's statements; where there are several fits, model and status come first."""
+    """Yield a fit's statements; with several fits, model and status come first."""
     alike = len(of_kind(fit.problem.kind, fits))
     before = "" if alike == len(fits) else f"{KINDS[fit.problem.kind]}: "
     if alike > 1:
@@ -257,8 +259,7 @@ def _verdict(fit: FitResult, fits: Sequence[FitResult]) -> Iterator[str]:
 
 def _stated(fit: FitResult) -> Budget | None:
     """Return the uncertainty budget; None where no uncertainty can be stated."""
-    lost = fit.status is VerdictStatus.NOT_DESCRIBED
-    return None if lost else fit.stated_budget
+    return None if fit.status is VerdictStatus.NOT_DESCRIBED else fit.stated_budget
 
 
 def _assumed(fit: FitResult) -> Iterator[str]:
@@ -269,8 +270,8 @@ def _assumed(fit: FitResult) -> Iterator[str]:
     if fixed:
         yield f"Held fixed: {listed(fixed)}."
     for p in (fit.params[name] for name in fit.assumed):
-        here = with_unit(p.value, p.stderr, p.unit)
-        yield f"Not given, so that the uncertainty counts it: {p.name}, here {here}."
+        value = with_unit(p.value, p.stderr, p.unit)
+        yield f"Not given, so that the uncertainty counts it: {p.name}, here {value}."
     if exact := fit.assessment.exact:
         yield f"Taken as exact: {listed(exact)}."
     yield from (f"Prior of {name}: {text}." for name, text in tables.priors_in_words(fit))
@@ -280,17 +281,17 @@ def _assumed(fit: FitResult) -> Iterator[str]:
     yield f"Search: {fit.method}, loss {fit.optimum.loss}."
 
 
-def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Section]:
+def _details(fit: FitResult, posteriors: Sequence[Posterior], suffix: str) -> Iterator[Section]:
     """Yield the sections after the signature."""
 
     def section(title: str, *blocks: Block) -> Section:
-        return Section(f"{title}{of}", blocks, details=True)
+        return Section(f"{title}{suffix}", blocks, details=True)
 
     pictures = list(pictures_of(fit))
     yield section("Pictures", *(p for p in pictures if p.name.startswith(_FRONT)))
     if (stated := _stated(fit)) is not None:
         yield section("Sources of uncertainty", tables.budget(stated), budget_picture(stated))
-    yield section("Parameters", *_parameters(fit, drawn))
+    yield section("Parameters", *_parameters(fit, posteriors))
     known = fit.identifiability
     texts = Bullets(tuple(p.text for p in known.parameters.values()))
     yield section("What the data determine", Paragraph(known.headline), texts)
@@ -300,15 +301,15 @@ def _details(fit: FitResult, drawn: Sequence[Posterior], of: str) -> Iterator[Se
     yield section("More pictures", *(p for p in pictures if not p.name.startswith(_FRONT)))
 
 
-def _parameters(fit: FitResult, drawn: Sequence[Posterior]) -> Iterator[Block]:
+def _parameters(fit: FitResult, posteriors: Sequence[Posterior]) -> Iterator[Block]:
     for method in ("wald",) if fit.first_order else fit.assessment.quick_methods:
         fit.conf_interval(method)
     intervals = fit.assessment.computed_intervals(CONFIDENCE)
-    alike = of_kind(fit.problem.kind, drawn)
+    alike = of_kind(fit.problem.kind, posteriors)
     yield tables.parameters(fit, intervals, alike)
     by_note: dict[str, list[str]] = {}
-    for one in intervals:
-        by_note.setdefault(one.note, []).append(tables.method_name(one))
+    for of_method in intervals:
+        by_note.setdefault(of_method.note, []).append(tables.method_name(of_method))
     notes = [f"Intervals by {listed(names)}: {note}" for note, names in by_note.items()]
     derived = fit.derived() if fit.status is not VerdictStatus.NOT_DESCRIBED else ()
     yield Bullets((*notes, *(f"Derived: {quantity}" for quantity in derived)))
@@ -343,23 +344,22 @@ def _posterior_details(posterior: Posterior) -> Iterator[Section]:
 
 
 def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:
-    """Yield how the points were measured, where they come from waveforms."""
-    seen = () if record is None else (settling(data, record),)
+    """Yield how the points were measured, if they were extracted from waveforms."""
     if "num_periods" not in data.quality:
         return
     verdicts = data.select(harmonic=1).quality["verdict"]
     bad = int((verdicts != "good").sum())
-    says = f"{bad} of them not good" if bad else "all good"
+    quality = f"{bad} of them not good" if bad else "all good"
     yield Section(
         "Extraction",
         (
             Paragraph(
-                f"Points measured from waveforms: {verdicts.size}, {says}. Leading cycles are left "
-                "out if friction had not yet settled after the previous step; the bias is an "
+                f"Points measured from waveforms: {verdicts.size}, {quality}. Leading cycles are "
+                "left out if friction had not yet settled after the previous step; the bias is an "
                 "upper bound for the remaining transient in the cycles used."
             ),
             tables.extraction(data),
-            *seen,
+            *(() if record is None else (settling(data, record),)),
         ),
         details=True,
     )
@@ -371,28 +371,26 @@ def _origin(results: Sequence[Result], command: str | None, *, typed: bool) -> I
             words(s.file, "read" if s.read else "origin of the file above", s.sha256) for s in files
         )
         yield TextTable("Files", ("file", "what it is", "SHA-256"), rows)
-    made = dict(pair for one in results for pair in provenance.options(one.provenances))
-    if made:
-        yield TextTable(
-            "Options", ("option", "value"), tuple(words(*pair) for pair in made.items())
-        )
+    options = dict(pair for r in results for pair in provenance.options(r.provenances))
+    if options:
+        rows = tuple(words(*pair) for pair in options.items())
+        yield TextTable("Options", ("option", "value"), rows)
     versions = ", ".join(f"{name} {version}" for name, version in provenance.versions().items())
     yield Paragraph(f"Versions: {versions}.")
     when = f"Made on {provenance.today()}"
     if command is None:
         yield Paragraph(f"{when}, in Python; no command describes this model and these data.")
         return
-    how = (
-        ". This command reproduces it:"
-        if typed
-        else ", in Python. With all rows of the files, this command gives the same result:"
-    )
-    yield Paragraph(when + how)
+    if typed:
+        yield Paragraph(f"{when}. This command reproduces it:")
+    else:
+        how = "With all rows of the files, this command gives the same result:"
+        yield Paragraph(f"{when}, in Python. {how}")
     yield Listing(command)
 
 
 def _fit_facts(fit: FitResult) -> dict[str, Any]:
-    """Return a fit for machines."""
+    """Return a fit as plain data for JSON."""
     intervals = fit.conf_interval().at(CONFIDENCE)
     return {
         "model": repr(fit.problem.model),

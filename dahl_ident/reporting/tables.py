@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from dahl_ident.diagnostics.comparison import ModelComparison
     from dahl_ident.results import FitResult, Posterior
 
-_LARGEST = 3  # sources of uncertainty that the first page names
+_LARGEST = 3  # number of sources of uncertainty on the first page
 _ASSUMED = "assumed; u counts it"
-_NO_PART = 1e-6  # share of the variance that the details leave out: a thousandth of u
+_NO_PART = 1e-6  # negligible share of the variance: a thousandth of u
 _DIGITS = {"mcse": 2, "ess": 4, "r_hat": 5}
-_LINEARIZATION_ROWS = 9  # few enough to read, from the smallest amplitude to the largest
+_LINEARIZATION_ROWS = 9  # amplitudes, from the smallest to the largest
 
 
 def answer(fit: FitResult) -> TextTable:
@@ -46,7 +46,8 @@ def answer(fit: FitResult) -> TextTable:
             verdict, reason = fit.verdict_on(name)
             lost = not verdict.known
             limit = limits[name]
-            closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())  # a bound holds
+            # of an undetermined parameter, a single limit is valid, an interval is not
+            closed = lost and bool(np.isfinite([limit.lower, limit.upper]).all())
             text = interval(limit.lower, limit.upper, "")
             within = Cell(text, struck=not described or closed)
             if not lost:
@@ -120,7 +121,7 @@ def budget(stated: Budget) -> TextTable:
 
 
 def _rounded(value: float, u: float) -> Cell:
-    """Return an uncertainty to two digits, written to the same place as its estimate."""
+    """Return an uncertainty with two digits, rounded like its estimate."""
     return Cell(rounded(value, u)[1], u)
 
 
@@ -129,7 +130,7 @@ def _dof(dof: float) -> Cell:
 
 
 def priors_in_words(fit: FitResult) -> Iterator[tuple[str, str]]:
-    """Yield each parameter with a prior, and the prior as a reader of a certificate knows it."""
+    """Yield each parameter with a prior, and the prior in words."""
     known: Mapping[str, Any] = fit.problem.priors
     for name, prior in known.items():
         unit = fit.params[name].unit
@@ -144,7 +145,7 @@ def priors_in_words(fit: FitResult) -> Iterator[tuple[str, str]]:
 
 
 def prior_text(prior: Any) -> str:
-    """Return bounds or a frozen distribution as they are typed."""
+    """Return bounds or a frozen distribution as typed by a user."""
     if isinstance(prior, tuple):
         return ":".join(map(repr, prior))
     arguments = [*map(repr, prior.args), *(f"{k}={v!r}" for k, v in prior.kwds.items())]
@@ -152,11 +153,11 @@ def prior_text(prior: Any) -> str:
 
 
 def parameters(
-    fit: FitResult, intervals: Sequence[ConfidenceIntervals], drawn: Sequence[Posterior]
+    fit: FitResult, intervals: Sequence[ConfidenceIntervals], posteriors: Sequence[Posterior]
 ) -> TextTable:
-    """Return every parameter with its intervals, one column a method."""
-    at = [one.at(CONFIDENCE) for one in intervals]
-    lost = fit.status is VerdictStatus.NOT_DESCRIBED  # then no interval holds
+    """Return every parameter with its intervals, one column for each method."""
+    by_method = [of_method.at(CONFIDENCE) for of_method in intervals]
+    invalid = fit.status is VerdictStatus.NOT_DESCRIBED
     rows = []
     for name, p in fit.params.items():
         value, error = rounded(p.value, p.stderr)
@@ -166,12 +167,12 @@ def parameters(
         if name in fit.assumed:
             shown, u = words(value, f"{error}, assumed")
         within = []
-        for limits in (method.get(name) for method in at):
+        for limits in (of_method.get(name) for of_method in by_method):
             text = interval(limits.lower, limits.upper, "") if limits else "-"
-            within.append(Cell(text, struck=bool(limits) and lost))
-        within += [Cell(credible_interval(posterior, name)) for posterior in drawn]
+            within.append(Cell(text, struck=bool(limits) and invalid))
+        within += [Cell(credible_interval(posterior, name)) for posterior in posteriors]
         rows.append((Cell(name), shown, u, Cell(p.unit or "-"), *within, Cell(p.description)))
-    methods = [*(method_name(one) for one in intervals), *("posterior" for _ in drawn)]
+    methods = [*map(method_name, intervals), *["posterior"] * len(posteriors)]
     columns = (f"{method} {level_text(CONFIDENCE)}" for method in methods)
     header = ("parameter", "estimate", "standard error", "unit", *columns, "description")
     return TextTable("Estimates and intervals, one column a method", header, tuple(rows))
@@ -183,7 +184,7 @@ def method_name(intervals: ConfidenceIntervals) -> str:
 
 
 def credible_interval(posterior: Posterior, name: str) -> str:
-    """Return the central interval of a posterior, rounded as the others are."""
+    """Return the central interval of a posterior."""
     if name not in posterior.names:
         return "-"
     lower, upper = posterior.quantile(name, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE])
@@ -194,22 +195,22 @@ def posterior_summary(posterior: Posterior) -> TextTable:
     """Return the moments and quantiles of a posterior; struck if they must not be used."""
     lost = not posterior.trusted
     rows: list[Row] = []
-    for name, of in posterior.summary().iterrows():
-        row: Row = {"parameter": str(name), "unit": str(of["unit"]) or "-"}
-        for column in of.index.drop("unit"):
-            number_of = float(of[column])
-            text = rounded(number_of, float(of["std"]))[0]  # by the standard deviation
+    for name, statistics in posterior.summary().iterrows():
+        row: Row = {"parameter": str(name), "unit": str(statistics["unit"]) or "-"}
+        for column in statistics.index.drop("unit"):
+            value = float(statistics[column])
+            text = rounded(value, float(statistics["std"]))[0]
             if column == "std":
-                text = rounded(float(of["mean"]), number_of)[1]
+                text = rounded(float(statistics["mean"]), value)[1]
             elif column in _DIGITS:
-                text = f"{number_of:.{_DIGITS[column]}g}" if np.isfinite(number_of) else "-"
-            row[str(column)] = Cell(text, _finite(number_of), struck=lost)
+                text = f"{value:.{_DIGITS[column]}g}" if np.isfinite(value) else "-"
+            row[str(column)] = Cell(text, _finite(value), struck=lost)
         rows.append(row)
     return TextTable.of("Posterior of each parameter", rows)
 
 
 def linearization(fit: FitResult) -> TextTable | None:
-    """Return equivalent stiffness, damping and loss of the friction against amplitude."""
+    """Return equivalent stiffness, damping and loss of the friction over amplitude."""
     friction = any(element.has_memory for element in fit.model.elements)
     if not friction or not all(np.isfinite(e.value) for e in fit.params.values()):
         return None
@@ -223,19 +224,19 @@ def linearization(fit: FitResult) -> TextTable | None:
         if quantity.amplitude is not None:
             derived.setdefault(quantity.name, []).append(quantity)
     lost = fit.status is VerdictStatus.NOT_DESCRIBED
-    for name, along in derived.items():
-        power, unit = prefix([quantity.value for quantity in along], along[0].unit)
-        texts = (rounded(q.value / power, q.stderr / power) for q in along)
+    for name, quantities in derived.items():
+        power, unit = prefix([q.value for q in quantities], quantities[0].unit)
+        texts = (rounded(q.value / power, q.stderr / power) for q in quantities)
         columns[f"{name} [{unit}]"] = [
             Cell(f"{value} \u00b1 {error}", q.value / power, lost)
-            for (value, error), q in zip(texts, along, strict=True)
+            for (value, error), q in zip(texts, quantities, strict=True)
         ]
     caption = f"Friction as an equivalent spring and damper (damping at {f:.4g} Hz)"
     return _of_columns(caption, columns)
 
 
 def comparison(compared: ModelComparison) -> Iterator[TextTable]:
-    """Yield models side by side, and what means the same in every law."""
+    """Yield the models side by side, and the quantities common to all laws."""
     rows = zip(compared.rows, compared.models, strict=True)
     cells = tuple(words(*row, model.estimates) for row, model in rows)
     yield TextTable("Models compared", (*compared.columns, "estimates"), cells)
@@ -287,7 +288,7 @@ def extraction(data: FrequencyResponse) -> TextTable:
 
 
 def _column(name: str, values: FloatArray, unit: str) -> dict[str, list[Cell]]:
-    """Return a column of numbers with the prefix of its unit that suits them."""
+    """Return a column of numbers, with a suitable prefix of its unit."""
     power, unit = prefix(values, unit)
     return {f"{name} [{unit}]": [number(v / power) for v in values]}
 
@@ -297,19 +298,19 @@ def _of_columns(caption: str, columns: Mapping[str, Sequence[Cell]]) -> TextTabl
 
 
 def goodness(fit: FitResult) -> TextTable:
-    """Return the numbers that say how well the model describes the data."""
+    """Return statistics of the goodness of fit."""
     rows: Row = {
         "data (real numbers)": f"{fit.ndata}",
         "degrees of freedom": f"{fit.nfree}",
         "rms misfit": percent(fit.goodness.rms_misfit),
     }
-    if not fit.scale_known:  # else chi-square stands among the tests
+    if not fit.scale_known:  # otherwise chi-square is among the tests
         rows["sum of squares"] = number(fit.chisqr)
         rows["sum of squares over degrees of freedom"] = number(fit.redchi)
     rows["noise scale"] = "known" if fit.scale_known else f"{fit.scale:.4g}, estimated"
     assumed = [p for p in fit.problem.model.parameters if p.assumed]
-    held = "".join(f" at {p.name} = {p.value:g}" for p in assumed)
-    rows |= {f"AIC{held}": number(fit.aic, 6), f"BIC{held}": number(fit.bic, 6)}
+    at_assumed = "".join(f" at {p.name} = {p.value:g}" for p in assumed)
+    rows |= {f"AIC{at_assumed}": number(fit.aic, 6), f"BIC{at_assumed}": number(fit.bic, 6)}
     listed = [{"measure": name, "value": cell} for name, cell in rows.items()]
     return TextTable.of("Goodness of fit", listed)
 
@@ -319,5 +320,5 @@ def _finite(value: float | None) -> float | None:
 
 
 def _expanded(stated: ParameterBudget) -> Cell:
-    """Return U, or the interval where that is not value ± U."""
+    """Return U, or the interval if it is not value ± U."""
     return Cell(stated.expanded, stated.U if stated.limits is None else None)
