@@ -75,67 +75,67 @@ def fit(
     Parameters
     ----------
     data : FrequencyResponse, DataFrame, Record or sequence of Record
-        What was measured; a pandas table is read by `read_frequency_response`.
-        Displacement-controlled rows need an amplitude, force-controlled rows
-        a drive. Records of any motion are fitted sample by sample, several as runs of one device.
+        Measured data; a pandas table is read by `read_frequency_response`.
+        Displacement-controlled rows need an amplitude, force-controlled rows a drive. Records of
+        any motion are fitted sample by sample, several as runs of one device.
     model : Element
         One element or a sum, such as ``Dahl() + Mass(0.3)``. Numbers are fixed, the rest free.
     method : {"lm", "scipy", "ipopt"}, default "lm"
         "lm" is Levenberg and Marquardt's method from a global start. "scipy" is
         `scipy.optimize.least_squares` on the same residuals and Jacobian from the same starts.
-        "ipopt" goes on from the optimum by IPOPT, and alone takes `constraints` and noise in the
-        drive. All three find the same optimum; "lm" is the fastest.
+        "ipopt" continues from the optimum with IPOPT, and alone takes `constraints` and noise in
+        the drive. All three find the same optimum; "lm" is the fastest.
     free : iterable of str, optional
-        Names of parameters that have values but are to be estimated, starting from these values.
+        Names of parameters with values that are to be estimated; the values are starts.
     fixed : mapping of str to float, optional
         Parameters to hold at a value.
     noise : {"measured", "relative", "absolute"}, optional
-        Of tables: by default "measured" where the data have a covariance, else "relative".
+        For tables. Default: "measured" if the data have a covariance, otherwise "relative".
     sensors : Sensors, optional
-        Gains and delay of the channels; left out, they are taken as exact. Of records: priors
-        about 1 and 0 alone, whose standard deviations count in the uncertainty.
+        Gains and delay of the channels; left out, they are taken as exact. For records, only
+        priors about 1 and 0, whose standard deviations are included in the uncertainty.
     loss : {"linear", "huber", "soft_l1", "student_t"}, default "linear"
-        A robust loss down-weights outliers; the noise's scale is then estimated robustly. All
-        sources of error count as without one.
+        A robust loss down-weights outliers; the noise's scale is then estimated robustly. The
+        sources of error are the same as without one.
     start : mapping of str to float, optional
         Additional start of the search: values of some or all free parameters.
     constraints : callable, optional
-        With "ipopt": takes a mapping of every parameter's name to its casadi symbol and returns
-        comparisons, such as ``lambda p: [p["sigma"] >= 100 * p["f_max"]]``.
+        With "ipopt": function of a mapping of every parameter's name to its casadi symbol, which
+        returns comparisons, such as ``lambda p: [p["sigma"] >= 100 * p["f_max"]]``.
     drive_std, drive_covariance : array_like, shapes (n,) and (n, 2), optional
         With "ipopt", for force-controlled rows: standard deviation of the measured drive, and its
         covariance with real and imaginary part of the response.
     steady : {"exact", "describing function"}, default "exact"
-        How rows whose force was controlled are predicted: by the exact steady motion of a model
-        with a mass, or as if the displacement were a sine. The second is faster and the paper's.
+        How force-controlled rows are predicted: by the exact steady motion of a model with a mass,
+        or as if the displacement were a sine, which is faster and the method of the paper.
     output : {"force", "motion"}, optional
         For records: predict the force from the measured displacement, or the motion from the
         measured force. Default: the motion if the model has a mass.
     excitation : {"force", "base"}, default "force"
-        Of records whose motion is predicted: "base" where their force channel is the acceleration
-        of the base, m/s^2, and the motion relative to it.
+        For records whose motion is predicted: "base" if their force channel is the acceleration of
+        the base, m/s^2, and the motion is relative to it.
     throw : bool, default True
-        Raise where the data give no finite optimum; otherwise return the best point, with its
+        Raise an error if there is no finite optimum; otherwise return the best point, with its
         `status`.
     progress : bool, default False
-        Of records: show on the terminal how the search goes, once it has taken two seconds.
+        For records: show the progress of the search on the terminal after two seconds.
 
     Returns
     -------
     FitResult
-        Estimates, errors and diagnostics, each computed when first asked for.
+        Estimates, errors and diagnostics, each computed when first needed.
 
     Raises
     ------
     FitInterrupted
         If a fit of records was stopped from the keyboard; its `result` holds the best so far.
     FitError
-        If there is no finite optimum and `throw`; the error's `result` holds what was found.
-        Also if there are fewer numbers than parameters, or no values tried predict every row.
+        If there is no finite optimum and `throw`; the error's `result` is the best point. Also if
+        there are fewer numbers than parameters, or no values that were tried predict every row.
     ModelError
-        If nothing is free, or a name is unknown.
+        If no parameter is free, or a name is unknown.
     DataError
-        If the rows lack what their model or noise needs.
+        If the rows lack data for their model or noise.
     ValidationError
         If an option is unknown.
 
@@ -152,13 +152,13 @@ def fit(
     refuse_options(kind_of(data), locals(), fit)
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
-    by_ipopt: dict[str, Any] = {
+    ipopt_options: dict[str, Any] = {
         "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
     }  # fmt: skip
-    of_ipopt = [name for name, value in by_ipopt.items() if value is not None]
-    if of_ipopt and method != "ipopt":
+    given = [name for name, value in ipopt_options.items() if value is not None]
+    if given and method != "ipopt":
         raise ValidationError(
-            f"{' and '.join(of_ipopt)} given; only {argument('method', 'ipopt')} takes that"
+            f"{' and '.join(given)} given; only {argument('method', 'ipopt')} takes that"
         )
 
     problem = problem_of(
@@ -172,7 +172,7 @@ def fit(
             else:
                 from dahl_ident.fitting.ipopt import solve_ipopt
 
-                optimum = solve_ipopt(problem, start=start, loss=loss, tell=tell, **by_ipopt)
+                optimum = solve_ipopt(problem, start=start, loss=loss, tell=tell, **ipopt_options)
             result = FitResult(optimum, first_order=constraints is not None)
     except FitInterrupted as stop:
         raise FitInterrupted(
@@ -216,7 +216,7 @@ def fit_many(
     DataError
         If the tables do not agree in shape, or there is none.
     ModelError
-        If nothing is free, or a name is unknown.
+        If no parameter is free, or a name is unknown.
     FitError
         If there are fewer numbers than parameters.
 
@@ -267,72 +267,72 @@ def posterior(
     Parameters
     ----------
     data : FrequencyResponse, Record, sequence of Record or FitResult
-        What was measured; or a fit, whose data, model, noise and sensors are taken over. Records
-        are fitted first; where `output`, `excitation` or `start` is needed, give their fit.
+        Measured data; or a fit, whose data, model, noise and sensors are used. Records are fitted
+        first; if `output`, `excitation` or `start` is needed, give their fit.
     model : Element, optional
         One element or a sum, such as ``Dahl() + Mass(0.3)``; left out with a fit.
     method : {"mcmc", "grid"}, default "mcmc"
         "mcmc" samples with emcee. "grid" integrates over up to three free parameters with
-        importance points: no chain, the same answer at every call, and the evidence. An unknown
-        noise scale is integrated analytically there and does not count among the three.
+        importance points: no chain, a reproducible result, and the evidence. An unknown noise scale
+        is integrated analytically and is not one of the three.
     priors : mapping of str to distribution or (low, high), optional
         By parameter: a frozen distribution of scipy.stats over the value, or bounds, between
-        which positive parameters are log-uniform and the others uniform. Parameters left out
-        get wide bounds from the size of the data, which the report states.
+        which positive parameters are log-uniform and the others uniform. Other parameters have
+        wide bounds from the size of the data, which the report states.
     free, fixed, noise, sensors, steady
         As for :func:`dahl_ident.fit`. Sensors may have any prior here.
     likelihood : {"gaussian", "student_t", "none"}, default "gaussian"
-        "student_t" makes outliers count less (4 degrees of freedom; on a grid it needs noise of
-        known scale); "none" gives the prior.
+        "student_t" reduces the weight of outliers (4 degrees of freedom; on a grid it needs noise
+        of known scale); "none" gives the prior.
     uncertainty : {"combined", "noise"}, default "combined"
-        "combined" counts every source of the fit's uncertainty budget that was estimated from the
-        data, such as scatter between runs and model error, and samples exponents that were not
-        given, log-uniform over their range, which takes several times as long as a given one.
-        "noise" counts independent noise alone, as do likelihoods other than "gaussian". The
-        verdict says which.
+        "combined" includes every source of the fit's uncertainty budget that was estimated from
+        the data, such as scatter between runs and model error, and samples exponents that were not
+        given, log-uniform over their range, which takes several times as long as with given ones.
+        "noise" includes independent noise alone, as do likelihoods other than "gaussian". The
+        verdict states which.
     seed : int, optional
-        The same seed gives the same chain. Left out, one is drawn, and reported. A grid needs
-        none.
+        The same seed gives the same chain. Default: a random one, which is reported. A grid does
+        not need a seed.
     steps : int, optional
-        Total number of steps, warm-up included. Left out, the chain runs until it has
-        converged: 50 autocorrelation times after warm-up, R-hat below 1.01, and `ess`.
+        Total number of steps, warm-up included. Default: until the chain has converged, with 50
+        autocorrelation times after warm-up, R-hat below 1.01, and `ess`.
     max_steps : int, default 20000
-        Where to stop a chain that does not converge.
+        Limit of steps without convergence.
     ess : float, default 2000
-        Effective number of draws wanted for every parameter.
+        Required effective number of draws of every parameter.
     walkers : int, optional
-        In all ensembles together. Default: 32 an ensemble, or more for many parameters.
+        Number in all ensembles together. Default: 32 per ensemble, more for many parameters.
     ensembles : int, default 4
-        Groups of walkers that are independent of each other.
+        Number of independent groups of walkers.
     resume : path, optional
-        HDF5 file that keeps the chain: begun where there is none, continued to the *total*
-        number of steps where there is. It is whole at every moment, also after a crash, and the
-        resulting chain is the same however often it was interrupted.
+        HDF5 file for the chain: created if it does not exist, otherwise continued to the *total*
+        number of steps. It is valid at any time, also after a crash, and interruptions do not
+        change the chain.
     pool : object with map, optional
-        Spreads the likelihood over processes. Left out, one process computes all walkers at
+        Distributes the likelihood over processes. Default: one process computes all walkers at
         once, which is faster unless a single likelihood takes milliseconds.
     progress : bool, default False
-        Show on the terminal how far it is; of a chain, with the time that is left.
+        Show the progress on the terminal; for a chain, with the remaining time.
     tolerance : float, default 1e-3
-        With "grid": relative error of the evidence and error of probabilities to be reached.
+        With "grid": largest relative error of the evidence and error of probabilities.
 
     Returns
     -------
     Posterior
-        Its first line says where it has not converged.
+        Its first line states if it has not converged.
 
     Raises
     ------
     SamplingError
-        If no place of finite density is found, the scale of the noise cannot be estimated, the
-        chain never moved (it is in the error's `posterior`), `resume` names a file that is
-        damaged, in use, or of another run, or more than three parameters are free on a grid.
+        If no point of finite density is found, the scale of the noise cannot be estimated, the
+        chain never moved (it is in the error's `posterior`), `resume` is a file that is damaged, in
+        use, or of another run, or more than three parameters are free on a grid.
     ModelError
-        If nothing is free, or a name is unknown.
+        If no parameter is free, or a name is unknown.
     DataError
-        If the rows lack what their model or noise needs.
+        If the rows lack data for their model or noise.
     ValidationError
-        If an option or a prior is not as described, or belongs to the other method.
+        If an option or a prior is invalid, or belongs to the other method.
 
     Examples
     --------
@@ -394,12 +394,12 @@ def posterior(
     )  # fmt: skip
     start = partial(starting_points, density, optimum)
     with progress_bar(settings) if progress else nullcontext() as bar:
-        drawn = sample_chain(
+        sample = sample_chain(
             density, start, settings, seed=seed, resume=resume, pool=pool,
             listeners=[] if bar is None else [bar],
         )  # fmt: skip
-    result = Posterior(density, drawn, fitted, uncertainty)
-    drawn.check(result.names, result)
+    result = Posterior(density, sample, fitted, uncertainty)
+    sample.check(result.names, result)
     return result
 
 
@@ -410,13 +410,13 @@ _NOT_OF_METHODS = {
 
 
 def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
-    """Refuse what a fit has already."""
+    """Refuse options that a fit already has, and fits that a posterior cannot use."""
     names = ("model", "noise", "sensors", "fixed", "steady")
-    named = [name for name in names if options[name] is not None]
-    named += ["free"] if tuple(options["free"]) else []
-    if named:
+    given = [name for name in names if options[name] is not None]
+    given += ["free"] if tuple(options["free"]) else []
+    if given:
         raise ValidationError(
-            f"{', '.join(named)} is given together with a FitResult, which has its own; pass the "
+            f"{', '.join(given)} is given together with a FitResult, which has its own; pass the "
             "data instead"
         )
     if fit.first_order or fit.optimum.loss != "linear":
@@ -446,7 +446,7 @@ def _density(
     likelihood: str,
     uncertainty: str,
 ) -> tuple[LogDensity, Optimum | None]:
-    """Return the density with every source of error, or noise alone, and where to start from."""
+    """Return the density, with every source of error or noise alone, and its starting optimum."""
     from scipy import stats
 
     stated, optimum = dict(priors or {}), None if fit is None else fit.optimum
@@ -460,11 +460,11 @@ def _density(
     errors = fit.errors_of_combinations
     theta = optimum.theta_in(wider) if errors is None else errors.theta
     ranges = {p.name: p.prior for p in wider.parameters if p.prior is not None}
-    of_assumed = {
-        name: ranges[name] if one.source == EXPONENT else stats.norm(1.0, one.std)
-        for name, one in assumed.items()
+    assumed_priors = {
+        name: ranges[name] if assumption.source == EXPONENT else stats.norm(1.0, assumption.std)
+        for name, assumption in assumed.items()
     }
     shared = None if errors is None else row_errors(errors)
-    prior = joint_prior(wider, stated, wider.to_values(theta), of_assumed)
+    prior = joint_prior(wider, stated, wider.to_values(theta), assumed_priors)
     density = Density(wider, prior, likelihood, shared)
     return density, replace(optimum, problem=wider, theta=theta)

@@ -1,4 +1,4 @@
-"""Fits of many tables at once: estimates side by side, each table's full result on request."""
+"""Fits of many tables at once: arrays of estimates, and the full result of each table."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class FitBatch(Sequence[FitResult]):
     def values(self) -> FloatArray:
         """Estimates, shape (S, P): those of ``batch[i].params``.
 
-        Each table has its error model, which takes some 10 ms and is computed once.
+        The error model of each table takes some 10 ms and is computed once.
         ``batch.optima.values`` are the optima of the search alone.
         """
         return np.asarray(self._params[..., 0])
@@ -84,7 +84,7 @@ class FitBatch(Sequence[FitResult]):
     def stderr(self) -> FloatArray:
         """Combined standard uncertainties of `values`, shape (S, P).
 
-        Those from noise alone where a table leaves nothing to estimate other errors from.
+        They are from noise alone if a table does not allow an estimate of other errors.
         """
         return np.asarray(self._params[..., 1])
 
@@ -94,7 +94,7 @@ class FitBatch(Sequence[FitResult]):
         return np.asarray(self._params[..., 2])
 
     def to_frame(self) -> Any:
-        """Return a pandas table: one row a table, value and uncertainties of each parameter.
+        """Return a pandas table: for each table a row of values and uncertainties.
 
         Returns
         -------
@@ -112,6 +112,6 @@ class FitBatch(Sequence[FitResult]):
         return pd.DataFrame(columns)
 
     def __repr__(self) -> str:
-        ends = Counter(status.name.lower() for status in self.status)
-        outcomes = ", ".join(f"{count} {name}" for name, count in ends.items())
+        counts = Counter(status.name.lower() for status in self.status)
+        outcomes = ", ".join(f"{count} {name}" for name, count in counts.items())
         return f"<FitBatch: {len(self)} tables, free {', '.join(self.var_names)}; {outcomes}>"

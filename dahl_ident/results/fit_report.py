@@ -1,4 +1,4 @@
-"""Reports of a fit, as text and for machines: the verdict, then every number with its source."""
+"""Reports of a fit as text, HTML and plain data: first the verdict, then the numbers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dahl_ident.diagnostics.intervals import ConfidenceIntervals
 from dahl_ident.results.fitted_model import FittedModel
 
 _CORRELATED = 0.1  # least correlation shown; smaller ones change an uncertainty by 0.5 %
-_BRIEF = 15  # lines of a short report: what a reader takes in at a glance
+_BRIEF = 15  # most lines of a short report
 
 
 def facts(fit: FittedModel) -> dict[str, Any]:
-    """Return a fit's statements for machines, apart from its parameters."""
+    """Return a fit's statements as plain data, apart from its parameters."""
     budget = fit.stated_budget
     return {
         "status": str(fit.status),
@@ -36,8 +36,8 @@ _Section = tuple[str, list[str]]  # a heading with its lines
 
 
 def fit_report(fit: FittedModel, intervals: ConfidenceIntervals, *, details: bool = True) -> str:
-    """Return the whole report as text, or verdict and parameters on at most 15 lines."""
-    sections = _all(fit, intervals)
+    """Return the whole report as text, or verdict and parameters in at most 15 lines."""
+    sections = _sections(fit, intervals)
     if details:
         return "\n".join(_lines(sections))
     title, verdict = next(sections)
@@ -57,12 +57,12 @@ def _lines(sections: Iterable[_Section]) -> Iterator[str]:
 
 def as_html(fit: FittedModel, intervals: ConfidenceIntervals) -> str:
     """Return the whole report as HTML."""
-    parts = [(title, html.escape("\n".join(lines))) for title, lines in _all(fit, intervals)]
+    parts = [(title, html.escape("\n".join(lines))) for title, lines in _sections(fit, intervals)]
     body = "".join(f"<h4>{title}</h4><pre>{lines}</pre>" for title, lines in parts)
     return f"<div>{body}</div>"
 
 
-def _all(fit: FittedModel, intervals: ConfidenceIntervals) -> Iterator[_Section]:
+def _sections(fit: FittedModel, intervals: ConfidenceIntervals) -> Iterator[_Section]:
     first, *others = fit.statements
     warnings = [f"Warning: {text}." for text in fit.goodness.warnings]
     yield "Verdict", [first, *warnings, *others]
@@ -92,15 +92,14 @@ def _parameters(
     for name in names:
         p = fit.params[name]
         if not p.vary:
-            assumed = name in fit.assumed
             shown = rounded(p.value, p.stderr) if p.stderr is not None else (f"{p.value:g}", "")
-            stated = name in intervals
-            within = interval(*intervals[name][-1][1:], "") if stated else ""
-            rows.append([name, *shown, p.unit, within, "assumed" if assumed else "fixed"])
+            within = interval(*intervals[name][-1][1:], "") if name in intervals else ""
+            word = "assumed" if name in fit.assumed else "fixed"
+            rows.append([name, *shown, p.unit, within, word])
             continue
         value, error = rounded(p.value, p.stderr)
         if math.isfinite(p.value) and p.stderr == math.inf and fit.nfree > 0:
-            value = "?"  # any other would do as well
+            value = "?"  # undetermined
         within = ""
         if name in intervals:
             limits = intervals[name][-1]
@@ -125,12 +124,12 @@ def _correlations(fit: FittedModel) -> list[str]:
 
 def _solver(fit: FittedModel) -> list[str]:
     assumed = [p for p in fit.problem.model.parameters if p.assumed]
-    held = "".join(f", at {p.name} = {p.value:g}" for p in assumed)
+    at_assumed = "".join(f", at {p.name} = {p.value:g}" for p in assumed)
     lines = [
         f"{fit.method}, {fit.nfev} evaluations; {fit.ndata} numbers, {fit.nvarys} parameters",
-        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}{held}",
+        f"{fit.optimum.status.outcome}; AIC {fit.aic:.2f}, BIC {fit.bic:.2f}{at_assumed}",
     ]
-    if fit.scale_known:  # chi-square stands among the tests
+    if fit.scale_known:  # chi-square is among the tests
         return lines
     robust = "" if fit.optimum.loss == "linear" else " (robust)"
     sums = f"{fit.chisqr:.5g}, over degrees of freedom {fit.redchi:.5g}"

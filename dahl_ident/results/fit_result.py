@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class FitResult(FittedModel):
     """The result of a fit: estimates, their errors, and whether to trust them.
 
-    Made by :func:`dahl_ident.fit`, from a table or from records. Names follow lmfit's
-    ``ModelResult`` where both have the same thing; the covariance is never rescaled silently:
-    `scale` is 1 where the noise is known, else estimated and reported. Of records, parameters of
+    Made by :func:`dahl_ident.fit`, from a table or from records. Names are those of lmfit's
+    ``ModelResult`` for the same quantities; the covariance is never rescaled silently: `scale` is 1
+    if the noise is known, otherwise it is estimated and reported. For records, the parameters of
     each record follow those of the model: states at its first sample, offset and drift.
 
     Examples
@@ -51,11 +51,11 @@ class FitResult(FittedModel):
         Parameters
         ----------
         method : {"combined", "profile", "wald", "bootstrap"}, default "combined"
-            How the intervals are made.
+            Method of the intervals.
         level : float, default 0.9545
             Their confidence level.
         details : bool, default True
-            False: verdict and the device's parameters alone, on at most 15 lines.
+            False: verdict and the device's parameters only, in at most 15 lines.
 
         Returns
         -------
@@ -72,7 +72,7 @@ class FitResult(FittedModel):
         return self.conf_interval(method, (level,))
 
     def plot(self, kind: str | None = None, ax: Any = None, *, record: int = 0) -> Any:
-        """Draw the fit.
+        """Plot the fit.
 
         Parameters
         ----------
@@ -81,9 +81,9 @@ class FitResult(FittedModel):
             "budget": shares of the uncertainty as bars; of records also "loop": force over
             displacement.
         ax : matplotlib Axes, or two of them for the "fit" of a table, optional
-            New ones where left out.
+            Created if left out.
         record : int, default 0
-            Which record.
+            Index of the record.
 
         Returns
         -------
@@ -94,14 +94,14 @@ class FitResult(FittedModel):
         return draw(self, kind, ax, record)
 
     def plot_fit(self, ax: Any = None, *, record: int = 0) -> Any:
-        """Draw data and fit: gain above phase, over amplitude or frequency, or a record over time.
+        """Plot data and fit: gain and phase over amplitude or frequency, or a record over time.
 
         Parameters
         ----------
         ax : matplotlib Axes, or two of them for a table, optional
-            New ones where left out.
+            Created if left out.
         record : int, default 0
-            Which record.
+            Index of the record.
 
         Returns
         -------
@@ -117,18 +117,18 @@ class FitResult(FittedModel):
         | None = None,
         record: int = 0,
     ) -> Axes:
-        """Draw the residuals: of every row, suspicious points ringed, or of every sample.
+        """Plot the residuals: of every row, with circles around suspicious points, or every sample.
 
         Parameters
         ----------
         ax : matplotlib Axes, optional
-            New where left out.
+            Created if left out.
         against : str, optional
-            What to draw them over. Rows of a table: the "amplitude" of displacement, the
-            "frequency", or the amplitude of "velocity"; left out, amplitude or frequency, as
-            suits the table. Samples: "time", the default, or "displacement".
+            Horizontal axis. For a table: the "amplitude" of displacement, the "frequency", or the
+            amplitude of "velocity"; default: amplitude or frequency, as suits the table. For
+            records: "time", the default, or "displacement".
         record : int, default 0
-            Which record.
+            Index of the record.
 
         Returns
         -------
@@ -143,7 +143,8 @@ class FitResult(FittedModel):
     def to_json(self) -> str:
         """Return the fit as JSON: table or records, model, noise, sensors, optimum, estimates.
 
-        The optimum is where the search ended, assumed exponents held; the estimates are `params`.
+        The optimum is the end of the search, with assumed exponents fixed; the estimates are
+        `params`.
         """
         estimates = {
             name: {"value": p.value, "stderr": p.stderr, "unit": p.unit}
@@ -158,9 +159,9 @@ class FitResult(FittedModel):
         Raises
         ------
         DataError
-            If the text holds no such fit, one of another version's schema, or was changed.
+            If the text is not such a fit, has another version of the schema, or was changed.
         ModelError
-            If a law of the model is not known here.
+            If a law of the model is unknown.
         """
         return cls(**fit_storage.from_json(text))
 
@@ -171,10 +172,10 @@ class FitResult(FittedModel):
         Raises
         ------
         DataError
-            If the file cannot be read, holds no such fit, one of another version's schema, or was
+            If the file cannot be read, is not such a fit, has another version of the schema, or was
             changed.
         ModelError
-            If a law of the model is not known here.
+            If a law of the model is unknown.
         """
         return cls(**fit_storage.from_json(read_text(path), str(path)))
 

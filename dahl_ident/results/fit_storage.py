@@ -1,8 +1,8 @@
-"""Fits as JSON: data, model, noise, sensors and optimum, so that all of it can be judged again.
+"""Fits as JSON: data, model, noise, sensors and optimum.
 
-The file says its schema and version. What is stored are facts that do not change with the
+The file states its schema and version. It contains what does not change with the version of the
 package: table or records, the model as plain data, the estimate with its covariance. Residuals,
-intervals and verdicts are computed when asked for, by whatever version loads the file.
+intervals and verdicts are computed again by the version that loads the file.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from dahl_ident.sensors import EXACT, Sensors
 from dahl_ident.version import __version__
 
 _SCHEMAS = {"table": "dahl_ident.fit_result", "records": "dahl_ident.record_fit"}
-VERSION = 4  # version of the layout; files of others are refused
-_SAME = 1e-6  # relative difference that no version of a numerical library makes
+VERSION = 4  # version of the layout; any other is refused
+_SAME = 1e-6  # relative difference above that between versions of numerical libraries
 
 _TEXTS = ("level", "run", "controlled", "harmonic")  # labels, words and counts
 _SENSORS = ("force_gain", "displacement_gain", "delay")
 _CHANNELS = ("displacement", "velocity", "acceleration", "force", "drive")
 _OF_RECORD = ("drive_unit", "drive_factor", "drive_factor_uncertainty", "motion", "provenance")
-_OF_PROBLEM = ("output", "excitation", "calibration")  # as they are given
+_OF_PROBLEM = ("output", "excitation", "calibration")  # as given by the user
 
 
 def to_json(optimum: Optimum, first_order: bool, estimates: Mapping[str, Any] | None = None) -> str:
-    """Return a fit as JSON text, numbers that JSON does not know as text, such as "inf".
+    """Return a fit as JSON text, with infinite numbers and NaN as text.
 
-    `estimates` are for readers of the file: a fit that is loaded has the same again.
+    `estimates` are for other readers of the file; loading the fit computes them again.
     """
     problem = optimum.problem
     facts = {
@@ -55,12 +55,12 @@ def to_json(optimum: Optimum, first_order: bool, estimates: Mapping[str, Any] | 
         "optimum": _describe_optimum(optimum) | {"first_order": first_order},
     }
     content = plain_data(facts, not_finite=str)
-    indent = None if problem.response is None else 1  # samples would stand on a line each
+    indent = None if problem.response is None else 1  # not one line for each sample
     return json.dumps({**content, "digest": digest(content)}, allow_nan=False, indent=indent)
 
 
 def from_json(text: str, source: str = "the text") -> dict[str, Any]:
-    """Return the arguments of the fit that JSON text holds."""
+    """Return the arguments of the fit in JSON text."""
     try:
         content = json.loads(text)
     except json.JSONDecodeError as exc:
@@ -83,7 +83,7 @@ def from_json(text: str, source: str = "the text") -> dict[str, Any]:
 
 
 def _check(content: Any, source: str) -> None:
-    """Refuse what is not a fit of the version that is known, as it was written."""
+    """Refuse anything but an unchanged fit of this version of the layout."""
     stated = content.get("schema") if isinstance(content, Mapping) else None
     if stated not in _BUILT:
         expected = " or ".join(map(repr, _BUILT))
@@ -95,7 +95,7 @@ def _check(content: Any, source: str) -> None:
             "load it with the version that wrote it, or repeat the fit"
         )
     if content.get("digest") != digest({k: v for k, v in content.items() if k != "digest"}):
-        raise DataError(  # nobody can answer for such numbers
+        raise DataError(
             f"{source} was changed after the fit was saved: its data, model and estimate do not "
             "agree with each other; take the file as it was written, or repeat the fit"
         )
@@ -103,10 +103,10 @@ def _check(content: Any, source: str) -> None:
 
 
 def _agrees(optimum: Optimum) -> bool:
-    """Return whether values and sum of squares are those of the estimate, with these data.
+    """Return whether the model reproduces the values and the sum of squares of the estimate.
 
-    So that a user's law is still what it was. At a limit the values are not finite numbers, and a
-    robust loss has another sum.
+    This detects a change of a user's law. Estimates at a limit, and those with a robust loss, are
+    not checked.
     """
     if optimum.status.at_infinity or optimum.loss != "linear":
         return True
@@ -127,12 +127,12 @@ def _describe_table(problem: TableProblem) -> dict[str, Any]:
 
 
 def _table_problem(content: Mapping[str, Any]) -> TableProblem:
-    known = Sensors(**{name: _channel(content["sensors"][name]) for name in _SENSORS})
+    sensors = Sensors(**{name: _channel(content["sensors"][name]) for name in _SENSORS})
     return TableProblem(
         _data(content["data"]),
         model_from_description(content["model"]),
         noise=content["noise"],
-        sensors=EXACT if known.are_exact else known,
+        sensors=EXACT if sensors.are_exact else sensors,
         steady=content["steady"],
     )
 
@@ -167,15 +167,14 @@ _BUILT: Mapping[str, Callable[[Mapping[str, Any]], Problem]] = {
 
 
 def _describe_optimum(optimum: Optimum) -> dict[str, Any]:
-    """Return an optimum as data, its problem left out."""
+    """Return an optimum as data, without its problem."""
     cost = optimum.constraint_cost
     combinations = [asdict(c) for c in optimum.combinations]
-    stored = {one.name: getattr(optimum, one.name) for one in fields(optimum)}
+    stored = {field.name: getattr(optimum, field.name) for field in fields(optimum)}
     stored |= {"status": optimum.status.name, "combinations": combinations}
     stored["constraint_cost"] = None if cost is None else asdict(cost)
-    follows = ("problem", "scale_known")
-    kept = {name: value for name, value in stored.items() if name not in follows}
-    return {"names": list(optimum.names), **kept}
+    del stored["problem"], stored["scale_known"]  # which follow from other entries
+    return {"names": list(optimum.names), **stored}
 
 
 def _optimum(problem: Problem, stored: Mapping[str, Any]) -> Optimum:

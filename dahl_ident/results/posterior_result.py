@@ -1,4 +1,4 @@
-"""The posterior of a model's parameters, as users hold it."""
+"""The posterior of a model's parameters, for users."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from dahl_ident.results.posterior_draws import PosteriorDraws
 from dahl_ident.units import Quantity
 
 SCHEMA = "dahl_ident.posterior"
-_RULE_DRAWS = 4000  # draws that statements rest on
-_CHECK_DRAWS = 1000  # draws of a check: a share of 1 % errs by 0.3 %
+_STATED_DRAWS = 4000  # draws for statements
+_CHECK_DRAWS = 1000  # draws for a check: a share of 1 % has an error of 0.3 %
 
 
 class Posterior(PosteriorDraws):
     """Parameters, priors and weighted draws of one posterior density.
 
-    Made by :func:`dahl_ident.posterior`. The draws are those of a Markov chain, under emcee's names
-    where both have the same thing, or importance points (``method="grid"``), which are the same at
-    every call and state their error. An unknown scale of the noise is shown as ``noise_scale``.
+    Made by :func:`dahl_ident.posterior`. The draws are those of a Markov chain, with the names of
+    emcee, or importance points (``method="grid"``), which are reproducible and have a known error.
+    An unknown scale of the noise is called ``noise_scale``.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class Posterior(PosteriorDraws):
         Returns
         -------
         arviz.InferenceData or xarray.DataTree
-            Responses are held as whitened residuals, real and imaginary part.
+            Responses are stored as whitened residuals, real and imaginary part.
 
         Raises
         ------
@@ -97,32 +97,33 @@ class Posterior(PosteriorDraws):
     def judgement(self) -> Judgement:
         """Every finding about the posterior, and the status that follows from them.
 
-        Not determined where it has not converged, or a prior that nobody gave sets a parameter;
-        not described where data or prior object; approximate where the fit's numbers are.
+        Not determined if it has not converged, or a default prior sets a parameter; not described
+        if data and model or prior contradict each other; approximate if the fit is.
         """
         return Judgement(_findings(self))
 
     @property
     def counted_fit(self) -> FitResult | None:
-        """The fit whose sources of error are counted; None where noise alone is."""
+        """The fit whose sources of error are counted; None if noise alone is counted."""
         return self.fit if self.uncertainty == "combined" else None
 
     @cached_property
     def prior_influences(self) -> tuple[PriorInfluence, ...]:
-        """The parameters that the prior determines rather than the data, or against them."""
+        """The parameters that the prior determines, or that contradict it."""
         if self.likelihood == "none":
             return ()
-        return prior_influences(self._density.prior, self._drawn(_RULE_DRAWS, 0))
+        return prior_influences(self._density.prior, self._drawn(_STATED_DRAWS, 0))
 
     @cached_property
     def checks(self) -> tuple[PredictiveCheck, ...]:
         """Posterior predictive checks of the residuals, with noise alone.
 
-        None where the prior was sampled, or where rows share errors; the fit's tests count there.
+        Empty if the prior was sampled, or if rows share errors, in which case the fit's tests
+        apply.
         """
         density: Any = self._density
-        counted = self.counted_fit is not None
-        if self.likelihood == "none" or counted or not density.normalised:
+        has_shared_errors = self.counted_fit is not None
+        if self.likelihood == "none" or has_shared_errors or not density.normalised:
             return ()
         return predictive_checks(density, self._drawn(_CHECK_DRAWS, 0), np.random.default_rng(0))
 
@@ -152,14 +153,14 @@ class Posterior(PosteriorDraws):
         size: int | None = None,
         seed: int = 0,
     ) -> Any:
-        """Return what another measurement should show, at draws from the posterior.
+        """Return the prediction of another measurement, at draws from the posterior.
 
         Parameters
         ----------
         at, amplitude, drive, quantity, initial
             As for :meth:`dahl_ident.FitResult.predict`.
         size : int, optional
-            How many draws: 1000, or 100 of records.
+            Number of draws. Default: 1000, or 100 for records.
         seed : int, default 0
             Of the draws.
 
@@ -168,9 +169,9 @@ class Posterior(PosteriorDraws):
         PredictiveBand or RecordBand
         """
         if not isinstance(at, Record):
-            there = problem_at(self.problem, at, amplitude, drive, quantity)
-            values = self.draws(1000 if size is None else size, seed)
-            return PredictiveBand(there.predict(there.to_search(values[:, : len(there.names)])))
+            problem = problem_at(self.problem, at, amplitude, drive, quantity)
+            values = self.draws(1000 if size is None else size, seed)[:, : len(problem.names)]
+            return PredictiveBand(problem.predict(problem.to_search(values)))
         if self.fit is None:
             raise FitError("there are too few data for a least-squares fit of the record's start")
         draws = self.draws(100 if size is None else whole_number(size, "size", 2), seed)
@@ -190,14 +191,14 @@ class Posterior(PosteriorDraws):
         -------
         tuple of DerivedQuantity
         """
-        by_name = dict(zip(self.names, self.draws(_RULE_DRAWS).T, strict=True))
+        by_name = dict(zip(self.names, self.draws(_STATED_DRAWS).T, strict=True))
         return tuple(
             DerivedQuantity(name, unit, A, float(draws.mean()), float(draws.std(ddof=1)))
             for name, unit, A, draws in quantities(self.problem, by_name, amplitudes, frequency_hz)
         )
 
     def plot(self, kind: str | None = None, ax: Any = None) -> Any:
-        """Draw the posterior.
+        """Plot the posterior.
 
         Parameters
         ----------
@@ -205,7 +206,7 @@ class Posterior(PosteriorDraws):
             "corner" (the default): the density of each parameter and of each pair. "trace": the
             walkers' paths, for a chain.
         ax : axes, optional
-            As the function of this name in :mod:`dahl_ident.plots` takes them.
+            As for the function of this name in :mod:`dahl_ident.plots`.
 
         Returns
         -------
@@ -219,14 +220,14 @@ class Posterior(PosteriorDraws):
         return kinds[kind or "corner"](ax=ax)
 
     def plot_corner(self, **options: Any) -> NDArray[Any]:
-        """Draw marginals and pairs; options as :func:`dahl_ident.plots.plot_corner`."""
+        """Plot marginals and pairs; options as for :func:`dahl_ident.plots.plot_corner`."""
         from dahl_ident.plots import plot_corner
 
-        draws = self.draws(_RULE_DRAWS)
+        draws = self.draws(_STATED_DRAWS)
         return plot_corner(self._labels, draws, log=self._density.logarithmic, **options)
 
     def plot_trace(self, **options: Any) -> NDArray[Any]:
-        """Draw the walkers' paths; options as :func:`dahl_ident.plots.plot_trace`."""
+        """Plot the walkers' paths; options as for :func:`dahl_ident.plots.plot_trace`."""
         from dahl_ident.plots import plot_trace
 
         paths, log = self.get_chain(), self._density.logarithmic
@@ -250,7 +251,7 @@ class Posterior(PosteriorDraws):
             "message": self.message,
             "likelihood": self.likelihood,
             "priors": dict(self.priors),
-            "set_by_prior": [rule.name for rule in self.prior_influences],
+            "set_by_prior": [influence.name for influence in self.prior_influences],
             "findings": [finding.to_dict() for finding in self.findings],
             "summary": self.summary().to_dict(orient="index"),
             **self.sample.facts,
@@ -263,8 +264,8 @@ class Posterior(PosteriorDraws):
     def __str__(self) -> str:
         table = self.summary().to_string(float_format=lambda v: f"{v:.5g}")
         priors = [f"  {name}: {text}" for name, text in self.priors.items()]
-        said = [str(f) for f in self.findings if f.code not in ("sampled", "not_converged")]
-        return "\n".join([self.message, *said, "", table, "", "Priors:", *priors])
+        others = [str(f) for f in self.findings if f.code not in ("sampled", "not_converged")]
+        return "\n".join([self.message, *others, "", table, "", "Priors:", *priors])
 
     def __repr__(self) -> str:
         first = self.message.partition(":")[0]
@@ -279,7 +280,7 @@ def _findings(posterior: Posterior) -> Iterator[Finding]:
 
 
 def _objections(posterior: Posterior) -> Iterator[Finding]:
-    """Yield what speaks against the numbers."""
+    """Yield convergence, influences of priors, and contradictions."""
     converged, fit = posterior.converged, posterior.counted_fit
     code = "sampled" if converged else "not_converged"
     severity = VerdictStatus.TRUSTED if converged else VerdictStatus.NOT_DETERMINED
@@ -295,7 +296,7 @@ def _objections(posterior: Posterior) -> Iterator[Finding]:
 
 
 def _misfits(posterior: Posterior) -> tuple[Finding, ...]:
-    """Return where the data contradict the model."""
+    """Return findings that the data contradict the model."""
     fit = posterior.fit
     if fit is None or (posterior.counted_fit is None and posterior.normalised):
         lost = Question.DESCRIBED, VerdictStatus.NOT_DESCRIBED
@@ -309,7 +310,7 @@ def _misfits(posterior: Posterior) -> tuple[Finding, ...]:
 
 
 def _notes(posterior: Posterior) -> Iterator[Finding]:
-    """Yield what the numbers count and assume, and the evidence."""
+    """Yield counted sources of error, assumptions, and the evidence."""
     fit, counted = posterior.fit, posterior.counted_fit is not None
     if fit is not None and posterior.likelihood != "none":
         assumed, names = Question.ASSUMED, posterior.names

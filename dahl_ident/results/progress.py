@@ -1,4 +1,4 @@
-"""A bar on the terminal while a chain or a long fit runs."""
+"""Progress of chains and long fits on the terminal."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from dahl_ident.units import percent
 
 
 def expected_steps(settings: ChainSettings, verdict: Convergence | None) -> int | None:
-    """Return the total number of steps as far as known: None before the first verdict."""
+    """Return the expected total number of steps; None before the first verdict."""
     if settings.steps is not None:
         return settings.steps
     if verdict is None or not verdict.usable:
         return None
     kept = verdict.steps - verdict.discard
-    most = max(LENGTH * verdict.tau.max(), kept * settings.ess / verdict.ess.min())
-    return min(int(verdict.discard + most) + 1, settings.max_steps)
+    needed = max(LENGTH * verdict.tau.max(), kept * settings.ess / verdict.ess.min())
+    return min(int(verdict.discard + needed) + 1, settings.max_steps)
 
 
 @contextmanager
 def progress_bar(settings: ChainSettings) -> Iterator[Listener]:
-    """Yield a listener that moves a bar."""
+    """Yield a listener that updates a bar."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
@@ -43,7 +43,7 @@ def progress_bar(settings: ChainSettings) -> Iterator[Listener]:
 
 @contextmanager
 def fit_progress() -> Iterator[Callable[[int, float], None]]:
-    """Yield a function of evaluations and share of variance left, which shows them after 2 s."""
+    """Yield a function that shows evaluations and unexplained share of variance after 2 s."""
     with spinner("fitting") as show:
         yield lambda evaluations, share: show(
             f": {evaluations} evaluations, {percent(share**0.5, 3)} rms left"
@@ -52,6 +52,6 @@ def fit_progress() -> Iterator[Callable[[int, float], None]]:
 
 @contextmanager
 def grid_progress() -> Iterator[Callable[[int], None]]:
-    """Yield a function of the number of points, which shows it after 2 s."""
+    """Yield a function that shows the number of points after 2 s."""
     with spinner("integrating") as show:
         yield lambda points: show(f": {points} points")

@@ -14,16 +14,16 @@ from dahl_ident.diagnostics.budget import ParameterBudget
 from dahl_ident.diagnostics.formatting import pair, symbol, tabular, unit
 from dahl_ident.errors import FitError
 
-_WIDE = 0.2  # relative uncertainty beyond which a positive parameter is drawn in its logarithm
+_WIDE = 0.2  # relative uncertainty above which the logarithm of a positive parameter is drawn
 
 
 def uncertain(result: Any) -> tuple[dict[str, ParameterBudget], FloatArray]:
     """Return the budgets of the model's free parameters, and the covariance of their values."""
     budget = result.budget()
     free = {p.name for p in result.model.parameters if result.params[p.name].vary}
-    places = [i for i, name in enumerate(budget) if name in free]
+    kept = [i for i, name in enumerate(budget) if name in free]
     stated = {name: part for name, part in budget.items() if name in free}
-    covariance = np.asarray(budget.covariance)[np.ix_(places, places)]
+    covariance = np.asarray(budget.covariance)[np.ix_(kept, kept)]
     if set(stated) != free or not np.all(np.isfinite(covariance)):
         lost = sorted(free - set(stated)) or sorted(free)
         raise FitError(f"{', '.join(lost)} has no finite uncertainty to export; see the verdict")
@@ -33,8 +33,7 @@ def uncertain(result: Any) -> tuple[dict[str, ParameterBudget], FloatArray]:
 def gtc_archive(result: Any) -> str:
     """Return an archive of GTC: each parameter as the sum of its sources.
 
-    The correlation of two parameters, which the budget has for all sources together, is that of
-    each source.
+    Each source has the correlation of two parameters that the budget has for all sources together.
     """
     gtc, persistence = library("GTC", "exports"), library("GTC.persistence", "exports")
     budget, covariance = uncertain(result)
@@ -49,12 +48,12 @@ def gtc_archive(result: Any) -> str:
         nonzero = [i for i, size in enumerate(sizes) if size > 0.0]
         dof = min(parts[names[i]][source].dof for i in nonzero)
         labels = [f"{names[i]}: {source}" for i in nonzero]
-        made = gtc.multiple_ureal([0.0] * len(nonzero), sizes[nonzero].tolist(), dof, labels)
+        errors = gtc.multiple_ureal([0.0] * len(nonzero), sizes[nonzero].tolist(), dof, labels)
         for a, i in enumerate(nonzero):
             for b in range(a):
                 r = covariance[i, nonzero[b]] / shared[i, nonzero[b]]
-                gtc.set_correlation(float(np.clip(r, -1.0, 1.0)), made[a], made[b])
-            totals[i] = totals[i] + made[a]
+                gtc.set_correlation(float(np.clip(r, -1.0, 1.0)), errors[a], errors[b])
+            totals[i] = totals[i] + errors[a]
     archive = persistence.Archive()
     archive.add(**{n: gtc.result(total, label=n) for n, total in zip(names, totals, strict=True)})
     return str(persistence.dumps_json(archive)) + "\n"
@@ -89,20 +88,20 @@ def latex(result: Any) -> str:
         budget = result.budget()
     except FitError:  # there is no finite uncertainty
         budget = {}
-    rows, held = [], {p.name: p.value for p in result.model.parameters}
+    rows, values = [], {p.name: p.value for p in result.model.parameters}
     for name, p in result.params.items():
         part = budget.get(name)
         k = "" if part is None else f"{part.k:.2f}"
         U = None if part is None else part.U
-        rows.append((symbol(name), *pair(held.get(name, p.value), U), k, unit(p.unit)))
+        rows.append((symbol(name), *pair(values.get(name, p.value), U), k, unit(p.unit)))
     return tabular(("", "value", "$U$", "$k$", "unit"), rows)
 
 
 def draws(result: Any, size: int, seed: int, path: str | Path | None) -> bytes:
     """Return draws of the model's parameters, as CSV, or as Parquet for such a path.
 
-    A posterior's own draws; those of a fit are normal with its covariance, in the logarithm for
-    positive parameters of more than 20 % uncertainty.
+    They are those of a posterior; for a fit they are normal with its covariance, in the logarithm
+    of positive parameters of more than 20 % uncertainty.
     """
     import pandas as pd
 
@@ -112,11 +111,11 @@ def draws(result: Any, size: int, seed: int, path: str | Path | None) -> bytes:
         table = {name: table[name] for name in result.params if name in table}
     else:
         table = _normal(result, count, seed)
-        held = {p.name: p.value for p in result.model.parameters}
-        table = {name: table.get(name, np.full(count, held[name])) for name in held}
+        values = {p.name: p.value for p in result.model.parameters}
+        table = {name: table.get(name, np.full(count, value)) for name, value in values.items()}
     units = {name: result.params[name].unit for name in table}
     frame = pd.DataFrame(
-        {f"{n} [{units[n]}]" if units[n] else n: values for n, values in table.items()}
+        {f"{n} [{units[n]}]" if units[n] else n: drawn for n, drawn in table.items()}
     )
     place = None if path is None else place_of(path, "a table of draws", (".csv", ".parquet"))
     if place is None or place.suffix.lower() == ".csv":
@@ -133,8 +132,8 @@ def _normal(result: Any, size: int, seed: int) -> dict[str, FloatArray]:
     positive = np.array([result.params[name].min == 0.0 for name in budget])
     wide = positive & (u > _WIDE * np.abs(values))
     scale = np.where(wide, 1.0 / np.where(wide, values, 1.0), 1.0)
-    moved = np.random.default_rng(seed).multivariate_normal(
+    errors = np.random.default_rng(seed).multivariate_normal(
         np.zeros(values.size), covariance * np.outer(scale, scale), size, method="eigh"
     )
-    drawn = np.where(wide, values * np.exp(np.where(wide, moved, 0.0)), values + moved)
+    drawn = np.where(wide, values * np.exp(np.where(wide, errors, 0.0)), values + errors)
     return dict(zip(budget, drawn.T, strict=True))

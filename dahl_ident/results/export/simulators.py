@@ -17,12 +17,12 @@ from dahl_ident.units import percent
 from dahl_ident.version import __version__
 
 LUMPED = {"mass": "mass", "damper": "damping", "spring": "stiffness"}
-_EXPONENT_MATTERS = 0.02  # of f_max
+_EXPONENT_MATTERS = 0.02  # error of the force over f_max due to the exponent
 
 
 @dataclass(frozen=True)
 class Law:
-    """A friction element: its kind, its equation, and its values by the names of its class."""
+    """A friction element: its kind, its equation, and its values by the parameters of its class."""
 
     kind: str
     equation: str
@@ -37,15 +37,15 @@ class Device:
     """The elements of a fit."""
 
     laws: tuple[Law, ...]  # all but masses, viscous dampers and springs
-    mass: float  # sums, as are damping and stiffness
+    mass: float  # sum over the elements, as are damping and stiffness
     damping: float
     stiffness: float
     rotation: bool  # whether forces are torques
-    notes: tuple[str, ...]  # origin and verdict, and what the format leaves out
+    notes: tuple[str, ...]  # origin, verdict, and omissions of the format
 
 
-def device(result: Any, form: str, carried: Mapping[str, str]) -> Device:
-    """Return the device of a fit."""
+def device(result: Any, form: str, supported: Mapping[str, str]) -> Device:
+    """Return the device of a fit; `supported` has a note, or "", for each kind of element."""
     laws = []
     lumped = dict.fromkeys(LUMPED.values(), 0.0)
     notes = [f"made by dahl_ident {__version__}, SI units; the fit is {result.status.value}"]
@@ -57,41 +57,41 @@ def device(result: Any, form: str, carried: Mapping[str, str]) -> Device:
         )
     for element in result.model.elements:
         values = _values(element)
-        if element.kind in LUMPED and element.kind in carried:
+        if element.kind in LUMPED and element.kind in supported:
             lumped[LUMPED[element.kind]] += values[LUMPED[element.kind]]
-        elif element.kind in carried:
+        elif element.kind in supported:
             laws.append(Law(element.kind, element.equation, values))
         else:
             raise ModelError(
-                f"{form} carries {', '.join(carried)}, and the model has {element.kind}; fit "
+                f"{form} carries {', '.join(supported)}, and the model has {element.kind}; fit "
                 "without it, or export to another format, such as matlab"
             )
-        if carried[element.kind]:
-            notes.append(f"{element.kind}: {carried[element.kind]}")
+        if supported[element.kind]:
+            notes.append(f"{element.kind}: {supported[element.kind]}")
     units = {p.unit for p in result.params.values()}
     rotation = any("rad" in unit or unit.startswith("N m") for unit in units)
     return Device(tuple(laws), **lumped, rotation=rotation, notes=tuple(notes))
 
 
 def short(value: float) -> float:
-    """Return a number of at most ten digits, more than any measurement has."""
+    """Return a number rounded to ten digits."""
     return float(f"{value:.10g}")
 
 
 def _values(element: Any) -> dict[str, float]:
-    """Return the values by the names that the class of the element has for them."""
+    """Return the values of an element by the names of parameters in its class."""
     prefix = f"{element.name}_" if getattr(element, "name", None) else ""
     return {p.name.removeprefix(prefix): short(p.value) for p in element.parameters}
 
 
-def linear(law: Law, form: str) -> tuple[str, ...]:
-    """Return what to say where a format takes the exponent of Dahl for 1 and has one limit."""
+def note_on_exponent(law: Law, form: str) -> tuple[str, ...]:
+    """Return a note if alpha is not 1 in a format without it; refuse an error that matters."""
     if law.values.get("asymmetry"):
         raise ModelError(f"{form} has one limit of friction for both directions, and the model two")
     a = law["alpha"] - 1.0
     if a == 0.0:
         return ()
-    path = np.geomspace(1e-3, 1e3, 2001)  # from full slip the other way: 1 - s F/f_max = 2
+    path = np.geomspace(1e-3, 1e3, 2001)  # after a reversal from full slip: 1 - s F/f_max = 2
     with np.errstate(invalid="ignore", divide="ignore"):
         z = np.maximum(2.0**-a + a * path, 0.0) ** (-1.0 / a)
     worst = float(np.max(np.abs(z - 2.0 * np.exp(-path))))
@@ -111,14 +111,14 @@ _COULOMB = {
 
 
 def mujoco(result: Any) -> str:
-    """Return a joint with a passive motor whose LuGre friction is that of the fit."""
+    """Return a joint with a passive motor that has the friction of the fit as LuGre friction."""
     parts = device(result, "mujoco", {"dahl": "", "lugre": "", **dict.fromkeys(LUMPED, "")})
     notes, motors, damping = list(parts.notes), [], parts.damping
     for number, law in enumerate(parts.laws, start=1):
         f_max = static = law["f_max"]
-        micro, speed = 0.0, 1.0  # of no effect where both limits are equal
+        micro, speed = 0.0, 1.0  # without effect, as both limits are equal
         if law.kind == "dahl":
-            notes += linear(law, "mujoco")
+            notes += note_on_exponent(law, "mujoco")
         else:
             static, speed = short(f_max * law["static_ratio"]), law["stribeck_speed"]
             micro, damping = law["micro_damping"], damping + law["viscous"]
@@ -133,7 +133,7 @@ def mujoco(result: Any) -> str:
 
 
 def frictionloss(result: Any) -> str:
-    """Return a joint whose friction has a limit alone, for any release of MuJoCo."""
+    """Return a joint with a friction limit only, for any release of MuJoCo."""
     parts = device(result, "mujoco-frictionloss", _COULOMB)
     limit = sum(_limit(law, "mujoco-frictionloss") for law in parts.laws)
     return _mjcf(parts, parts.notes, parts.damping, limit, ())
@@ -167,10 +167,10 @@ def _mjcf(
 
 
 def urdf(result: Any) -> str:
-    """Return the dynamics of a joint, to be put into the joint of a robot."""
-    carried = {**_COULOMB, "mass": "belongs to the inertial element of the link"}
-    carried.pop("spring")
-    parts = device(result, "urdf", carried)
+    """Return the dynamics element of a joint of a robot."""
+    supported = {**_COULOMB, "mass": "belongs to the inertial element of the link"}
+    supported.pop("spring")
+    parts = device(result, "urdf", supported)
     limit = sum(_limit(law, "urdf") for law in parts.laws)
     kind = "revolute" if parts.rotation else "prismatic"
     comment = "\n".join(f"  {note.replace('--', '-')}" for note in parts.notes)
@@ -188,7 +188,7 @@ def _limit(law: Law, form: str) -> float:
 
 
 def modelica(result: Any) -> str:
-    """Return a compliant component between two flanges; the mass is a constant in it."""
+    """Return a compliant component between two flanges, with the mass as a constant."""
     kinds = ("dahl", "bouc_wen", "lugre", "power_damper", *LUMPED)
     parts = device(result, "modelica", {**dict.fromkeys(kinds, ""), "mass": "a constant alone"})
     base, s, v, out = (
@@ -213,7 +213,7 @@ def modelica(result: Any) -> str:
 
 
 def _slope(law: Law, i: int, v: str) -> str:
-    """Return the change of force over displacement as an expression of Modelica."""
+    """Return the derivative of the force with respect to displacement, in Modelica."""
     if law.kind == "bouc_wen" and "exponent" in law.values:
         soft, stiff = (f"sign({r}{i})*abs({r}{i})^exponent{i}" for r in "qp")
         rate = f"(({soft} - {stiff}) + ({soft} + {stiff})*sign({v}*z{i}))"
@@ -237,15 +237,15 @@ def _force(law: Law, i: int, v: str) -> str:
 
 
 def matlab(result: Any) -> str:
-    """Return a script that makes a struct: values, uncertainties, covariance, equations."""
+    """Return a script that defines a struct: values, uncertainties, covariance, equations."""
     lines = [f"% the fit is {result.status.value}"]
     lines += [
         f"% {e.kind}: {e.equation}" for e in result.model.elements if getattr(e, "equation", "")
     ]
-    held = {p.name: p.value for p in result.model.parameters}
+    values = {p.name: p.value for p in result.model.parameters}
     for name, p in result.params.items():
-        value = held.get(name, p.value)
-        lines.append(f"friction.{name} = {_matlab(value)};  % {p.unit}".rstrip(" %"))
+        value = _matlab(values.get(name, p.value))
+        lines.append(f"friction.{name} = {value};  % {p.unit}".rstrip(" %"))
     try:
         budget, covariance = uncertain(result)
     except FitError as exc:
@@ -305,9 +305,7 @@ def _slips(law: Law, state: str) -> list[str]:
 
 
 def _power(law: Law, _: str) -> list[str]:
-    c = law["coefficient"]
-    p = law["exponent"]
-    speed = law["reference_speed"]
+    c, p, speed = law["coefficient"], law["exponent"], law["reference_speed"]
     return [f"force += v == 0.0 ? 0.0 : copysign({c!r} * pow(fabs(v) / {speed!r}, {p!r}), v);"]
 
 
@@ -318,7 +316,7 @@ _LINES: dict[str, Callable[[Law, str], list[str]]] = {
 
 
 def c_header(result: Any) -> str:
-    """Return the header; the mass is a macro, its force is not in the function."""
+    """Return the C header; the mass is a macro, and its force is not in the function."""
     parts = device(result, "c", dict.fromkeys((*_LINES, *LUMPED), ""))
     body = ["double level;"] if any(law.kind == "lugre" for law in parts.laws) else []
     states = 0
@@ -328,8 +326,8 @@ def c_header(result: Any) -> str:
         states += {"maxwell_slip": len(law.values) // 2, "power_damper": 0}.get(law.kind, 1)
         kinds.add("dahl" if law.kind == "lugre" else law.kind)
     lumped = ((parts.damping, "v"), (parts.stiffness, "x"))
-    body += [f"force += {size!r} * {moved};" for size, moved in lumped if size]
-    template = (files(__package__) / "friction.h.j2").read_text("utf-8")
-    made = jinja2.Template(template, trim_blocks=True, keep_trailing_newline=True)
-    text: str = made.render(parts=parts, states=max(states, 1), kinds=kinds, body=body)
+    body += [f"force += {size!r} * {motion};" for size, motion in lumped if size]
+    source = (files(__package__) / "friction.h.j2").read_text("utf-8")
+    template = jinja2.Template(source, trim_blocks=True, keep_trailing_newline=True)
+    text: str = template.render(parts=parts, states=max(states, 1), kinds=kinds, body=body)
     return text
