@@ -57,6 +57,7 @@ _GOOD = 0.5  # effective points, over the points of a round, at which the mixtur
 # independent randomizations, whose scatter is the error: the fewer, the more even each one's points
 _REPEATS = 6
 _FIRST = 128  # points drawn from each component at first; their number then doubles
+_MOST_POINTS = 2**18  # evaluations of a density
 _COVERAGE = 2.6  # standard errors in an error: 95 % of Student's t, six repeats' 5 dof
 _LIMITS = ndtr(np.linspace(-2.0, 2.0, 9))  # probabilities whose error counts
 _BLOCK = 256  # points in one call of the density: its arrays stay in the processor's cache
@@ -130,13 +131,12 @@ def integrate(
     decorrelation: Decorrelation = STRAIGHT,
     *,
     tolerance: float = 1e-3,
-    most: int = 2**18,
 ) -> WeightedPoints:
     """Return a density as weighted points, with its integral."""
     target = _Integrand(log_density, prior, decorrelation)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         mixture = _fitted(target, centre, covariance)
-        return _repeated(target, mixture, tolerance, most)
+        return _repeated(target, mixture, tolerance)
 
 
 def in_blocks(function: Function, theta: FloatArray) -> FloatArray:
@@ -262,7 +262,7 @@ def _root(x: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(std[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(len(std))))
 
 
-def _repeated(target: _Integrand, mixture: _Mixture, tolerance: float, most: int) -> WeightedPoints:
+def _repeated(target: _Integrand, mixture: _Mixture, tolerance: float) -> WeightedPoints:
     """Return points from one mixture, doubled in number until their error is small enough."""
     D = mixture.means.shape[1]
     sequences = [mixture.sequences(_ROUNDS + number) for number in range(_REPEATS)]
@@ -281,7 +281,7 @@ def _repeated(target: _Integrand, mixture: _Mixture, tolerance: float, most: int
             _error(theta, weights),
             target.evaluations,
         )
-        if points.error <= tolerance or target.evaluations + log_weights.size > most:
+        if points.error <= tolerance or target.evaluations + log_weights.size > _MOST_POINTS:
             return points
         size = theta.shape[1] // len(sequences[0])
 

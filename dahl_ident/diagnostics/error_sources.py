@@ -337,7 +337,8 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
         Shapes.of(all_points, parallel=True, unit=unit),
     ):
         changes, absorbed = shape.changes(points, stiffness) * first, None
-        square, columns = _mean_square(changes), estimate.changed(changes * size)
+        square = 0.5 * float(np.sum(np.abs(changes) ** 2, axis=0).mean())
+        columns = estimate.changed(changes * size)
         if shape.parallel:
             absorbed = _absorbed(problem, estimate.jacobian, columns)
             columns = columns + estimate.jacobian @ absorbed
@@ -466,8 +467,3 @@ def _correlation(first: FloatArray, second: FloatArray, parallel: bool) -> Float
         if np.ptp(np.concatenate([first[:, axis], second[:, axis]])) > 0.0:
             squares += ((first[:, axis, None] - second[:, axis]) / _LENGTH) ** 2
     return np.asarray(np.exp(-0.5 * squares))
-
-
-def _mean_square(changes: ComplexArray) -> float:
-    """Return the mean square of ln gain and phase that changes of unit variance make."""
-    return 0.5 * float(np.sum(np.abs(changes) ** 2, axis=0).mean())

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
@@ -341,16 +342,9 @@ def minimise_by_scipy(
     """
     from scipy import optimize
 
-    last: dict[bytes, FloatArray] = {}  # scipy calls for residuals, and then for their Jacobian
-
-    def rows(theta: FloatArray) -> FloatArray:
-        key = theta.tobytes()
-        if key not in last:
-            last.clear()
-            last[key] = evaluated(theta)
-        return last[key]
-
-    def evaluated(theta: FloatArray) -> FloatArray:
+    @lru_cache(maxsize=1)  # scipy calls for residuals, and then for their Jacobian
+    def rows(key: bytes) -> FloatArray:
+        theta = np.frombuffer(key)
         m, values = problem.n_residuals, problem.to_values(theta)
         if not np.isfinite(values).all() or (values[problem.space.positive] == 0.0).any():
             return np.full((1 + theta.size, m + problem.n_priors), np.nan)
@@ -362,13 +356,13 @@ def minimise_by_scipy(
         return at
 
     def residuals(at: FloatArray) -> FloatArray:
-        return np.asarray(rows(at)[0])
+        return np.asarray(rows(at.tobytes())[0])
 
     def jacobian(at: FloatArray) -> FloatArray:
-        return rows(at)[1:].T
+        return rows(at.tobytes())[1:].T
 
     theta, converged, nfev = start, False, 1
-    if np.isfinite(rows(start)[0]).all():
+    if np.isfinite(rows(start.tobytes())[0]).all():
         with np.errstate(all="ignore"):
             end = optimize.least_squares(
                 residuals, start, jacobian, bounds=problem.bounds(),

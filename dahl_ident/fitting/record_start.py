@@ -97,6 +97,7 @@ class _Scan:
         self.length = float(np.abs(x).max()) or 1.0
         rate = float(np.sqrt(np.mean([np.var(h[1]) / np.var(h[0]) for h in self.histories])))
         self.time = 1.0 / rate if rate > 0.0 else 1.0
+        self.force = max(float(np.std(h[3])) for h in self.histories)
 
     def _histories(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return displacement, velocity, acceleration and force of a record's fastest part."""
@@ -176,7 +177,7 @@ class _Scan:
                 force, length, time = map(float, parameter.dimension)
                 unit = self.length**length * self.time**time
                 if force:
-                    size = self._force_size() ** force
+                    size = self.force**force
                     if unit_dimension is not None and unit_dimension[0]:
                         # the power of the unit parameter that has the dimension of a force
                         share = force / unit_dimension[0]
@@ -193,9 +194,6 @@ class _Scan:
                 else:
                     grids.append([unit * s for s in _LENGTHS])
         return grids
-
-    def _force_size(self) -> float:
-        return max(float(np.std(h[3])) for h in self.histories)
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
         """Return the force along each record; none if one has no motion at these values."""

@@ -345,6 +345,7 @@ def _posterior_details(posterior: Posterior) -> Iterator[Section]:
 
 def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Section]:
     """Yield how the points were measured, if they were extracted from waveforms."""
+    pictures = () if record is None else (settling(data, record),)  # checks the record
     if "num_periods" not in data.quality:
         return
     verdicts = data.select(harmonic=1).quality["verdict"]
@@ -359,7 +360,7 @@ def _extraction(data: FrequencyResponse, record: Record | None) -> Iterator[Sect
                 "upper bound for the remaining transient in the cycles used."
             ),
             tables.extraction(data),
-            *(() if record is None else (settling(data, record),)),
+            *pictures,
         ),
         details=True,
     )

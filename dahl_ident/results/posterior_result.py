@@ -100,7 +100,7 @@ class Posterior(PosteriorDraws):
         Not determined if it has not converged, or a default prior sets a parameter; not described
         if data and model or prior contradict each other; approximate if the fit is.
         """
-        return Judgement(_findings(self))
+        return Judgement([*_objections(self), *_notes(self), *reading(self)])
 
     @property
     def counted_fit(self) -> FitResult | None:
@@ -270,13 +270,6 @@ class Posterior(PosteriorDraws):
     def __repr__(self) -> str:
         first = self.message.partition(":")[0]
         return f"<{type(self).__name__}: {', '.join(self.names)}; {first}>"
-
-
-def _findings(posterior: Posterior) -> Iterator[Finding]:
-    """Yield every finding about a posterior."""
-    yield from _objections(posterior)
-    yield from _notes(posterior)
-    yield from reading(posterior)
 
 
 def _objections(posterior: Posterior) -> Iterator[Finding]:

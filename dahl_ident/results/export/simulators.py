@@ -84,10 +84,9 @@ def _values(element: Any) -> dict[str, float]:
     return {p.name.removeprefix(prefix): short(p.value) for p in element.parameters}
 
 
-def note_on_exponent(law: Law, form: str) -> tuple[str, ...]:
-    """Return a note if alpha is not 1 in a format without it; refuse an error that matters."""
-    if law.values.get("asymmetry"):
-        raise ModelError(f"{form} has one limit of friction for both directions, and the model two")
+def _note_on_exponent(law: Law) -> tuple[str, ...]:
+    """Return a note if alpha is not 1, which MuJoCo assumes; refuse an error that matters."""
+    _limit(law, "mujoco")
     a = law["alpha"] - 1.0
     if a == 0.0:
         return ()
@@ -97,7 +96,7 @@ def note_on_exponent(law: Law, form: str) -> tuple[str, ...]:
     worst = float(np.max(np.abs(z - 2.0 * np.exp(-path))))
     if not worst <= _EXPONENT_MATTERS:
         raise ModelError(
-            f"{form} carries Dahl with the exponent 1, and alpha is {1.0 + a:.4g}: the force would "
+            f"mujoco carries Dahl with the exponent 1, and alpha is {1.0 + a:.4g}: the force would "
             f"differ by {percent(worst)} of f_max; fit with {argument('alpha', 1)} if that "
             "describes the data"
         )
@@ -118,7 +117,7 @@ def mujoco(result: Any) -> str:
         f_max = static = law["f_max"]
         micro, speed = 0.0, 1.0  # without effect, as both limits are equal
         if law.kind == "dahl":
-            notes += note_on_exponent(law, "mujoco")
+            notes += _note_on_exponent(law)
         else:
             static, speed = short(f_max * law["static_ratio"]), law["stribeck_speed"]
             micro, damping = law["micro_damping"], damping + law["viscous"]
@@ -182,6 +181,7 @@ def urdf(result: Any) -> str:
 
 
 def _limit(law: Law, form: str) -> float:
+    """Return the limit of friction, which has to be the same in both directions."""
     if law.values.get("asymmetry"):
         raise ModelError(f"{form} has one limit of friction for both directions, and the model two")
     return law["f_max"]
