@@ -289,7 +289,7 @@ def campaign(
                     lost = exc
             available = [key for key in tasks if key in journal.places]
             rows = zip(available, journal.rows(available), strict=True)
-            statuses = write_tables((_whole(tasks[key], row) for key, row in rows), folder)
+            statuses = write_tables((_table_row(tasks[key], row) for key, row in rows), folder)
     if lost is not None:
         raise DataError(
             f"{lost}; {len(available)} of {len(tasks)} fits are in {folder / 'results.csv'}, and "
@@ -337,7 +337,7 @@ def _unless_refused(
     yield from done
 
 
-def _whole(task: Task, row: dict[str, Any]) -> dict[str, Any]:
+def _table_row(task: Task, row: dict[str, Any]) -> dict[str, Any]:
     row = {name: value for name, value in row.items() if name not in _JOURNAL_ONLY}
     labels = {"device": task.device} | ({"run": task.run} if task.run else {})
     return {**labels, **task.covariates, **row, "version": __version__}

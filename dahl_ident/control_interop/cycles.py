@@ -5,13 +5,13 @@ fundamental of a free oscillation x = A cos(omega t) is balanced if
 
     1 + H(j omega) N(A) = 0,    or    L(omega) + N(A) = 0 with L = 1/H, a dynamic stiffness.
 
-Both curves, -L over frequency and N over amplitude, are drawn in logarithmic polar coordinates,
-where they are smooth and even; their crossings start Newton's method in (ln A, ln omega). From
+Both curves, -L over frequency and N over amplitude, are computed in logarithmic polar coordinates,
+where they are smooth; their crossings are the starts of Newton's method in (ln A, ln omega). From
 each crossing the exact periodic motion is found by shooting
 (:mod:`dahl_ident.control_interop.free_motion`).
 
-A disturbance dA of the amplitude moves the root by ds = -N'(A) dA/L'(s), so dA grows
-at the rate -A Re(N'/L'(s)); a stable cycle has a negative one, which is Loeb's criterion.
+A disturbance dA of the amplitude shifts the root by ds = -N'(A) dA/L'(s), so dA grows
+at the rate -A Re(N'/L'(s)), which is negative for a stable cycle (Loeb's criterion).
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from dahl_ident.elements.linear_system import LinearSystem, check_system
 from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError, ValidationError
 
-_AMPLITUDES_PER_DECADE = 60  # 4 % apart: N is smooth, and crossings are searched for in between
+_AMPLITUDES_PER_DECADE = 60  # 4 % apart; N is smooth, and crossings are interpolated
 _FREQUENCIES_PER_DECADE = 400  # 0.6 % apart; sharper resonances get additional ones
-_BEYOND_KNEES = (1e-6, 1e8)  # there N has reached its limits, sigma and a force over A
+_BEYOND_KNEES = (1e-6, 1e8)  # factors beyond which N is at its limits, sigma and a force over A
 _BEYOND_ROOTS = 1e3  # beyond all poles and zeros L is a power of the frequency
 _AROUND_RESONANCE = np.geomspace(0.01, 300.0, 60)  # times |Re| of a pole, its half width
 _PAIRS_AT_ONCE = 2**20  # of segments: 16 MB for each complex array
@@ -58,11 +58,11 @@ class LimitCycle:
     frequency_hz : float
         Hz.
     growth_rate : float
-        Rate at which the worst small disturbance grows, 1/s; negative where all decay. Of the
-        describing function: a disturbance of the amplitude.
+        Growth rate of the least stable small disturbance, 1/s; negative if all decay. With the
+        describing function: that of a disturbance of the amplitude.
     share : float
         Root sum of squares of the displacement's mean and harmonics 2 to 9 over its fundamental;
-        0 of the describing function, which assumes a sine.
+        0 with the describing function, which assumes a sine.
 
     Examples
     --------
@@ -88,9 +88,9 @@ class LimitCycle:
 
 
 class LimitCycles(tuple[LimitCycle, ...]):
-    """Limit cycles by rising amplitude; where there is none, `reason` says why.
+    """Limit cycles by rising amplitude; if there are none, `reason` says why.
 
-    Where they are those of the describing function, `approximate` says why.
+    If they are those of the describing function, `approximate` says why.
 
     Examples
     --------
@@ -127,14 +127,14 @@ def limit_cycles(
         Range of the search, Hz. By default three decades beyond all poles and zeros of H and of the
         loop closed by sigma; for an FRD its own range, for a discrete loop up to half its rate.
     steady : {"exact", "describing function"}, default "exact"
-        "exact": the periodic motion itself, with all harmonics, by shooting from each solution. A
-        loop that has no equation of motion (an FRD, a discrete or delayed one) keeps the
-        result of the describing function.
+        "exact": the periodic motion with all harmonics, by shooting from each solution. For a
+        loop without an equation of motion (an FRD, a discrete or delayed one) the result is that of
+        the describing function.
 
     Returns
     -------
     LimitCycles
-        A tuple of LimitCycle, by rising amplitude; empty where none exists, with the reason.
+        A tuple of LimitCycle, by rising amplitude; if it is empty, its `reason` says why.
 
     Raises
     ------
@@ -146,9 +146,9 @@ def limit_cycles(
 
     Notes
     -----
-    Describing functions assume that x is nearly a sine about zero; they are accurate where H falls
+    Describing functions assume that x is nearly a sine about zero; they are accurate if H decreases
     steeply with frequency. Motions with long rests, such as slow stick-slip caused by integrator
-    wind-up, are far from that: an exact unstable cycle can lie at less than half the amplitude of
+    wind-up, are far from a sine: an exact unstable cycle can have less than half the amplitude of
     the describing function, and cycles far from any solution of it are not found.
 
     Two cycles closer to each other than the grid, 4 % in amplitude and 0.6 % in frequency, may be
@@ -234,7 +234,7 @@ def stiffness_of(linear: Element, omega: FloatArray) -> ComplexArray:
 
 
 def stiffness_slope(linear: Element, omega: FloatArray) -> ComplexArray:
-    """Return dL/domega by central differences, one-sided at the ends of what is known."""
+    """Return dL/domega by central differences, one-sided at the ends of the known range."""
     low, high = known_range(linear)
     before = np.maximum(omega * (1.0 - _STEP), low)
     after = np.minimum(omega * (1.0 + _STEP), high)
@@ -297,9 +297,9 @@ def _crossings(first: ComplexArray, second: ComplexArray) -> list[tuple[int, int
         possible &= (high >= part(q).min()) & (low <= part(q).max())
     candidates = np.flatnonzero(possible)
     pairs: list[tuple[int, int]] = []
-    together = max(1, _PAIRS_AT_ONCE // q.size)
-    for start in range(0, candidates.size, together):
-        chunk = candidates[start : start + together]
+    size = max(1, _PAIRS_AT_ONCE // q.size)
+    for start in range(0, candidates.size, size):
+        chunk = candidates[start : start + size]
         a, b = step_p[chunk, None], step_q[None, :]
         between = q[None, :-1] - p[chunk, None]
         area = (a.conj() * b).imag

@@ -1,7 +1,7 @@
 """All exact steady motions of plants with known parameters, from those of the describing function.
 
 Motions that the describing function misses are found by continuation: each motion is followed from
-point to point, forwards and backwards, as far as it exists.
+point to point, forwards and backwards, as long as it exists.
 """
 
 from __future__ import annotations
@@ -58,9 +58,8 @@ def exact_motions(
 ) -> ExactMotions:
     """Return the exact motions of points, (n,), near estimates of their fundamentals, (n, most).
 
-    Where the estimate is `unique`, so is the motion, and it is computed from rest. Elsewhere the
-    starts are each estimate, and each motion of the points before and after, followed in small
-    steps.
+    If the estimate of a point is `unique`, so is the motion, which is computed from rest. Otherwise
+    the starts are all estimates, and all motions of the adjacent points, followed in small steps.
     """
     shooting = Shooting(model)
     log_points = np.log([omega, drive])
@@ -77,10 +76,10 @@ def exact_motions(
     values = np.array([float(v) for v in model.known_values()])
     motions: list[list[_Orbit]] = [[] for _ in omega]
 
-    def solved(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> SteadyMotion:
+    def solve(rows: NDArray[np.intp], starts: FloatArray | None, **options: Any) -> SteadyMotion:
         return shooting(
             np.tile(values, (rows.size, 1)), omega[rows], drive[rows], harmonics=HARMONICS,
-            starts=starts, **({"stable": False} | how),
+            starts=starts, **({"stable": False} | options),
         )  # fmt: skip
 
     def add_new(rows: NDArray[np.intp], solution: SteadyMotion) -> NDArray[np.intp]:
@@ -97,22 +96,22 @@ def exact_motions(
 
     single = np.flatnonzero(is_unique)
     if single.size:
-        add_new(single, solved(single, None))
+        add_new(single, solve(single, None))
     rows, column = np.nonzero(np.isfinite(estimates) & ~is_unique[:, None])
     starts = np.zeros((rows.size, shooting.system.order))
     starts[:, 0] = estimates[rows, column].real
     starts[:, 1] = -omega[rows] * estimates[rows, column].imag
 
-    def follow(rows: NDArray[np.intp], starts: FloatArray | None, **how: Any) -> None:
-        """Add the motions to which the starts lead, and continue each one to its neighbours."""
+    def follow(rows: NDArray[np.intp], starts: FloatArray | None, **options: Any) -> None:
+        """Add the motions found from the starts, and continue each one to the adjacent points."""
         while rows.size:
-            solution = solved(rows, starts, **how)
+            solution = solve(rows, starts, **options)
             new = add_new(rows, solution)
             neighbours = np.concatenate([rows[new] - 1, rows[new] + 1])
             inside = (neighbours >= 0) & (neighbours < omega.size)
             inside[inside] &= continues[neighbours[inside]]
             rows, starts = neighbours[inside], np.tile(solution.starts[new], (2, 1))[inside]
-            how |= {"again": False, "cycles": None, "stable": False}
+            options |= {"again": False, "cycles": None, "stable": False}
 
     continues = ~is_unique
     follow(rows, starts, cycles=_CYCLES)  # leads to stable motions
@@ -135,7 +134,7 @@ def exact_motions(
 def _followed(motions: list[list[_Orbit]], is_start: BoolArray) -> IntArray:
     """Return the index of the stable motion that a sweep follows at each point.
 
-    It is the nearest to that of the previous point, or the smallest where a sweep begins.
+    It is the nearest to that of the previous point, or the smallest at the start of a sweep.
     """
     result = np.full(len(motions), -1, dtype=np.intp)
     last: complex | None = None

@@ -1,8 +1,8 @@
 """The equivalent linear plant of a plant with friction at one amplitude, and its margins.
 
 At the amplitude A and angular frequency omega_0 friction acts as a spring Re N(A) in parallel with
-a damper Im N(A)/omega_0. The damper is exact at omega_0 alone, because friction loses the same
-energy in a cycle at every frequency. Margins need no such approximation: they follow from the
+a damper Im N(A)/omega_0. The damper is exact only at omega_0, because friction dissipates the same
+energy per cycle at every frequency. Margins need no such approximation: they follow from the
 frequency response at constant amplitude, where the loop gain is C(j omega)/(L(omega) + N(A)).
 """
 
@@ -83,9 +83,9 @@ class LoopMargins:
     amplitude : ndarray, shape (m,)
         Zero-to-peak displacement, m.
     gain_margin : ndarray, shape (..., m)
-        Factor nearest to 1 that takes the loop gain through -1; infinite if there is none.
+        Factor nearest to 1 by which the loop gain reaches -1; infinite if there is none.
     phase_margin_deg : ndarray, shape (..., m)
-        Rotation nearest to 0 that takes it through -1, degrees; infinite if there is none.
+        Rotation nearest to 0 by which it reaches -1, degrees; infinite if there is none.
     modulus_margin : ndarray, shape (..., m)
         Smallest distance of the loop gain from -1, the inverse of the peak sensitivity.
     """

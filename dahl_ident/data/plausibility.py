@@ -157,9 +157,9 @@ def record_warnings(
     yield places, "steps of time are 1000 times larger or smaller from {}: another unit?"
 
 
-def _stuck(held: FloatArray, partner: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
-    """Return the samples from which one signal is constant while the other changes."""
-    steps = np.abs(np.diff(held))
+def _stuck(signal: FloatArray, partner: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
+    """Return the first samples of runs in which one signal is constant while the other changes."""
+    steps = np.abs(np.diff(signal))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
     starts = starts - 1  # the first sample of the repeated value
     travel = np.abs(partner[[(starts + stops) // 2, stops]] - partner[starts]).max(axis=0)
@@ -169,13 +169,14 @@ def _stuck(held: FloatArray, partner: FloatArray, *, smooth: bool = False) -> ND
         return np.asarray(starts[:1] if smooth else starts[:0])
     usual, count = _usual(steps), np.sum(steps == 0.0)
     jumps = np.append(steps, 0.0)[stops] > 5.0 * usual
-    jumps |= (held[starts] == 0.0) & (_edges(held, starts, stops) > 3.0 * usual)
-    if smooth:
-        jumps |= _edges(held, starts, stops) > _bend(held)
-    held_samples = np.sum(stops - starts)
-    if count - held_samples < _SELDOM * held.size and held_samples < _MOSTLY * held.size:
-        value, first, count = np.unique(held[starts], return_index=True, return_counts=True)
-        once = (count == 1) & (value > held.min()) & (value < held.max())
+    jumps |= (signal[starts] == 0.0) & (_edges(signal, starts, stops) > 3.0 * usual)
+    if smooth:  # a smooth signal has no step much larger than its usual second differences
+        bend = np.quantile(np.abs(np.diff(signal, 2)), 0.98)
+        jumps |= _edges(signal, starts, stops) > 5.0 * float(bend)
+    stuck_samples = np.sum(stops - starts)
+    if count - stuck_samples < _SELDOM * signal.size and stuck_samples < _MOSTLY * signal.size:
+        value, first, count = np.unique(signal[starts], return_index=True, return_counts=True)
+        once = (count == 1) & (value > signal.min()) & (value < signal.max())
         jumps[first[once]] = True
     return np.asarray(starts[jumps])
 
@@ -197,11 +198,6 @@ def _edges(values: FloatArray, starts: NDArray[np.intp], stops: NDArray[np.intp]
 def _usual(steps: FloatArray) -> float:
     """Return the 95 % quantile of the nonzero steps; 0 if there are none."""
     return float(np.quantile(steps[steps > 0.0], 0.95)) if steps.any() else 0.0
-
-
-def _bend(values: FloatArray) -> float:
-    """Return a limit for the first or last step of a run in a smooth signal."""
-    return 5.0 * float(np.quantile(np.abs(np.diff(values, 2)), 0.98))
 
 
 def _unit_changes(values: FloatArray, partner: FloatArray) -> NDArray[np.intp]:

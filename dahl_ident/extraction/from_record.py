@@ -474,7 +474,7 @@ def _combined(a: Point, b: Point) -> Point:
         "num_periods": periods,
         "settling_periods": settling,
         "end_time": b.quality["end_time"],
-        "verdict": [_verdict(*both) for both in verdicts],
+        "verdict": [_merged_verdict(*both) for both in verdicts],
     }
     means = ("frequency_hz", "amplitude", "drive", "response")
     return replace(
@@ -487,6 +487,6 @@ def _combined(a: Point, b: Point) -> Point:
     )
 
 
-def _verdict(first: str, second: str) -> str:
+def _merged_verdict(first: str, second: str) -> str:
     parts = [part for text in (first, second) for part in text.split("; ") if part != "good"]
     return "; ".join(dict.fromkeys(parts)) or "good"
