@@ -125,3 +125,57 @@ def test_every_field_of_the_metadata_is_explained():
     fields = re.findall(r"^(?:\[\[)?([a-z_]+)(?:\]\])?(?: =|$)", template.read_text("utf-8"), re.M)
     assert set(fields) >= {"number", "role", "instruments", "ambient", "k"}
     assert [name for name in fields if f"`{name}`" not in page and f"[{name}]" not in page] == []
+
+
+# The README: its commands and links exist. What its code prints: ``test_docs``.
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = sorted(set(re.findall(r"^dahl-ident (\w+)(.*?)(?:#|$)", README, re.MULTILINE)))
+
+
+@pytest.mark.parametrize(("command", "rest"), COMMANDS)
+def test_commands_have_the_options_that_are_shown(command, rest, run):
+    helped = run(command, "--help").out
+    for option in re.findall(r"(?<=\s)--?[a-z][a-z-]*", rest):
+        assert option in helped
+
+
+def test_make_targets_exist():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"(?:`|^)make ([a-z][a-z-]+)", README, re.MULTILINE)) <= targets
+
+
+def test_links_lead_to_files():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert "docs/images/overview.png" in links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+# The notebooks: each opens with its aim and holds its outputs; `make docs` compares them.
+
+LARGEST = 300_000  # bytes
+NOTEBOOKS = notebooks()
+
+
+def _cells(path):
+    return list(json.loads(path.read_text(encoding="utf-8"))["cells"])
+
+
+def test_notebooks_are_numbered_without_a_gap():
+    assert [int(path.name[:2]) for path in NOTEBOOKS] == list(range(1, len(NOTEBOOKS) + 1))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_opens_with_its_aim_and_holds_its_outputs(path):
+    cells = _cells(path)
+    opening = "".join(cells[0]["source"])
+    assert opening.startswith(f"# {int(path.name[:2])} ")
+    assert "After this notebook you can" in opening
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    assert {output["output_type"] for cell in code for output in cell["outputs"]} == {
+        "display_data", "stream",
+    }  # fmt: skip
+    assert any(printed({"cells": cells}))
+    assert path.stat().st_size < LARGEST
