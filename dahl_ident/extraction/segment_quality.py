@@ -67,7 +67,7 @@ def quantisation_errors(
     to (2 step/pi) |J_1(2 pi A/step)|, at most about 0.2 step sqrt(step/A).
     """
     sampled = step**2 / 12.0 * 4.0 / samples_a_cycle
-    largest = np.maximum(np.maximum(amplitude, step), np.finfo(np.float64).tiny)
+    largest = np.maximum(np.maximum(amplitude, step), TINY)
     rounded = (residual > _UNROUNDED * step) & (residual <= _DITHERED * step)
     error = np.sqrt(sampled + 0.04 * step**2 * step / largest)
     return np.asarray(np.where(rounded, error, 0.0))

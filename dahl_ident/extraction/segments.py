@@ -36,6 +36,7 @@ from dahl_ident.extraction.sine_fit import (
     column_blocks,
     columns,
     estimate_frequency,
+    is_solvable,
     normal_equations,
     steady_segment,
     track_phase,
@@ -56,7 +57,6 @@ _STRAY_BY_CHANCE = 1e-3  # fraction of the cycles of a sine that are called stra
 _NEGLIGIBLE = 1e-4  # fraction of the amplitude that a cycle may stray in any case
 _END_CYCLES = 2  # cycles at either end that are not part of the reference ...
 _CYCLES_PER_END_CYCLE = 5  # ... but at most one in this many of all
-_SOLVABLE = 1e8  # largest condition number of normal equations
 _STRAYING = 0.005  # fraction of the amplitude that a further cycle may stray from the sine
 _MOST_CYCLES_MORE = 2  # cycles by which a segment may grow on either side
 _MOST_CYCLES_LESS = 3  # cycles by which it may shrink on either side; more means slow change
@@ -262,7 +262,7 @@ def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
     within = slice(int(cuts[0]), int(cuts[-1]))
     blocks = column_blocks(segment.theta[within], segment.tau[within], 1, 1)
     normal, right = normal_equations(segment.channels[:1, within], 6, blocks)
-    if not np.linalg.cond(normal) < _SOLVABLE:
+    if not is_solvable(normal):
         return None
     inverse = np.asarray(np.linalg.inv(normal), np.float64)
     coefficients = inverse @ right[:, 0]

@@ -49,6 +49,7 @@ _BLOCKS_PER_CYCLE = 64  # averages over such blocks lose 4e-4 of the fundamental
 _MEANS_PER_CYCLE = 256  # averages lose 3e-5 of the fundamental and 0.2 % of the ninth harmonic
 _EVEN = 0.05  # fraction of a step by which samples may deviate from an even grid
 _FEWEST_SAMPLES = 2  # a phase difference needs two samples
+_LARGEST_CONDITION = 1e8  # condition number of normal matrices
 _LEAST_WEIGHT = 1e-6  # least weight of a cycle, as a fraction of the largest
 _MAX_STEPS = 20  # iterations; without convergence by then the start was wrong
 _TRACKED = 0.1  # rad of phase error, which the four-parameter fit then removes
@@ -407,9 +408,14 @@ def normal_equations(
     return normal, right
 
 
+def is_solvable(normal: FloatArray) -> bool:
+    """Return whether a normal matrix is well-conditioned."""
+    return bool(np.linalg.cond(normal) < _LARGEST_CONDITION)
+
+
 def checked_inverse(normal: FloatArray, segment: Segment) -> FloatArray:
     """Return the inverse of a normal matrix, or raise an error if it is ill-conditioned."""
-    if np.linalg.cond(normal) > 1e8:
+    if not is_solvable(normal):
         raise ExtractionError(
             f"the samples around t = {segment.centre:.6g} s do not separate the harmonics of "
             f"{segment.omega / (2.0 * np.pi):.6g} Hz apart; expected samples spread over whole "
