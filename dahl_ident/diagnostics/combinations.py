@@ -102,10 +102,10 @@ def stiffness_seen(optimum: Optimum) -> Candidate | None:
     of_springs = np.array([slopes[name] if name in free else 0.0 for name in names])
     value = float(N[0].real) + sum(values[name] for name in springs)
     motion = problem.data.motion
-    where = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
+    name = f"the stiffness seen at {A:.3g} {shown_unit('m', motion)}"
     direction = (by[0].real + of_springs) / value
     members = free | (frozenset(friction) & frozenset(names))
-    return Candidate(where, shown_unit("N/m", motion), value, direction, members)
+    return Candidate(name, shown_unit("N/m", motion), value, direction, members)
 
 
 def runaway(optimum: Optimum) -> frozenset[str]:

@@ -47,7 +47,7 @@ _OFTEN = 0.15
 _SHARED_LEVELS = 0.02  # of three kinds together
 _SELDOM = 0.01  # of suspicious points
 _LENGTH = 1.0  # of the model error, in ln A and ln omega
-_MOST_PLACES = 200  # points of shapes, chosen evenly among more rows
+_MOST_POINTS = 200  # points of shapes, chosen evenly among more rows
 _MOST_NOISY = 100  # levels with a noise each: the cost is cubic in their number
 _SMOOTH = 1e-3  # eigenvalue of the correlation, over the largest, that is negligible
 _MOST_SHAPES = 24  # of its eigenvectors; a decade of both amplitude and frequency takes 15
@@ -165,28 +165,28 @@ def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
     gaps between repeats.
     """
     order = np.lexsort((x, groups))
-    apart = np.diff(x[order])
+    differences = np.diff(x[order])
     joined = np.diff(groups[order]) == 0
-    gaps = np.sort(apart[joined & (apart > _EQUAL)])
+    gaps = np.sort(differences[joined & (differences > _EQUAL)])
     small = gaps[gaps < _SAME_LEVEL]
     k = np.arange(1, len(small) + 1)
     larger = np.append(gaps, np.maximum(gaps[-1:], _SAME_LEVEL))  # and one after the last value
     mean = np.maximum(np.cumsum(larger[::-1])[::-1][k] / (len(larger) - k) - small, _EQUAL)
     unlikely = k * np.log(np.expm1(-larger[k] / mean) / np.expm1(-small / mean))
-    apart_at_most = _EQUAL
+    widest_repeat = _EQUAL
     if unlikely.max(initial=0.0) > np.log(max(len(gaps), 1) / _BY_CHANCE):
-        apart_at_most = float(small[np.argmax(unlikely)])
+        widest_repeat = float(small[np.argmax(unlikely)])
 
     def labelled(breaks: NDArray[np.bool_]) -> NDArray[np.intp]:
         return np.concatenate([[0], np.cumsum(breaks)])
 
-    breaks = ~(joined & (apart <= apart_at_most))
+    breaks = ~(joined & (differences <= widest_repeat))
     label = labelled(breaks)
     starts = np.flatnonzero(np.concatenate([[True], breaks]))
     ends = np.append(starts[1:], len(x)) - 1
     wide = (x[order][ends] - x[order][starts] > _SAME_LEVEL)[label[1:]]
     labels = np.empty(len(x), dtype=np.intp)
-    labels[order] = labelled(breaks | (wide & (apart > _EQUAL)))
+    labels[order] = labelled(breaks | (wide & (differences > _EQUAL)))
     return labels
 
 
@@ -224,24 +224,24 @@ class Source:
         self,
         names: Sequence[str],
         slopes: ComplexArray,
-        where: FloatArray,
+        points: FloatArray,
         stiffness: ComplexArray | None,
     ) -> FloatArray | None:
         """Return the changes of ln gain and phase at other points, (n, 2, q), at unit variance.
 
-        `slopes` (n, Q) are the derivatives of ln R with respect to theta there, and `stiffness`
-        the dynamic stiffness; None leaves out forces in parallel with the model. None is returned
-        for a source that does not extend to other points.
+        `points` are ln A and ln omega, (n, 2), `slopes` (n, Q) the derivatives of ln R with respect
+        to theta at them, and `stiffness` the dynamic stiffness; None leaves out forces in parallel
+        with the model. None is returned for a source that does not extend to other points.
         """
         if self.rate_of is not None:
             name, centre = self.rate_of
-            ln_speed = (where.sum(axis=1) - centre)[:, None, None]
+            ln_speed = (points.sum(axis=1) - centre)[:, None, None]
             return np.asarray(parts(slopes[:, [names.index(name)]]) * ln_speed)
         if self.shapes is None or (self.parallel and stiffness is None):
             return None
         ratio = np.ones(len(slopes), dtype=np.complex128) if stiffness is None else stiffness
-        made = parts(self.shapes.changes(where, ratio).T)
-        return made if self.absorbed is None else made - parts(slopes) @ self.absorbed
+        changes = parts(self.shapes.changes(points, ratio).T)
+        return changes if self.absorbed is None else changes - parts(slopes) @ self.absorbed
 
     def drawn(
         self, names: Sequence[str], slopes: ComplexArray, near: NDArray[np.intp], units: FloatArray
@@ -267,36 +267,36 @@ def parts(relative: ComplexArray) -> FloatArray:
 class Shapes:
     """Eigenvectors of a smooth correlation between rows, extended to other points."""
 
-    places: FloatArray  # (n, 2): ln A and ln omega of the rows
+    points: FloatArray  # (n, 2): ln A and ln omega of the rows
     weights: FloatArray
     # whether it is a force in parallel with the model, which depends on frequency alone
     parallel: bool
     unit: float  # stiffness at unit variance of such a force
 
     @classmethod
-    def of(cls, places: FloatArray, *, parallel: bool, unit: float = 1.0) -> Shapes:
+    def of(cls, points: FloatArray, *, parallel: bool, unit: float = 1.0) -> Shapes:
         """Return the significant eigenvectors; of many rows, for evenly chosen ones."""
-        if len(places) > _MOST_PLACES:
-            order = np.lexsort(places.T[::-1])
-            chosen = np.linspace(0, len(places) - 1, _MOST_PLACES).round().astype(int)
-            places = places[order[chosen]]
-        values, vectors = np.linalg.eigh(_correlation(places, places, parallel))
+        if len(points) > _MOST_POINTS:
+            order = np.lexsort(points.T[::-1])
+            chosen = np.linspace(0, len(points) - 1, _MOST_POINTS).round().astype(int)
+            points = points[order[chosen]]
+        values, vectors = np.linalg.eigh(_correlation(points, points, parallel))
         kept = np.flatnonzero(values > _SMOOTH * values[-1])[::-1][:_MOST_SHAPES]
-        return cls(places, vectors[:, kept] / np.sqrt(values[kept]), parallel, unit)
+        return cls(points, vectors[:, kept] / np.sqrt(values[kept]), parallel, unit)
 
-    def at(self, places: FloatArray) -> FloatArray:
+    def at(self, points: FloatArray) -> FloatArray:
         """Return the shapes at other points (k, 2), shape (k, q)."""
-        return np.asarray(_correlation(places, self.places, self.parallel) @ self.weights)
+        return np.asarray(_correlation(points, self.points, self.parallel) @ self.weights)
 
-    def changes(self, places: FloatArray, stiffness: ComplexArray) -> ComplexArray:
+    def changes(self, points: FloatArray, stiffness: ComplexArray) -> ComplexArray:
         """Return relative changes of the response by each shape in gain and phase, (2 q, k)."""
-        shapes = self.at(places).T.astype(np.complex128)
+        shapes = self.at(points).T.astype(np.complex128)
         if self.parallel:
             shapes = shapes * quotient(self.unit, stiffness)
         return np.asarray(np.concatenate([shapes, 1j * shapes]))
 
 
-def places(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
+def log_points(amplitude: FloatArray, omega: FloatArray) -> FloatArray:
     """Return ln A and ln omega, shape (n, 2)."""
     return np.asarray(np.log(np.column_stack(np.broadcast_arrays(amplitude, omega))))
 
@@ -324,7 +324,7 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
     problem = estimate.problem
     view = estimate.view
     first = view.harmonic == 1
-    points = places(view.amplitude, view.omega)
+    points = log_points(view.amplitude, view.omega)
     unit = float(np.abs(view.stiffness[first]).max(initial=0.0)) or 1.0
     all_points = points if further is None else np.vstack([points, further])
     size = _sizes(problem, estimate.predicted)
@@ -356,7 +356,7 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
 def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
     """Yield a power of the peak speed for each parameter of friction that may scatter."""
     view = estimate.view
-    speed, first = places(view.amplitude, view.omega).sum(axis=1), view.harmonic == 1
+    speed, first = log_points(view.amplitude, view.omega).sum(axis=1), view.harmonic == 1
     if not (first.any() and np.ptp(np.log(view.omega)) > _LEAST_RATE_RANGE):
         return
     centre = float(speed[first].mean())

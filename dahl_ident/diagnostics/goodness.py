@@ -416,9 +416,8 @@ def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
         return tested
     if not without.rms_misfit * EXPLAINS < tested.rms_misfit:
         return tested
-    where = _side_by_side(optimum, tested)
-    if where:
-        return replace(tested, neighbours=where)
+    if neighbours := _side_by_side(optimum, tested):
+        return replace(tested, neighbours=neighbours)
     (remaining,) = (str(f) for f in without.findings() if f.code == "noise")
     names = tuple(point.name for point in tested.suspicious)
     return replace(tested, apart=names, verdict_without=remaining)
@@ -429,8 +428,8 @@ def _side_by_side(optimum: Optimum, tested: Goodness) -> str:
     rows = [point.row for point in tested.suspicious]
     if is_at_end(optimum, rows):
         return "it is the first or the last"
-    where = neighbourhood(optimum, rows)
-    return f"they are neighbours, {where}" if where else ""
+    region = neighbourhood(optimum, rows)
+    return f"they are neighbours, {region}" if region else ""
 
 
 def _within_runs(errors: ErrorModel) -> Goodness | None:

@@ -290,16 +290,16 @@ class IntervalComparison:
     >>> import dahl_ident as di
     >>> fit = di.fit(di.load_dataset("noisy"), di.Dahl())
     >>> comparison = fit.compare_intervals(levels=(0.95,))
-    >>> [one.method for one in comparison.intervals], comparison.disagreements
+    >>> [intervals.method for intervals in comparison.intervals], comparison.disagreements
     (['wald', 'bootstrap', 'profile'], ())
     """
 
     intervals: tuple[ConfidenceIntervals, ...]  # by noise alone, the most trusted last
-    disagreements: tuple[Disagreement, ...]  # limits on which one of them differs from the last
-    stated: ConfidenceIntervals  # by every source of error, as the fit states them
+    disagreements: tuple[Disagreement, ...]  # limits that differ from those of the last
+    stated: ConfidenceIntervals  # of the fit, by every source of error
 
     def __str__(self) -> str:
-        parts = [str(one) for one in (self.stated, *self.intervals)]
+        parts = [*map(str, (self.stated, *self.intervals))]
         if not self.disagreements:
             return "\n\n".join([*parts, "The methods that count noise alone agree."])
         by_interest = sorted(self.disagreements, key=lambda d: -abs(d.level - LEVELS[1]))
@@ -317,7 +317,7 @@ def compare(
         raise ValidationError(f"{len(intervals)} intervals given; a comparison needs two or more")
     last = intervals[-1]
     disagreements = []
-    count = min(len(one.names) for one in intervals)
+    count = min(map(len, intervals))
     theta = optimum.theta[:count]
     for earlier in intervals[:-1]:
         if not np.array_equal(earlier.levels, last.levels):

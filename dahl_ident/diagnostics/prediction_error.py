@@ -1,6 +1,6 @@
 r"""Error of a prediction of a measurement: parameters, model error, scatter, noise.
 
-At an operating point where the model's relative slopes with respect to the parameters are j, ln
+At an operating point points the model's relative slopes with respect to the parameters are j, ln
 gain and phase of the device exceed those of the model by -j delta + sum_k C_k u_k, with delta and
 u_k as in :mod:`dahl_ident.diagnostics.mixed_model` and C_k the effect of a source at that point.
 Their best linear prediction is the expected departure of the device from the model there. With
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS, satterthwaite
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
-from dahl_ident.diagnostics.error_sources import error_sources, parts, places
+from dahl_ident.diagnostics.error_sources import error_sources, log_points, parts
 from dahl_ident.diagnostics.estimate import relative_units
 from dahl_ident.problem import TableProblem
 
@@ -49,12 +49,12 @@ def prediction_error(
     """Return the error of a predicted fundamental."""
     state, names = errors.state, errors.names
     model, basis = state.model, errors.estimate.basis
-    where = places(amplitude, omega)
+    points = log_points(amplitude, omega)
     by_theta = parts(slopes)
     X = np.zeros((len(slopes), 2, model.U.shape[1]))
     X[..., : model.parameters] = -by_theta @ basis.matrix
     for k, source in enumerate(errors.sources):
-        changes = source.changes(names, slopes, where, stiffness)
+        changes = source.changes(names, slopes, points, stiffness)
         if changes is not None:
             X[..., model.columns(k)] = changes
     covariance, by_variance = state.prediction_variance(X)
@@ -102,8 +102,8 @@ def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) ->
     """Return the fundamental's row nearest to each point, in ln A and ln omega."""
     view = problem.stiffness_data
     rows = np.flatnonzero(view.harmonic == 1)
-    measured = places(view.amplitude, view.omega)[rows]
-    distance = np.sum((places(amplitude, omega)[:, None] - measured) ** 2, axis=-1)
+    measured = log_points(view.amplitude, view.omega)[rows]
+    distance = np.sum((log_points(amplitude, omega)[:, None] - measured) ** 2, axis=-1)
     return np.asarray(rows[np.argmin(distance, axis=1)])
 
 
@@ -135,11 +135,11 @@ def departures(
         sized = {(False, ""): errors.rms(NOISE) ** 2}
     if not any(sized.values()):
         return None
-    where, estimate = places(amplitude, omega), errors.estimate
-    sources = [s for s in error_sources(estimate, where) if s.name == MODEL_ERROR]
+    points, estimate = log_points(amplitude, omega), errors.estimate
+    sources = [s for s in error_sources(estimate, points) if s.name == MODEL_ERROR]
     pairs = [(source, sized.get(source.kind, 0.0) ** 0.5) for source in sources]
     pairs = [(source, std) for source, std in pairs if std]
-    changes = [(s.changes(errors.names, slopes, where, stiffness), std) for s, std in pairs]
+    changes = [(s.changes(errors.names, slopes, points, stiffness), std) for s, std in pairs]
     at_points = np.concatenate([std * c for c, std in changes if c is not None], axis=-1)
     columns = np.concatenate([std * source.columns for source, std in pairs], axis=-1)
     n = errors.problem.n_residuals // 2

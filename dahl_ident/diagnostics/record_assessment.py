@@ -82,15 +82,15 @@ class RecordAssessment(Assessment):
         u = np.sqrt(np.diagonal(self.covar)).tolist()
         values = dict(zip(names, self.optimum.values.tolist(), strict=True))
         stderr = dict(zip(names, u, strict=True))
-        for one in self.errors.assumed:
-            values[one.name] = one.value
-            stderr[one.name] = one.value * one.std
+        for exponent in self.errors.assumed:
+            values[exponent.name] = exponent.value
+            stderr[exponent.name] = exponent.value * exponent.std
         return values, stderr
 
     @property
     def assumed(self) -> tuple[str, ...]:
         """Names of parameters whose values are assumed; the uncertainty counts their ranges."""
-        return tuple(one.name for one in self.errors.assumed)
+        return tuple(exponent.name for exponent in self.errors.assumed)
 
     @property
     def success(self) -> bool:
@@ -169,13 +169,13 @@ class RecordAssessment(Assessment):
         k = coverage_factors(dof, array[:, None])
         u = np.sqrt(np.diagonal(self.covar))
         lower, upper = around(self.problem.space, values, u, k)
-        ln_u = np.array([one.std for one in assumed])
+        ln_u = np.array([p.std for p in assumed])
         ln_U = coverage_factors(self.errors.least_dof, array[:, None]) * ln_u
-        assumed_values = np.array([one.value for one in assumed])
+        assumed_values = np.array([p.value for p in assumed])
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
         return ConfidenceIntervals(
-            "combined", array, (*self.problem.names, *(one.name for one in assumed)),
-            (*(p.unit for p in self.problem.parameters), *(one.unit for one in assumed)),
+            "combined", array, (*self.problem.names, *(p.name for p in assumed)),
+            (*(p.unit for p in self.problem.parameters), *(p.unit for p in assumed)),
             np.append(values, assumed_values), np.hstack([lower, assumed_values * np.exp(-ln_U)]),
             np.hstack([upper, assumed_values * np.exp(ln_U)]), note,
         )  # fmt: skip
@@ -216,11 +216,11 @@ class RecordAssessment(Assessment):
     @property
     def contradicted_exponents(self) -> Iterator[ContradictedExponent]:
         """The exponents that the records contradict, or put outside their range."""
-        for one in self.errors.exponents:
-            if one.contradicted:
-                value = one.value * float(np.exp(one.log_ratio))
-                u, limits = value * one.log_ratio_std, one.range if one.assumed else None
-                yield ContradictedExponent(one.name, one.value, value, u, limits)
+        for p in self.errors.exponents:
+            if p.contradicted:
+                value = p.value * float(np.exp(p.log_ratio))
+                u, limits = value * p.log_ratio_std, p.range if p.assumed else None
+                yield ContradictedExponent(p.name, p.value, value, u, limits)
 
     @property
     def significant_misfit(self) -> tuple[float, float] | None:

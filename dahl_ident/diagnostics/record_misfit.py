@@ -189,7 +189,7 @@ def _forces(
         friction = heading
     lengths = {min(length, farthest) for length in lengths if length > 0.0} or {farthest}
     ahead = heading * friction / (np.abs(friction).max() or 1.0)
-    speed, place = v / (np.abs(v).max() or 1.0), (x - x.mean()) / (np.ptp(x) or 1.0)
+    speed, position = v / (np.abs(v).max() or 1.0), (x - x.mean()) / (np.ptp(x) or 1.0)
     width = _LEVELS[1] - _LEVELS[0]
     levels = np.maximum(1.0 - np.abs(ahead[:, None] - _LEVELS) / width, 0.0)
     limits = ahead[:, None] * np.exp(-((speed[:, None] * _SPEEDS) ** 2))
@@ -206,5 +206,5 @@ def _forces(
     return {
         FRICTION: decaying(levels),
         VELOCITY: np.column_stack([damping, decaying(limits)]),
-        DISPLACEMENT: np.column_stack([place, place**2, place**3]),
+        DISPLACEMENT: np.column_stack([position, position**2, position**3]),
     }

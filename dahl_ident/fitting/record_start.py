@@ -126,12 +126,12 @@ class _Scan:
             choices[longest] = choices[longest][::2]
         begin: list[_Start] = []
         columns: dict[tuple[int, int], list[FloatArray]] = {}
-        for places in product(*(range(len(c)) for c in choices)):
-            for e, place in enumerate(places):
-                if (e, place) not in columns:
-                    columns[e, place] = self._columns(elements[e], choices[e][place])
-            shapes = [choices[e][p] for e, p in enumerate(places)]
-            sets = [columns[e, p] for e, p in enumerate(places)]
+        for node in product(*(range(len(c)) for c in choices)):
+            for e, i in enumerate(node):
+                if (e, i) not in columns:
+                    columns[e, i] = self._columns(elements[e], choices[e][i])
+            shapes = [choices[e][i] for e, i in enumerate(node)]
+            sets = [columns[e, i] for e, i in enumerate(node)]
             if all(sets):
                 begin += self._solve(elements, shapes, sets)
         if not begin:
@@ -145,7 +145,7 @@ class _Scan:
             if rank < count and all(_differ(start.values, other) for other in kept.values()):
                 kept[rank, not start.passive] = start.values  # in turn, passive ones first
                 ranks[start.passive] += 1
-        chosen = [kept[place] for place in sorted(kept)][:count]
+        chosen = [kept[rank] for rank in sorted(kept)][:count]
         return np.array([started_at(self.problem, values) for values in chosen])
 
     def grids(self, element: Element) -> list[list[float]]:
@@ -266,9 +266,9 @@ class _Scan:
         return values
 
     @staticmethod
-    def _scales(element: Element, place: int) -> bool:
-        """Whether a parameter is free, without a value, and scales the element's force."""
-        parameter, label = element.parameters[place], element.labels[place]
+    def _scales(element: Element, index: int) -> bool:
+        """Return whether a parameter is free, without a value, and scales the element's force."""
+        parameter, label = element.parameters[index], element.labels[index]
         return bool(
             parameter.free
             and parameter.value is None
@@ -317,7 +317,7 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
 
 def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None:
     """Set the initial loads of laws with several springs to match the record's first samples."""
-    of_record, place = problem.own(full, number), 2 if problem.output == "motion" else 0
+    of_record, start = problem.own(full, number), 2 if problem.output == "motion" else 0
 
     def misfit() -> float:
         try:
@@ -327,11 +327,11 @@ def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None
         return float(np.var(problem.measured[number] - output))
 
     for element in problem.model.elements:
-        stop = place + (len(element.starts) if element.has_memory else element.n_states)
+        stop = start + (len(element.starts) if element.has_memory else element.n_states)
         if element.has_memory and len(element.starts) > 1:
             tried = []
             for load in _LOADS:
-                of_record[place:stop] = load
+                of_record[start:stop] = load
                 tried.append(misfit())
-            of_record[place:stop] = _LOADS[int(np.argmin(tried))]
-        place = stop
+            of_record[start:stop] = _LOADS[int(np.argmin(tried))]
+        start = stop

@@ -100,11 +100,11 @@ class RepeatSums:
             shift[-2, -1] = k * self.period  # drift = within the repeat + the time of its start
             total += shift.T @ self.products[:, k] @ shift
         later = np.arange(_SIMULATED, repeats) * self.period
-        last, one = self.products[:, -1], np.zeros((n, n))
-        one[-2, -1] = 1.0
-        cross = last @ one
+        last, drift = self.products[:, -1], np.zeros((n, n))
+        drift[-2, -1] = 1.0
+        cross = last @ drift
         total += later.size * last + later.sum() * (cross + cross.swapaxes(1, 2))
-        total += (later**2).sum() * (one.T @ last @ one)
+        total += (later**2).sum() * (drift.T @ last @ drift)
         unknowns = total[:, P:, P:]
         size = np.sqrt(np.maximum(np.diagonal(unknowns, axis1=1, axis2=2), 1e-300))
         units = size[:, :, None] * size[:, None, :]
@@ -138,14 +138,14 @@ def evaluate_motions(
     sums = [RepeatSums.of(knowledge, motion, recorded) for motion in resolved]
     sizes: dict[str, Any] = {
         "displacement": peaks[None, :, 0],
-        "force": np.stack([one.force for one in sums], axis=1),
+        "force": np.stack([of_motion.force for of_motion in sums], axis=1),
         "speed": peaks[None, :, 1],
         "acceleration": peaks[None, :, 2],
     }
-    if any(one.kind != "trapezoid" for one in resolved):
-        sizes["frequency_hz"] = np.array([[one.fastest_hz for one in resolved]])
+    if any(motion.kind != "trapezoid" for motion in resolved):
+        sizes["frequency_hz"] = np.array([[motion.fastest_hz for motion in resolved]])
     within = np.flatnonzero(allowed(limits, sizes, len(resolved)))
-    period = np.array([one.period for one in resolved])[within]
+    period = np.array([motion.period for motion in resolved])[within]
     rows = [
         sums[k].rows(_REPEATS if lasting is None else max(int(lasting / T), LEAST_CYCLES))
         for k, T in zip(within.tolist(), period.tolist(), strict=True)

@@ -164,7 +164,7 @@ def plan(
     if steady is not None:
         one_of(steady, "steady", STEADY)
         knowledge = replace(knowledge, steady=steady)
-    wanted, has_numbers = target_of(target)
+    targets, has_numbers = target_of(target)
     if not has_numbers and not np.isfinite(bench.time):
         raise ValidationError(
             f"plan: without a target uncertainty the time is needed: give {limit('time')}, or "
@@ -178,7 +178,7 @@ def plan(
     motions = motions_among(candidates)
     if motions:
         for_sines_only = {
-            "target 'response'": RESPONSE in wanted,
+            "target 'response'": RESPONSE in targets,
             "scatter": bool(scatter),
             "suspects": bool(suspects),
             "larger": larger is not None,
@@ -192,7 +192,7 @@ def plan(
             )
         thinned = replace(knowledge.thinned(SEARCHED), errors=None, scatter=0.0)
         recorded = recorded_force(noise, sample_rate, knowledge)
-        arguments = (thinned, bench, wanted, has_numbers, costs)
+        arguments = (thinned, bench, targets, has_numbers, costs)
         return _of_motions(PlanRequest(*arguments, recorded=recorded, motions=motions))
     if sample_rate is not None:
         raise ValidationError(
@@ -202,7 +202,7 @@ def plan(
     if controlled == "force" and knowledge.steady == "exact":
         knowledge = knowledge.thinned(SEARCHED)
     question = PlanRequest(
-        knowledge, bench, wanted, has_numbers, costs, controlled, noise_of_cycle(noise, knowledge),
+        knowledge, bench, targets, has_numbers, costs, controlled, noise_of_cycle(noise, knowledge),
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
         larger_model(knowledge, larger, suspects), dict(suspects or {}),

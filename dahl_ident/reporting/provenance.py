@@ -198,7 +198,7 @@ def _sample(posterior: Posterior) -> list[str]:
     if posterior.is_chain:
         how = ["--seed", str(posterior.seed), "--steps", str(posterior.steps)]
     return [
-        "sample", *_model(posterior.asked), "--noise", posterior.problem.noise, *how,
+        "sample", *_model(posterior.given_problem), "--noise", posterior.problem.noise, *how,
         *_changed(
             likelihood=(posterior.likelihood, "gaussian"),
             uncertainty=(posterior.uncertainty, "combined"),

@@ -271,8 +271,7 @@ class FittedModel(Result):
             share; then the combined and the expanded uncertainty.
         """
         limits = self.conf_interval().at(LEVELS[1])
-        ends = {name: (one.lower, one.upper) for name, one in limits.items()}
-        return self.assessment.budget().within(ends)
+        return self.assessment.budget().within({n: (i.lower, i.upper) for n, i in limits.items()})
 
     @cached_property
     def stated_budget(self) -> Budget | None:

@@ -75,8 +75,8 @@ class PosteriorDraws(Result):
         return list(self.names)
 
     @property
-    def asked(self) -> Any:
-        """The problem as it was given, before exponents that were not given became parameters."""
+    def given_problem(self) -> Any:
+        """The problem without assumed exponents as parameters."""
         return (self.fit or self).problem
 
     @property
