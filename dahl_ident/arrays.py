@@ -11,6 +11,8 @@ from dahl_ident.errors import ValidationError
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 TINY = float(np.finfo(np.float64).tiny)
 """Replaces 0 in denominators, so that quotients are finite."""
@@ -134,7 +136,7 @@ def broadcast_shape(**named: NDArray[Any]) -> tuple[int, ...]:
         raise ValidationError(f"shapes do not go together: {shapes}") from None
 
 
-def _refuse(array: FloatArray, good: NDArray[np.bool_], name: str, expected: str) -> None:
+def _refuse(array: FloatArray, good: BoolArray, name: str, expected: str) -> None:
     bad = np.argwhere(~good)
     first = tuple(int(i) for i in bad[0])
     value = float(array[first])

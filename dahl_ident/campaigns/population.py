@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.diagnostics.formatting import interval, with_unit
 from dahl_ident.errors import DataError, ValidationError
 
@@ -51,7 +51,7 @@ class _Fits:
     y: FloatArray
     u2: FloatArray
     X: FloatArray
-    device: NDArray[np.intp]
+    device: IntArray
     devices: int
 
     @classmethod
@@ -59,7 +59,7 @@ class _Fits:
         labels, numbers = np.unique(device, return_inverse=True)
         return cls(y, u2, X, numbers, labels.size)
 
-    def select(self, mask: NDArray[np.bool_]) -> _Fits:
+    def select(self, mask: BoolArray) -> _Fits:
         return _Fits.of(self.y[mask], self.u2[mask], self.X[mask], self.device[mask])
 
     def sums(self, values: FloatArray) -> FloatArray:
@@ -485,7 +485,7 @@ def _nodes(data: _Fits, mode: tuple[float, float], axis: int) -> FloatArray:
     return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
 
 
-def _outlying(data: _Fits) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _outlying(data: _Fits) -> tuple[FloatArray, BoolArray]:
     """Return each device's p value against all others, and which are outlying.
 
     Outlying devices are removed one by one, the most distant first, so that they do not mask one
@@ -518,9 +518,7 @@ def _outlying(data: _Fits) -> tuple[FloatArray, NDArray[np.bool_]]:
     return p, outlying
 
 
-def _charts(
-    y: FloatArray, device: NDArray[np.intp], inside: NDArray[np.bool_], ordered: bool
-) -> dict[str, Any]:
+def _charts(y: FloatArray, device: IntArray, inside: BoolArray, ordered: bool) -> dict[str, Any]:
     """Return control charts of fits; those `inside` the population set centre and limits.
 
     If devices have several fits, a value is the deviation from the mean of its device, enlarged to

@@ -9,10 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.control_interop.force_balance import BoolArray, IntArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
 from dahl_ident.elements.model import Model
 
@@ -76,13 +74,13 @@ def exact_motions(
     values = np.array([float(v) for v in model.known_values()])
     motions: list[list[_Orbit]] = [[] for _ in omega]
 
-    def solve(rows: NDArray[np.intp], starts: FloatArray | None, **options: Any) -> SteadyMotion:
+    def solve(rows: IntArray, starts: FloatArray | None, **options: Any) -> SteadyMotion:
         return shooting(
             np.tile(values, (rows.size, 1)), omega[rows], drive[rows], harmonics=HARMONICS,
             starts=starts, **({"stable": False} | options),
         )  # fmt: skip
 
-    def add_new(rows: NDArray[np.intp], solution: SteadyMotion) -> NDArray[np.intp]:
+    def add_new(rows: IntArray, solution: SteadyMotion) -> IntArray:
         """Add the motions that are new; return their indices."""
         new = []
         for i in np.flatnonzero(solution.found & np.isfinite(solution.multiplier)).tolist():
@@ -102,7 +100,7 @@ def exact_motions(
     starts[:, 0] = estimates[rows, column].real
     starts[:, 1] = -omega[rows] * estimates[rows, column].imag
 
-    def follow(rows: NDArray[np.intp], starts: FloatArray | None, **options: Any) -> None:
+    def follow(rows: IntArray, starts: FloatArray | None, **options: Any) -> None:
         """Add the motions found from the starts, and continue each one to the adjacent points."""
         while rows.size:
             solution = solve(rows, starts, **options)

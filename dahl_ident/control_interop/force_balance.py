@@ -22,13 +22,11 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import Sine
 from dahl_ident.elements.model import as_model
 
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _Values = list[Sequence[FloatArray]]
 

@@ -16,9 +16,9 @@ from typing import Any, Literal
 
 import control
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray, positive_array
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, positive_array
 from dahl_ident.control_interop.cycles import stiffness_of, stiffness_slope
 from dahl_ident.control_interop.linear_part import split
 from dahl_ident.control_interop.nonlinearity import friction_and_slope
@@ -192,7 +192,7 @@ class Branches:
     growth_rate: FloatArray
 
     @property
-    def stable(self) -> NDArray[np.bool_]:
+    def stable(self) -> BoolArray:
         """Whether motions near each response approach it; False if there is none."""
         return np.asarray(self.growth_rate <= 0.0)
 

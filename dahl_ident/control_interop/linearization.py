@@ -14,9 +14,10 @@ from typing import Any
 
 import control
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import (
+    BoolArray,
     ComplexArray,
     FloatArray,
     array_between,
@@ -235,7 +236,7 @@ def _margins(loop: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _at_zeros(
-    curve: FloatArray, value: FloatArray, step: FloatArray, valid: NDArray[np.bool_]
+    curve: FloatArray, value: FloatArray, step: FloatArray, valid: BoolArray
 ) -> FloatArray:
     """Return `value` where `curve` crosses zero within an interval, infinity elsewhere."""
     before, after = curve[..., :-1], curve[..., 1:]

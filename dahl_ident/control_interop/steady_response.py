@@ -20,14 +20,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dahl_ident.arrays import (
+    BoolArray,
     ComplexArray,
     FloatArray,
+    IntArray,
     broadcast_shape,
     non_negative_array,
     positive_array,
 )
 from dahl_ident.control_interop.exact_response import HARMONICS, exact_motions
-from dahl_ident.control_interop.force_balance import BoolArray, IntArray, find_roots, flatten
+from dahl_ident.control_interop.force_balance import find_roots, flatten
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements.driven_motion import LINEAR, NEUTRAL, STEADY, Shooting, Steady, obstacle
 from dahl_ident.elements.element import Element

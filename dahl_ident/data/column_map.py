@@ -29,9 +29,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, non_negative_number, positive_number
+from dahl_ident.arrays import BoolArray, FloatArray, non_negative_number, positive_number
 from dahl_ident.data.columns import CONTROLLED, FILE_COLUMNS, RECORD_COLUMNS, Column, one_of
 from dahl_ident.data.raw_columns import RawChannel, RawFile, plain
 from dahl_ident.data.storage import read_toml
@@ -383,7 +382,7 @@ class Binding:
         warnings.warn(f"{self.source.name}: {message}", DataWarning, stacklevel=3)
         self.warnings.append(message)
 
-    def warn_rows(self, rows: NDArray[np.bool_], message: str) -> None:
+    def warn_rows(self, rows: BoolArray, message: str) -> None:
         """Warn about the marked rows, if there are any."""
         marked = np.flatnonzero(rows)
         if marked.size:

@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.rows import sizes
 from dahl_ident.errors import DataError
 from dahl_ident.units import percent
 
-Warn = Callable[[NDArray[np.bool_], str], None]
+Warn = Callable[[BoolArray, str], None]
 """A function that warns about the marked rows, if any, with a message."""
 _SIGNIFICANT = 0.00135  # one-sided probability of three standard deviations
 _ASSUMED_ERROR = 0.1  # relative error of the gain if no covariance is known
@@ -98,7 +98,7 @@ def check_energy(file: str, data: FrequencyResponse, warn: Warn) -> None:
     warn(creating, "the phase's sign creates energy")
 
 
-def _opposite_phase(part: FrequencyResponse) -> NDArray[np.bool_]:
+def _opposite_phase(part: FrequencyResponse) -> BoolArray:
     """Return the few rows whose phase is about as large as that of the others but negative."""
     sine = part.response.imag / part.gain
     negative = sine < 0.0
@@ -129,7 +129,7 @@ def check_phase_size(data: FrequencyResponse, warn: Warn) -> None:
 
 def record_warnings(
     time: FloatArray, motion: FloatArray, force: FloatArray
-) -> Iterator[tuple[NDArray[np.intp], str]]:
+) -> Iterator[tuple[IntArray, str]]:
     """Yield samples where a sensor sticks, samples are lost or the unit changes; and a message."""
     if not 2 < force.size == motion.size == time.size:
         return
@@ -157,7 +157,7 @@ def record_warnings(
     yield places, "steps of time are 1000 times larger or smaller from {}: another unit?"
 
 
-def _stuck(signal: FloatArray, partner: FloatArray, *, smooth: bool = False) -> NDArray[np.intp]:
+def _stuck(signal: FloatArray, partner: FloatArray, *, smooth: bool = False) -> IntArray:
     """Return the first samples of runs in which one signal is constant while the other changes."""
     steps = np.abs(np.diff(signal))
     starts, stops = _runs(np.concatenate([[False], steps == 0.0]))
@@ -181,7 +181,7 @@ def _stuck(signal: FloatArray, partner: FloatArray, *, smooth: bool = False) -> 
     return np.asarray(starts[jumps])
 
 
-def _runs(marked: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _runs(marked: BoolArray) -> tuple[IntArray, IntArray]:
     """Return the first and the last sample of each long run of marked samples."""
     change = np.diff(np.concatenate([[False], marked, [False]]).view(np.int8))
     starts, stops = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
@@ -189,7 +189,7 @@ def _runs(marked: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]
     return starts[long], stops[long]
 
 
-def _edges(values: FloatArray, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> FloatArray:
+def _edges(values: FloatArray, starts: IntArray, stops: IntArray) -> FloatArray:
     """Return the larger of the steps into and out of each run; 0 at the ends of the record."""
     steps = np.concatenate([[0.0], np.abs(np.diff(values)), [0.0]])
     return np.asarray(np.maximum(steps[starts], steps[stops + 1]))
@@ -200,7 +200,7 @@ def _usual(steps: FloatArray) -> float:
     return float(np.quantile(steps[steps > 0.0], 0.95)) if steps.any() else 0.0
 
 
-def _unit_changes(values: FloatArray, partner: FloatArray) -> NDArray[np.intp]:
+def _unit_changes(values: FloatArray, partner: FloatArray) -> IntArray:
     """Return the samples from which values are 1000 times larger or smaller than before."""
     if values.size > 2 * _PART:
         parts = [slice(i, i + _PART + 2 * _SWITCH) for i in range(0, values.size, _PART)]
@@ -221,7 +221,7 @@ def _unit_changes(values: FloatArray, partner: FloatArray) -> NDArray[np.intp]:
     return np.asarray(at[changed])
 
 
-def _scaled_values(values: FloatArray) -> NDArray[np.intp]:
+def _scaled_values(values: FloatArray) -> IntArray:
     """Return the samples from which a smooth signal, far from zero, is scaled by 1000 or 1/1000."""
     if values.size < _SWITCH:
         return np.zeros(0, dtype=np.intp)
@@ -236,7 +236,7 @@ def _scaled_values(values: FloatArray) -> NDArray[np.intp]:
     return np.asarray(3 + np.flatnonzero(far & scaled))
 
 
-def _sizes(values: FloatArray, at: NDArray[np.intp], order: int) -> tuple[FloatArray, FloatArray]:
+def _sizes(values: FloatArray, at: IntArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Return mean differences of the given order before and after some samples."""
     size = np.abs(np.diff(values, order))
     total = np.concatenate([[0.0], np.cumsum(size)])
@@ -245,13 +245,13 @@ def _sizes(values: FloatArray, at: NDArray[np.intp], order: int) -> tuple[FloatA
     return before, (total[high] - total[at]) / (high - at)
 
 
-def _few(samples: NDArray[np.intp]) -> NDArray[np.intp]:
+def _few(samples: IntArray) -> IntArray:
     """Return the first of neighbouring samples; none if there are many, as in random numbers."""
     first = samples[np.diff(samples, prepend=-2 * _SWITCH) > _SWITCH]
     return first if first.size <= _MOST_CHANGES else first[:0]
 
 
-def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> NDArray[np.bool_]:
+def creates_energy(loss: FloatArray, std: FloatArray, dof: FloatArray) -> BoolArray:
     """Return which losses are negative by more than their noise."""
     return np.asarray(loss < -_limit(dof) * std)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import LARGEST, ComplexArray, FloatArray
+from dahl_ident.arrays import LARGEST, BoolArray, ComplexArray, FloatArray
 from dahl_ident.data.columns import Column
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DahlIdentError, DataError, UnitError
@@ -161,7 +161,7 @@ class RawFile:
     options: Mapping[str, Any] = field(default_factory=dict)
     stated: Mapping[str, str] = field(default_factory=dict)
 
-    def rows(self, keep: NDArray[np.bool_]) -> RawFile:
+    def rows(self, keep: BoolArray) -> RawFile:
         """Return the file with only the rows to `keep` of channels of this length."""
         kept = np.flatnonzero(keep)
         channels = tuple(
@@ -264,7 +264,7 @@ class RawFile:
         self.require(np.abs(values) < LARGEST, channel, "finite numbers")
         return values.astype(np.complex128)
 
-    def require(self, good: NDArray[np.bool_], channel: RawChannel, expected: str) -> None:
+    def require(self, good: BoolArray, channel: RawChannel, expected: str) -> None:
         """Raise a DataError that names the first cell that is not `good`."""
         bad = np.flatnonzero(~good)
         if bad.size:

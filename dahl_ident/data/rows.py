@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.data.columns import COLUMNS
 from dahl_ident.data.frequency_response import FrequencyResponse
 from dahl_ident.data.record import Record
@@ -50,7 +50,7 @@ class Rows:
 
     quantity: Quantity
     harmonic: NDArray[np.int64]
-    forced: NDArray[np.bool_]
+    forced: BoolArray
     omega: FloatArray
     response: ComplexArray
     amplitude: FloatArray | None
@@ -73,7 +73,7 @@ class Rows:
         return tuple(np.unique(self.harmonic).tolist())
 
     @cached_property
-    def fundamental(self) -> NDArray[np.intp]:
+    def fundamental(self) -> IntArray:
         """For each row, that of its fundamental in the same table (the first of several), or -1."""
         shape = self.response.shape
         absent = np.zeros(())
@@ -98,7 +98,7 @@ class Rows:
         return np.take_along_axis(values, row, axis=-1)
 
     @property
-    def of_displacement(self) -> NDArray[np.bool_]:
+    def of_displacement(self) -> BoolArray:
         """Which rows are harmonics of the displacement, under a sinusoidal force, (n,)."""
         return np.asarray(self.forced & (self.harmonic != 1))
 
@@ -138,7 +138,7 @@ class Rows:
         columns["response"] = np.array([table.response for table in tables])
         return cls._with(columns, first.quantity)
 
-    def take(self, tables: NDArray[np.intp] | slice | int) -> Rows:
+    def take(self, tables: IntArray | slice | int) -> Rows:
         """Return one or some of the stacked tables; shared columns stay as they are."""
         taken: dict[str, Any] = {}
         for name in (field.name for field in fields(self)):

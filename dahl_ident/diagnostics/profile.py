@@ -22,9 +22,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.elements import Parameter
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, microslip_charts
@@ -34,9 +33,6 @@ from dahl_ident.fitting.losses import loss_named
 from dahl_ident.fitting.optimum import Status, inverse
 from dahl_ident.fitting.search import DOUBTFUL
 from dahl_ident.problem import Quadratic
-
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 # Searches for limits
 _NEAR = 1e-3  # distance of the root from its target at which one last Newton step is exact enough

@@ -13,10 +13,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.contributions import CHANNELS, positive_part
 from dahl_ident.diagnostics.correlated_residuals import correlated, sandwich
 from dahl_ident.diagnostics.record_sources import LinearFit, by_delay
@@ -44,8 +43,6 @@ DISPLACEMENT = "noise in the displacement"
 TURNS = "displacement at turning points"
 SAMPLING = "turning points between samples"
 WINDOW = "window of differentiation"
-
-IntArray = NDArray[np.intp]
 
 
 def motion_sources(

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArray
 
 _THRESHOLD = 0.3  # fraction of the amplitude that half a cycle exceeds; noise may be a tenth
 _QUANTILES = (0.995, 0.9, 0.7)  # that give the amplitude, tried in turn: a few peaks may be large
@@ -219,9 +219,7 @@ def scattered(samples: FloatArray, count: int) -> FloatArray:
     return np.asarray(samples[..., np.sort((fractions * size).astype(np.intp))])
 
 
-def _lobe_spacing(
-    beyond: NDArray[np.intp], above: NDArray[np.bool_], pairs: NDArray[np.intp]
-) -> NDArray[np.intp]:
+def _lobe_spacing(beyond: IntArray, above: BoolArray, pairs: IntArray) -> IntArray:
     """Return the half period, in samples, near pairs of samples beyond the threshold."""
     changes = np.flatnonzero(above[1:] != above[:-1]) + 1
     lobe = np.searchsorted(changes, pairs, side="right")
@@ -232,7 +230,7 @@ def _lobe_spacing(
 
 
 def _crossings(
-    time: FloatArray, motion: FloatArray, before: NDArray[np.intp], after: NDArray[np.intp]
+    time: FloatArray, motion: FloatArray, before: IntArray, after: IntArray
 ) -> FloatArray:
     """Return the times of upward zero crossings between samples `before` and `after`."""
     upward = np.flatnonzero((motion[:-1] < 0.0) & (motion[1:] >= 0.0))
@@ -267,14 +265,14 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, periods: 
     return Cycles(start, stop, np.log(amplitude), noise, frequency)
 
 
-def groups_of_cycles(cuts: NDArray[np.intp]) -> Iterator[tuple[int, int]]:
+def groups_of_cycles(cuts: IntArray) -> Iterator[tuple[int, int]]:
     """Yield the first cycle, and that after the last, of groups whose samples fit in the cache."""
     groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
     yield from pairwise([*np.unique(groups).tolist(), cuts.size - 1])
 
 
 def sine_in_each(
-    theta: FloatArray, y: FloatArray, bounds: NDArray[np.intp], n: NDArray[np.intp]
+    theta: FloatArray, y: FloatArray, bounds: IntArray, n: IntArray
 ) -> tuple[ComplexArray, FloatArray]:
     """Return the phasor of each cycle, fitted with an offset, and the residual variance."""
     middle = 0.5 * float(y.min() + y.max()) if y.size else 0.0
@@ -292,7 +290,7 @@ def sine_in_each(
     return fitted[:, 1] - 1j * fitted[:, 2], variance
 
 
-def _sums(values: NDArray[Any], bounds: NDArray[np.intp]) -> NDArray[Any]:
+def _sums(values: NDArray[Any], bounds: IntArray) -> NDArray[Any]:
     """Return the sums between pairs of bounds."""
     return np.add.reduceat(np.append(values, 0.0), bounds)[::2] if bounds.size else values[:0]
 
@@ -309,7 +307,7 @@ def _log_frequency(
         return np.asarray(np.log((whole + fraction) / np.diff(middle)))
 
 
-def _with_gap(time: FloatArray, edges: FloatArray) -> NDArray[np.bool_]:
+def _with_gap(time: FloatArray, edges: FloatArray) -> BoolArray:
     """Return which cycles lack samples over a part of their time."""
     periods = np.diff(edges)
     broken = np.zeros(periods.size, dtype=bool)

@@ -15,10 +15,9 @@ If r is not a whole number, the alias separates from the harmonic as the number 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtri
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray, IntArray
 from dahl_ident.extraction.cycles import scattered
 from dahl_ident.extraction.sine_fit import HARMONICS, Segment, SineFit
 
@@ -180,9 +179,7 @@ def _leakage(per_cycle: float, cycles: int) -> float:
     return float(abs(np.sinc(cycles * (per_cycle - round(per_cycle)))))
 
 
-def _extrapolated(
-    known: NDArray[np.intp], size: FloatArray, orders: NDArray[np.intp]
-) -> FloatArray:
+def _extrapolated(known: IntArray, size: FloatArray, orders: IntArray) -> FloatArray:
     """Return sizes at other orders by a power law through the known ones; 0 for a pure sine."""
     if not (known > 1).any():
         return np.zeros(orders.size)

@@ -16,9 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.errors import ExtractionError, Placeholder, argument
 from dahl_ident.extraction.cycles import (
     Cycles,
@@ -276,7 +275,7 @@ def _inside(segment: Segment, edges: FloatArray) -> _Inside | None:
     return _Inside(segment, coefficients, inverse, float(explained.sum()) / dof, dof)
 
 
-def _cycle_sums(segment: Segment, cuts: NDArray[np.intp], coefficients: FloatArray) -> FloatArray:
+def _cycle_sums(segment: Segment, cuts: IntArray, coefficients: FloatArray) -> FloatArray:
     """Return sums over each cycle of cos^2, sin^2, cos sin, and of both times the residual."""
     sums = np.zeros((5, cuts.size - 1))
     for first, last in groups_of_cycles(cuts):

@@ -33,9 +33,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, ComplexArray, FloatArray, IntArray
 from dahl_ident.errors import ExtractionError, argument
 
 FEWEST_CYCLES = 2  # needed to fit offset and drift in addition
@@ -497,7 +496,7 @@ def _block_sums(
     return middle, np.add.reduceat(residual, starts, axis=1), counts
 
 
-def _phase_blocks(theta: FloatArray, per_cycle: int) -> tuple[NDArray[np.intp], FloatArray]:
+def _phase_blocks(theta: FloatArray, per_cycle: int) -> tuple[IntArray, FloatArray]:
     """Return the first sample and the number of samples of blocks of equal phase."""
     block = np.floor((theta - theta[0]) * (per_cycle / (2.0 * np.pi)))
     starts = np.flatnonzero(np.diff(block, prepend=-1.0))
@@ -512,10 +511,10 @@ def powers(rotor: ComplexArray, highest: int) -> ComplexArray:
     return powers
 
 
-def _whitening(window: ComplexArray, lines: NDArray[np.intp]) -> tuple[ComplexArray, FloatArray]:
+def _whitening(window: ComplexArray, lines: IntArray) -> tuple[ComplexArray, FloatArray]:
     """Return the matrix that makes lines of white noise independent, and the freedom of each."""
 
-    def spectrum(line: NDArray[np.intp]) -> ComplexArray:
+    def spectrum(line: IntArray) -> ComplexArray:
         return np.where(line >= 0, window[np.abs(line)], window[np.abs(line)].conj())
 
     at_lines = spectrum(lines)

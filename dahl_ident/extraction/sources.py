@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import whole_number
 from dahl_ident.data import FrequencyResponse, Record
-from dahl_ident.data.readers import record_pieces, refuse_repeated, run_names
+from dahl_ident.data.readers import Columns, PathLike, record_pieces, refuse_repeated, run_names
 from dahl_ident.data.rows import labelled
 from dahl_ident.errors import DataError, ValidationError, name_options, names_options
 from dahl_ident.extraction.cycles import Mode
@@ -26,8 +26,6 @@ from dahl_ident.extraction.from_record import record_response
 from dahl_ident.extraction.phasors import Settings
 from dahl_ident.units import percent
 
-PathLike = str | Path
-Columns = Mapping[str, Any] | str | Path
 Records = Record | PathLike | Sequence[Record | PathLike] | Mapping[str, Record | PathLike]
 _PATTERN = re.compile(r"[*?\[]")
 _PIECE = 10_000_000  # samples: about 0.6 GB while they are extracted

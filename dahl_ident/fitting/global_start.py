@@ -32,15 +32,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, interleaved
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, IntArray, interleaved
 from dahl_ident.elements import Element, Friction, Parameter
 from dahl_ident.elements.held_motion import form_of
 from dahl_ident.errors import FitError, argument
 from dahl_ident.fitting.directions import Direction, Directions, directions, is_positive
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
-
-IntArray = NDArray[np.intp]
 
 _STEP = 0.01  # of ln(A/length) in a table, which is read at the nearest step
 _LOWEST, _NODES = -3200, 6400  # first step and number of steps of a table: 14 decades either way

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.noise import bend
 from dahl_ident.problem import EXPLICIT, Problem, Quadratic
@@ -29,8 +29,6 @@ from dahl_ident.problem import EXPLICIT, Problem, Quadratic
 if TYPE_CHECKING:
     from dahl_ident.fitting.asymptotes import Limit
 
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 Evaluate = Callable[[FloatArray, IntArray], Quadratic]
 """Cost, gradient and Hessian at theta, (S, P), given the searches' indices, (S,)."""
 Bounds = tuple[FloatArray, FloatArray]

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting.asymptotes import (
     Chart,
@@ -39,7 +39,6 @@ from dahl_ident.fitting.global_start import Starts, edge_starts, global_starts, 
 from dahl_ident.fitting.levenberg_marquardt import (
     NEARLY,
     AtLimit,
-    IntArray,
     Minima,
     minimise,
     minimise_by_scipy,

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.plots import style
 
@@ -80,7 +80,7 @@ def plot_residuals(
     return axis
 
 
-def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[NDArray[np.intp]]:
+def _curves(x: FloatArray, group: ArrayLike | None) -> Iterator[IntArray]:
     """Yield the rows of each group in order of x, if no two of them have the same x."""
     groups = np.zeros(x.size) if group is None else np.asarray(group)
     names = np.unique(groups)

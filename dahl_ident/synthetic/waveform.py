@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray
 
 Course = Literal["smooth", "linear", "log"]
 _GRID_PER_PERIOD, _BISECTIONS = 64, 44  # for turning points
@@ -101,7 +100,7 @@ class Waveform:
         parts[1:, outside] = 0.0
         return WaveValues(*parts)
 
-    def by_segment(self, time: FloatArray) -> Iterator[tuple[int, NDArray[np.bool_], FloatArray]]:
+    def by_segment(self, time: FloatArray) -> Iterator[tuple[int, BoolArray, FloatArray]]:
         """Yield the number of each segment, a mask of the times in it, and these times."""
         t = np.clip(np.asarray(time), 0.0, self.duration)
         starts = np.array([s.start for s in self.segments])
