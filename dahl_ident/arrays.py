@@ -29,6 +29,13 @@ def quotient(
         return np.where(denominator != 0.0, numerator / denominator, 0.0)
 
 
+def unit_diagonal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a matrix scaled to a diagonal of 1, or 0, and the roots of its diagonal, 1 for 0."""
+    size = np.sqrt(matrix.diagonal())
+    size = np.where(size > 0.0, size, 1.0)
+    return matrix / np.outer(size, size), size
+
+
 def interleaved(values: ComplexArray) -> FloatArray:
     """Return real and imaginary parts, interleaved in the last axis."""
     return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import fft
 from scipy.linalg import solve_toeplitz, toeplitz
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, unit_diagonal
 from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 
 _SINGULAR = 1e-13  # eigenvalue of J'J, with unit diagonal, that is rounding
@@ -71,9 +71,8 @@ def sandwich(
         columns = np.flatnonzero((J != 0.0).any(axis=0))
         nonzero = J if columns.size == P else J[:, columns]
         middle[np.ix_(columns, columns)] += nonzero.T @ correlated(nonzero, known)
-    size = np.sqrt(normal.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
-    normal, middle = normal / np.outer(size, size), middle / np.outer(size, size)
+    normal, size = unit_diagonal(normal)
+    middle = middle / np.outer(size, size)
     covariance_of_theta = np.diag(np.full(P, np.inf))
     seen = np.flatnonzero(normal.diagonal() > 0.0)
     part = np.ix_(seen, seen)
@@ -92,11 +91,8 @@ def sandwich(
 
 def inverse_normal(jacobians: Sequence[FloatArray]) -> FloatArray:
     """Return the inverse of the normal matrix J'J of all records, pseudo where it is singular."""
-    normal = np.asarray(sum(J.T @ J for J in jacobians))
-    size = np.sqrt(normal.diagonal())
-    size = np.where(size > 0.0, size, 1.0)
-    scale = np.outer(size, size)
-    return np.asarray(np.linalg.pinv(normal / scale, hermitian=True) / scale)
+    normal, size = unit_diagonal(np.asarray(sum(J.T @ J for J in jacobians)))
+    return np.asarray(np.linalg.pinv(normal, hermitian=True) / np.outer(size, size))
 
 
 def autoregression(

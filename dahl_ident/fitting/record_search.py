@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, unit_diagonal
 from dahl_ident.errors import FitError, FitInterrupted, argument
 from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise, minimise_by_scipy
@@ -165,14 +165,12 @@ class RecordSearch:
             at = problem.quadratic(end.theta[0], self.scale, self.rho)
             if not np.isfinite(at.cost):
                 return end
-            size = np.sqrt(at.hessian.diagonal())
-            # for parameters without effect, such as a damper that is zero
-            size[size == 0.0] = 1.0
+            hessian, size = unit_diagonal(at.hessian)
             blocked = ((end.theta[0] <= low) & (at.gradient > 0.0)) | (
                 (end.theta[0] >= high) & (at.gradient < 0.0)
             )
             slope = np.where(blocked, 0.0, at.gradient / size)
-            fall = slope @ np.linalg.pinv(at.hessian / np.outer(size, size), hermitian=True) @ slope
+            fall = slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
         return replace(end, converged=np.array([bool(fall < _HINDERED**2 * noise)]))
 
     def minimise(
@@ -321,12 +319,10 @@ class RecordSearch:
         waves = problem.delay_slopes(problem.to_values(theta))
         slope = np.concatenate([problem.filtered(wave / -problem.sizes[0]) for wave in waves])
         columns = np.column_stack([jacobian, np.pad(slope, (0, len(residual) - len(slope)))])
-        normal, right = columns.T @ columns, columns.T @ residual
+        normal, size = unit_diagonal(columns.T @ columns)
         self.evaluations += 1 if problem.output == "motion" else 3
-        size = np.sqrt(normal.diagonal())
-        size[size == 0.0] = 1.0
-        inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
-        step = -(inverse @ (right / size))
+        inverse = np.linalg.pinv(normal, hermitian=True)
+        step = -(inverse @ (columns.T @ residual / size))
         if not inverse[-1, -1] > 0.0:
             return 0.0, 0.0
         return float(step[-1] / size[-1]), float(step[-1] ** 2 / inverse[-1, -1])
@@ -455,9 +451,8 @@ class RecordSearch:
         self.evaluations += 1
         if not np.isfinite(at.cost):
             return np.inf, theta
-        size = np.sqrt(at.hessian.diagonal())
-        size[size == 0.0] = 1.0
-        slope, matrix = at.gradient / size, at.hessian / np.outer(size, size)
+        matrix, size = unit_diagonal(at.hessian)
+        slope = at.gradient / size
         slope[index], matrix[index], matrix[:, index] = 0.0, 0.0, 0.0
         step = -np.linalg.pinv(matrix, rcond=_ALIKE, hermitian=True) @ slope
         predicted = float(at.cost) + 0.5 * float(step @ slope)
@@ -556,9 +551,8 @@ def _has_idle(problem: RecordProblem, end: Minima) -> bool:
     if ((theta <= low) | (theta >= high)).any():
         return True
     noise = 2.0 * float(end.cost[0]) / problem.n_residuals
-    size = np.sqrt(hessian.diagonal())
-    size[size == 0.0] = 1.0
-    inverse = np.linalg.pinv(hessian / np.outer(size, size), rcond=EXACT, hermitian=True)
+    scaled, size = unit_diagonal(hessian)
+    inverse = np.linalg.pinv(scaled, rcond=EXACT, hermitian=True)
     idle = (noise * inverse.diagonal() / size**2 > _IDLE**2) & problem.space.relative
     idle |= (hessian == np.eye(len(hessian))).all(axis=1)  # rows of parameters without effect
     return bool(idle[: len(problem.free)].any())
