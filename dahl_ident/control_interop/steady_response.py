@@ -222,33 +222,32 @@ def response(
     multiplier = np.full(X.shape, np.nan)
     chosen = np.zeros(X.shape[0], dtype=np.intp)
     why = "" if steady == "describing function" else obstacle(plant)
-    moving = np.broadcast_to(f, shape).ravel() > 0.0
+    f, u0 = np.broadcast_arrays(f, u0)
+    omega, u = 2.0 * np.pi * f.ravel(), u0.ravel()
+    moving = omega > 0.0
     exact = moving if steady == "exact" and not why else np.zeros(moving.shape, dtype=np.bool_)
     if exact.any():
-        omega, u = (np.broadcast_to(v, shape).ravel()[exact] for v in (2.0 * np.pi * f, u0))
         unique = points.friction.unique & (points.linear.imag[exact] >= 0.0)
-        motions = exact_motions(plant, omega, u, X[exact], unique)
+        motions = exact_motions(plant, omega[exact], u[exact], X[exact], unique)
         padding = ((0, 0), (0, motions.multiplier.shape[1] - X.shape[1]))
         multiplier = np.pad(multiplier, padding, constant_values=np.nan)
         harmonics = np.pad(harmonics, (*padding, (0, 0)), constant_values=np.nan)
         harmonics[exact], multiplier[exact], chosen[exact] = motions
     exists = np.isfinite(harmonics[..., 1])
     count = exists.sum(axis=1).reshape(shape)
-    active = points.linear.imag < 0.0
+    active = (points.linear.imag < 0.0).reshape(shape)
+    unstable = ((chosen < 0) & exists.any(axis=1)).reshape(shape)
     values = np.array([float(v) for v in plant.known_values()])
     drifts = bool(np.any(exact & (count.ravel() == 0))) and Shooting(plant).drifts(values)
-    message = _message(
-        count, drifts, active.reshape(shape), ((chosen < 0) & exists.any(axis=1)).reshape(shape),
-        np.broadcast_to(f, shape), np.broadcast_to(u0, shape),
-    )  # fmt: skip
+    message = _message(count, drifts, active, unstable, f, u0)
     if steady == "exact" and not exact.all() and why != LINEAR:
         replaced = f"the describing function stands for the exact motion ({why or 'at 0 Hz'})"
         message = "; ".join(filter(None, (message, replaced)))
     if steady == "describing function" and not obstacle(plant):
         at = np.flatnonzero(moving & (count.ravel() == 1))
         at = at[:: 1 + at.size // _MOST_CHECKED]
-        omega, u = (np.broadcast_to(v, shape).ravel()[at] for v in (2.0 * np.pi * f, u0))
-        message = "; ".join(filter(None, (message, _not_a_sine(plant, omega, u, amplitude[at, 0]))))
+        distortion = _not_a_sine(plant, omega[at], u[at], amplitude[at, 0])
+        message = "; ".join(filter(None, (message, distortion)))
     if all_roots:
         f, u0, shape = f[..., None], u0[..., None], (*shape, exists.shape[1])
     else:
