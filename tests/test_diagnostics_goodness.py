@@ -1,5 +1,6 @@
 """Tests of tests: they stay silent over noise, and speak of what was put into the data."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -89,6 +90,16 @@ class TestDepartures:
         assert not found.acceptable
         assert "which no rate-independent model can describe" in found.headline
         assert "friction's stiffness falls by" in found.headline
+
+    def test_a_trend_is_stated_with_its_error(self):
+        found = judge(swept_table(0.6))
+        said = re.search(r"stiffness falls by \(?([0-9.]+) ± ([0-9.]+)\)? %", found.headline)
+        assert said is not None
+        size, error = float(said[1]), float(said[2])
+        assert size == pytest.approx(60.0, abs=1.5 * error)
+        (trend,) = (t for t in found.trends if t.covariate == "frequency")
+        ends = np.exp(trend.stiffness.value + trend.stiffness.stderr * np.array([-1.0, 1.0]))
+        assert error == pytest.approx(50.0 * (ends[1] - ends[0]), rel=0.02)
 
     def test_ten_scattered_points_show_a_fall_of_stiffness_by_30_percent(self):
         """As the points of a damper do: most such tables are not to be trusted."""
