@@ -52,6 +52,10 @@ class TestSilence:
         assert np.mean(np.array(runs) < 0.05) < 0.09
         assert sum(bool(g.suspicious) for g in found) <= 5
 
+    def test_signs_of_few_rows_are_not_counted(self):
+        assert not judge(table(n=8)).runs
+        assert judge(table(n=12)).runs
+
     def test_known_noise(self):
         data = table(seed=2)
         C = (0.01 * np.abs(data.response))[:, None, None] ** 2 * np.eye(2)

@@ -127,6 +127,13 @@ def test_the_least_misfit_is_least():
     assert np.sqrt(np.mean(left**2)) == pytest.approx(found.misfit, rel=1e-9)
 
 
+@pytest.mark.parametrize("damping", [0.4, -0.05])
+def test_a_damper_in_parallel_with_a_density_has_either_sign(damping):
+    found = slip_density(table(LAW + di.Damper(damping)), di.Damper())
+    assert found.parallel["damping"] == pytest.approx(damping, rel=0.02)
+    assert found.least_misfit < 0.003
+
+
 def test_loops_of_dahl_and_of_a_gap_are_no_sum_of_jenkins_elements():
     assert slip_density(table(di.Dahl(1.0, 6.0))).least_misfit > 0.05
     assert slip_density(table(di.Backlash(Jenkins(3.0, 0.3), 0.05))).least_misfit > 0.1
