@@ -13,7 +13,9 @@ from dahl_ident import (
     Backlash,
     BoucWen,
     Dahl,
+    Damper,
     FrequencyResponse,
+    Mass,
     MaxwellSlip,
     Sensors,
     Spring,
@@ -21,6 +23,7 @@ from dahl_ident import (
     fit,
     load_dataset,
     report,
+    response,
 )
 from dahl_ident.diagnostics import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
@@ -251,6 +254,20 @@ class TestNamed:
             assert ("the force held exceeds friction's limit (0." in found.verdict) is named
             if named:
                 assert not found.trusted
+
+    def test_at_a_resonance_harmonics_of_friction_are_carried(self):
+        """Mass and spring cancel there, but not at the harmonics that friction has."""
+        plant = Dahl(15.0, 2e6, 1.0) + Mass(40.0) + Damper(300.0) + Spring(2e5)
+        f = np.tile(np.linspace(9.0, 14.0, 6), 4)
+        u = np.repeat([6.0, 12.0, 18.4, 60.0], 6)
+        R = response(plant, f, u).receptance * relative_noise(24, 0.005, 3)
+        size = (0.005 * np.abs(R))[:, None, None] ** 2 * np.eye(2)
+        data = FrequencyResponse(
+            f, R, drive=u, level=u, controlled="force", quantity="receptance", covariance=size
+        )
+        found = fit(data, Dahl(alpha=1.0) + Mass(40.0) + Damper() + Spring())
+        assert "beyond_limit" not in {one.code for one in found.findings}
+        assert found.trusted
 
     def test_points_that_were_all_flagged(self):
         flawed = np.array(["not settled"] * 30)

@@ -174,13 +174,19 @@ def beyond_friction_limit(
 
     The fundamental of friction is at most 4/pi times its limit. At the peak of a sinusoidal force,
     friction and the linear elements balance it; the peak of the latter is at most a few times their
-    fundamental. `scatter` is the relative standard deviation of the force between runs.
+    fundamental or, near a resonance where they cancel, what the fundamental of friction exceeds its
+    limit by, as far as they can carry its third harmonic. `scatter` is the relative standard
+    deviation of the force between runs.
     """
     problem, values = optimum.problem, parameter_values(optimum)
-    bound, u = 0.0, 0.0
+    bound, u, third = 0.0, 0.0, np.zeros((), dtype=np.complex128)
     for element in problem.model.elements:
-        if not element.is_linear:
-            law_values = [np.asarray(values[p.name]) for p in element.parameters]
+        law_values = [np.asarray(values[p.name]) for p in element.parameters]
+        if element.is_linear:
+            third = third + element.stiffness(
+                law_values, problem.stiffness_data.amplitude, 3.0 * problem.stiffness_data.omega
+            )
+        else:
             bound += float(element.force_bounds(law_values)[1])
             forces = (p for p in element.parameters if p.dimension == (1, 0, 0))
             u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
@@ -205,7 +211,9 @@ def beyond_friction_limit(
     if problem.data.drive is None:
         return
     driven = (problem.data.controlled == "force") & np.isfinite(force)
-    carried = _WITH_HARMONICS * np.abs(view.stiffness * _sensor_factor(optimum) - friction) * size
+    fundamental = np.abs(view.stiffness * _sensor_factor(optimum) - friction) * size
+    harmonics = np.minimum(np.abs(third) * size, bound - limit)
+    carried = np.maximum(_WITH_HARMONICS * fundamental, fundamental + harmonics)
     beyond = np.where(driven, problem.data.drive - carried - limit, -np.inf)
     row = int(np.argmax(beyond))
     if beyond[row] > _IMPOSSIBLE * np.hypot(u, scatter * limit):
