@@ -138,9 +138,8 @@ def executed(tree: Path, rooms: Iterable[str]) -> Executed:
     data.read()
     seconds: defaultdict[str, float] = defaultdict(float)
     for case in ElementTree.parse(tree / "seconds.xml").iter("testcase"):
-        _, file, *test = f"{case.get('classname')}.{str(case.get('name')).partition('[')[0]}".split(
-            "."
-        )
+        _, file, *classes = str(case.get("classname")).split(".")
+        test = [*classes, str(case.get("name")).partition("[")[0]]
         seconds[f"tests/{file}.py::{'::'.join(test)}"] += float(case.get("time", 0.0))
     return Executed(data, seconds)
 

@@ -172,21 +172,17 @@ def beyond_friction_limit(
 ) -> Iterator[Finding]:
     """Yield where friction would have to exceed its limits, except in the rows `ignored`.
 
-    The fundamental of friction is at most 4/pi times its limit. At the peak of a sinusoidal force,
-    friction and the linear elements balance it; the peak of the latter is at most a few times their
-    fundamental or, near a resonance where they cancel, what the fundamental of friction exceeds its
-    limit by, as far as they can carry its third harmonic. `scatter` is the relative standard
+    The fundamental of friction is at most 4/pi times its limit. The peak of a sinusoidal force is
+    at most the limit and what the linear elements carry: a few times their fundamental. Near a
+    resonance, where the fundamentals of mass and spring cancel, they still carry harmonics, by
+    which the fundamental of friction may exceed its limit. `scatter` is the relative standard
     deviation of the force between runs.
     """
     problem, values = optimum.problem, parameter_values(optimum)
-    bound, u, third = 0.0, 0.0, np.zeros((), dtype=np.complex128)
+    bound, u = 0.0, 0.0
     for element in problem.model.elements:
-        law_values = [np.asarray(values[p.name]) for p in element.parameters]
-        if element.is_linear:
-            third = third + element.stiffness(
-                law_values, problem.stiffness_data.amplitude, 3.0 * problem.stiffness_data.omega
-            )
-        else:
+        if not element.is_linear:
+            law_values = [np.asarray(values[p.name]) for p in element.parameters]
             bound += float(element.force_bounds(law_values)[1])
             forces = (p for p in element.parameters if p.dimension == (1, 0, 0))
             u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
@@ -212,6 +208,13 @@ def beyond_friction_limit(
         return
     driven = (problem.data.controlled == "force") & np.isfinite(force)
     fundamental = np.abs(view.stiffness * _sensor_factor(optimum) - friction) * size
+    third = sum(
+        element.stiffness(
+            [np.asarray(values[p.name]) for p in element.parameters], size, 3.0 * view.omega
+        )
+        for element in problem.model.elements
+        if element.is_linear
+    )
     harmonics = np.minimum(np.abs(third) * size, bound - limit)
     carried = np.maximum(_WITH_HARMONICS * fundamental, fundamental + harmonics)
     beyond = np.where(driven, problem.data.drive - carried - limit, -np.inf)
