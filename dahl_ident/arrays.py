@@ -36,6 +36,12 @@ def unit_diagonal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return matrix / np.outer(size, size), size
 
 
+def cholesky_root(covariance: FloatArray) -> FloatArray:
+    """Return a root of a covariance, whatever the sizes of its standard deviations."""
+    correlation, std = unit_diagonal(covariance)
+    return std[:, None] * np.linalg.cholesky(correlation)
+
+
 def interleaved(values: ComplexArray) -> FloatArray:
     """Return real and imaginary parts, interleaved in the last axis."""
     return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)

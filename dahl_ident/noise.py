@@ -49,9 +49,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.rows import Rows
 from dahl_ident.errors import DataError, argument
@@ -410,7 +409,7 @@ def _amplitude_error(rows: Rows) -> AmplitudeError | None:
     return AmplitudeError(variance, cross) if variance.any() else None
 
 
-def _first(bad: NDArray[np.bool_]) -> str:
+def _first(bad: BoolArray) -> str:
     """Return the index of the first bad row, after that of its table if several are stacked."""
     return str([int(i) for i in np.argwhere(bad)[0]])
 

@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, cholesky_root
 from dahl_ident.bayes.moves import STRAIGHT, Decorrelation, decorrelation_of
 from dahl_ident.bayes.priors import JointPrior
 from dahl_ident.bayes.row_errors import RowErrors
@@ -179,7 +179,7 @@ class Density(LogDensity):
             )
 
     @property
-    def counted(self) -> tuple[str, ...]:  # type: ignore[override]  # others keep it
+    def counted(self) -> tuple[str, ...]:  # type: ignore[override]  # a fixed attribute of others
         """The sources of error in the likelihood."""
         return ("noise",) if self.errors is None else tuple(self.errors.counted)
 
@@ -362,9 +362,8 @@ class RecordDensity(LogDensity):
     def root(self) -> FloatArray:
         """A root of the covariance of the coordinates, (P, P)."""
         covariance = self.covariance / np.outer(self._slopes, self._slopes)
-        size = np.sqrt(covariance.diagonal())
         try:
-            return np.asarray(size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size)))
+            return cholesky_root(covariance)
         except np.linalg.LinAlgError as exc:
             raise SamplingError(
                 "the records do not determine every parameter, so that their likelihood has no "
@@ -384,7 +383,7 @@ class RecordDensity(LogDensity):
 
     @cached_property
     def _nuisance(self) -> list[tuple[FloatArray, FloatArray]]:
-        """For each record, orthonormal derivatives by states and offsets, and those by theta."""
+        """Derivatives of each record: by states and offsets, orthonormal, and by theta."""
         count = len(self.names)
         per_record = self.problem.per_record
         parts = []

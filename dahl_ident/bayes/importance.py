@@ -31,10 +31,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermevander
-from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp, ndtr, stdtrit
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray, cholesky_root
 from dahl_ident.bayes.density import LogDensity
 from dahl_ident.bayes.moves import STRAIGHT, Decorrelation
 from dahl_ident.bayes.priors import JointPrior
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from scipy.stats import qmc
 
 Function = Callable[[FloatArray], FloatArray]
-Rows = NDArray[np.intp]
+Rows = IntArray
 
 # degrees of freedom of the components' Student's t: tails heavier than a posterior's, yet few
 # points are wasted there
@@ -210,8 +209,7 @@ class _Mixture:
 
 def _fitted(target: _Integrand, centre: FloatArray, covariance: FloatArray) -> _Mixture:
     """Return a mixture that resembles the density."""
-    std = np.sqrt(np.diagonal(covariance))
-    root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
+    root = cholesky_root(covariance)
     step = 1e-3 * root.T  # small, so that a straight line in theta is one in phi
     decorrelated = target.decorrelation.decorrelated
     ahead = decorrelated(centre + step)
@@ -349,8 +347,7 @@ def interpolated(
     from scipy.stats import qmc, t
 
     D = len(centre)
-    size = np.sqrt(covariance.diagonal())
-    root = size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size))
+    root = cholesky_root(covariance)
     wide = density.around is None
     for_terms, for_checks, of_prior = (qmc.Sobol(D, seed=seed) for seed in range(3))
     seen: list[list[FloatArray]] = []

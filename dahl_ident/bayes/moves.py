@@ -34,9 +34,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, interleaved
+from dahl_ident.arrays import FloatArray, IntArray, interleaved
 from dahl_ident.elements import Element
 from dahl_ident.problem import TableProblem
 
@@ -57,7 +56,7 @@ class Decorrelation:
 
     problem: TableProblem | None  # its theta, (S, P), is first in the points, (S, D)
     friction: tuple[Element, ...]  # the nonlinear elements with free parameters
-    linear: NDArray[np.intp]  # (L,) coordinates in which the force of linear elements is linear
+    linear: IntArray  # (L,) coordinates in which the force of linear elements is linear
     projection: FloatArray  # (2 n, L) from Re N and Im N at every row to the shift
 
     def decorrelated(self, x: FloatArray) -> FloatArray:

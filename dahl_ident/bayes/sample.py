@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammainccinv
 
-from dahl_ident.arrays import FloatArray, positive_number
+from dahl_ident.arrays import FloatArray, cholesky_root, positive_number
 from dahl_ident.bayes.chain import Chain, ChainSettings, Convergence, Listener, Pool, run
 from dahl_ident.bayes.checkpoint import identity, open_chain
 from dahl_ident.bayes.density import Density, LogDensity
@@ -335,8 +335,7 @@ def _centre_and_root(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the centre and a root of the covariance, with ln s if it is sampled."""
     P = len(theta)
-    std = np.sqrt(np.diagonal(covariance))
-    root = std[:, None] * np.linalg.cholesky(covariance / np.outer(std, std))
+    root = cholesky_root(covariance)
     if not density.has_scale:
         return theta, root
     assert isinstance(density, Density)

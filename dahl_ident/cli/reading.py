@@ -18,9 +18,7 @@ from dahl_ident.cli.options import controlled_setting, setting
 from dahl_ident.errors import DataError, ValidationError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from dahl_ident.arrays import BoolArray
     from dahl_ident.data import FrequencyResponse, Record
 
 _OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
@@ -199,7 +197,7 @@ def _labelled(
     return data.select(rows=np.array([str(label) in wanted for label in labels]))
 
 
-def _rows_where(data: FrequencyResponse, text: str) -> NDArray[np.bool_]:
+def _rows_where(data: FrequencyResponse, text: str) -> BoolArray:
     """Return which rows meet a condition on columns: only comparisons, and, or, not."""
     import numpy as np
 

@@ -341,7 +341,7 @@ def split_header(text: str) -> tuple[str, str | None]:
         return square[1], unit
     for match in filter(None, (p.fullmatch(text) for p in (_CURVED, _UNBRACKETED))):
         if match[2].strip() == "dB":
-            return match[1], "dB"  # the reader of the gain asks for the reference
+            return match[1], "dB"  # without a reference: an error if the column is used
         with contextlib.suppress(UnitError):
             return match[1], parse_unit(match[2]).text
     return text.strip(), None

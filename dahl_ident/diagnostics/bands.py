@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, positive_array
+from dahl_ident.arrays import SMALLEST, BoolArray, ComplexArray, FloatArray, positive_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -338,7 +338,7 @@ def _combined_band(
     errors: ErrorModel,
     R: ComplexArray,
     by: ComplexArray,
-    known: NDArray[np.bool_],
+    known: BoolArray,
     amplitude: FloatArray,
     omega: FloatArray,
     stiffness: ComplexArray | None = None,

@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray, quotient
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray, quotient
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import (
     APART,
@@ -57,7 +57,7 @@ _MOST_LEVEL_NOISE = 0.05  # of ln A: sensors scatter less; more would hide a wro
 _FEWEST = 2  # runs, or repeated levels, that show a scatter
 
 
-_LEVELS_OF: WeakKeyDictionary[FrequencyResponse, NDArray[np.intp]] = WeakKeyDictionary()
+_LEVELS_OF: WeakKeyDictionary[FrequencyResponse, IntArray] = WeakKeyDictionary()
 """Number of each row's level, by table, as several callers need it."""
 
 
@@ -92,7 +92,7 @@ def is_monotonic(data: FrequencyResponse) -> bool:
     return bool(np.abs(signs).sum() > 1 and abs(signs.sum()) == np.abs(signs).sum())
 
 
-def repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArray:
+def repeats(level: IntArray, fundamental: BoolArray) -> FloatArray:
     """Return which rows belong to each level that was measured more than once, (levels, n).
 
     Of very many levels, neighbours are combined.
@@ -104,7 +104,7 @@ def repeats(level: NDArray[np.intp], fundamental: NDArray[np.bool_]) -> FloatArr
     return np.asarray((np.arange(groups)[:, None] == group[level]) & fundamental, dtype=np.float64)
 
 
-def repeated_levels(data: FrequencyResponse) -> NDArray[np.intp]:
+def repeated_levels(data: FrequencyResponse) -> IntArray:
     """Return the number of each row's level, shape (n,).
 
     Rows have one level if the frequency and the controlled drive or amplitude agree as closely as
@@ -141,7 +141,7 @@ def passes(data: FrequencyResponse) -> NDArray[np.str_] | None:
     return np.array([f"pass {k + 1}" for k in number.tolist()])
 
 
-def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
+def rows_of_tests(data: FrequencyResponse) -> list[IntArray]:
     """Return the rows of each test: runs, else labelled levels, else repeats of one level."""
     for labels in (data.run, data.level):
         if labels is not None:
@@ -151,12 +151,12 @@ def rows_of_tests(data: FrequencyResponse) -> list[NDArray[np.intp]]:
     return grouped_rows(repeated_levels(data))
 
 
-def grouped_rows(group: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def grouped_rows(group: IntArray) -> list[IntArray]:
     """Return the rows of each group, given the number of each row's group."""
     return np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
 
 
-def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
+def _agreeing(x: FloatArray, groups: IntArray) -> IntArray:
     """Return a label for each value: the same for values of a group that repeat one another.
 
     The gaps between values without repeats are assumed to be exponentially distributed, with the
@@ -177,7 +177,7 @@ def _agreeing(x: FloatArray, groups: NDArray[np.intp]) -> NDArray[np.intp]:
     if unlikely.max(initial=0.0) > np.log(max(len(gaps), 1) / _BY_CHANCE):
         widest_repeat = float(small[np.argmax(unlikely)])
 
-    def labelled(breaks: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def labelled(breaks: BoolArray) -> IntArray:
         return np.concatenate([[0], np.cumsum(breaks)])
 
     breaks = ~(joined & (differences <= widest_repeat))
@@ -244,7 +244,7 @@ class Source:
         return changes if self.absorbed is None else changes - parts(slopes) @ self.absorbed
 
     def drawn(
-        self, names: Sequence[str], slopes: ComplexArray, near: NDArray[np.intp], units: FloatArray
+        self, names: Sequence[str], slopes: ComplexArray, near: IntArray, units: FloatArray
     ) -> FloatArray | None:
         """Return the changes (n, 2, q) that vary from test to test, at unit variance; None without.
 

@@ -27,10 +27,9 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from dahl_ident.arrays import TINY, ComplexArray, FloatArray
+from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import DRIVE_FACTOR, EXPONENT
 from dahl_ident.fitting import Optimum
@@ -93,7 +92,7 @@ class Basis:
         """Return the same changes of the coordinates at another theta."""
         return replace(self, slopes=self.chart.derivative(theta))
 
-    def holds(self, slopes: FloatArray) -> NDArray[np.bool_]:
+    def holds(self, slopes: FloatArray) -> BoolArray:
         """Return whether quantities with the derivatives (..., Q) are determined, shape (...).
 
         A quantity that depends on theta, but on no coordinate, is infinite in the limit.
@@ -225,7 +224,7 @@ class WeightedEstimate:
         Q, R = np.linalg.qr(self.jacobian @ kept)
         return np.asarray(kept @ np.linalg.solve(R, Q.T))
 
-    def without(self, left_out: NDArray[np.intp]) -> WeightedEstimate:
+    def without(self, left_out: IntArray) -> WeightedEstimate:
         """Return the estimate without some residuals, by one Gauss-Newton step."""
         kept = np.ones(len(self.y), dtype=bool)
         kept[left_out] = False
@@ -236,7 +235,7 @@ class WeightedEstimate:
             return self
         return replace(self, theta=theta, residuals=r, jacobian=J, basis=self.basis.at(theta))
 
-    def jackknife(self, tests: Sequence[NDArray[np.intp]]) -> FloatArray:
+    def jackknife(self, tests: Sequence[IntArray]) -> FloatArray:
         """Return the covariance of theta by leaving out each test, (Q, Q), to first order.
 
         The change by each test is weighted with the root of its leverage, so that the covariance
@@ -303,7 +302,7 @@ def weighted_estimate(
 
 
 def jackknife_with_weights(
-    estimate: WeightedEstimate, optimum: Optimum, tests: Sequence[NDArray[np.intp]]
+    estimate: WeightedEstimate, optimum: Optimum, tests: Sequence[IntArray]
 ) -> FloatArray:
     """Return the covariance of theta, (Q, Q), by estimating it and the weights without each test.
 
@@ -345,7 +344,7 @@ class LinearRows:
     slopes: FloatArray  # (n, 2, Q): derivatives with respect to theta
     growth: FloatArray  # (n, 2)
     priors: tuple[FloatArray, FloatArray]  # (p,) and (p, Q): residuals and derivatives
-    first: NDArray[np.bool_]  # (n,): fundamentals
+    first: BoolArray  # (n,): fundamentals
     numbers: FloatArray  # (n,): real numbers in each row, 1 or 2
 
     @classmethod
@@ -364,7 +363,7 @@ class LinearRows:
             np.where(stated.data.harmonic == 0, 1.0, 2.0),
         )
 
-    def take(self, rows: NDArray[np.bool_]) -> LinearRows:
+    def take(self, rows: BoolArray) -> LinearRows:
         """Return some of the rows, and all priors."""
         named = ("z", "slopes", "growth", "first", "numbers")
         return replace(self, **{name: getattr(self, name)[rows] for name in named})
@@ -493,7 +492,7 @@ def _extrapolation(moved: FloatArray, last: FloatArray | None) -> float:
 
 
 @lru_cache(maxsize=64)  # asked for at every step of a search
-def tests_of(data: FrequencyResponse) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def tests_of(data: FrequencyResponse) -> tuple[IntArray, IntArray]:
     """Return the number of each row's test, and the row of its fundamental, (n,) each.
 
     A test is all rows of one level in one run; a row without a fundamental refers to itself.
@@ -529,7 +528,7 @@ def _weights(
     return np.zeros(stated.data.n), scale
 
 
-def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) -> float:
+def _disagreement(y: FloatArray, J: FloatArray, harmonics: BoolArray) -> float:
     """Return the factor of the harmonics' variance with which they agree with the fundamentals.
 
     Both are estimates of the parameters, and the factor is that of Paule and Mandel: the square of
@@ -537,7 +536,7 @@ def _disagreement(y: FloatArray, J: FloatArray, harmonics: NDArray[np.bool_]) ->
     """
     of_harmonics = np.pad(np.repeat(harmonics, 2), (0, len(y) - 2 * len(harmonics)))
 
-    def normal_equations(rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    def normal_equations(rows: BoolArray) -> tuple[FloatArray, FloatArray]:
         return J[rows].T @ J[rows], J[rows].T @ y[rows]
 
     A, b = normal_equations(~of_harmonics)

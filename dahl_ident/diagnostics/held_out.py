@@ -29,10 +29,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.confidence_levels import CONFIDENCE
 from dahl_ident.diagnostics.contributions import satterthwaite
 from dahl_ident.diagnostics.error_sources import FEWEST_TESTS, rows_of_tests
@@ -50,8 +49,8 @@ _WIDEST = 1e6  # standard deviation of ln gain or phase above which there is no 
 class HeldOut:
     """Fundamentals of tests left out, predicted from the others; ln gain and phase, (r, 2)."""
 
-    rows: NDArray[np.intp]  # (r,): indices in the data
-    test: NDArray[np.intp]  # (r,): number of each row's test
+    rows: IntArray  # (r,): indices in the data
+    test: IntArray  # (r,): number of each row's test
     # (r, 2): deviations from the predictions, their standard deviations, and the degrees of freedom
     # of these; NaN without a prediction
     deviation: FloatArray

@@ -23,10 +23,9 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, special
 
-from dahl_ident.arrays import TINY, FloatArray
+from dahl_ident.arrays import TINY, BoolArray, FloatArray, IntArray
 
 _STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
@@ -46,7 +45,7 @@ class MixedModel:
         y: FloatArray,
         J: FloatArray,
         Z: Sequence[FloatArray],
-        group: NDArray[np.intp],
+        group: IntArray,
         known: FloatArray,
         groups: int,
         most: FloatArray,
@@ -265,7 +264,7 @@ class MixedState:
         first = self.model.starts - self.model.parameters
         return np.add.reduceat(columns, first, axis=0) if len(first) else columns[:0]
 
-    def scored(self, price: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
+    def scored(self, price: FloatArray, free: BoolArray) -> FloatArray:
         """Return the variances >= 0 to which a scoring step leads, of the free ones."""
         from scipy.optimize import nnls
 
@@ -318,12 +317,12 @@ class MixedState:
         rows = self.weights[self.model.group]
         return np.asarray(rows * (self.model.y - self.model.U @ self.predicted))
 
-    def block(self, rows: NDArray[np.intp]) -> FloatArray:
+    def block(self, rows: IntArray) -> FloatArray:
         """Return P of some rows, (r, r)."""
         w, U = self.weights[self.model.group[rows]], self.model.U[rows]
         return np.asarray(np.diag(w) - (w[:, None] * U) @ self.K @ (U.T * w))
 
-    def block_falls(self, rows: NDArray[np.intp]) -> FloatArray:
+    def block_falls(self, rows: IntArray) -> FloatArray:
         """Return by how much P of some rows falls with each variance, (count, r, r)."""
         model, group = self.model, self.model.group[rows]
         w, falls = self.weights[group], []

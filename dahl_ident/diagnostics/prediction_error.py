@@ -17,9 +17,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, NOISE, TESTS, satterthwaite
 from dahl_ident.diagnostics.error_model import ErrorModel, no_narrower
 from dahl_ident.diagnostics.error_sources import error_sources, log_points, parts
@@ -98,7 +97,7 @@ def stated_noise(
     return np.asarray(units @ units.swapaxes(1, 2))
 
 
-def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) -> NDArray[np.intp]:
+def _nearest(problem: TableProblem, amplitude: FloatArray, omega: FloatArray) -> IntArray:
     """Return the fundamental's row nearest to each point, in ln A and ln omega."""
     view = problem.stiffness_data
     rows = np.flatnonzero(view.harmonic == 1)

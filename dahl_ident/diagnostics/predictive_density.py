@@ -17,9 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, interleaved
+from dahl_ident.arrays import FloatArray, IntArray, interleaved
 from dahl_ident.diagnostics.estimate import tests_of
 from dahl_ident.diagnostics.mixed_model import MixedModel, MixedState
 from dahl_ident.diagnostics.record_sources import blocks_of
@@ -41,7 +40,7 @@ class PredictiveDensity:
     """Log densities of tests left out."""
 
     tests: FloatArray  # (T,): log density of each test
-    run: NDArray[np.intp]  # (T,): the run of each
+    run: IntArray  # (T,): the run of each
     # root mean square misfit of the fundamentals, and of all harmonics over the fundamental; NaN
     # without any
     misfit: float
@@ -166,9 +165,7 @@ def _stated_variances(optimum: Optimum, size: FloatArray) -> FloatArray:
     return np.asarray(both.ravel())
 
 
-def _densities(
-    state: MixedState, test: NDArray[np.intp], unit: FloatArray, *, robust: bool
-) -> FloatArray:
+def _densities(state: MixedState, test: IntArray, unit: FloatArray, *, robust: bool) -> FloatArray:
     """Return the log density of each test, given all others."""
     densities = np.empty(int(test.max()) + 1)
     for number in range(len(densities)):

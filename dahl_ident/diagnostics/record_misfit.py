@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in
 from dahl_ident.diagnostics.record_sources import LinearFit, blocks_of
 from dahl_ident.elements import Friction
@@ -113,7 +112,7 @@ def motion_misfit(
 
 
 def _between_blocks(
-    Q: FloatArray, residuals: FloatArray, blocks: Sequence[NDArray[np.intp]], by_noise: FloatArray
+    Q: FloatArray, residuals: FloatArray, blocks: Sequence[IntArray], by_noise: FloatArray
 ) -> float:
     """Return the variance of the fitted coefficients, from blocks, over that `by_noise`.
 

@@ -13,10 +13,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.diagnostics.contributions import positive_part
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
@@ -41,7 +40,7 @@ class LinearFit:
     jacobians: Sequence[FloatArray]  # (n, P): derivatives of each record's prediction
     residuals: Sequence[FloatArray]  # (n,): measured minus predicted
     noise: Sequence[FloatArray]  # autocovariances of the residuals' noise
-    of_model: NDArray[np.bool_]  # (P,): parameters that are not states or offsets of records
+    of_model: BoolArray  # (P,): parameters that are not states or offsets of records
 
     @classmethod
     def of(
@@ -258,9 +257,7 @@ def between_blocks(fit: LinearFit) -> FloatArray | None:
     return _between(fit, blocks, fit.by_noise[0], _LEVEL)
 
 
-def blocks_of(
-    waves: Sequence[FloatArray], blocks: int = BLOCKS
-) -> list[tuple[int, NDArray[np.intp]]]:
+def blocks_of(waves: Sequence[FloatArray], blocks: int = BLOCKS) -> list[tuple[int, IntArray]]:
     """Return the number of each block's record, and the block's samples in it."""
     samples = sum(len(wave) for wave in waves)
     return [
@@ -287,7 +284,7 @@ def between_records(fit: LinearFit, known: FloatArray) -> FloatArray | None:
 
 def _between(
     fit: LinearFit,
-    groups: Sequence[Sequence[tuple[int, NDArray[np.intp]]]],
+    groups: Sequence[Sequence[tuple[int, IntArray]]],
     noise: FloatArray,
     level: float,
 ) -> FloatArray | None:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.diagnostics.estimate import WeightedEstimate, scores_of
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
@@ -44,7 +44,7 @@ class RunDeviations:
     labels: NDArray[np.str_]  # (R,): the runs
     # (R, Q + 2): added to the search coordinates, to ln gain, and to the phase of the fundamental
     each: FloatArray
-    scatters: NDArray[np.bool_]  # (Q + 2,): which of them differ between runs
+    scatters: BoolArray  # (Q + 2,): which of them differ between runs
 
 
 class Linearization:
@@ -58,7 +58,7 @@ class Linearization:
         # predicted responses (n,) of each run at its parameters; the same with its gain and phase
         self.predicted, self.fitted = np.zeros((2, m // 2), dtype=np.complex128)
         # of each run: its problem, its rows (n,), and its theta
-        self.parts: list[tuple[TableProblem, NDArray[np.bool_], FloatArray]] = []
+        self.parts: list[tuple[TableProblem, BoolArray, FloatArray]] = []
         for label, b in zip(runs.labels, runs.each, strict=True):
             rows = np.asarray(problem.data.run) == label
             deviation = b[-2] + 1j * b[-1] * self._harmonic[rows]
@@ -71,7 +71,7 @@ class Linearization:
             self.fitted[rows] = self.predicted[rows] * np.exp(deviation)
             self.parts.append((part, rows, run_theta))
 
-    def of_run(self, number: int) -> tuple[NDArray[np.bool_], FloatArray]:
+    def of_run(self, number: int) -> tuple[BoolArray, FloatArray]:
         """Return which residuals belong to a run, and their derivatives.
 
         The derivatives are with respect to the deviations of that run.

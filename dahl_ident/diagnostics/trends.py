@@ -24,7 +24,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import friction_stiffness, is_spring
@@ -111,7 +111,7 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     return Stiffening(float(ends[low]), float(ends[high]), unit, float(size), float(spread), p)
 
 
-def _bands(x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _bands(x: FloatArray) -> tuple[BoolArray, NDArray[np.int64]]:
     """Return which rows lie in bands with enough rows, and the number of the band of each."""
     width = max(float(np.ptp(x)) / _BANDS, _NARROWEST) * (1.0 + 1e-9)
     position = np.floor((x - x.min()) / width)

@@ -23,9 +23,8 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.advice import advice
 from dahl_ident.diagnostics.budget import ParameterBudget
 from dahl_ident.diagnostics.combinations import candidates, stiffness_seen
@@ -344,7 +343,7 @@ def _ambiguous(optimum: Optimum) -> dict[str, str]:
     return reasons
 
 
-def _exchanges(optimum: Optimum) -> Iterator[NDArray[np.intp]]:
+def _exchanges(optimum: Optimum) -> Iterator[IntArray]:
     """Yield the orders in which like parameters of an element are exchanged, in pairs.
 
     Single pairs come first, then several pairs at once. The identical parts that a law declares are

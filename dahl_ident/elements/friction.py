@@ -13,11 +13,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import (
+    BoolArray,
     ComplexArray,
     FloatArray,
+    IntArray,
     broadcast_shape,
     non_negative_array,
     positive_array,
@@ -193,7 +195,7 @@ class Friction(Element):
 
     def _rows(
         self, values: Values, amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[FloatArray, NDArray[np.intp]]:
+    ) -> tuple[FloatArray, IntArray]:
         """Return rows of amplitude, frequency and values without repetition, and each point's row.
 
         Amplitudes of the same parameters rise from row to row.
@@ -230,7 +232,7 @@ class Friction(Element):
         columns = [np.asarray(v)[..., None] for v in values]
         fractions = np.arange(1, _SECTIONS + 1) / _SECTIONS
         low, width = np.zeros(start.shape), start.copy()
-        ends: NDArray[np.bool_] = np.ones(start.shape, dtype=bool)
+        ends: BoolArray = np.ones(start.shape, dtype=bool)
         for step in range(60):
             force = low[..., None] + width[..., None] * fractions
             with np.errstate(all="ignore"):

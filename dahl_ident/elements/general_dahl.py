@@ -49,7 +49,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.elements.facts import Orders
 
 _LEAST_BETA = 1e-200
@@ -135,7 +135,7 @@ def _close_loop(beta: FloatArray, alpha: FloatArray) -> _Closure:
     return _Closure(p, path, _length(p, path, slips))
 
 
-def _length(p: FloatArray, path: FloatArray, slips: NDArray[np.bool_]) -> FloatArray:
+def _length(p: FloatArray, path: FloatArray, slips: BoolArray) -> FloatArray:
     """Return L from E(L) = (1 - exp(-p L))/p, infinite for full slip."""
     full = slips | (p * path >= 1.0)
     return np.where(full, np.inf, -np.log1p(-np.where(full, 0.0, p * path)) / p)

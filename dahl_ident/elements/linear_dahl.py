@@ -37,10 +37,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, special
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 _BLOCK = 8192
 """Amplitudes in one pass: their intermediate arrays stay in the processor's cache."""
@@ -115,7 +114,7 @@ def _blocks(size: int, length: int) -> list[slice]:
     return [slice(start, start + length) for start in range(0, size, length)]
 
 
-def _indices(condition: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _indices(condition: BoolArray) -> IntArray:
     """Return the indices where `condition` holds: quicker to work with than a mask."""
     return condition.nonzero()[0]
 
@@ -131,9 +130,7 @@ def _bessel_part(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     return tanh, inverse, i1e, np.minimum(stiffness, 1.0)
 
 
-def _loss(
-    b: FloatArray, small: NDArray[np.intp], inverse: FloatArray, ratio: FloatArray
-) -> FloatArray:
+def _loss(b: FloatArray, small: IntArray, inverse: FloatArray, ratio: FloatArray) -> FloatArray:
     """Return Im h = (4/pi) q/beta, given 1/beta and tanh(beta)/beta."""
     loss = _FOUR_BY_PI * (1.0 - ratio) * inverse
     if small.size:
@@ -145,7 +142,7 @@ def _loss(
 
 
 def _loss_by_ln_sigma(
-    small: NDArray[np.intp],
+    small: IntArray,
     inverse: FloatArray,
     tanh: FloatArray,
     ratio: FloatArray,
@@ -159,7 +156,7 @@ def _loss_by_ln_sigma(
 
 
 def _decay(
-    b: FloatArray, small: NDArray[np.intp], inverse: FloatArray, tanh: FloatArray, i1e: FloatArray
+    b: FloatArray, small: IntArray, inverse: FloatArray, tanh: FloatArray, i1e: FloatArray
 ) -> FloatArray:
     """Return p = -d ln(Re h) / d ln(beta)."""
     decay = 2.0 - b * (special.i0e(b) / i1e - tanh)

@@ -24,9 +24,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
 from dahl_ident.elements.facts import (
     STEP,
     HistoryGradient,
@@ -124,7 +123,7 @@ class Masing(Friction):
         u = path.displacement - path.displacement[0] + start
         origins, parents, headings, path_of = _paths(u)
 
-        def along(x: FloatArray, path: NDArray[np.intp]) -> FloatArray:
+        def along(x: FloatArray, path: IntArray) -> FloatArray:
             """Return the force added on a path from its origin to x."""
             moved = x - origins[path]
             scale = np.where(path == 0, 1.0, 2.0)
@@ -183,7 +182,7 @@ class Masing(Friction):
 
 def _paths(
     u: FloatArray,
-) -> tuple[FloatArray, NDArray[np.intp], FloatArray, NDArray[np.intp]]:
+) -> tuple[FloatArray, IntArray, FloatArray, IntArray]:
     """Return the paths of Masing's rules along displacements that begin on the backbone curve.
 
     Path 0 is the backbone curve. Every other path begins at a reversal, on an earlier path, its

@@ -151,7 +151,7 @@ class MaxwellSlip(Masing):
         return values[:n], values[n:]
 
     @property
-    def starts(self) -> tuple[tuple[str, str, str], ...]:  # type: ignore[override]
+    def starts(self) -> tuple[tuple[str, str, str], ...]:  # type: ignore[override]  # as many as springs
         """A load of every spring."""
         meaning = "force of a spring at the first sample, over that at which it slips"
         return tuple((f"initial_load_{i + 1}", "", meaning) for i in range(self.n_states))

@@ -15,9 +15,8 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.engine.translate import System
 from dahl_ident.errors import FitError
 
@@ -47,7 +46,7 @@ class Settled(NamedTuple):
         system, with respect to those at its beginning.
     """
 
-    found: NDArray[np.bool_]
+    found: BoolArray
     coefficients: ComplexArray
     by_amplitude: ComplexArray
     by_parameter: ComplexArray
@@ -62,7 +61,7 @@ class Loops(NamedTuple):
     shrinks in a cycle, (rows,).
     """
 
-    found: NDArray[np.bool_]
+    found: BoolArray
     coefficients: ComplexArray
     by_amplitude: ComplexArray
     by_parameter: ComplexArray

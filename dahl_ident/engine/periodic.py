@@ -11,9 +11,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.engine.motion import settled
 from dahl_ident.engine.translate import System
 
@@ -39,7 +38,7 @@ class SteadyMotion(NamedTuple):
         Largest modulus of the multipliers of a whole cycle; above 1 a motion is unstable.
     """
 
-    found: NDArray[np.bool_]
+    found: BoolArray
     harmonics: ComplexArray
     by_drive: ComplexArray
     by_parameter: ComplexArray
@@ -80,7 +79,7 @@ def steady_motions(
     )
 
     def solve(
-        which: NDArray[np.bool_],
+        which: BoolArray,
         starts: FloatArray | None = None,
         *runs: int | None,
         finer: float = 1.0,

@@ -34,9 +34,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.elements import Asymptote, Element, Parameter
 from dahl_ident.fitting.directions import Direction, Directions, directions, free_springs
 from dahl_ident.fitting.optimum import DeterminedCombination, Status, blanked
@@ -90,7 +89,7 @@ class Chart:
             derivative[..., spring, :] -= size * self.matrix[sigma]
         return derivative
 
-    def of(self, tables: NDArray[np.intp] | int) -> Chart:
+    def of(self, tables: IntArray | int) -> Chart:
         """Return the chart of some tables of a batch, or of one."""
         return self if self.offset.ndim == 1 else replace(self, offset=self.offset[tables])
 
@@ -128,7 +127,7 @@ class Limit:
         phi: FloatArray,
         slopes: FloatArray,
         covariance: FloatArray,
-        lost: NDArray[np.bool_],
+        lost: BoolArray,
     ) -> tuple[DeterminedCombination, ...]:
         """Return the determined combinations; `slopes` is dtheta/dphi, the last two are of phi."""
         determined, finite = [], np.where(np.isfinite(covariance), covariance, 0.0)
@@ -148,8 +147,8 @@ class Limit:
         return tuple(determined)
 
     def spread(
-        self, slopes: FloatArray, inner: FloatArray, lost: NDArray[np.bool_]
-    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        self, slopes: FloatArray, inner: FloatArray, lost: BoolArray
+    ) -> tuple[FloatArray, BoolArray]:
         """Return the covariance of theta, and which parameters are undetermined, from those of phi.
 
         `slopes` is dtheta/dphi, (P, Q); `inner` and `lost` are the covariance and that of phi.
@@ -204,9 +203,7 @@ class Reach:
         self._rows = np.array(rows).reshape(-1, P).T
         self._least = np.stack(np.broadcast_arrays(*least), axis=-1) if least else np.empty(0)
 
-    def __call__(
-        self, theta: FloatArray, tables: NDArray[np.intp] | None = None
-    ) -> NDArray[np.bool_]:
+    def __call__(self, theta: FloatArray, tables: IntArray | None = None) -> BoolArray:
         """Return whether theta is inside, () for (P,), (S,) for (S, P).
 
         `tables` are the tables of a batch to which theta belongs, all by default.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dahl_ident.arrays import BoolArray
 from dahl_ident.fitting.levenberg_marquardt import Minima
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.fitting.optimum import (
@@ -50,7 +50,7 @@ def optima(
         covariance = inner * (final / scale)[:, None, None] ** 2
     status: list[Status] = []
     combinations: dict[int, tuple[DeterminedCombination, ...]] = {}
-    outside: NDArray[np.bool_] = np.zeros(S, dtype=np.bool_)
+    outside: BoolArray = np.zeros(S, dtype=np.bool_)
     if problem.is_bounded:
         outside = np.any(at_bound(problem, theta), axis=1)
     for table in range(S):

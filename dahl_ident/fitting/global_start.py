@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, IntArray, interleaved
+from dahl_ident.arrays import SMALLEST, BoolArray, ComplexArray, FloatArray, IntArray, interleaved
 from dahl_ident.elements import Element, Friction, Parameter
 from dahl_ident.elements.held_motion import form_of
 from dahl_ident.errors import FitError, argument
@@ -173,7 +173,7 @@ class _Curves:
     columns: list[_LinearPart]
     known: ComplexArray | None
     """Part that does not depend on a coefficient, (..., K, n)."""
-    edges: list[NDArray[np.bool_]]
+    edges: list[BoolArray]
     """Nodes at either end of each direction, (K,)."""
 
 
@@ -395,7 +395,7 @@ def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
 
 def _possible(
     d: Directions, ordered: list[Direction], axes: list[FloatArray], index: IntArray
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return the nodes where an element is physically possible, or all if it is nowhere."""
     names = [x.parameter.name for x in ordered]
     possible = []

@@ -30,10 +30,10 @@ from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import null_space
 
-from dahl_ident.arrays import FloatArray, finite_array, non_negative_array
+from dahl_ident.arrays import BoolArray, FloatArray, finite_array, non_negative_array
 from dahl_ident.errors import FitError, ModelError, ValidationError, argument
 from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima
@@ -509,9 +509,7 @@ def _for_rows(value: FloatArray, name: str, shape: tuple[int, ...]) -> FloatArra
     return np.broadcast_to(value, shape)
 
 
-def _on_constraints(
-    information: FloatArray, slopes: FloatArray
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _on_constraints(information: FloatArray, slopes: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the covariance where slopes @ dtheta = 0, and which parameters are undetermined."""
     if not len(slopes):
         return inverse(information)

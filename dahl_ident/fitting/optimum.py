@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.fitting.losses import Loss, loss_named
 from dahl_ident.problem import Problem
 
@@ -258,11 +258,11 @@ class OptimumBatch:
     values: FloatArray
     covariance: FloatArray
     scale: FloatArray
-    dof: NDArray[np.intp]
+    dof: IntArray
     cost: FloatArray
-    nfev: NDArray[np.intp]
+    nfev: IntArray
     status: tuple[Status, ...]
-    undetermined: NDArray[np.bool_]
+    undetermined: BoolArray
     method: str
     loss: str
     combinations: Mapping[int, tuple[DeterminedCombination, ...]]
@@ -301,7 +301,7 @@ class OptimumBatch:
         return self.problem.scale_known
 
     @property
-    def success(self) -> NDArray[np.bool_]:
+    def success(self) -> BoolArray:
         """Whether each problem has a finite optimum that was found."""
         return np.array([status.found_optimum for status in self.status])
 
@@ -363,7 +363,7 @@ class OptimumBatch:
         return " ".join(parts)
 
 
-def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
+def at_bound(problem: Problem, theta: FloatArray) -> BoolArray:
     """Return which parameters lie at a bound."""
     low, high = problem.bounds()
     with np.errstate(invalid="ignore"):
@@ -371,7 +371,7 @@ def at_bound(problem: Problem, theta: FloatArray) -> NDArray[np.bool_]:
         return np.asarray((theta - low <= near) | (high - theta <= near))
 
 
-def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | NDArray[np.intp]) -> FloatArray:
+def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | IntArray) -> FloatArray:
     """Return the standard deviation of residuals whose half sum of squares is `cost`.
 
     It is not less than that of rounding errors, and NaN without degrees of freedom.
@@ -442,7 +442,7 @@ def information_of(
     return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
 
 
-def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def inverse(information: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the covariance, (..., P, P), and which parameters are undetermined, (..., P).
 
     Parameters with a component in a null direction of the information have infinite variance and
@@ -464,7 +464,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     return blanked(covariance, undetermined), undetermined
 
 
-def blanked(covariance: FloatArray, undetermined: NDArray[np.bool_]) -> FloatArray:
+def blanked(covariance: FloatArray, undetermined: BoolArray) -> FloatArray:
     """Return `covariance` with infinite variances and zero covariances of the undetermined."""
     either = undetermined[..., :, None] | undetermined[..., None, :]
     diagonal = either & np.eye(covariance.shape[-1], dtype=np.bool_)

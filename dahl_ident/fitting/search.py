@@ -23,9 +23,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, IntArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting.asymptotes import (
     Chart,
@@ -335,7 +335,7 @@ class TableSearch:
             slopes = None if chart is None else chart.derivative(theta)
             return problem.take(table[which]).quadratic(theta, scale, self.loss, slopes)
 
-        def inside(at: FloatArray, which: IntArray) -> NDArray[np.bool_]:
+        def inside(at: FloatArray, which: IntArray) -> BoolArray:
             return self.reach(theta_at(at, which), table[which])
 
         if self.method == "scipy" and chart is None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.control_interop import response
 from dahl_ident.elements import Model
 from dahl_ident.errors import ValidationError
@@ -79,7 +79,7 @@ class Candidates:
             **{name: getattr(self, name)[:, chosen] for name in _OF_DRAWS},
         )
 
-    def at_draws(self, draws: NDArray[np.intp]) -> Candidates:
+    def at_draws(self, draws: IntArray) -> Candidates:
         """Return the candidates at some of the draws."""
         return replace(self, **{name: getattr(self, name)[draws] for name in _OF_DRAWS})
 
@@ -161,7 +161,7 @@ def evaluate(
     return replace(candidates, rows=candidates.rows * candidates.weight)
 
 
-def allowed(limits: BenchLimits, sizes: Mapping[str, FloatArray], count: int) -> NDArray[np.bool_]:
+def allowed(limits: BenchLimits, sizes: Mapping[str, FloatArray], count: int) -> BoolArray:
     """Return which of `count` candidates stay within every limit at nearly all draws."""
     possible, refused = np.ones(count, dtype=bool), {}
     for name, size in sizes.items():
@@ -179,9 +179,7 @@ def allowed(limits: BenchLimits, sizes: Mapping[str, FloatArray], count: int) ->
     return possible
 
 
-def _single_valued(
-    knowledge: Knowledge, drive: FloatArray, frequency_hz: FloatArray
-) -> NDArray[np.bool_]:
+def _single_valued(knowledge: Knowledge, drive: FloatArray, frequency_hz: FloatArray) -> BoolArray:
     """Return where every draw has exactly one steady amplitude."""
     single = np.ones(len(drive), dtype=bool)
     known = {p.name for p in knowledge.model.parameters}
@@ -239,7 +237,7 @@ class BenchTime:
                     force = force + A * np.abs(element.stiffness(numbers, A, omega + 0.0 * A))
         return cls(f, np.quantile(decay, _SLOW, axis=0), np.median(force, axis=0), **costs)
 
-    def order(self, levels: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
+    def order(self, levels: Sequence[int] | IntArray) -> IntArray:
         """Return the levels, (..., m), in order of rising friction force.
 
         In this order no transient is larger than the friction force.
@@ -248,7 +246,7 @@ class BenchTime:
         rising = np.lexsort((self.frequency_hz[chosen], self.force[chosen]), axis=-1)
         return np.take_along_axis(chosen, rising, axis=-1)
 
-    def settling_cycles(self, ordered: Sequence[int] | NDArray[np.intp]) -> FloatArray:
+    def settling_cycles(self, ordered: Sequence[int] | IntArray) -> FloatArray:
         """Return the cycles before measuring at each level, (..., m), in this order; may be inf."""
         chosen = np.asarray(ordered, dtype=np.intp)
         force, decay = self.force[chosen], self.decay[chosen]
@@ -259,7 +257,7 @@ class BenchTime:
         cycles = np.where(start <= self.settled, 0.0, np.where(decay > 0.0, cycles, 0.0))
         return np.asarray(np.maximum(np.ceil(cycles - 1e-9), self.least_settling))
 
-    def fixed(self, levels: Sequence[int] | NDArray[np.intp]) -> FloatArray:
+    def fixed(self, levels: Sequence[int] | IntArray) -> FloatArray:
         """Return the seconds of a run before anything is measured, for each set of levels."""
         ordered = self.order(levels)
         settling = self.settling_cycles(ordered) / self.frequency_hz[ordered]
@@ -271,7 +269,7 @@ class BenchTime:
         """Seconds before anything is measured at each candidate alone, (K,)."""
         return self.fixed(np.arange(len(self.frequency_hz))[:, None])
 
-    def seconds(self, levels: Sequence[int] | NDArray[np.intp], cycles: FloatArray) -> float:
+    def seconds(self, levels: Sequence[int] | IntArray, cycles: FloatArray) -> float:
         """Return the seconds of one run."""
         measured = (cycles / self.frequency_hz[np.asarray(levels)]).sum()
         return float(self.fixed(levels) + measured)

@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime
 
 _POWER = 4.0  # of the norm over the targets: 1 adds their variances, infinity takes the largest
@@ -74,7 +74,7 @@ class Term:
     # (S, P, C) directions over their target standard uncertainties; None for D-optimality
     targets: FloatArray | None = None
     # (T,) first of the columns of each target, whose variances are added; None for one column each
-    starts: NDArray[np.intp] | None = None
+    starts: IntArray | None = None
     weight: float = 1.0  # in the sum of the terms
     # number of the last parameters, departures, whose uncertainty is not part of the criterion
     departures: int = 0
@@ -129,7 +129,7 @@ class Objective:
     terms: tuple[Term, ...]
     runs: int = 1
 
-    def only(self, candidates: Sequence[int] | NDArray[np.intp]) -> Objective:
+    def only(self, candidates: Sequence[int] | IntArray) -> Objective:
         """Return the objective of some candidates, or of each of several sets, (designs, m)."""
         chosen = np.asarray(candidates, dtype=np.intp)
         return replace(self, terms=tuple(replace(t, packed=t.packed[chosen]) for t in self.terms))
@@ -212,7 +212,7 @@ def _best_seconds(
 class Design:
     """Levels in the order of a run, whole cycles at each, and how many runs."""
 
-    levels: NDArray[np.intp]
+    levels: IntArray
     cycles: FloatArray
     runs: int
     value: float  # of the criterion
@@ -227,7 +227,7 @@ class Coverage(NamedTuple):
     span: float  # smallest ln of the largest displacement amplitude over the smallest
     amplitude: FloatArray  # (K,) ln of the displacement amplitude of every candidate
 
-    def wide(self, levels: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def wide(self, levels: IntArray) -> BoolArray:
         """Return which sets of levels, (..., m), have the required span."""
         return np.asarray(np.ptp(self.amplitude[levels], axis=-1) >= self.span)
 
@@ -239,7 +239,7 @@ class Exchange:
         self,
         objective: Objective,
         bench: BenchTime,
-        pool: NDArray[np.intp],
+        pool: IntArray,
         coverage: Coverage | None = None,
     ) -> None:
         self._objective, self._bench, self._pool = objective, bench, pool
@@ -275,7 +275,7 @@ class Exchange:
             yield from ([*others, j] for j in self._promising(others, time) if j != k)
 
     def _best_cycles(
-        self, levels: NDArray[np.intp], time: float, iterations: int
+        self, levels: IntArray, time: float, iterations: int
     ) -> tuple[Objective, FloatArray]:
         """Return the objective and the best cycles of each design, (..., m); NaN if too short."""
         f = self._bench.frequency_hz[levels]

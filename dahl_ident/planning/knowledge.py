@@ -11,9 +11,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, finite_array
+from dahl_ident.arrays import FloatArray, IntArray, finite_array
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
@@ -83,7 +82,7 @@ class Knowledge:
         """Scale of each search coordinate, (P,): 1 for logarithms, the size of draws for others."""
         return units_of(self.parameters, self.theta)
 
-    def only(self, draws: NDArray[np.intp]) -> Knowledge:
+    def only(self, draws: IntArray) -> Knowledge:
         """Return the knowledge restricted to some of the draws."""
         return replace(self, theta=self.theta[draws], information=self.information[draws])
 
@@ -119,7 +118,7 @@ class Knowledge:
         ]
 
 
-def spread(count: int, most: int) -> NDArray[np.intp]:
+def spread(count: int, most: int) -> IntArray:
     """Return at most `most` of the numbers below `count`, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dahl_ident.arrays import IntArray
 from dahl_ident.diagnostics.trends import LEAST_DOF, LEAST_RANGE
 from dahl_ident.errors import ValidationError
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime, Candidates
@@ -53,7 +53,7 @@ class Search:
         if question.larger is not None:
             self._suspects = forecast_of_suspects(question, few.knowledge, few.candidates)
             self._terms.append(self._suspects.term(question.suspects))
-        self._pool: NDArray[np.intp] | None = None
+        self._pool: IntArray | None = None
 
     def best(self) -> Design:
         """Return the shortest plan that reaches the targets, or the best in the time allowed."""
@@ -128,7 +128,7 @@ class Search:
         judged = not self.question.has_numbers or self.can_be_judged(design)
         return bool(design.ratio <= 1.0) and judged
 
-    def _promising(self, time: float) -> NDArray[np.intp]:
+    def _promising(self, time: float) -> IntArray:
         """Return promising candidates: those of the continuous design, and evenly spread ones."""
         if self._pool is None:
             K, f, alone = self.forecast.candidates.count, self.bench.frequency_hz, self.bench.alone

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import FloatArray, non_negative_array, positive_number
+from dahl_ident.arrays import BoolArray, FloatArray, non_negative_array, positive_number
 from dahl_ident.errors import ValidationError
 
 KINDS = ("trapezoid", "multisine")
@@ -190,7 +190,7 @@ def seconds_of_move(distance: float, speed: float, acceleration: float) -> float
 
 def course(
     motions: Sequence[PlannedMotion], repeats: Sequence[int], change_over: float, time: FloatArray
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
+) -> tuple[FloatArray, NDArray[np.int64], BoolArray]:
     """Return displacement, number of the motion, and whether it is measured, at any times.
 
     The exciter begins at zero and moves from motion to motion along a quintic, from rest to rest,

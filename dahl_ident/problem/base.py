@@ -8,9 +8,9 @@ from copy import copy
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Model, Parameter
 from dahl_ident.errors import ValidationError
@@ -135,7 +135,7 @@ class Problem(ABC):
         """The number of tables: one."""
         return 1
 
-    def take(self, tables: NDArray[np.intp] | slice) -> Self:
+    def take(self, tables: IntArray | slice) -> Self:
         """Return this problem: one table stands for as many as are asked for."""
         return self
 

@@ -8,9 +8,8 @@ from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
@@ -148,7 +147,7 @@ class ProblemBatch(TableProblem):
             )
         return problem._with_rows(cls, replace(problem._rows, response=responses))
 
-    def take(self, tables: NDArray[np.intp] | slice) -> ProblemBatch:
+    def take(self, tables: IntArray | slice) -> ProblemBatch:
         """Return the batch of some of the tables."""
         return self._with_rows(ProblemBatch, self._rows.take(tables))
 

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.control_interop.force_balance import solve
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Model, Parameter
@@ -122,7 +122,7 @@ class Nearby:
 class _Group:
     """Rows that are computed together, with all their harmonics; `operator` is (j omega)^p."""
 
-    rows: slice | NDArray[np.intp]
+    rows: slice | IntArray
     harmonic: NDArray[np.int64]
     forced: bool
     omega: FloatArray
@@ -191,7 +191,7 @@ class Predictor:
                 unstable += np.arange(self.rows.n)[group.rows][~stable].tolist()
         return unstable
 
-    def _steady_rows(self, part: slice | NDArray[np.intp]) -> SteadyRows | None:
+    def _steady_rows(self, part: slice | IntArray) -> SteadyRows | None:
         rows = self.rows
         if self._shooting is None or rows.drive is None:
             return None
@@ -378,7 +378,7 @@ class Predictor:
         of_model: Sequence[FloatArray],
         sensed: Sequence[FloatArray],
         error: FloatArray | None,
-    ) -> tuple[FloatArray, NDArray[np.bool_] | None]:
+    ) -> tuple[FloatArray, BoolArray | None]:
         """Return the true amplitude of each row, and where it exists; None if everywhere."""
         amplitude = group.amplitude if self._neutral else group.amplitude / sensed[1]
         if not group.forced:
@@ -389,7 +389,7 @@ class Predictor:
         return (amplitude, None) if exists.all() else (np.where(exists, amplitude, 1.0), exists)
 
 
-def _where(exists: NDArray[np.bool_] | None, Z: ComplexArray) -> ComplexArray:
+def _where(exists: BoolArray | None, Z: ComplexArray) -> ComplexArray:
     return Z if exists is None else np.where(exists, Z, np.nan)
 
 
@@ -436,14 +436,14 @@ def _fundamental(rows: Rows, response: ComplexArray) -> ComplexArray:
     return np.where(rows.of_displacement, rows.of_fundamental(response), response)
 
 
-def _parts(rows: Rows) -> Iterator[tuple[slice | NDArray[np.intp], bool]]:
+def _parts(rows: Rows) -> Iterator[tuple[slice | IntArray, bool]]:
     """Yield rows, and whether force-controlled, for each kind of row."""
     kinds = np.unique(rows.forced).tolist()
     for forced in kinds:
         yield slice(None) if len(kinds) == 1 else np.flatnonzero(rows.forced == forced), forced
 
 
-def _require(rows: NDArray[np.bool_], controlled: str, name: str) -> None:
+def _require(rows: BoolArray, controlled: str, name: str) -> None:
     if rows.any():
         uncontrolled = {"displacement": "force", "force": "displacement"}[controlled]
         raise DataError(

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import comb
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import BoolArray, FloatArray
 from dahl_ident.data import Record
 
 HIGHEST_ORDER = (
@@ -100,7 +99,7 @@ def drive_noise(drives: Sequence[FloatArray]) -> DriveNoise | None:
     return DriveNoise(tuple(stds), noise / signal) if signal > 0.0 else None
 
 
-def excited(drive: FloatArray) -> NDArray[np.bool_]:
+def excited(drive: FloatArray) -> BoolArray:
     """Return at which frequencies of its Fourier transform a drive has power; all if none."""
     power = _power(drive)
     if not power.any():

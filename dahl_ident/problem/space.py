@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import FloatArray, positive_array, real_array
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray, positive_array, real_array
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
@@ -32,7 +32,7 @@ class Space:
         parameters: Sequence[Parameter],
         bends: FloatArray | None = None,
         *,
-        inside: bool | NDArray[np.bool_] = False,
+        inside: bool | BoolArray = False,
     ) -> None:
         self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in self.parameters)
@@ -182,7 +182,7 @@ class Interchangeable:
         return array
 
 
-def _exchange(array: FloatArray, columns: NDArray[np.intp], key: FloatArray) -> None:
+def _exchange(array: FloatArray, columns: IntArray, key: FloatArray) -> None:
     """Exchange the rows of `columns` in `array` until the key rises."""
     order = np.argsort(key, axis=-1)
     for alike in columns.T:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements import Model
 from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
 
@@ -35,7 +35,7 @@ class RowMotion(NamedTuple):
     displacement: ComplexArray
     by_drive: ComplexArray
     by_parameter: ComplexArray
-    stable: NDArray[np.bool_]
+    stable: BoolArray
 
 
 class _SteadyMotions(NamedTuple):
@@ -64,7 +64,7 @@ class SteadyRows:
         omega: FloatArray,
         measured: ComplexArray,
         harmonic: NDArray[np.int64],
-        fundamental: NDArray[np.intp],
+        fundamental: IntArray,
         orbits: dict[int, FloatArray],
     ) -> None:
         self._model, self._shooting = model, shooting
@@ -117,7 +117,7 @@ class SteadyRows:
         stable = stable.reshape(*shape[:-1], m)[..., point]
         return RowMotion(X[..., 0], X[..., 1], X[..., 2:], stable)
 
-    def is_linear(self, values: Sequence[FloatArray]) -> NDArray[np.bool_]:
+    def is_linear(self, values: Sequence[FloatArray]) -> BoolArray:
         """Return whether friction is hardly more than a spring at every row, () or (S,).
 
         Searches for limits go there. The motion is then a sine, while shooting would lose it to
@@ -150,7 +150,7 @@ class SteadyRows:
                 reachable.append(value * longer**length if scaled else value)
         return reachable
 
-    def _is_unique(self, values: Sequence[FloatArray], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def _is_unique(self, values: Sequence[FloatArray], shape: tuple[int, ...]) -> BoolArray:
         """Return where the response is unique: no part of the plant feeds energy in."""
         if not self._unique_laws:
             return np.zeros(shape, dtype=np.bool_)
@@ -183,13 +183,13 @@ class SteadyRows:
 
     def _followed(
         self,
-        points: NDArray[np.intp],
+        points: IntArray,
         values: FloatArray,
         omega: FloatArray,
         drive: FloatArray,
         measured: ComplexArray,
         chosen: list[int],
-    ) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    ) -> tuple[ComplexArray, BoolArray]:
         """Return the motions of one table's points, and which are stable.
 
         Each level is followed in the order of its rows; with derivatives as far as there are
@@ -241,7 +241,7 @@ class SteadyRows:
         return result, stable
 
 
-def levels(drive: FloatArray) -> list[NDArray[np.intp]]:
+def levels(drive: FloatArray) -> list[IntArray]:
     """Return the rows of every level, in their order; a level is held to within a tenth."""
     rising = np.argsort(drive, kind="stable")
     level = np.empty(drive.size, dtype=np.intp)

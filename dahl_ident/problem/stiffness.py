@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray
+from dahl_ident.arrays import SMALLEST, ComplexArray, FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Element, Model
 from dahl_ident.errors import DataError, ModelError
@@ -35,7 +35,7 @@ class StiffnessData:
         """Median of |Z|, shape () or (S,); above zero also where most responses are zero."""
         return np.asarray(np.maximum(np.median(np.abs(self.stiffness), axis=-1), SMALLEST))
 
-    def of_rows(self, rows: NDArray[np.intp]) -> StiffnessData:
+    def of_rows(self, rows: IntArray) -> StiffnessData:
         """Return some of the rows."""
         return StiffnessData(*(getattr(self, one.name)[..., rows] for one in fields(self)))
 
@@ -71,7 +71,7 @@ class StiffnessData:
         return tuple(np.unique(self.harmonic).tolist())
 
     @cached_property
-    def _places(self) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
+    def _places(self) -> tuple[FloatArray, IntArray, FloatArray]:
         """Return ln A of a grid over all rows, each row's cell of it, and its place in the cell."""
         ln_A = np.log(np.maximum(self.amplitude, SMALLEST))
         low, high = ln_A.min(), ln_A.max()

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Self, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray, interleaved
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.frequency_response import fundamental_alone
@@ -163,7 +163,7 @@ class TableProblem(Problem):
         widened._set_noise(noise_for(self._rows, self.noise))
         return widened
 
-    def part(self, rows: NDArray[np.bool_], response: ComplexArray) -> TableProblem:
+    def part(self, rows: BoolArray, response: ComplexArray) -> TableProblem:
         """Return the problem of some rows, with other responses in place of the data's."""
         data = replace(self.data.select(rows=rows), response=response)
         part = self.like(data=data)
@@ -304,7 +304,7 @@ class TableProblem(Problem):
     # Coordinates
 
     @cached_property
-    def friction_columns(self) -> NDArray[np.intp]:
+    def friction_columns(self) -> IntArray:
         """Indices of the parameters of elements that depend on the amplitude."""
         names = {p.name for e in self.model.elements if not e.is_linear for p in e.parameters}
         return np.flatnonzero([name in names for name in self.names])
@@ -439,7 +439,7 @@ class TableProblem(Problem):
                 by = -noise.amplitude.whitening(noise.covariance, slope)(change)
             else:
                 by = noise.change(self.predict(theta), change)
-        return np.ascontiguousarray(by).view(np.float64)
+        return interleaved(by)
 
     def draw(
         self, theta: ArrayLike, scale: float, size: int, rng: np.random.Generator

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident import plots
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, unit_diagonal
 from dahl_ident.data import curves
 from dahl_ident.diagnostics.bands import ENERGY
 from dahl_ident.diagnostics.confidence_levels import LEVELS, level_text, thresholds
@@ -435,8 +435,7 @@ def _check_origin(data: FrequencyResponse, record: Record) -> None:
 def corner(posterior: Posterior) -> Picture:
     """Return the picture of the densities of a posterior's parameters and of pairs of them."""
     covariance = np.atleast_2d(np.cov(posterior.values.T, aweights=posterior.weights))
-    size = np.sqrt(covariance.diagonal())
-    correlation = covariance / np.outer(size, size)
+    correlation, _ = unit_diagonal(covariance)
     i, j = np.unravel_index(np.argmax(np.abs(np.triu(correlation, 1))), correlation.shape)
     finding = (
         f"The strongest correlation is {correlation[i, j]:.2f}, between {posterior.names[i]} and "

@@ -26,9 +26,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dahl_ident.arrays import ComplexArray, FloatArray
+from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
 from dahl_ident.bayes.density import TAIL_DOF, Density
 from dahl_ident.bayes.priors import JointPrior, ParameterPrior
 from dahl_ident.bayes.sample import ChainSample
@@ -120,7 +119,7 @@ def pointwise_log_likelihood(density: Density, points: FloatArray) -> FloatArray
     return np.asarray(rows + constant[:, None] / z.shape[1])
 
 
-def _neighbours(data: FrequencyResponse) -> NDArray[np.intp]:
+def _neighbours(data: FrequencyResponse) -> IntArray:
     """Return the rows in order of harmonic, frequency and amplitude."""
     amplitude = data.drive if data.amplitude is None else data.amplitude
     assert amplitude is not None

@@ -242,7 +242,7 @@ class PosteriorDraws(Result):
         return self.sample.draws.drawn(whole_number(size, "size", 1), seed)
 
     def to_frame(self) -> pd.DataFrame:
-        """Return every draw, one column a parameter; those of a grid have a column ``weight``."""
+        """Return all draws, with a column for each parameter; for a grid also ``weight``."""
         import pandas as pd
 
         frame = pd.DataFrame(self.values, columns=list(self.names))
