@@ -263,11 +263,10 @@ def test_methods_that_return_nothing_are_named(method):
         law(dahl, **{method: lambda _, values: None})(0.2, 3.0)
 
 
-def test_states_without_rates_are_named():
-    two = law(dahl, n_states=2)(1.0, 1.0)
-    for use in (lambda: two.describing_function(1.0), lambda: di.response(two + di.Mass(1), 1, 1)):
-        with pytest.raises(ModelError, match="Mine has 2 states, but its slope gives one rate"):
-            use()
+@pytest.mark.parametrize("more", [{}, {"mechanics": lambda *_: None}])
+def test_a_law_of_several_states_is_refused(more):
+    with pytest.raises(ModelError, match=r"Mine has 2 states; expected one, the force: .* with \+"):
+        law(dahl, n_states=2, **more)(1.0, 1.0)
 
 
 def test_mechanics_that_return_nothing_are_named():

@@ -147,11 +147,6 @@ class Friction(Element):
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
         """Return the present force, and its change over time: slope times velocity."""
-        if len(states) != 1:
-            raise ModelError(
-                f"{type(self).__name__} has {len(states)} states, but its slope gives one rate, "
-                "that of the force; leave n_states out, or give mechanics(), with a rate for each"
-            )
         (force,) = states
         slope = self.slope(force, direction, velocity, values)
         return Mechanics(0.0, self.output(force, slope, velocity, values), (slope * velocity,))

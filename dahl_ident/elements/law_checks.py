@@ -129,6 +129,11 @@ def check_slope(law: Friction) -> None:
     """Refuse a law whose slope cannot be that of a friction law."""
     if is_of_package(type(law)) or not law.one_state:
         return
+    if law.n_states != 1:
+        raise ModelError(
+            f"{type(law).__name__} has {law.n_states} states; expected one, the force: leave "
+            "n_states out, and add laws in parallel with +"
+        )
     declared = tuple(law.parameters)
     done = _CHECKED.setdefault(type(law), set())
     if declared in done:
