@@ -107,7 +107,7 @@ def test_a_history_behind_a_gap_is_exact(asymmetry, start):
     inner = di.Dahl(1.0, 3.0, asymmetry=asymmetry) if asymmetry else di.Dahl(1.0, 3.0)
     law = di.Backlash(inner, 0.8)
     values = [float(v) for v in law.known_values()]
-    law = law.with_bound(tuple(p if p.name == "alpha" else p.freed() for p in law.parameters))
+    law = law.copy_with(tuple(p if p.name == "alpha" else p.freed() for p in law.parameters))
     found = law.history(values, Path(x), start, slopes=True)
     moved = [v + 1e-12 * (label == "alpha") for label, v in zip(law.labels, values, strict=True)]
     np.testing.assert_allclose(found.value, law.force_history(moved, x, state=start), atol=1e-7)

@@ -170,7 +170,7 @@ def _run_laws(folder: Path, laws: Any) -> None:
 
 def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
     """Return the model as plain data, the names of its parameters, and digests of its law files."""
-    from dahl_ident.elements.law_files import file_of, own_laws
+    from dahl_ident.elements.law_files import file_of, user_laws
     from dahl_ident.elements.model import describe_model, model_from_description
 
     if (
@@ -180,7 +180,7 @@ def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[st
     ):
         raise ValidationError('there is no model; give [[model]] tables, such as kind = "dahl"')
     model = model_from_description(entries)
-    files = {file for law in own_laws(model.elements) if (file := file_of(law)) is not None}
+    files = {file for law in user_laws(model.elements) if (file := file_of(law)) is not None}
     digests = {Path(file.path).name: file.digest for file in sorted(files)}
     return describe_model(model), [p.name for p in model.parameters], digests
 

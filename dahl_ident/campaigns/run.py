@@ -300,11 +300,11 @@ def campaign(
 
 def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
     """Return the modules and files that define the model's laws, other than this package's."""
-    from dahl_ident.elements.law_files import LawFile, file_of, own_laws, source_path
+    from dahl_ident.elements.law_files import LawFile, file_of, source_path, user_laws
     from dahl_ident.elements.model import model_from_description
 
     sources: dict[str | LawFile, None] = {}
-    for law in own_laws(model_from_description(definition.options["model"]).elements):
+    for law in user_laws(model_from_description(definition.options["model"]).elements):
         file, path = file_of(law), source_path(law)
         if path is None:
             raise ModelError(

@@ -241,7 +241,7 @@ def _unphysical(fit: Assessed) -> Iterator[Finding]:
     for element in fit.model.elements:
         values = [p.value or 0.0 for p in element.parameters]
         if np.isfinite(values).all() and not is_single(element):
-            for text in element.physics(values):
+            for text in element.physical_objections(values):
                 yield described("unphysical", _APPROXIMATE, objection=text)
 
 

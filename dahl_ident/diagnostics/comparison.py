@@ -497,7 +497,7 @@ def _candidates(
         at_element = [values[p.name] for p in e.parameters]
         finite = bool(np.all(np.isfinite(at_element)))
         usable = finite and all(at_element[:2])
-        unchanged = e.started(at_element) if finite else e
+        unchanged = e.started_at(at_element) if finite else e
         offers.append((unchanged, e.alternatives(at_element, smallest) if usable else {}))
     reasons = dict.fromkeys(("shape", "asymmetry", "speed", "masing"), misfit)
     if problem.response is not None:

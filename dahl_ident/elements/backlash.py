@@ -97,7 +97,7 @@ class Backlash(Friction):
     @property
     def element(self) -> Friction:
         """The law behind the gap, with its present parameters."""
-        return self._element.with_bound(self.parameters[:-1])
+        return self._element.copy_with(self.parameters[:-1])
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
         """Return dF/dx while the link is in contact."""
@@ -114,7 +114,7 @@ class Backlash(Friction):
         return Mechanics(0.0, force, (slope * velocity * (1.0 - crossing), velocity * crossing))
 
     @property
-    def inside(self) -> tuple[Any, ...]:
+    def inner_elements(self) -> tuple[Any, ...]:
         """The element behind the gap."""
         return (self._element,)
 
@@ -138,10 +138,10 @@ class Backlash(Friction):
         return float(self.slope(0.0, 1.0, 0.0, values))
 
     def _loops(
-        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+        self, table: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
     ) -> Loops:
-        """Return settled loops at rows of amplitude, frequency and values, with their harmonics."""
-        return loops_of(self._element, at, orders, chosen, gap=True)
+        """Return the settled loops at rows of amplitude, frequency and values."""
+        return loops_of(self._element, table, orders, chosen, gap=True)
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
@@ -193,9 +193,9 @@ class Backlash(Friction):
         """Return those of the element."""
         return [*self.element.resolved(values[:-1], amplitude), values[-1]]
 
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+    def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of the element."""
-        return self.element.physics(values[:-1])
+        return self.element.physical_objections(values[:-1])
 
     def describe(self) -> dict[str, Any]:
         """Return the element and the gap as plain data."""
@@ -220,7 +220,7 @@ class Backlash(Friction):
         element = law.from_description(inner, inner.pop("name", name))
         blank = cls(element)
         gap = blank.parameters[-1].described(rest["gap"])
-        return blank.with_bound((*blank.parameters[:-1], gap))
+        return blank.copy_with((*blank.parameters[:-1], gap))
 
     def __repr__(self) -> str:
         gap = super().__repr__().rpartition("gap=")[2].partition(",")[0].rstrip(")")

@@ -136,17 +136,17 @@ class BoucWen(Friction):
         return sigma, q, np.where(p * slipping > steepest * (1.0 + 1e-9), np.nan, p), *exponent
 
     def _loops(
-        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+        self, table: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
     ) -> Loops:
         """Return settled loops, with p limited to that of instant unloading.
 
         Data in gross slip do not bound p, so searches may let it grow without end.
         """
-        resolved = at.copy()
-        resolved[:, _P] = np.minimum(at[:, _P], _AT_ONCE[1] / at[:, 0])
+        resolved = table.copy()
+        resolved[:, _P] = np.minimum(table[:, _P], _AT_ONCE[1] / table[:, 0])
         loops = super()._loops(resolved, orders, chosen)
         if _P - 2 in chosen:
-            loops.by_parameter[resolved[:, _P] < at[:, _P], :, chosen.index(_P - 2)] = 0.0
+            loops.by_parameter[resolved[:, _P] < table[:, _P], :, chosen.index(_P - 2)] = 0.0
         return loops
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
@@ -177,7 +177,7 @@ class BoucWen(Friction):
         low = 1.0 / np.maximum(rates[1], 1e-300)
         return low, np.minimum(1.0 / np.maximum(rates[0], 1e-300), 1e3 * low)
 
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+    def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to a loop that gains energy."""
         _, q, p, *_ = self.parameters
         if values[1] + values[2] <= 0.0:

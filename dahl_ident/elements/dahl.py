@@ -203,7 +203,7 @@ class Dahl(Friction):
             raise ValidationError(f"names has {unknown[0]!r}; expected some of {', '.join(known)}")
         values = self.known_values()
         parameters = [replace(p, free=p.name in chosen) for p in self.parameters]
-        result = self.with_bound(tuple(parameters)).settled(values, Sine(A, np.zeros(())), 2)
+        result = self.copy_with(tuple(parameters)).settled(values, Sine(A, np.zeros(())), 2)
         every = dict(zip(known, (*result.by_parameter, result.by_amplitude), strict=True))
         return {name: every[name][()] for name in chosen}
 
@@ -354,33 +354,33 @@ class Dahl(Friction):
         alpha, name = self.parameter("alpha"), self.name
         exponent = "exponent 1" if alpha.free else "exponent free"
         other_alpha = alpha.fixed(1.0) if alpha.free else alpha.freed()
-        changed = self.with_bound(tuple(other_alpha if p is alpha else p for p in self.parameters))
+        changed = self.copy_with(tuple(other_alpha if p is alpha else p for p in self.parameters))
         two = [
-            Dahl(name=label).started((force * f_max, stiffness * sigma, 1.0))
+            Dahl(name=label).started_at((force * f_max, stiffness * sigma, 1.0))
             for label, force, stiffness in (("early", 0.3, 0.6), ("late", 0.7, 0.4))
         ]
         alternatives = {
-            exponent: Alternative((changed.started((f_max, sigma, 1.0, *values[3:])),)),
+            exponent: Alternative((changed.started_at((f_max, sigma, 1.0, *values[3:])),)),
             "two Dahl elements": Alternative(tuple(two)),
         }
         if not alpha.assumed and (alpha.free or alpha.value != 1.0):
             return alternatives
-        limits = Dahl(asymmetry=None, name=name).started((f_max, sigma, 1.0, 0.01))
+        limits = Dahl(asymmetry=None, name=name).started_at((f_max, sigma, 1.0, 0.01))
         if not self.has_optional:
             alternatives["two limits"] = Alternative((limits,), "asymmetry")
         gap = min(0.3 * f_max / sigma, smallest)
-        behind = self.started(values)
-        alternatives["gap"] = Alternative((Backlash(behind).started((*values, gap)),))
+        behind = self.started_at(values)
+        alternatives["gap"] = Alternative((Backlash(behind).started_at((*values, gap)),))
         rates = sigma, sigma / f_max, sigma / f_max
-        alternatives["Bouc-Wen"] = Alternative((BoucWen(name=name).started(rates),))
+        alternatives["Bouc-Wen"] = Alternative((BoucWen(name=name).started_at(rates),))
         alternatives["Bouc-Wen, exponent free"] = Alternative(
-            (BoucWen(exponent=None, name=name).started((*rates, 1.0)),)
+            (BoucWen(exponent=None, name=name).started_at((*rates, 1.0)),)
         )
-        alternatives["Iwan"] = Alternative((Iwan(name=name).started((f_max, sigma, 0.0, 0.5)),))
+        alternatives["Iwan"] = Alternative((Iwan(name=name).started_at((f_max, sigma, 0.0, 0.5)),))
         alternatives["LuGre"] = Alternative((LuGre(name=name),), "speed")
         alternatives["Maxwell slip"] = Alternative((MaxwellSlip(_JENKINS, name=name),), "masing")
         if not self.has_optional:
-            both = Backlash(limits).started((f_max, sigma, 1.0, 0.01, gap))
+            both = Backlash(limits).started_at((f_max, sigma, 1.0, 0.01, gap))
             alternatives["two limits and gap"] = Alternative((both,), "asymmetry")
         return alternatives
 
@@ -391,7 +391,7 @@ class Dahl(Friction):
             return None
         return UniversalCurve(sigma, linear_dahl.describing_function)
 
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+    def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to an almost vanishing limit."""
         if not self.has_optional or abs(values[3]) < _ONE_SIDED:
             return ()

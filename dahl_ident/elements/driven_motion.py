@@ -160,7 +160,7 @@ class Shooting:
             if element.is_linear:
                 linear += element.stiffness(numbers, np.zeros(()), omega)
             elif isinstance(element, Friction):
-                (law,) = element.inside or (element,)
+                (law,) = element.inner_elements or (element,)
                 stuck += law.rest_stiffness(numbers[: len(law.parameters)])
         return np.asarray(drive / (np.abs(linear) + stuck))
 

@@ -1,4 +1,4 @@
-"""Elements: what every law answers, its mathematics in plain numbers and in checked calls."""
+"""The base class of all elements: checked methods for users, and the unchecked mathematics."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 
 class Element(ABC):
-    """Part of a mechanism: Z(A, omega) = F/X, its share of the dynamic stiffness.
+    """Part of a mechanism, with the dynamic stiffness Z(A, omega) = F/X.
 
-    Elements act in parallel: ``+`` adds their forces at one displacement. A number given to an
-    element fixes that parameter; one left out is free, to be estimated. A subclass with a `kind`
-    can be written to files under this name.
+    Elements act in parallel: ``+`` adds their forces at one displacement. A parameter that is given
+    a number is fixed; one left out is free, and is estimated. A subclass with a `kind` can be
+    written to files under this name.
 
     Attributes
     ----------
@@ -60,26 +60,26 @@ class Element(ABC):
     rate_independent : bool
         True: the stiffness does not depend on the frequency.
     has_memory : bool
-        True: the force depends on the displacement's history.
+        True: the force depends on the history of displacement.
     unique_response : bool
         True: in parallel with a passive linear part the response to a sine force is unique, because
         A abs(L + N(A)) rises with A.
     parameters : tuple of Parameter
         In the order of the constructor: declarations on the class, with values on an element.
     optional : (Parameter, float) or None
-        One more parameter, and the number at which an element does not have it.
+        One more parameter, and the number that means: without this parameter.
     linear_parameters : tuple of str
-        Labels in each of which the force is proportional, the others held.
+        Labels of parameters in which the force is linear.
     scale_parameters : tuple of str
-        Labels that scale the whole force when multiplied together by one factor.
+        Labels of parameters that, all multiplied by one factor, multiply the force by it.
     like_parts : tuple of tuple of str
-        Labels of parts that could be exchanged; estimates are ordered by the first label of each.
+        Labels of each of several interchangeable parts; estimates are ordered by the first label.
     softens : bool
         True: Re N falls with the amplitude, whatever the values.
     holds_at_rest : bool
-        True: a displacement held constant may take a force.
-    start : tuple of str
-        Name, unit and meaning of the unknown from which the states of a driven motion start.
+        True: holding a constant displacement may take a force.
+    starts : tuple of (str, str, str)
+        Name, unit and meaning of each unknown from which the states follow at the first sample.
     """
 
     kind: ClassVar[str] = ""
@@ -123,19 +123,19 @@ class Element(ABC):
 
     @property
     def has_optional(self) -> bool:
-        """Whether the element has the parameter that is optional."""
+        """Whether the element has its optional parameter."""
         return self.optional is not None and self.optional[0].name in self.labels
 
-    def with_bound(self, parameters: tuple[Parameter, ...]) -> Self:
+    def copy_with(self, parameters: tuple[Parameter, ...]) -> Self:
         """Return a copy of this element with other values, bounds or free flags."""
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         copy.parameters = parameters
         return copy
 
-    def started(self, values: Sequence[float]) -> Self:
-        """Return this element with values to start from where it is free."""
-        return self.with_bound(
+    def started_at(self, values: Sequence[float]) -> Self:
+        """Return this element with start values for its free parameters."""
+        return self.copy_with(
             tuple(
                 replace(p, value=p.nearest(v), assumed=False) if p.free else p
                 for p, v in zip(self.parameters, values, strict=True)
@@ -149,26 +149,25 @@ class Element(ABC):
         return {"kind": self.kind, **name, **parameters}
 
     @classmethod
-    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
-        """Return the element that :meth:`describe` described; `rest` has neither kind nor name."""
+    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
+        """Return the element that :meth:`describe` described, here without its kind and name."""
         options: dict[str, Any] = {"name": name}
-        if cls.optional and cls.optional[0].name in rest:
+        if cls.optional and cls.optional[0].name in description:
             options[cls.optional[0].name] = None
-        return cls(**options)._described(rest)
+        return cls(**options)._described(description)
 
     def _described(self, description: Mapping[str, Any]) -> Self:
         """Return this element with the parameters that plain data describe, by label."""
-        known = self.labels
-        unknown = [label for label in description if label not in known]
+        unknown = [label for label in description if label not in self.labels]
         if unknown:
             raise ModelError(
                 f"the {self.kind} element has the keys {', '.join(unknown)}; expected "
-                f"{', '.join(known)}"
+                f"{', '.join(self.labels)}"
             )
-        return self.with_bound(
+        return self.copy_with(
             tuple(
                 p.described(description[label]) if label in description else p
-                for label, p in zip(known, self.parameters, strict=True)
+                for label, p in zip(self.labels, self.parameters, strict=True)
             )
         )
 
@@ -226,15 +225,16 @@ class Element(ABC):
         Parameters
         ----------
         displacement : array_like, shape (n,)
-            m; between samples the motion is taken as monotone or, by an element that depends on
-            the rate, as a polynomial with the velocity (and acceleration) of both.
+            m; between samples it is taken to be monotone or, for an element that depends on the
+            rate, a polynomial with the velocity (and acceleration) of both samples.
         initial_force : float, default 0
             Force at the first sample, N; for an element with memory.
         velocity, acceleration : array_like, shape (n,), optional
             m/s and m/s^2; needed where the element depends on them.
         time : array_like, shape (n,), optional
-            s; gives the velocity and acceleration that are left out, by central differences.
-            Without it samples are taken as even where displacement and velocity agree with that.
+            s; a velocity or acceleration that is left out follows from it by central differences.
+            Without it, even sampling is assumed if displacement and velocity are consistent with
+            that.
 
         Returns
         -------
@@ -264,12 +264,12 @@ class Element(ABC):
         start = finite_number(initial_force, "initial_force")
         self._check_start(values, start)
         v, a = (
-            None if channel is None else np.atleast_1d(motion(channel, name, x, self))
+            None if channel is None else np.atleast_1d(required_history(channel, name, x, self))
             for channel, name in ((velocity, "velocity"), (acceleration, "acceleration"))
         )
         t = None
         if time is not None and x.size > 1:
-            t = motion(time, "time", x, self)
+            t = required_history(time, "time", x, self)
             if np.any(np.diff(t) <= 0.0):
                 raise ValidationError("time does not rise from sample to sample")
             v = np.gradient(x, t) if v is None else v
@@ -304,7 +304,7 @@ class Element(ABC):
             parts.append(f"name={self.name!r}")
         return f"{type(self).__name__}({', '.join(parts)})"
 
-    # The mathematics, in plain numbers: nothing is checked here.
+    # The mathematics, in plain numbers; arguments are not checked.
 
     @property
     def name(self) -> str | None:
@@ -346,8 +346,8 @@ class Element(ABC):
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 at the parameter `values`, unchecked; all arguments broadcast.
 
-        With as many `derivatives` as are asked for: 0 none, 1 that with respect to the amplitude,
-        2 those with respect to the parameters too.
+        `derivatives` is 0 for none, 1 for that with respect to the amplitude, 2 for those with
+        respect to the parameters too.
         """
 
     def stiffness(
@@ -359,22 +359,22 @@ class Element(ABC):
     def stiffness_gradient(
         self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
     ) -> StiffnessGradient:
-        """Return F_k/X_1 with its derivatives, over amplitude and each parameter, unchecked."""
+        """Return F_k/X_1 with all its derivatives, unchecked."""
         return self.settled(values, Sine(amplitude, omega, harmonic), 2)
 
-    def answers(self, harmonic: int) -> bool:
-        """Return whether a sine of displacement may give the force this harmonic, at any values.
+    def has_harmonic(self, harmonic: int) -> bool:
+        """Return whether the force may have this harmonic under a sinusoidal displacement.
 
-        A linear element answers with the fundamental alone, a law that is the same in both
-        directions with odd harmonics.
+        The force of a linear element has only the fundamental, that of a law that is the same in
+        both directions only odd harmonics.
         """
         return harmonic == 1 if self.is_linear else harmonic % 2 == 1
 
     def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
-        """Return units of force and stiffness in which the law has fewer numbers, and those.
+        """Return a force, a stiffness, and the values in these units, of which fewer vary.
 
-        ``N(A; values) = stiffness * N(A stiffness/force; numbers)``. One and the values
-        themselves where a law has no such units.
+        ``N(A; values) = stiffness * N(A stiffness/force; values in these units)``. By default 1,
+        1 and the values themselves.
         """
         return np.ones(()), np.ones(()), values
 
@@ -383,8 +383,8 @@ class Element(ABC):
     ) -> HistoryGradient:
         """Return the force at every sample with its derivatives, unchecked.
 
-        `state` is the unknown at the first sample: the force there, in most laws. Without `slopes`
-        the derivatives are not looked at.
+        `state` is the unknown at the first sample: in most laws, the force there. Without `slopes`
+        the derivatives need not be right.
         """
         raise ModelError(f"{self!r} has no force over time")
 
@@ -398,18 +398,17 @@ class Element(ABC):
         acceleration: FloatArray | None = None,
         time: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the force at every sample of one history, unchecked; `state` is the first."""
+        """Return the force alone of :meth:`history`."""
         path = Path(displacement, velocity, acceleration, time)
         return self.history(values, path, state, slopes=False).value
 
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return the part in an equation of motion, in plain arithmetic.
+        """Return the element's part in an equation of motion, in plain arithmetic.
 
-        `x` is the displacement, `direction` the sign of the velocity, `states` what
-        :attr:`n_states` counts: the present force of an element with memory, where it needs no
-        more.
+        `x` is the displacement, `direction` the sign of the velocity. There are :attr:`n_states`
+        `states`: in most laws with memory one, the present force.
         """
         raise ModelError(
             f"{self!r} has no equation of motion, so it cannot be driven by a force over time; "
@@ -417,13 +416,13 @@ class Element(ABC):
         )
 
     @property
-    def inside(self) -> tuple[Any, ...]:
-        """Elements of which this one is made, such as that behind a gap."""
+    def inner_elements(self) -> tuple[Any, ...]:
+        """Elements that this one contains, such as that behind a gap."""
         return ()
 
     @property
     def n_states(self) -> int:
-        """States in an equation of motion."""
+        """Number of states in an equation of motion."""
         return int(self.has_memory)
 
     @property
@@ -432,22 +431,22 @@ class Element(ABC):
         return any(p.is_mass for p in self.parameters)
 
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
-        """Return the states at the first sample, in plain arithmetic, from the unknowns there.
+        """Return the states at the first sample from the unknowns there, in plain arithmetic.
 
-        The states of an element without memory are unknowns themselves.
+        The states of a linear element are the unknowns themselves.
         """
         return starts
 
     def start_with(self, values: Sequence[Any], force: float) -> float:
-        """Return the unknown at the first sample with which a history starts with a force."""
+        """Return the unknown at the first sample for which the force there is `force`."""
         return force
 
     def coarser(self) -> Self:
-        """Return this element, or one whose motion under a force costs less and is nearly alike."""
+        """Return this element, or an approximation whose motion under a force costs less."""
         return self
 
     def free_responses(self, time: FloatArray) -> FloatArray:
-        """Return the force from each state of a linear element at the first sample, (n, states)."""
+        """Return a linear element's force from a unit of each initial state, (n, states)."""
         return np.zeros((time.size, 0))
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
@@ -455,7 +454,7 @@ class Element(ABC):
         return np.full((), np.inf), np.full((), np.inf)
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return amplitudes between which N changes, m; NaN for a linear element."""
+        """Return the amplitudes between which N changes, m; NaN for a linear element."""
         return np.full((), np.nan), np.full((), np.nan)
 
     def transient_decay(
@@ -469,46 +468,43 @@ class Element(ABC):
         return ()
 
     def combinations(self) -> tuple[Combination, ...]:
-        """Return products of powers that data may determine where single parameters are lost."""
+        """Return products of powers that data may determine where their factors are not."""
         return ()
 
     def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
-        """Return, by a few words, what is tried in place of this element; started at `values`.
+        """Return alternatives to this element by a short description of each.
 
-        `smallest` is the smallest amplitude measured, m.
+        They start from this element's `values`; `smallest` is the smallest amplitude measured, m.
         """
         return {}
 
     def universal_curve(self) -> UniversalCurve | None:
-        """Return the curve that all values of the scale parameters follow, or None."""
+        """Return the curve that N follows for all values of the scale parameters, or None."""
         return None
 
     def resembles(
         self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
     ) -> tuple[str, float] | None:
-        """Return a simpler law and how far its best N is from this one's at some levels, rms.
+        """Return a simpler law, if there is one, and the rms deviation of its best fit to this N.
 
-        None for a law without a simpler one.
+        The deviation is relative, over levels of `amplitude` and `omega`.
         """
         return None
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return the values with those that no longer matter at an amplitude held where they do."""
+        """Return the values, each limited to the range in which it has an effect at `amplitude`."""
         return values
 
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
-        """Return the physical objections to the values, in words."""
+    def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
+        """Return sentences that say why the values are physically impossible."""
         return ()
 
     def rational_stiffness(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return numerator and denominator of Z(s), from the highest power of s down.
-
-        None for an element that is not linear.
-        """
+        """Return a linear element's numerator and denominator of Z(s), highest power first."""
         return None
 
     def system_at(self, values: Sequence[float]) -> Any:
-        """Return the python-control system that the element was made from, or None."""
+        """Return the python-control system from which the element was made, or None."""
         return None
 
 
@@ -523,10 +519,10 @@ def prefixed(name: str | None, label: str) -> str:
     return f"{name}_{label}"
 
 
-def motion(
+def required_history(
     value: ArrayLike | None, name: str, displacement: ArrayLike, needed_by: Element
 ) -> FloatArray:
-    """Return a checked history as long as `displacement`, or say which element needs it."""
+    """Return a history, checked to be there and as long as `displacement`."""
     if value is None:
         raise ValidationError(f"{needed_by!r} needs {name} to give its force; pass {name}=")
     history, x = finite_array(value, name), real_array(displacement, "displacement")

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.law_checks import traced
+from dahl_ident.elements.law_checks import symbolic_mechanics
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def law_equations(element: Element) -> Equations:
     values = [_symbol(p) for p in element.parameters]
     states = [ca.SX.sym(f"y{i}") for i in range(element.n_states)]
     with numpy_names():
-        part = traced(element, values, x, v, s, states)
+        part = symbolic_mechanics(element, values, x, v, s, states)
     rates = ca.vertcat(v, 0.0, *part.rates)
     names = [ca.SX.sym(p.name) if v.is_constant() else v for p, v in _pairs(element, values)]
     return Equations([x, v, *states], u, s, names, rates, ca.SX(part.force), held=True)
@@ -78,7 +78,7 @@ def plant_equations(
         for element, numbers in model.of(values):
             element_states = [ca.SX.sym(f"y{len(states) + i}") for i in range(element.n_states)]
             states += element_states
-            part = traced(element, numbers, x, v, s, element_states)
+            part = symbolic_mechanics(element, numbers, x, v, s, element_states)
             if excitation == "base" and element.is_linear and element.n_states:
                 raise ModelError(
                     f"{element!r} has inertia inside, and how the base moves it is not known; "

@@ -1,8 +1,8 @@
 """Friction laws: any relation between displacement and force with memory.
 
 A law is one class: declared parameters and ``slope``, the derivative of the force with respect to
-displacement. Everything else follows from the slope: settled loops and forces along histories are
-the engine's (:mod:`dahl_ident.elements.held_motion`). A law with closed forms overrides these
+displacement. Everything else follows from the slope: the engine computes settled loops and forces
+along histories (:mod:`dahl_ident.elements.held_motion`). A law with closed forms overrides these
 methods.
 """
 
@@ -26,7 +26,7 @@ from dahl_ident.arrays import (
     positive_number,
     whole_number,
 )
-from dahl_ident.elements.element import Element, motion
+from dahl_ident.elements.element import Element, required_history
 from dahl_ident.elements.facts import (
     SOFTENED,
     HistoryGradient,
@@ -43,9 +43,9 @@ from dahl_ident.errors import ModelError, ValidationError
 if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
-_SMALLEST = 1e-100  # m; smaller amplitudes are rest
+_SMALLEST = 1e-100  # m; smaller amplitudes count as rest
 _FARTHEST = 1e9  # m; a law that has not slipped fully there never does
-_SECTIONS = 16  # of a bracket, when the force is sought at which the slope vanishes
+_SECTIONS = 16  # of a bracket, in the search for the force at which the slope vanishes
 
 
 class Friction(Element):
@@ -55,7 +55,7 @@ class Friction(Element):
     ----------
     *values : float or None, optional
         The declared parameters, in their order: a number fixes one, None frees it. One left out
-        has its declared value, or is free.
+        has its declared value, or is free if it has none.
     name : str, optional
         Prefix of the parameters' names.
     **named : float or None, optional
@@ -64,8 +64,8 @@ class Friction(Element):
     Raises
     ------
     ModelError
-        If there are more values than parameters, a label is unknown or given twice, or, when the
-        law is first used, its slope cannot be that of a friction law.
+        If there are more values than parameters, a label is unknown or given twice, or the slope
+        cannot be that of a friction law (checked when the law is first used).
     ValidationError
         If a value is outside its parameter's bounds, or the parameters are not declared as they
         should be.
@@ -118,8 +118,7 @@ class Friction(Element):
             Sign of the velocity, +1 or -1.
         velocity : array or None
             dx/dt, m/s; None for a law that is declared rate-independent. A law that uses it
-            declares ``rate_independent = False``; where only its quasi-static behaviour is asked
-            for, the velocity is 0.
+            declares ``rate_independent = False``; for its quasi-static behaviour the velocity is 0.
         values : sequence of array
             The parameters in their declared order.
         """
@@ -132,29 +131,21 @@ class Friction(Element):
         return force
 
     def quasi_static_slope(self, force: Any, direction: Any, values: Sequence[Any]) -> Any:
-        """Return dF/dx at vanishing speed; ModelError if the law needs an undeclared velocity."""
-        if not self.rate_independent:
-            return self.slope(force, direction, 0.0, values)
-        try:
-            return self.slope(force, direction, None, values)
-        except TypeError as error:
-            raise ModelError(
-                f"{type(self).__name__}.slope failed without a velocity ({error}); a law that "
-                "uses the velocity must declare rate_independent = False"
-            ) from error
+        """Return dF/dx at vanishing speed."""
+        return self.slope(force, direction, None if self.rate_independent else 0.0, values)
 
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return the present force, and its change over time: slope times velocity."""
+        """Return the present force, and its rate: slope times velocity."""
         (force,) = states
         slope = self.slope(force, direction, velocity, values)
         return Mechanics(0.0, self.output(force, slope, velocity, values), (slope * velocity,))
 
     def start_bounds(self, values: Values) -> tuple[float, float]:
-        """Return between which numbers the unknowns at the first sample are: forces of full slip.
+        """Return the bounds of the unknown at the first sample: those of forces of full slip.
 
-        Friction that begins beyond them falls back within a small part of x_c.
+        A force beyond them would fall back within a small part of x_c.
         """
         up, down = (float(force) for force in self.force_limits(values))
         return self.start_with(values, -down), self.start_with(values, up)
@@ -162,88 +153,89 @@ class Friction(Element):
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 of the settled loop; derivatives are 0 where a parameter is fixed.
 
-        NaN where nothing settles.
+        NaN where no loop settles.
         """
         chosen = [i for i, p in enumerate(self.parameters) if p.free and derivatives > 1]
-        at, rows = self._rows(values, sine.amplitude, sine.omega)
-        orders, place = np.unique(sine.harmonic, return_inverse=True)
-        place = place.reshape(np.shape(sine.harmonic))
-        loops = self._loops(at, orders.tolist(), chosen)
-        A = at[:, :1]
+        table, rows = self._table(values, sine.amplitude, sine.omega)
+        orders, columns = np.unique(sine.harmonic, return_inverse=True)
+        columns = columns.reshape(np.shape(sine.harmonic))
+        loops = self._loops(table, orders.tolist(), chosen)
+        A = table[:, :1]
         value = loops.coefficients / A
-        rests = A[:, 0] <= _SMALLEST
-        if self.rate_independent and rests.any():
-            law_values = [np.asarray(v) for v in at[rests, 2:].T]
-            value[rests] = self.rest_stiffness(law_values)[:, None] * (orders == 1)
-        by = np.zeros((len(values) if derivatives > 1 else 0, *value.shape), dtype=np.complex128)
-        by[chosen] = np.moveaxis(loops.by_parameter, 2, 0) / A
+        at_rest = A[:, 0] <= _SMALLEST
+        if self.rate_independent and at_rest.any():
+            stiffness = self.rest_stiffness(list(table[at_rest, 2:].T))
+            value[at_rest] = stiffness[:, None] * (orders == 1)
+        count = len(values) if derivatives > 1 else 0
+        slopes = np.zeros((count, *value.shape), dtype=np.complex128)
+        slopes[chosen] = np.moveaxis(loops.by_parameter, 2, 0) / A
         by_amplitude = (loops.by_amplitude - value) / A
         return StiffnessGradient(
-            value[rows, place], by_amplitude[rows, place], tuple(d[rows, place] for d in by)
+            value[rows, columns], by_amplitude[rows, columns], tuple(slopes[:, rows, columns])
         )
 
     def _loops(
-        self, at: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
+        self, table: FloatArray, orders: Sequence[int] = (1,), chosen: Sequence[int] = ()
     ) -> Loops:
-        """Return settled loops at rows of amplitude, frequency and values, with their harmonics."""
-        return loops_of(self, at, orders, chosen)
+        """Return the settled loops at rows of amplitude, frequency and values."""
+        return loops_of(self, table, orders, chosen)
 
-    def _rows(
+    def _table(
         self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> tuple[FloatArray, IntArray]:
         """Return rows of amplitude, frequency and values without repetition, and each point's row.
 
-        Amplitudes of the same parameters rise from row to row.
+        Amplitudes of the same values rise from row to row.
         """
-        speed = np.ones(()) if self.rate_independent else np.maximum(omega, _SMALLEST)
+        frequency = np.ones(()) if self.rate_independent else np.maximum(omega, _SMALLEST)
         amplitude = np.maximum(amplitude, _SMALLEST)
-        *columns, _ = np.broadcast_arrays(*values, speed, amplitude, omega)
-        every = np.column_stack([column.ravel() for column in columns]).astype(np.float64)
-        at, rows = np.unique(every, axis=0, return_inverse=True)
+        *columns, _ = np.broadcast_arrays(*values, frequency, amplitude, omega)
+        points = np.column_stack([column.ravel() for column in columns]).astype(np.float64)
+        table, rows = np.unique(points, axis=0, return_inverse=True)
         n = len(values)
-        return at[:, [n + 1, n, *range(n)]], rows.reshape(columns[0].shape)
+        return table[:, [n + 1, n, *range(n)]], rows.reshape(columns[0].shape)
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives; 0 by parameters that are fixed.
+        """Return the force at every sample; derivatives are 0 where a parameter is fixed.
 
-        Between samples the displacement of a law that depends on the rate has the velocity, and the
-        acceleration where it is known, of both.
+        Between samples the displacement of a law that depends on the rate has the velocities, and
+        the accelerations where known, of both samples.
         """
         if not self.rate_independent:
-            motion(path.velocity, "velocity", path.displacement, self)
+            required_history(path.velocity, "velocity", path.displacement, self)
         free = [i for i, p in enumerate(self.parameters) if p.free]
         return force_along(self, values, path, state, free if slopes else None)
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf if there is none."""
         shape = np.broadcast_shapes(*(np.shape(v) for v in values))
-        start = np.broadcast_to(self.rest_stiffness(values) * _FARTHEST, shape)
-        return self._limit(values, 1.0, start), self._limit(values, -1.0, start)
+        largest = np.broadcast_to(self.rest_stiffness(values) * _FARTHEST, shape)
+        return self._limit(values, 1.0, largest), self._limit(values, -1.0, largest)
 
-    def _limit(self, values: Values, direction: float, start: FloatArray) -> FloatArray:
-        """Return the least force at which the slope vanishes; inf if there is none to `start`."""
+    def _limit(self, values: Values, direction: float, largest: FloatArray) -> FloatArray:
+        """Return the smallest force at which the slope vanishes; inf if it exceeds `largest`."""
         columns = [np.asarray(v)[..., None] for v in values]
         fractions = np.arange(1, _SECTIONS + 1) / _SECTIONS
-        low, width = np.zeros(start.shape), start.copy()
-        ends: BoolArray = np.ones(start.shape, dtype=bool)
+        low, width = np.zeros(largest.shape), largest
+        exists: BoolArray = np.ones(largest.shape, dtype=bool)
         for step in range(60):
             force = low[..., None] + width[..., None] * fractions
             with np.errstate(all="ignore"):
                 slope = self.quasi_static_slope(direction * force, direction, columns)
-                stuck = ~(slope + 0.0 * force > 0.0)
+                vanished = ~(slope + 0.0 * force > 0.0)
             if step == 0:
-                ends = np.asarray(stuck.any(axis=-1))
-            stuck[..., -1] = True
+                exists = np.asarray(vanished.any(axis=-1))
+            vanished[..., -1] = True
             width = width / _SECTIONS
-            low = low + width * stuck.argmax(axis=-1)
-            if np.all((width <= 1e-16 * low) | ~ends):
+            low = low + width * vanished.argmax(axis=-1)
+            if np.all((width <= 1e-16 * low) | ~exists):
                 break
-        return np.where(ends, low, np.inf)
+        return np.where(exists, low, np.inf)
 
     def rest_stiffness(self, values: Values) -> FloatArray:
-        """Return dF/dx at zero force, which N tends to at small amplitudes, N/m."""
+        """Return dF/dx at zero force, the limit of N at small amplitudes, N/m."""
         return np.asarray(self.quasi_static_slope(np.zeros(()), 1.0, values), dtype=np.float64)
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
@@ -251,20 +243,18 @@ class Friction(Element):
 
         The fundamental of a wave of height 1 is at most 4/pi, that of the square wave.
         """
-        limits = self.force_limits(values)
-        highest = np.maximum(*limits)
+        highest = np.maximum(*self.force_limits(values))
         force = np.where(np.isfinite(highest), highest, 0.0)[..., None] * np.linspace(-1, 1, 101)
         columns = [np.asarray(v)[..., None] for v in values]
-        steepest = self.quasi_static_slope(force, 1.0, columns).max(axis=-1)
-        steepest = np.maximum(steepest, self.quasi_static_slope(force, -1.0, columns).max(axis=-1))
-        steepest = np.where(np.isfinite(highest), 1.02 * steepest, np.inf)
+        slopes = [self.quasi_static_slope(force, s, columns).max(axis=-1) for s in (1.0, -1.0)]
+        steepest = np.where(np.isfinite(highest), 1.02 * np.maximum(*slopes), np.inf)
         return 4.0 / np.pi * steepest, 4.0 / np.pi * highest
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return where N begins to change and where full slip sets in, m.
+        """Return the amplitudes at which N begins to change and at which full slip sets in, m.
 
-        Twice the force limit over the stiffness at zero force; for a law that never slips fully,
-        where 1 % and all but 1 % of the stiffness are gone, as far as that happens.
+        Both are the force limit over the stiffness at zero force. For a law that never slips fully,
+        N has changed by 1 % at the first, and by less than 100 % up to the second.
         """
         ratio = np.asarray(np.maximum(*self.force_limits(values)) / self.rest_stiffness(values))
         if np.all(np.isfinite(ratio)):
@@ -273,13 +263,12 @@ class Friction(Element):
         columns = [np.asarray(v)[..., None] for v in values]
         with np.errstate(all="ignore"):
             N = np.abs(self.stiffness(columns, A, np.zeros(())))
-            lost = np.abs(N / N[..., :1] - 1.0)
-        known = np.isfinite(lost) & (lost < 1.0)
-        low = A[np.argmax(lost > SOFTENED, axis=-1)]
-        high = A[known.shape[-1] - 1 - np.argmax(known[..., ::-1], axis=-1)]
+            change = np.abs(N / N[..., :1] - 1.0)
+        low = A[np.argmax(change > SOFTENED, axis=-1)]
+        high = A[A.size - 1 - np.argmax(change[..., ::-1] < 1.0, axis=-1)]
         return np.asarray(low), np.asarray(high)
 
-    def answers(self, harmonic: int) -> bool:
+    def has_harmonic(self, harmonic: int) -> bool:
         """Return whether the force may have this harmonic: even ones where directions differ."""
         return harmonic % 2 == 1 or not same_both_ways(self)
 
@@ -287,8 +276,8 @@ class Friction(Element):
         self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return the factor by which a deviation from the settled loop shrinks in one cycle."""
-        at, rows = self._rows(values, amplitude, omega)
-        return np.asarray(np.abs(self._loops(at).decays)[rows])
+        table, rows = self._table(values, amplitude, omega)
+        return np.asarray(np.abs(self._loops(table).decays)[rows])
 
     def _check_start(self, values: Sequence[float], initial_force: float) -> None:
         up, down = (float(v) for v in self.force_limits([np.asarray(v) for v in values]))
@@ -298,26 +287,18 @@ class Friction(Element):
                 f"slip, {-down:g} and {up:g}"
             )
 
-    def _loop(self, values: Sequence[float], amplitude: float, theta: FloatArray) -> FloatArray:
-        """Return the force on the settled loop at rising angles from 0 to 2 pi."""
-        angle = np.union1d(theta, np.pi)  # where the motion turns
-        x, v = amplitude * np.cos(angle), -amplitude * np.sin(angle)
-        start = self.start_with(values, self._top(values, amplitude))
-        force = self.force_history(values, x, v, start)
-        return force[np.searchsorted(angle, theta)]
-
     def _top(self, values: Sequence[float], amplitude: float) -> float:
         """Return the force of the settled loop at the largest displacement."""
         return float(self._loops(np.array([[amplitude, 1.0, *values]])).tops[0])
 
     def _coefficients(self, amplitude: FloatArray, harmonic: int) -> ComplexArray:
-        """Return F_k/X_1, refused where no loop settles."""
+        """Return F_k/X_1; refuse amplitudes at which no loop settles."""
         N = self.stiffness(self.known_values(), amplitude, np.zeros(()), harmonic)
-        lost = ~np.isfinite(N)
-        if lost.any():
+        unsettled = ~np.isfinite(N)
+        if unsettled.any():
             raise ModelError(
-                f"{self!r} has no steady loop at the amplitude {amplitude[lost].min():g} m, where "
-                "its force or its slope grows too large; expected a smaller amplitude"
+                f"{self!r} has no steady loop at the amplitude {amplitude[unsettled].min():g} m, "
+                "where its force or its slope grows too large; expected a smaller amplitude"
             )
         return N
 
@@ -334,7 +315,7 @@ class Friction(Element):
         Parameters
         ----------
         amplitude : array_like
-            Zero-to-peak displacement A >= 0, m. At A = 0 its limit.
+            Zero-to-peak displacement A >= 0, m. At A = 0 the result is the limit.
 
         Returns
         -------
@@ -421,7 +402,7 @@ class Friction(Element):
         return self.describing_function(amplitude).real[()]
 
     def equivalent_damping(self, amplitude: ArrayLike, omega: ArrayLike) -> FloatArray:
-        """Return -b_1/(A omega) = Im N(A)/omega, the viscous damper with the same loss.
+        """Return -b_1/(A omega) = Im N(A)/omega, the viscous damping with the same loss.
 
         `omega` > 0 is in rad/s and broadcast with `amplitude`, N s/m; errors as
         `describing_function`.
@@ -484,4 +465,7 @@ class Friction(Element):
         A = positive_number(amplitude, "amplitude")
         theta = np.linspace(0.0, 2.0 * np.pi, whole_number(points, "points", 3))
         values = [float(v) for v in self.known_values()]
-        return A * np.cos(theta), self._loop(values, A, theta)
+        angle = np.union1d(theta, np.pi)  # where the motion turns
+        start = self.start_with(values, self._top(values, A))
+        force = self.force_history(values, A * np.cos(angle), -A * np.sin(angle), start)
+        return A * np.cos(theta), force[np.searchsorted(angle, theta)]

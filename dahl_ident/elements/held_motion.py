@@ -34,7 +34,7 @@ _FINER = 10.0  # times finer than a driven motion, for laws of one state
 
 def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -> System:
     """Return the compiled equations of a law; parameters `chosen`, or not at their values, vary."""
-    law = law.with_bound(
+    law = law.copy_with(
         tuple(
             p.freed() if i in chosen or p.value is None or bool(np.any(v != p.value)) else p
             for i, (p, v) in enumerate(zip(law.parameters, values, strict=True))
@@ -77,7 +77,12 @@ def form_of(law: Element) -> Hashable:
 
 
 def loops_of(
-    law: Element, at: FloatArray, orders: Sequence[int], chosen: Sequence[int], *, gap: bool = False
+    law: Element,
+    table: FloatArray,
+    orders: Sequence[int],
+    chosen: Sequence[int],
+    *,
+    gap: bool = False,
 ) -> Loops:
     """Return the settled loops of a law at rows of amplitude, frequency and values.
 
@@ -86,8 +91,9 @@ def loops_of(
     from dahl_ident.engine import loops
 
     n = len(law.parameters)
-    system = system_of(law, list(at[:, 2 : 2 + n].T), [i for i in chosen if i < n])
-    return loops(system, at[:, 0], at[:, 1], at[:, 2:], chosen=chosen, harmonics=orders, gap=gap)
+    system = system_of(law, list(table[:, 2 : 2 + n].T), [i for i in chosen if i < n])
+    A, omega, values = table[:, 0], table[:, 1], table[:, 2:]
+    return loops(system, A, omega, values, chosen=chosen, harmonics=orders, gap=gap)
 
 
 def force_along(

@@ -107,7 +107,7 @@ class Iwan(Masing):
 
     def coarser(self) -> Iwan:
         """Return this law with fewer Jenkins elements in its place."""
-        copy = self.with_bound(self.parameters)
+        copy = self.copy_with(self.parameters)
         copy._count = _FEW_SLIDERS
         return copy
 

@@ -501,7 +501,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:40]}..."
 
 
-def traced(
+def symbolic_mechanics(
     element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
 ) -> Mechanics:
     """Return an element's part in an equation of motion, in symbols."""

@@ -188,16 +188,16 @@ def restored(file: LawFile, name: str) -> Any:
     return object.__new__(cls)
 
 
-def own_laws(elements: Iterable[Element]) -> list[type[Element]]:
+def user_laws(elements: Iterable[Element]) -> list[type[Element]]:
     """Return the classes of a model's laws that are not this package's; those behind gaps too."""
-    both = (type(part) for element in elements for part in (element, *element.inside))
+    both = (type(part) for element in elements for part in (element, *element.inner_elements))
     return list(dict.fromkeys(law for law in both if not is_of_package(law)))
 
 
 def describe_laws(elements: Iterable[Element]) -> list[dict[str, Any]]:
     """Return what to import for the laws of a model that are not this package's, as plain data."""
     descriptions = []
-    for law in own_laws(elements):
+    for law in user_laws(elements):
         path, file = source_path(law), file_of(law)
         module = Path(file.path).stem if file else law.__module__
         about = {"kind": law.kind, "class": law.__qualname__, "module": module, "file": path}

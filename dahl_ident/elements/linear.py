@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Element, motion
+from dahl_ident.elements.element import Element, required_history
 from dahl_ident.elements.facts import (
     HistoryGradient,
     Mechanics,
@@ -44,7 +44,7 @@ class Lumped(Element):
     ) -> HistoryGradient:
         """Return p times the displacement, velocity or acceleration, and its derivatives."""
         name = Path._fields[self.order]
-        history = motion(path[self.order], name, path.displacement, self)
+        history = required_history(path[self.order], name, path.displacement, self)
         force = np.asarray(values[0] * history)
         return HistoryGradient(force, np.zeros(force.shape), (history,))
 
@@ -61,7 +61,7 @@ class Lumped(Element):
         (value,) = self.known_values()
         return np.append(value, np.zeros(self.order)), np.ones(1)
 
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+    def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return an objection to a negative value."""
         (parameter,) = self.parameters
         return (f"{parameter.name} is negative",) if values[0] < 0.0 else ()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.record import is_even
-from dahl_ident.elements.element import Element, motion, prefixed
+from dahl_ident.elements.element import Element, prefixed, required_history
 from dahl_ident.elements.facts import (
     STEP,
     HistoryGradient,
@@ -228,9 +228,9 @@ class LinearSystem(Element):
         x = path.displacement
         v = a = np.zeros(x.shape)
         if c or m or equation.order:
-            v = motion(path.velocity, "velocity", x, self)
+            v = required_history(path.velocity, "velocity", x, self)
         if m or equation.order:
-            a = motion(path.acceleration, "acceleration", x, self)
+            a = required_history(path.acceleration, "acceleration", x, self)
         force = np.asarray(k * x + c * v + m * a)
         if equation.order:
             poles = np.linalg.eigvals(equation.matrix)

@@ -154,7 +154,7 @@ class Masing(Friction):
         )
         return HistoryGradient(value, by_state, tuple(by))
 
-    def answers(self, harmonic: int) -> bool:
+    def has_harmonic(self, harmonic: int) -> bool:
         """Return whether the harmonic is odd, because both directions are alike."""
         return harmonic % 2 == 1
 

@@ -147,10 +147,12 @@ class Model(Element):
             v for element, numbers in self.of(values) for v in element.resolved(numbers, amplitude)
         ]
 
-    def physics(self, values: Sequence[float]) -> tuple[str, ...]:
+    def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
         """Return the objections of all elements to their values."""
         return tuple(
-            text for element, numbers in self.of(values) for text in element.physics(numbers)
+            text
+            for element, numbers in self.of(values)
+            for text in element.physical_objections(numbers)
         )
 
     def coarser(self) -> Model:
@@ -166,7 +168,7 @@ class Model(Element):
         for element in self._elements:
             parameters = tuple(changes.get(p.name, p) for p in element.parameters)
             same = parameters == element.parameters
-            elements.append(element if same else element.with_bound(parameters))
+            elements.append(element if same else element.copy_with(parameters))
         return Model(*elements)
 
     def with_free(self, names: Iterable[str]) -> Model:

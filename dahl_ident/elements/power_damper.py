@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import gamma, rgamma
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element, motion
+from dahl_ident.elements.element import Element, required_history
 from dahl_ident.elements.facts import (
     STEP,
     HistoryGradient,
@@ -129,7 +129,7 @@ class PowerDamper(Element):
     ) -> HistoryGradient:
         """Return the force for the velocity at every sample with its derivatives, unchecked."""
         c, p, speed = values
-        v = motion(path.velocity, "velocity", path.displacement, self) / speed
+        v = required_history(path.velocity, "velocity", path.displacement, self) / speed
         unit = np.asarray(np.sign(v) * np.abs(v) ** p)
         force = np.asarray(c * unit)
         if not slopes:

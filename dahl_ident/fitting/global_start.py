@@ -404,7 +404,7 @@ def _possible(
         numbers = [
             by_name.get(p.name, 1.0 if p.value is None else p.value) for p in d.element.parameters
         ]
-        possible.append(not d.element.physics(numbers))
+        possible.append(not d.element.physical_objections(numbers))
     return np.asarray(possible) if any(possible) else np.ones(len(possible), dtype=np.bool_)
 
 

@@ -260,7 +260,9 @@ def forecast_of_suspects(
     theta = problem.to_search(np.stack(columns, axis=-1))
     units = units_of(problem.parameters, theta)
     fundamental = problem.predict(theta)[..., None]
-    even = candidates.controlled == "displacement" and any(e.answers(2) for e in larger.elements)
+    even = candidates.controlled == "displacement" and any(
+        e.has_harmonic(2) for e in larger.elements
+    )
     rows = []
     for k in (1, 2) if even else (1,):
         harmonic_problem = knowledge.problem_at(*levels, model=larger, harmonic=k, noise="absolute")

@@ -406,7 +406,7 @@ def _check(rows: Rows, model: Model) -> None:
         _require(~rows.forced, "displacement", "amplitude")
     if rows.drive is None:
         _require(rows.forced, "force", "drive")
-    if not any(element.answers(k) for element in model.elements for k in rows.orders):
+    if not any(element.has_harmonic(k) for element in model.elements for k in rows.orders):
         raise DataError(
             f"the rows hold the harmonics {', '.join(map(str, rows.orders))}, and no element of "
             f"{model!r} has any of them; give odd ones as well, or use a law that is asymmetric"

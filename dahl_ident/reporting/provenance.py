@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.elements.law_checks import is_of_package
-from dahl_ident.elements.law_files import own_laws, source_path
+from dahl_ident.elements.law_files import source_path, user_laws
 from dahl_ident.problem import TableProblem
 from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.tables import prior_text
@@ -212,7 +212,7 @@ def _model(problem: TableProblem) -> list[str]:
     """Return the options of elements and sensors that are not defaults."""
     model = problem.model
     names = {p.name for p in model.parameters}
-    laws = own_laws(model.elements)
+    laws = user_laws(model.elements)
     if names <= _OPTIONS and {"f_max", "sigma"} <= names and not laws:
         words = [word for p in model.parameters for word in _parameter(p, problem)]
     else:

@@ -10,7 +10,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, LinearSystem, Model
 from dahl_ident.elements.equations import law_equations, numpy_names, plant_equations
-from dahl_ident.elements.law_checks import traced
+from dahl_ident.elements.law_checks import symbolic_mechanics
 from dahl_ident.elements.model import as_model
 from dahl_ident.elements.rational import Rational
 from dahl_ident.engine import Equations, march, translate
@@ -125,7 +125,7 @@ def _massless(laws: Sequence[Element], stiffness: float, damping: float) -> Equa
     with numpy_names():
         for law in laws:
             law_states = [ca.SX.sym(f"y{len(states) + i}") for i in range(law.n_states)]
-            part = traced(law, _values(law), x, s, s, law_states)
+            part = symbolic_mechanics(law, _values(law), x, s, s, law_states)
             rates = ca.vertcat(*part.rates) * s  # derivatives with respect to displacement
             tangent += ca.mtimes(ca.jacobian(part.force, ca.vertcat(*law_states)), rates)
             states, slopes = [*states, *law_states], [*slopes, rates]
