@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RESPONSIBLE = {
     "diagnostics": (
         "diagnostics_*", "verdicts", "intervals", "held_out", "comparison", "record_*",
-        "doubtful_elements", "mean_force_rows", "exchangeable_parameters", "measured_dampers",
+        "mean_force_rows", "measured_dampers",
     ),
     "problem": (
         "problem", "sensors", "noise", "record_*", "driven_plants", "harmonics_of_motion",

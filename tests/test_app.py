@@ -125,6 +125,15 @@ def test_a_bad_file_is_refused_in_the_reader_s_words(server):
     assert 'value="model" disabled' in page
 
 
+def test_two_channels_with_one_role_are_named(server):
+    place = server.upload([("run.csv", b"t,a,b\n0,1,2\n1,2,3\n")])
+    form = b"channel_0=a&role_0=force&channel_1=b&role_1=force"
+    kind = {"Content-Type": "application/x-www-form-urlencoded"}
+    status, _, text = server.request("POST", place, form, kind)
+    assert status == 400
+    assert "a and b are both the force; go back and choose" in unescape(text)
+
+
 def test_the_program_gives_what_the_page_shows(server, work, fitted):
     run = fitted
     page = unescape(server.page(run))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from dahl_ident.elements import (
     BoucWen,
@@ -26,8 +26,7 @@ from dahl_ident.elements import (
     Spring,
 )
 from dahl_ident.elements.law_files import KINDS, class_named, load_laws
-from dahl_ident.errors import DahlIdentError
-from dahl_ident.synthetic.experiment import toml_text
+from dahl_ident.errors import DahlIdentError, DataError
 from dahl_ident.units import SI_UNITS, parse_quantity
 
 _LAWS: tuple[tuple[str, str, Any], ...] = (
@@ -209,18 +208,23 @@ def _in_si(text: str, option: str) -> str:
 
 def columns_toml(form: Mapping[str, str]) -> str:
     """Return the column map of the data form: role, unit and sign of each channel."""
-    lines = []
+    entries: dict[str, dict[str, Any]] = {}
     for key, column in form.items():
         number = key.removeprefix("channel_")
         role = form.get(f"role_{number}", "")
         if number == key or not role:
             continue
-        lines.append(f"[{role}]\ncolumn = {_text(column)}")
+        if role in entries:
+            raise DataError(
+                f"{entries[role]['column']} and {column} are both the {role}; go back and choose "
+                "another role for one of them"
+            )
+        entries[role] = {"column": column}
         if form.get(f"unit_{number}", "").strip():
-            lines.append(f"unit = {_text(form[f'unit_{number}'].strip())}")
+            entries[role]["unit"] = form[f"unit_{number}"].strip()
         if form.get(f"sign_{number}") == "-1":
-            lines.append("sign = -1")
-    return "".join(f"{line}\n" for line in lines)
+            entries[role]["sign"] = -1
+    return tomli_w.dumps(entries)
 
 
 def report_toml(form: Mapping[str, str]) -> str:
@@ -244,8 +248,4 @@ def report_toml(form: Mapping[str, str]) -> str:
                 if math.isfinite(k := float(instrument.get("k", ""))):
                     instrument["k"] = k
             stated.setdefault("instruments", []).append(instrument)
-    return toml_text(stated)
-
-
-def _text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return tomli_w.dumps(stated)

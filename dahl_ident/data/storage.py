@@ -11,13 +11,12 @@ import json
 import math
 import os
 import stat
-import sys
 import threading
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -152,40 +151,25 @@ def put_in_place(path: Path, write: Callable[[Path], object], *, overwrite: bool
 
 @contextlib.contextmanager
 def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
-    """Hold the lock ``<file>.lock`` (not on Windows); raise `error` if another process holds it."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
+    """Hold the lock ``<file>.lock``; raise `error` if another process holds it."""
+    from filelock import FileLock, Timeout
 
     path = file.with_name(file.name + ".lock")
-    while True:
-        try:
-            opened = path.open("w")
-        except OSError as exc:
-            raise error(f"{file} cannot be written: {exc.strerror or exc}") from exc
-        with opened as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise error(
-                    f"another run is writing {file}; wait for its end, or give another file"
-                ) from None
-            if not _is_same_file(path, lock):  # the previous owner has removed it meanwhile
-                continue
-            try:
-                yield
-            finally:
-                path.unlink(missing_ok=True)
-            return
-
-
-def _is_same_file(path: Path, file: IO[str]) -> bool:
-    """Return whether an open file is the one that the path names."""
+    lock = FileLock(path, timeout=0)
     try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except FileNotFoundError:
-        return False
+        lock.acquire()
+    except Timeout:
+        raise error(
+            f"another run is writing {file}; wait for its end, or give another file"
+        ) from None
+    except OSError as exc:
+        raise error(f"{file} cannot be written: {exc.strerror or exc}") from exc
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink()  # first: a run that waits for it then makes its own
+        lock.release()
 
 
 def inert(frame: pd.DataFrame) -> pd.DataFrame:

@@ -7,12 +7,13 @@ Together with a seed it determines every number of the data.
 from __future__ import annotations
 
 import json
-import textwrap
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
+
+import tomli_w
 
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.storage import read_text
@@ -29,7 +30,6 @@ from dahl_ident.synthetic.excitation import (
 from dahl_ident.units import Motion
 
 _T = TypeVar("_T")
-_WIDTH, _INDENT = 50, "\n    "  # columns of a list in TOML; a longer one takes several lines
 _EXCITATIONS: dict[str, type[Excitation]] = {
     "stepped_sine": SteppedSine,
     "frequency_sweep": FrequencySweep,
@@ -173,7 +173,7 @@ class Experiment:
 
     def to_toml(self) -> str:
         """Return the description as TOML."""
-        return toml_text(self.to_dict())
+        return tomli_w.dumps(self.to_dict())
 
     @classmethod
     def from_toml(cls, text: str) -> Experiment:
@@ -250,21 +250,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(v) for v in value]
     return value
-
-
-def toml_text(data: Mapping[str, Any], prefix: str = "") -> str:
-    """Return nested plain data without None as TOML, which the standard library cannot write."""
-    lines, tables = [], []
-    for key, value in data.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            tables.append(f"\n[{name}]\n{toml_text(value, f'{name}.')}")
-        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            tables += [f"\n[[{name}]]\n{toml_text(entry, f'{name}.')}" for entry in value]
-        else:  # strings, booleans, finite numbers and lists of them are the same in JSON and TOML
-            text = json.dumps(value, ensure_ascii=False, allow_nan=False)
-            text = text.replace("\x7f", "\\u007f")  # not escaped by JSON
-            wide = isinstance(value, list) and len(text) > _WIDTH
-            rows = textwrap.wrap(text, _WIDTH) if wide else [text]
-            lines.append(f"{key} = {_INDENT.join(rows)}\n")
-    return "".join(lines + tables)
