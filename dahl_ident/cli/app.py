@@ -19,8 +19,8 @@ from dahl_ident.errors import DahlIdentError, arguments_as_options
 from dahl_ident.version import __version__
 
 _NAME = "dahl-ident"
-# all usage errors, whether Typer uses click or its own copy of it
-_WrongUse: type[Exception] = typer.BadParameter.__bases__[0]
+# base class of all usage errors, whether Typer uses click or its own copy of it
+_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
     name=_NAME,
@@ -63,7 +63,7 @@ def common(
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line as typed after ``dahl-ident``; always ends with SystemExit."""
     typed = sys.argv[1:] if arguments is None else arguments
-    # the matrices are small: numerical threads would wait for each other longer than they work
+    # the matrices are small: numerical threads would spend more time waiting than computing
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not console.open_streams():
         console.write_error("error: standard output is closed; send it to a file, or /dev/null")
@@ -75,8 +75,8 @@ def main(arguments: list[str] | None = None) -> None:
                 status = app(args=typed, prog_name=_NAME, standalone_mode=False)
         finally:
             sys.stdout.flush()
-    except _WrongUse as exc:
-        status = _refuse(exc, typed)
+    except _UsageError as exc:
+        status = _report_usage_error(exc, typed)
     except DahlIdentError as exc:
         console.write_error(f"error: {' '.join(str(exc).split())}")
         status = console.BAD_INPUT
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> None:
             console.write_error(
                 f"error: {exc.filename or 'standard output'}: {exc.strerror or exc}"
             )
-        # the rest of the buffer would fail again when Python ends
+        # Python flushes the rest of the buffer when it ends, which would fail again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = console.BAD_INPUT
     if status == console.INTERRUPTED:
@@ -96,14 +96,14 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(status)
 
 
-def _refuse(wrong: Any, typed: Sequence[str]) -> int:
+def _report_usage_error(error: Any, typed: Sequence[str]) -> int:
     """Print in two lines what is wrong with a command, and where its options are listed."""
-    message = " ".join(wrong.format_message().split())
+    message = " ".join(error.format_message().split())
     if message:  # empty if nothing was typed: Typer has printed the help
-        errors = getattr(wrong.__cause__, "errors", None)
-        got = f"; got {errors()[0]['input']!r}" if errors else ""
-        # the option parser has no context; only flags can precede the command
+        causes = getattr(error.__cause__, "errors", None)
+        got = f"; got {causes()[0]['input']!r}" if causes else ""
+        # errors of the option parser have no context; only flags can precede the command
         words = [word for word in typed if not word.startswith("-")]
-        command = wrong.ctx.command_path if wrong.ctx else " ".join([_NAME, *words[:1]])
+        command = error.ctx.command_path if error.ctx else " ".join([_NAME, *words[:1]])
         console.write_error(f"error: {message}{got}\nSee {command} --help")
     return console.WRONG_USE

@@ -1,4 +1,4 @@
-"""What commands read and write: results on standard output, files, warnings, errors.
+"""Output of commands: results on standard output, files, warnings, errors.
 
 Files are written atomically; ``-`` is standard input or output.
 """
@@ -29,20 +29,21 @@ from dahl_ident.progress import spinner
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse, Record
 
-STANDARD = "-"  # standard input or output, in place of a file's name
-BAD_INPUT = 1  # exit status, as of any uncaught error
-WRONG_USE = 2  # exit status, as click has it for unknown options
-NOT_TRUSTED = 3  # exit status: the first that is free
-_NARROWEST = 40  # columns; in a narrower window indented lines would hold a word or two
-_STATUS = re.compile(r"\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
+STANDARD = "-"  # standard input or output, in place of a file name
+# exit statuses
+BAD_INPUT = 1  # as of any uncaught error
+WRONG_USE = 2  # that of click for unknown options
+NOT_TRUSTED = 3  # the first that is free
+INTERRUPTED = 130  # that of shells: 128 + the number of SIGINT
+_MIN_WIDTH = 40  # columns; in a narrower window indented lines would hold a word or two
+_STATUS = re.compile(r"\A\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
 _STYLES = {"Trusted": "1;32", "Approximate": "1;33"}
 _RED = "1;31"
-INTERRUPTED = 130  # exit status, as shells have it: 128 and the number of SIGINT
 
 
 @dataclass
 class _Session:
-    """What holds for all output of a command; `quiet` leaves out all but errors and data."""
+    """Settings for all output of a command; `quiet` suppresses all but errors and data."""
 
     color: bool = True
     quiet: bool = False
@@ -60,38 +61,38 @@ def begin(typed: Sequence[str]) -> None:
 
     session.typed, session.quiet = typed, False
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # the name of a file, or a unit, may hold what the terminal's encoding does not
+        # a file name, or a unit, may have characters that the terminal's encoding lacks
         sys.stdout.reconfigure(errors="backslashreplace")
     # setattr, because this function ignores file and line
     setattr(warnings, "showwarning", show)  # noqa: B010 - an assignment fails the type check
 
 
 def open_streams() -> bool:
-    """Open the standard streams that are closed, to nowhere; return whether output was open.
+    """Connect closed standard streams to the null device; return whether output was open.
 
-    Otherwise the next file that is opened would get what libraries print.
+    Otherwise what libraries print would go into the next file that is opened.
     """
-    there = sys.stdout is not None
+    output_is_open = sys.stdout is not None
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            nowhere = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 - to the end
-            setattr(sys, name, nowhere)
-    return there
+            null = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 - open to the end
+            setattr(sys, name, null)
+    return output_is_open
 
 
 def option_name(name: str) -> str:
-    """Return how an argument is written on the command line."""
+    """Return the command-line option for an argument."""
     return f"--{name.replace('_', '-')}"
 
 
 def refuse(names: Iterable[str], why: str) -> None:
-    """Refuse the options of these names, if there are any; `why` ends "are given"."""
+    """Refuse the options with these names, if there are any; `why` follows "is given"."""
     if options := ", ".join(map(option_name, names)):
         raise ValidationError(f"{options} is given {why}")
 
 
 def changed(*groups: Any) -> list[str]:
-    """Return the names of the options of some groups that are not at their defaults."""
+    """Return the names of the options in some groups that differ from their defaults."""
     return [
         name
         for group in groups
@@ -103,30 +104,29 @@ def changed(*groups: Any) -> list[str]:
 def typed_command() -> str:
     """Return the command of this run, as typed."""
     command = shlex.join(["dahl-ident", *session.typed])
-    command = command.encode(errors="backslashreplace").decode()  # as names of files are told
+    command = command.encode(errors="backslashreplace").decode()  # as file names are printed
     piped = STANDARD in session.typed
     return f"{command}  # its input came through standard input" if piped else command
 
 
 def _styled(text: str, style: str) -> str:
-    """Return a text in a style (bold is 1) if results go to a terminal that may have colours."""
-    plain = "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb"
-    coloured = session.color and sys.stdout.isatty() and not plain
+    """Return a text in a style (1 is bold) if results go to a terminal that allows colours."""
+    no_color = "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb"
+    coloured = session.color and sys.stdout.isatty() and not no_color
     return f"\x1b[{style}m{text}\x1b[0m" if coloured else text
 
 
 def write(text: str) -> None:
-    """Print a text unchanged, the status of a result in colour where there is a terminal."""
+    """Print a text; if it begins with the status of a result, that is coloured on a terminal."""
     if not session.quiet:
-        status = _STATUS.match(text)
-        shown = _styled(status[0], _STYLES.get(status[1], _RED)) if status else ""
-        sys.stdout.write(f"{shown}{text[status.end() if status else 0 :]}\n")
+        text = _STATUS.sub(lambda match: _styled(match[0], _STYLES.get(match[1], _RED)), text)
+        sys.stdout.write(f"{text}\n")
 
 
 def write_wrapped(text: str) -> None:
     """Print a text; long lines are wrapped and indented."""
-    shown = sys.stdout.isatty() or "COLUMNS" in os.environ
-    width = max(_NARROWEST, shutil.get_terminal_size().columns) if shown else None
+    has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
+    width = max(_MIN_WIDTH, shutil.get_terminal_size().columns) if has_width else None
     for line in text.splitlines():
         indent = " " * (len(line) - len(line.lstrip()) + 4)
         if width is None or len(line) <= width:
@@ -137,10 +137,10 @@ def write_wrapped(text: str) -> None:
 
 @contextmanager
 def busy(task: str) -> Iterator[Callable[[float, float], None]]:
-    """Show on a terminal, after two seconds, that a task goes on, and for how long.
+    """Show on a terminal, after two seconds, that a task is running, and the time elapsed.
 
-    The function that is yielded takes the steps done and their number: then these, and the time
-    left, are shown as well.
+    The yielded function takes the number of steps done and the total; these and the remaining time
+    are then shown as well. Of a total of 1, of which a share is done, only the time is shown.
     """
     if session.quiet or not sys.stderr.isatty():
         yield lambda _done, _total: None
@@ -155,7 +155,7 @@ def write_error(text: str) -> None:
 
 
 def note(text: str) -> None:
-    """Print one line on standard error that --quiet leaves out."""
+    """Print one line on standard error, except with --quiet."""
     if not session.quiet:
         write_error(text)
 
@@ -164,16 +164,16 @@ def write_json(value: Any) -> None:
     """Print one JSON document."""
     from dahl_ident.data.storage import plain_data
 
-    known = plain_data(value, not_finite=lambda _: None)
-    text = json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False)
+    plain = plain_data(value, not_finite=lambda _: None)
+    text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
     sys.stdout.write(f"{text}\n")
 
 
 def table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table."""
-    from dahl_ident.diagnostics.formatting import table as aligned
+    from dahl_ident.diagnostics.formatting import table as aligned_table
 
-    write(f"{title}\n{aligned([header, *rows], left=range(len(header)))}")
+    write(f"{title}\n{aligned_table([header, *rows], left=range(len(header)))}")
 
 
 def heading(text: str) -> None:
@@ -190,17 +190,17 @@ def finish(trusted: bool, reason: str) -> None:
 
 def write_data(data: FrequencyResponse | Record, output: str, *, overwrite: bool) -> None:
     """Write a table or a record to a file, or as CSV to standard output."""
-    written(lambda place: data.save(place, overwrite=overwrite), output, ".csv")
+    write_output(lambda path: data.save(path, overwrite=overwrite), output, ".csv")
 
 
-def written(write: Callable[[str | Path], Path], output: str, ending: str) -> str:
-    """Call `write` with a path; for standard output, with a temporary file of this ending."""
+def write_output(write: Callable[[str | Path], Path], output: str, suffix: str) -> str:
+    """Call `write` with a path: for standard output, with that of a temporary file."""
     if output != STANDARD:
         return str(write(output))
     with tempfile.TemporaryDirectory() as directory:
-        content = write(Path(directory) / f"output{ending}").read_bytes()
+        content = write(Path(directory) / f"output{suffix}").read_bytes()
     sys.stdout.flush()
-    # UTF-8 as in a file, whatever the terminal's own encoding
+    # UTF-8 as in a file, whatever the terminal's encoding
     sys.stdout.buffer.write(content)
     return output
 

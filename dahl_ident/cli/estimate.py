@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, changed, refuse, written
+from dahl_ident.cli.console import STANDARD, changed, refuse, write_output
 from dahl_ident.cli.model import ModelOptions
 from dahl_ident.cli.options import (
     General,
@@ -89,7 +89,7 @@ def write_report(results: Sequence[Reported], place: str, writing: Writing, **op
 
     options |= {"command": console.typed_command(), "overwrite": writing.overwrite}
     with console.busy("writing the report") as progress:
-        return written(partial(report, results, progress=progress, **options), place, ".html")
+        return write_output(partial(report, results, progress=progress, **options), place, ".html")
 
 
 def report_also(

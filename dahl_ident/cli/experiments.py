@@ -12,12 +12,12 @@ from dahl_ident.cli import console
 from dahl_ident.cli.console import changed, refuse, write_data, write_picture
 from dahl_ident.cli.estimate import saved_fit
 from dahl_ident.cli.model import (
+    DAHL_PARAMETERS,
     ELEMENT_HELP,
-    OTHERS,
+    LINEAR_PARAMETERS,
     ModelOptions,
-    elements,
-    in_parallel,
-    refuse_with_elements,
+    model_of,
+    stated,
 )
 from dahl_ident.cli.options import (
     General,
@@ -38,10 +38,13 @@ if TYPE_CHECKING:
     from dahl_ident.elements import Element
     from dahl_ident.synthetic import Experiment
 
-_LIMITS = {
+_UNITS = {
     "frequency": "Hz", "displacement": "m", "force": "N", "speed": "m/s", "acceleration": "m/s^2",
 }  # fmt: skip
 _RANGE = "the highest value, or lowest:highest"
+# levels if none are stated
+_LEVEL_RANGE = (0.1, 10.0)  # over the displacement, or the force, at the knee of the friction
+_NUM_LEVELS = 30  # 15 in a decade, as in the shipped data sets
 
 
 @dataclass(frozen=True)
@@ -74,16 +77,15 @@ class Bench:
     between_runs: float = setting("Additional time for each run.", 0.0, unit="s")
 
     def limits(self) -> dict[str, Any]:
-        """Return the limits that were given."""
-        stated: dict[str, Any] = {
-            "frequency_hz" if name == "frequency" else name: ends(name, text, unit)
-            for name, unit in _LIMITS.items()
-            if (text := getattr(self, name)) is not None
+        """Return the limits that are stated."""
+        limits = {
+            "frequency_hz" if name == "frequency" else name: ends(name, text, _UNITS[name])
+            for name, text in stated(self, *_UNITS).items()
         }
-        return stated if self.time is None else {**stated, "time": self.time}
+        return limits | stated(self, "time")
 
-    def motions(self, sample_rate: float | None) -> dict[str, Any]:
-        """Return the arguments of ``plan`` that motions in time, or settled ones, need."""
+    def motion_keywords(self, sample_rate: float | None) -> dict[str, Any]:
+        """Return the arguments of ``plan`` for motions in time, or for settled sines."""
         if self.motion is None:
             return {"steady": self.steady}
         return {"candidates": self.motion, "sample_rate": sample_rate}
@@ -108,9 +110,9 @@ class Aim:
 
     def keywords(self) -> dict[str, Any]:
         """Return the arguments of ``plan``."""
-        wanted = [text.partition("=") for text in self.target or []]
-        shares = {name: number(name, value, "1") for name, sign, value in wanted if sign}
-        if shares and len(shares) < len(wanted):
+        targets = [text.partition("=") for text in self.target or []]
+        uncertainties = {name: number(name, value, "1") for name, equal, value in targets if equal}
+        if uncertainties and len(uncertainties) < len(targets):
             raise ValidationError(
                 "target has names with and without a number; give every one its uncertainty, or "
                 "none"
@@ -118,9 +120,9 @@ class Aim:
         ranges = dict(_pair("ranges", text) for text in self.ranges or [])
         suspects = dict(_pair("suspects", text) for text in self.suspects or [])
         return {
-            "target": shares or [name for name, _, _ in wanted] or None,
-            "ranges": {n: ends(f"ranges of {n}", text) for n, text in ranges.items()},
-            "suspects": {n: number(n, text, "1") for n, text in suspects.items()} or None,
+            "target": uncertainties or [name for name, _, _ in targets] or None,
+            "ranges": {name: ends(f"ranges of {name}", text) for name, text in ranges.items()},
+            "suspects": {name: number(name, t, "1") for name, t in suspects.items()} or None,
         }
 
 
@@ -156,7 +158,7 @@ def plan(
     --ranges sigma=15:60 --noise 0.01 --target f_max=0.01 --target sigma=0.01
     """
     from dahl_ident.data.storage import write_whole
-    from dahl_ident.planning import plan as make
+    from dahl_ident.planning import plan as make_plan
 
     laws.run()
     writing.check([table, waveform, picture], [] if fit is None else [fit], json=general.json)
@@ -164,10 +166,11 @@ def plan(
         raise ValidationError("--waveform and --motion need --sample-rate, Hz; give it")
     if sample_rate is not None and waveform is None and bench.motion is None:
         raise ValidationError("--sample-rate is that of --waveform or --motion; give one of them")
-    result = make(
-        _known(fit, model), limits=bench.limits(), noise=_noise(bench.noise), scatter=bench.scatter,
-        runs=bench.num_runs, controlled=bench.controlled, change_over=bench.change_over,
-        between_runs=bench.between_runs, seed=seed, **bench.motions(sample_rate), **aim.keywords(),
+    result = make_plan(
+        _fit_or_model(fit, model), limits=bench.limits(), noise=_noise(bench.noise),
+        scatter=bench.scatter, runs=bench.num_runs, controlled=bench.controlled,
+        change_over=bench.change_over, between_runs=bench.between_runs, seed=seed,
+        **bench.motion_keywords(sample_rate), **aim.keywords(),
     )  # fmt: skip
     if table is not None:
         text = result.to_frame().to_csv(index=False)
@@ -180,12 +183,12 @@ def plan(
         console.write_json(result.to_dict())
     else:
         console.write_wrapped(str(result))
-    missed = result.undetermined[0] if result.undetermined else "a wanted uncertainty is missed"
-    console.finish(result.reached, missed)
+    reason = result.undetermined[0] if result.undetermined else "the plan does not meet a target"
+    console.finish(result.reached, reason)
 
 
-def _known(fit: str | None, options: ModelOptions) -> Any:
-    """Return the saved fit, or the model of the options."""
+def _fit_or_model(fit: str | None, options: ModelOptions) -> Any:
+    """Return the saved fit, or else the model of the options."""
     from dahl_ident.elements.model import as_model
 
     if fit is not None:
@@ -208,20 +211,17 @@ def _pair(option: str, text: str) -> tuple[str, str]:
 
 
 def _noise(text: str | None) -> Any:
-    if text is None or "=" not in text:
-        return None if text is None else number("noise", text, "1")
+    if text is None:
+        return None
+    if "=" not in text:
+        return number("noise", text, "1")
     parts = [_pair("noise", part) for part in text.split(",")]
-    return {name: number(f"noise {name}", value, _LIMITS.get(name, "1")) for name, value in parts}
-
-
-_UNITS = {"displacement": "m", "force": "N"}
-_SPAN = (0.1, 10.0)  # least and largest level in characteristic displacements, if none are given
-_COUNT = 30  # levels: 15 in a decade, as in the shipped data sets
+    return {name: number(f"noise {name}", value, _UNITS.get(name, "1")) for name, value in parts}
 
 
 @dataclass(frozen=True)
 class PlantOptions:
-    """The true plant: friction and the elements in parallel."""
+    """The true plant: friction, and linear elements in parallel."""
 
     panel: ClassVar[str] = "Model"
     f_max: float | None = setting("Friction force.", unit="N")
@@ -232,23 +232,16 @@ class PlantOptions:
     damping: float | None = setting("Add a damper.", unit="N s/m")
     stiffness: float | None = setting("Add a spring.", unit="N/m")
 
-    def built(self) -> Element:
+    def plant(self) -> Element:
         """Return the plant."""
-        from dahl_ident.elements import Dahl
-
-        names = ("f_max", "sigma", "alpha")
-        stated = {n: value for n in names if (value := getattr(self, n)) is not None}
-        others = {n: value for n in OTHERS if (value := getattr(self, n)) is not None}
-        if self.element:
-            refuse_with_elements(stated)
-            return in_parallel(elements(self.element), others)
-        missing = [name for name in ("f_max", "sigma") if name not in stated]
-        if missing:
+        dahl = stated(self, *DAHL_PARAMETERS)
+        missing = [name for name in ("f_max", "sigma") if name not in dahl]
+        if missing and not self.element:
             raise ValidationError(
                 f"no value for {' and '.join(missing)}; a simulation needs --f-max and --sigma, "
                 "or --element"
             )
-        return in_parallel(Dahl(**stated), others)
+        return model_of(self.element, dahl, stated(self, *LINEAR_PARAMETERS))
 
 
 @dataclass(frozen=True)
@@ -268,6 +261,7 @@ class Excitation:
     )
     settling_periods: int = setting("Before measuring.", 10)
     num_periods: int = setting("Measured.", 5)
+    steady: str = steady_setting()
     record: bool = setting("Waveforms, not a table.", False, "--record")
 
 
@@ -281,24 +275,16 @@ class Errors:
     )
     force_std: str = setting("Force noise: of a table a share, '0.5 %'; of samples 5mN.", "0")
 
-    def of(self, channel: str, unit: str) -> float:
-        """Return the standard deviation of a channel; a share where the unit is 1."""
+    def noise_std(self, channel: str, unit: str) -> float:
+        """Return the standard deviation of a channel, relative if the unit is 1."""
         text = getattr(self, f"{channel}_std")
         try:
             return number("it", text, unit)
         except (ModelError, UnitError) as exc:
-            wanted = f"the noise of samples, such as 5e-6 or 5u{unit}"
+            expected = f"the noise of samples, such as 5e-6 or 5u{unit}"
             if unit == "1":
-                wanted = "a share of the response, such as 0.005 or '0.5 %'; of samples: --record"
-            raise ValidationError(f"--{channel}-std is {text!r}; expected {wanted}") from exc
-
-
-@dataclass(frozen=True)
-class MotionOptions:
-    """The steady motion of a driven plant."""
-
-    panel: ClassVar[str] = "Excitation"
-    steady: str = steady_setting()
+                expected = "a share of the response, such as 0.005 or '0.5 %'; of samples: --record"
+            raise ValidationError(f"--{channel}-std is {text!r}; expected {expected}") from exc
 
 
 @with_option_groups
@@ -308,7 +294,6 @@ def simulate(
     plant: PlantOptions,
     excitation: Excitation,
     errors: Errors,
-    motion: MotionOptions,
     writing: Writing,
     experiment: Annotated[
         str | None, typer.Argument(help="Experiment file, .toml or .json, instead of options.")
@@ -326,52 +311,45 @@ def simulate(
 
     laws.run()
     whole_number(seed, "seed", 0)
-    if experiment is not None:
+    writing.check([output], [] if experiment is None else [experiment], json=general.json)
+    if experiment is None:
+        definition = _experiment(plant, excitation, errors)
+    else:
         refuse(
-            changed(plant, excitation, errors, motion),
+            changed(plant, excitation, errors),
             f"together with {experiment}, which describes the whole experiment; leave one of them "
             "out",
         )
-    inputs = [] if experiment is None else [experiment]
-    writing.check([output], inputs, json=general.json)
-    described = (
-        _experiment(plant, excitation, errors, motion)
-        if experiment is None
-        else Experiment.read(experiment)
-    )
+        definition = Experiment.read(experiment)
     if output is None:
-        console.write(described.to_json() if general.json else described.to_toml())
+        console.write(definition.to_json() if general.json else definition.to_toml())
         return
     with console.busy("simulating") as update:
-        data = run(described, seed=seed, progress=lambda done: update(done, 1.0))
+        data = run(definition, seed=seed, progress=lambda done: update(done, 1.0))
     write_data(data, output, overwrite=writing.overwrite)
 
 
-def _experiment(
-    plant: PlantOptions, excitation: Excitation, errors: Errors, motion: MotionOptions
-) -> Experiment:
+def _experiment(plant: PlantOptions, excitation: Excitation, errors: Errors) -> Experiment:
     from dahl_ident.synthetic import Acquisition, Channel, Experiment, SteppedSine, Table
 
-    truth = plant.built()
+    truth = plant.plant()
     settings: dict[str, Any] = dict(vars(excitation))
-    as_record = settings.pop("record")
+    frequency, steady, as_record = map(settings.pop, ("frequency", "steady", "record"))
     controlled = excitation.controlled
-    settings["levels"] = _numbers(
-        "levels", excitation.levels or _usual_levels(truth, controlled), _UNITS[controlled]
-    )
-    settings["frequencies_hz"] = _numbers("frequency", settings.pop("frequency"), "Hz")
-    steps = SteppedSine(**settings)
+    levels = excitation.levels or _default_levels(truth, controlled)
+    settings["levels"] = _numbers("levels", levels, _UNITS[controlled])
+    steps = SteppedSine(**settings, frequencies_hz=_numbers("frequency", frequency, "Hz"))
     if not as_record:
-        table = Table(errors.of("displacement", "1"), errors.of("force", "1"), **vars(motion))
-        return Experiment(truth, steps, table=table)
+        stds = errors.noise_std("displacement", "1"), errors.noise_std("force", "1")
+        return Experiment(truth, steps, table=Table(*stds, steady=steady))
     sensors = Acquisition(
-        displacement=Channel(noise_std=errors.of("displacement", "m")),
-        force=Channel(noise_std=errors.of("force", "N")),
+        displacement=Channel(noise_std=errors.noise_std("displacement", "m")),
+        force=Channel(noise_std=errors.noise_std("force", "N")),
     )
     return Experiment(truth, steps, sensors)
 
 
-def _usual_levels(truth: Element, controlled: str) -> str:
+def _default_levels(truth: Element, controlled: str) -> str:
     """Return levels of displacement or force around the knee of the friction."""
     import numpy as np
 
@@ -380,24 +358,24 @@ def _usual_levels(truth: Element, controlled: str) -> str:
     laws = [e for e in as_model(truth).elements if not e.is_linear]
     knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])
     if controlled == "force":
-        # a square wave of the friction force has a fundamental of 4/pi times it
+        # the bounds are of the fundamental: that of a square wave is 4/pi times its amplitude
         limits = [0.25 * np.pi * float(e.force_bounds(e.known_values())[1]) for e in laws]
         knees = np.array([[sum(limits)] * 2])
     low, high = (knees[:, 0].min(), knees[:, 1].max()) if laws else (0.0, 0.0)
     if not (np.isfinite([low, high]).all() and 0.0 < low <= high):
         raise ValidationError("the plant has no knee to place levels about; give --levels")
-    return f"{_SPAN[0] * low}:{_SPAN[1] * high}:{_COUNT}"
+    return f"{_LEVEL_RANGE[0] * low}:{_LEVEL_RANGE[1] * high}:{_NUM_LEVELS}"
 
 
 def _numbers(name: str, text: str, unit: str) -> list[float]:
-    """Return the numbers of ``1,2,5mm`` or of ``low:high:count``, evenly spread in logarithm."""
+    """Return the numbers of ``1,2,5mm``, or of ``low:high:count`` with logarithmic spacing."""
     import numpy as np
 
     try:
         if ":" not in text:
             return numbers(name, text, unit, sep=",")
-        span, _, count = text.rpartition(":")
-        low, high = numbers(name, span, unit)
+        bounds, _, count = text.rpartition(":")
+        low, high = numbers(name, bounds, unit)
         return [float(v) for v in np.geomspace(low, high, int(count))]
     except (ModelError, ValueError) as exc:
         raise ValidationError(

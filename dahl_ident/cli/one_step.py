@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import typer
 
 from dahl_ident.cli import console
-from dahl_ident.cli.console import STANDARD, write_data, written
+from dahl_ident.cli.console import STANDARD, write_data, write_output
 from dahl_ident.cli.estimate import finish, saved_fit
 from dahl_ident.cli.options import (
     General,
@@ -54,20 +54,20 @@ def inspect(
     from dahl_ident.data.storage import write_whole
 
     writing.check([output])
-    read_files = [contents_of(file, sheet=sheet) for file in files]
+    listings = [contents_of(file, sheet=sheet) for file in files]
     if output is not None:
-        proposed = {contents.column_map: contents.name for contents in read_files}
-        if len(proposed) > 1:
+        file_by_map = {listing.column_map: listing.name for listing in listings}
+        if len(file_by_map) > 1:
             raise typer.BadParameter(
-                f"{' and '.join(list(proposed.values())[:2])} need different column maps; "
+                f"{' and '.join(list(file_by_map.values())[:2])} need different column maps; "
                 "write one for each"
             )
-        content = f"{next(iter(proposed))}\n".encode()
+        content = f"{listings[0].column_map}\n".encode()
         write_whole(output, content, overwrite=writing.overwrite)
     if general.json:
-        console.write_json([asdict(contents) for contents in read_files])
-        return
-    console.write("\n\n".join(repr(contents) for contents in read_files))
+        console.write_json([asdict(listing) for listing in listings])
+    else:
+        console.write("\n\n".join(map(repr, listings)))
 
 
 @with_option_groups
@@ -100,12 +100,12 @@ def export(
         raise ValidationError(f"{len(files)} files are given; expected one saved fit")
     writing.check([output], files)
     fit = saved_fit(files[0])
-    how: dict[str, Any] = {"overwrite": writing.overwrite, "size": size, "seed": seed}
-    written(lambda place: Path(fit.export(to, place, **how)), output, ".csv")
+    options: dict[str, Any] = {"overwrite": writing.overwrite, "size": size, "seed": seed}
+    write_output(lambda path: Path(fit.export(to, path, **options)), output, ".csv")
     finish(fit)
 
 
-def _names(incomplete: str) -> list[str]:
+def _complete_name(incomplete: str) -> list[str]:
     from dahl_ident.synthetic.shipped import data_sets
 
     return starting(data_sets())(incomplete)
@@ -118,7 +118,8 @@ def datasets(
     name: Annotated[
         str | None,
         typer.Argument(
-            help="Data set to describe or copy; lists all if left out.", autocompletion=_names
+            help="Data set to describe or copy; lists all if left out.",
+            autocompletion=_complete_name,
         ),
     ] = None,
     output: OutputFile = None,
@@ -145,15 +146,15 @@ def datasets(
     if general.json:
         console.write_json(
             [
-                {k: v for k, v in vars(one).items() if k != "experiment"} | {"kind": one.kind}
-                for one in data_sets().values()
+                {k: v for k, v in vars(entry).items() if k != "experiment"} | {"kind": entry.kind}
+                for entry in data_sets().values()
             ]
         )
         return
-    for one in data_sets().values():
-        kind = one.kind.replace("_", " ")
+    for entry in data_sets().values():
         console.write_wrapped(
-            f"{one.name} ({kind}): {one.teaches}. Determines {', '.join(one.identifiable)}."
+            f"{entry.name} ({entry.kind.replace('_', ' ')}): {entry.teaches}. "
+            f"Determines {', '.join(entry.identifiable)}."
         )
 
 
@@ -182,7 +183,6 @@ def template(
         )
     writing.check([output])
     content = (Path(__file__).parent / "templates" / f"{name}.toml").read_bytes()
-
     if output == STANDARD:
         console.write(content.decode().removesuffix("\n"))
     else:
@@ -193,12 +193,12 @@ def template(
 def app(
     laws: Laws,
     folder: Annotated[
-        Path, typer.Argument(help="Folder in which the work is kept, one folder for each.")
+        Path, typer.Argument(help="Folder with a folder for each piece of work.")
     ] = Path(),
     port: Annotated[int, option("Port; 0 takes a free one.", min=0, max=65535)] = 0,
     browser: Annotated[bool, option("Open the page in the browser.")] = True,
 ) -> None:
-    """Open a page in the browser that goes from files to a signed report, on this machine alone.
+    """Open a page in the browser for all steps from files to a signed report, on this machine only.
 
     Example: dahl-ident app measurements
     """
@@ -210,13 +210,12 @@ def app(
             "install it with pip install 'dahl_ident[app]'"
         ) from exc
     if not folder.is_dir():
-        raise ValidationError(f"{folder} is not a folder; make it, or give one that is there")
+        raise ValidationError(f"{folder} is not a folder; make it, or give an existing one")
     laws.run()
     serve(folder, port=port, laws=tuple(laws.laws or ()), browser=browser)
 
 
-_LINE_EVERY = 60.0
-"""Seconds between lines of progress where there is no terminal."""
+_LINE_INTERVAL = 60.0  # s between lines of progress if there is no terminal
 
 
 @dataclass(frozen=True)
@@ -230,7 +229,7 @@ class Running:
         "Longest time for a device; by default 10 medians, at least 60 s.", unit="s"
     )
     memory: float | None = setting("Most memory for a device, GB; by default a fair share.")
-    patience: float = setting("Longest time without an answer of the scheduler.", 120.0, unit="s")
+    patience: float = setting("Longest time without an answer from the scheduler.", 120.0, unit="s")
     send_files: bool = setting(
         "Send workers the contents of files, not paths.", False, "--send-files"
     )
@@ -248,37 +247,38 @@ class Reporting:
     order: str | None = setting("Column that orders fits in time, for control charts.")
 
     def check(self, definition: Definition, *, overwrite: bool) -> None:
-        """Refuse, before anything runs, what the report could not be made from."""
+        """Refuse options with which the report could not be made, before any fit is run."""
         from dahl_ident.campaigns.campaign_report import FORMATS
         from dahl_ident.data.storage import place_of
 
         columns = self.covariate or []
-        place = self.report
-        if place is None:
+        if self.report is None:
             if columns or self.order:
                 raise ValidationError(
                     "--covariate and --order are for a report; give --report as well"
                 )
             return
-        place_of(place, "a campaign's report", FORMATS)
-        Writing(overwrite).check([place])
-        tasks = definition.tasks
-        known = set.intersection(*(set(task.covariates) for task in tasks))
-        for name, choice in [*(("--covariate", c) for c in columns), ("--order", self.order)]:
-            also = {"run"} if name == "--order" else set()
-            if choice is not None and choice not in known | also:
-                there = ", ".join(sorted(known)) or "none"
-                raise ValidationError(f"{name} {choice}: the fits have the covariates {there}")
+        place_of(self.report, "a campaign's report", FORMATS)
+        Writing(overwrite).check([self.report])
+        covariates = [task.covariates for task in definition.tasks]
+        common = set(covariates[0]).intersection(*covariates)
+        choices = [("--covariate", column, common) for column in columns]
+        if self.order is not None:
+            choices.append(("--order", self.order, common | {"run"}))
+        for name, column, allowed in choices:
+            if column not in allowed:
+                existing = ", ".join(sorted(common)) or "none"
+                raise ValidationError(f"{name} {column}: the fits have the covariates {existing}")
         texts = {
-            column: [v for task in tasks if isinstance(v := task.covariates[column], str)]
-            for column in known
+            column: [v for values in covariates if isinstance(v := values[column], str)]
+            for column in common
         }
         for column in columns:
             if texts[column]:
                 raise ValidationError(
                     f"--covariate {column} is {texts[column][0]!r}; expected numbers"
                 )
-        unused = sorted(c for c in known - {*columns, self.order} if not texts[c])
+        unused = sorted(c for c in common - {*columns, self.order} if not texts[c])
         if unused:
             console.note(
                 f"the report does not use {', '.join(unused)}; --covariate {unused[0]} states how "
@@ -308,36 +308,48 @@ def campaign(
     laws.run()
     reporting.check(read_definition(definition), overwrite=writing.overwrite)
     with console.busy("fits") as show:
-        update = show if sys.stderr.isatty() else _lines()
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this command says it itself
-        done = run_campaign(
-            definition, progress=lambda number, total, _: update(number, total), **vars(running)
+        update = show if sys.stderr.isatty() else _line_printer()
+        # this command reports lost connections itself
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        result = run_campaign(
+            definition, progress=lambda done, total, _: update(done, total), **vars(running)
         )
     if reporting.report is not None and not running.dry_run:
-        how: dict[str, Any] = {"covariates": reporting.covariate or [], "order": reporting.order}
-        how |= {"title": definition.stem, "overwrite": writing.overwrite}
-        console.note(f"report: {done.report(reporting.report, **how)}")
+        path = result.report(
+            reporting.report,
+            covariates=reporting.covariate or [],
+            order=reporting.order,
+            title=definition.stem,
+            overwrite=writing.overwrite,
+        )
+        console.note(f"report: {path}")
     if general.json:
-        facts = {"finished": list(done.finished), "to_do": list(done.to_do)}
-        console.write_json({**facts, "statuses": dict(done.statuses), "folder": str(done.folder)})
+        console.write_json(
+            {
+                "finished": list(result.finished),
+                "to_do": list(result.to_do),
+                "statuses": dict(result.statuses),
+                "folder": str(result.folder),
+            }
+        )
     elif running.dry_run:
-        console.write("\n".join([*(f"to do: {name}" for name in done.to_do), str(done)]))
+        console.write("\n".join([*(f"to do: {name}" for name in result.to_do), str(result)]))
     else:
-        console.write(f"{done}\ntable: {done.folder / 'results.csv'}")
-    usable = any(status in USABLE for status in done.statuses)
+        console.write(f"{result}\ntable: {result.folder / 'results.csv'}")
+    usable = any(status in USABLE for status in result.statuses)
     console.finish(running.dry_run or usable, "no fit can be used; the table says why")
 
 
-def _lines() -> Callable[[int, int], None]:
-    """Print rate and time left once a minute, for logs."""
-    began = shown = time.monotonic()
+def _line_printer() -> Callable[[int, int], None]:
+    """Return a function that prints the progress at most once a minute, for logs."""
+    started = last_line = time.monotonic()
 
     def update(done: int, total: int) -> None:
-        nonlocal shown
+        nonlocal last_line
         now = time.monotonic()
-        if now - shown >= _LINE_EVERY:
-            shown = now
-            rate = done / (now - began)
+        if now - last_line >= _LINE_INTERVAL:
+            last_line = now
+            rate = done / (now - started)
             left = (total - done) / rate / 60.0
             console.note(f"{done} of {total} fits, {rate:.3g} a second, {left:.0f} minutes left")
 

@@ -1,4 +1,4 @@
-"""Options of reading, and the tables or records that files hold, or the rows chosen of them."""
+"""Options for reading tables and records, and for selecting rows of a table."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from dahl_ident.arrays import BoolArray
     from dahl_ident.data import FrequencyResponse, Record
 
-_OF_RECORDS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
+# options of tables that records have as well
+_RECORD_OPTIONS = ("columns", "drive", "drive_factor", "drive_factor_uncertainty", "sheet")
 _COLUMN = 'Its column, with unit if needed: "x \\[mm]".'
-_COLUMNS = (
-    "frequency_hz", "amplitude", "drive", "gain", "harmonic", "level", "run"
-)  # fmt: skip
-_COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+# what conditions can name, in addition to phase_deg and the measures of quality
+_COLUMNS = ("frequency_hz", "amplitude", "drive", "gain", "harmonic", "level", "run")
+_COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le,
     ast.Gt: operator.gt, ast.GtE: operator.ge,
 }  # fmt: skip
 
 
-def _existing(patterns: list[str]) -> list[str]:
-    """Return the files of all patterns; refuse absent ones before heavy libraries are loaded."""
+def _existing_files(patterns: list[str]) -> list[str]:
+    """Return the files of all patterns; refuse missing ones before heavy libraries are loaded."""
     files: list[str] = []
     for pattern in patterns:
         if pattern == STANDARD or Path(pattern).exists():
@@ -49,13 +49,15 @@ def _existing(patterns: list[str]) -> list[str]:
 
 Files = Annotated[
     list[str],
-    typer.Argument(help="Files to read, or patterns; - is standard input.", callback=_existing),
+    typer.Argument(
+        help="Files to read, or patterns; - is standard input.", callback=_existing_files
+    ),
 ]
 
 
 @dataclass(frozen=True)
 class Channels:
-    """What ``read_record`` is told of the channels of a record."""
+    """The channels of a record; options of ``read_record``."""
 
     panel: ClassVar[str] = "Reading"
     time: str | None = setting(_COLUMN)
@@ -68,8 +70,8 @@ class Channels:
         "Treatment of empty samples: error or drop.", "error", one_of="error|drop"
     )
 
-    def refuse(self) -> None:
-        """Refuse these options where tables are read."""
+    def refuse_for_tables(self) -> None:
+        """Refuse these options if the files are tables."""
         refuse(
             changed(self),
             "without --record; leave it out, or name the columns of a table in a column map "
@@ -79,7 +81,7 @@ class Channels:
 
 @dataclass(frozen=True)
 class _Common:
-    """What tables and records are told alike."""
+    """Options common to tables and records."""
 
     panel: ClassVar[str] = "Reading"
     columns: Path | None = setting("Column map, a TOML file.")
@@ -120,28 +122,32 @@ class Reading(_Common):
         """Read the files into one table."""
         from dahl_ident.data import read_frequency_response
 
-        how = dict(vars(self))
-        where, levels, runs = (how.pop(name) for name in ("where", "levels", "runs"))
-        return selected(read_frequency_response(files, **how), where, levels, runs)
+        keywords = dict(vars(self))
+        where, levels, runs = map(keywords.pop, ("where", "levels", "runs"))
+        data = read_frequency_response(files, **keywords)
+        for column, labels in (("level", levels), ("run", runs)):
+            if labels is not None:
+                data = _with_labels(data, column, [label.strip() for label in labels.split(",")])
+        return data if where is None else data.select(rows=_rows_where(data, where))
 
     def read_records(self, files: list[str], channels: Channels) -> list[Record]:
-        """Read each file as a record; options of tables alone are refused."""
+        """Read each file as a record; options that only tables have are refused."""
         from dahl_ident.data import read_record
 
-        taken = ", ".join(map(option_name, _OF_RECORDS))
+        allowed = ", ".join(map(option_name, _RECORD_OPTIONS))
         refuse(
-            [name for name in changed(self) if name not in _OF_RECORDS],
-            f"together with records of waveforms; of the options of reading, they take {taken} "
+            [name for name in changed(self) if name not in _RECORD_OPTIONS],
+            f"together with records of waveforms; of the options of reading, they take {allowed} "
             "and the names of channels, such as --displacement (dahl-ident inspect proposes a "
             "column map)",
         )
-        how = vars(channels) | {name: getattr(self, name) for name in _OF_RECORDS}
-        return [read_record(name, **how) for name in files]
+        keywords = vars(channels) | {name: getattr(self, name) for name in _RECORD_OPTIONS}
+        return [read_record(file, **keywords) for file in files]
 
     def read_any(
         self, files: list[str], channels: Channels | None = None, *, record: bool = False
     ) -> FrequencyResponse | list[Record]:
-        """Read a table, or records where the files hold waveforms or `record` says so."""
+        """Read a table, or records if `record` is set or the files contain waveforms."""
         from dahl_ident.data.response_table import WaveformsError
 
         channels = channels or Channels()
@@ -150,14 +156,14 @@ class Reading(_Common):
         try:
             data = self.read(files)
         except WaveformsError:
-            if STANDARD in files:  # has been read, and cannot be read again
+            if STANDARD in files:  # which cannot be read a second time
                 raise
             console.note("the files hold waveforms: fitted sample by sample, as with --record")
             return self.read_records(files, channels)
         except DataError:
-            channels.refuse()
+            channels.refuse_for_tables()
             raise
-        channels.refuse()
+        channels.refuse_for_tables()
         return data
 
 
@@ -168,87 +174,68 @@ class RecordReading(_Common, Channels):
     drive: str | None = setting(_COLUMN)
 
 
-def selected(
-    data: FrequencyResponse, where: str | None, levels: str | None, runs: str | None
-) -> FrequencyResponse:
-    """Return the rows selected by the options --where, --levels and --runs."""
-    for name, column, text in (("--levels", "level", levels), ("--runs", "run", runs)):
-        if text is not None:
-            data = _labelled(data, name, column, [part.strip() for part in text.split(",")])
-    if where is None:
-        return data
-    rows = _rows_where(data, where)
-    if not rows.any():
-        raise ValidationError(f"--where {where!r} selects none of {data.n} rows")
-    return data.select(rows=rows)
-
-
-def _labelled(
-    data: FrequencyResponse, option: str, column: str, wanted: list[str]
-) -> FrequencyResponse:
+def _with_labels(data: FrequencyResponse, column: str, selected: list[str]) -> FrequencyResponse:
+    """Return the rows with the selected labels of level or run."""
     import numpy as np
 
-    labels = getattr(data, column)
-    known = [] if labels is None else list(dict.fromkeys(str(label) for label in labels))
-    missing = [label for label in wanted if label not in known]
+    labels = [] if getattr(data, column) is None else [str(v) for v in getattr(data, column)]
+    missing = [label for label in selected if label not in labels]
     if missing:
-        there = ", ".join(known) if known else f"no {column}s"
-        raise ValidationError(f"{option} names {', '.join(missing)}; the data have {there}")
-    return data.select(rows=np.array([str(label) in wanted for label in labels]))
+        existing = ", ".join(dict.fromkeys(labels)) or f"no {column}s"
+        raise ValidationError(f"--{column}s names {', '.join(missing)}; the data have {existing}")
+    return data.select(rows=np.isin(labels, selected))
 
 
 def _rows_where(data: FrequencyResponse, text: str) -> BoolArray:
     """Return which rows meet a condition on columns: only comparisons, and, or, not."""
     import numpy as np
 
-    every: dict[str, Any] = {
-        **{name: getattr(data, name) for name in _COLUMNS},
-        "phase_deg": np.degrees(data.phase),
-        **data.quality,
-    }
-    columns = {name: values for name, values in every.items() if values is not None}
+    columns = {name: v for name in _COLUMNS if (v := getattr(data, name)) is not None}
+    columns |= {"phase_deg": np.degrees(data.phase), **data.quality}
 
-    def refused(why: str) -> ValidationError:
+    def error(why: str) -> ValidationError:
         return ValidationError(
             f"--where is {text!r}: {why}; expected comparisons of {', '.join(columns)}, such as "
             "'level > 3 and harmonic == 1'"
         )
 
-    def value(node: ast.expr) -> Any:
+    def evaluated(node: ast.expr) -> Any:
         match node:
             case ast.Constant(value=int() | float() | str() as constant):
                 return constant
             case ast.Name(id=name):
                 if name not in columns:
-                    raise refused(f"there is no column {name}")
+                    raise error(f"there is no column {name}")
                 return columns[name]
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return np.logical_not(value(operand))
+                return np.logical_not(evaluated(operand))
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as size)):
                 return -size
             case ast.BoolOp(op=op, values=parts):
                 join = np.logical_and if isinstance(op, ast.And) else np.logical_or
-                return join.reduce([value(part) for part in parts])
+                return join.reduce([evaluated(part) for part in parts])
             case ast.Compare(left=left, ops=ops, comparators=others):
-                sides = [value(side) for side in (left, *others)]
-                pairs = zip(ops, sides, sides[1:], strict=False)
-                return np.logical_and.reduce([compared(*pair) for pair in pairs])
-        raise refused(f"{ast.unparse(node)} is not understood")
+                sides = [evaluated(side) for side in (left, *others)]
+                results = map(compared, ops, sides, sides[1:])
+                return np.logical_and.reduce(list(results))
+        raise error(f"{ast.unparse(node)} is not understood")
 
     def compared(op: ast.cmpop, *sides: Any) -> Any:
-        if type(op) not in _COMPARE:
-            raise refused("in, is and the like are not understood")
-        numbers = any(np.asarray(side).dtype.kind in "fiu" for side in sides)
+        if type(op) not in _COMPARISONS:
+            raise error("in, is and the like are not understood")
+        is_numeric = any(np.asarray(side).dtype.kind in "fiu" for side in sides)
         try:
-            left, right = (np.asarray(side).astype(float if numbers else str) for side in sides)
+            left, right = (np.asarray(side).astype(float if is_numeric else str) for side in sides)
         except ValueError as exc:
-            raise refused("a label that is not a number is compared with a number") from exc
-        return _COMPARE[type(op)](left, right)
+            raise error("a label that is not a number is compared with a number") from exc
+        return _COMPARISONS[type(op)](left, right)
 
     try:
-        rows = np.asarray(value(ast.parse(text, mode="eval").body))
+        rows = np.asarray(evaluated(ast.parse(text, mode="eval").body))
     except SyntaxError as exc:
-        raise refused(str(exc.msg)) from exc
+        raise error(str(exc.msg)) from exc
     if rows.dtype != np.bool_ or rows.shape != (data.n,):
-        raise refused("it contains no comparison")
+        raise error("it contains no comparison")
+    if not rows.any():
+        raise ValidationError(f"--where {text!r} selects none of {data.n} rows")
     return rows

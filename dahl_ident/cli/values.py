@@ -64,15 +64,15 @@ def ends(name: str, text: str, unit: str | None = None) -> float | tuple[float, 
     return values[0] if len(values) == 1 else (values[0], values[1])
 
 
-def number_or_free(name: str, text: str | None) -> float | None:
-    """Return a parameter's value, None where it is free."""
-    return None if text is None or text == FREE else number(name, text)
+def number_or_free(name: str, text: str) -> float | None:
+    """Return a parameter's value, None if it is free."""
+    return None if text == FREE else number(name, text)
 
 
-def known(name: str, text: str) -> Any:
-    """Return the value of a sensor: a number, None if it is free, or its prior.
+def sensor_value(name: str, text: str) -> Any:
+    """Return a parameter of a sensor: a number, None if it is free, or its prior.
 
-    A share such as ``0.5 %`` is the standard uncertainty of a gain.
+    A percentage such as ``0.5 %`` is the standard uncertainty of a gain.
     """
     if text.endswith("%") and name != "delay":
         return distribution(name, f"norm(1, {number(name, text[:-1].strip()) / 100.0!r})")
