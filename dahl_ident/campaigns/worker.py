@@ -101,9 +101,9 @@ def _load(law: str | LawFile) -> None:
     if isinstance(law, str):
         importlib.import_module(law)
         return
-    from dahl_ident.elements.law_files import run
+    from dahl_ident.elements.law_files import run_file
 
-    run(law)
+    run_file(law)
 
 
 def _fitted(job: Job, digests: list[str]) -> Row:

@@ -34,7 +34,7 @@ from dahl_ident.elements.facts import (
     UniversalCurve,
     Values,
 )
-from dahl_ident.elements.law_files import file_of, register, restored
+from dahl_ident.elements.law_files import empty_element, file_of, register
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError, ValidationError
 
@@ -109,7 +109,7 @@ class Element(ABC):
         file = file_of(type(self))
         if file is None:
             return super().__reduce_ex__(protocol)
-        return restored, (file, type(self).__qualname__), self.__dict__
+        return empty_element, (file, type(self).__qualname__), self.__dict__
 
     def _bind(self, arguments: Mapping[str, float | None], name: str | None) -> None:
         """Give the declared parameters their full names and values."""

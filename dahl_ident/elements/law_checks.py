@@ -1,8 +1,8 @@
 """Checks of a law that a user has written, made when it is first used.
 
-The parameters as they are declared; what ``slope`` returns; the loop that follows from it; and the
-same slope in symbols, for the engine. Values that are not given are tried: a law fails where it
-fails at the values given, or, where it may depend on the values, at every one that was tried.
+They concern the declared parameters, what ``slope`` returns, the loop that follows from it, and the
+same slope in symbols, for the engine. If a parameter has no value, several sets of values are
+tried, and a slope is refused only if it fails at all of them.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ if TYPE_CHECKING:
     from dahl_ident.elements.friction import Friction
 
 _TRIALS = 12  # sets of values
-_SPREAD = 0.5  # decades to either side, of values that are tried
+_SPREAD = 0.5  # decades to either side of a typical value
 _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
-_REST = len(_MAGNITUDES)  # place of force 0 between both signs of them
-_SHARES = np.linspace(0.0, 1.0, 201)  # of the largest force, to either side
-_FAR = 1e3  # times the scale: how far laws without full slip are looked at
-_BEYOND = 1.001  # of the force of full slip: integrators pass it by rounding and by a stage
+_REST = len(_MAGNITUDES)  # index of force 0, after all negative ones
+_FRACTIONS = np.linspace(0.0, 1.0, 201)  # of the largest force in each direction
+_FAR = 1e3  # times the scale: the largest force of a law without full slip
+_EXCEEDED = 1.001  # of the force of full slip, which stages of an integrator may exceed
 _OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
-_CLOSER = 8  # looks at the largest slope, each 64 times as close: forces differ by rounding then
-_CHANGED = 0.1  # of the slope at rest: the force at which it has changed so much is its scale
+_ZOOMS = 8  # by 64 each, towards the largest slope; then forces differ by rounding only
+_CHANGED = 0.1  # of the slope at rest: the force at which it has changed so much is the scale
 _ROUNDING = 1e-9  # of the largest slope
-_TO_SLIP = 0.98  # of the force of full slip: the largest loop
-_SOFT = 3.0  # times the scale: that of a law without full slip
-_CREATED = 0.01  # of the work of both directions: energy that the steps of an integral may create
-_AGREE = 1e-8  # relative: symbols and numbers
+_LOOP = 0.98  # of the force of full slip: the largest force of a loop
+_LOOP_WITHOUT_SLIP = 2.94  # times the scale: the same for a law without full slip
+_CREATED = 0.01  # of the work in both directions: energy that integration may create
+_TOLERANCE = 1e-8  # relative difference of results with symbols and with numbers
 _FORCE_UNIT = 32.0  # N, a unit in which a law has the same form; a power of 2 changes no digit
 _OVERRIDDEN = {"rest_stiffness": 1, "force_limits": 2, "force_bounds": 2, "knee": 2}
-"""Methods that a law may override, and how many arrays they return."""
+"""Methods that a law may override, and how many arrays each returns."""
 _RESERVED = ("name", "kind", "element")  # keys of an element in files
 
 _CHECKED: WeakKeyDictionary[type, set[tuple[Parameter, ...]]] = WeakKeyDictionary()
@@ -53,7 +53,7 @@ _SCALING: WeakKeyDictionary[type, tuple[str, ...]] = WeakKeyDictionary()
 
 
 def is_of_package(law: type) -> bool:
-    """Return whether a class is one of this package's own."""
+    """Return whether a class belongs to this package."""
     return law.__module__.partition(".")[0] == "dahl_ident"
 
 
@@ -87,8 +87,8 @@ def check_declarations(law: type[Element]) -> None:
                     f"{name}: the {what} of {p.name} is {text!r}; expected text, such as 'N/m'"
                 )
         for what, pair in {"bounds": (p.lower, p.upper), "prior": p.prior or (0, 1)}.items():
-            numbers = isinstance(pair, tuple) and len(pair) == 2
-            if not (numbers and all(isinstance(x, Real) for x in pair) and pair[0] < pair[1]):
+            is_pair = isinstance(pair, tuple) and len(pair) == 2
+            if not (is_pair and all(isinstance(x, Real) for x in pair) and pair[0] < pair[1]):
                 raise ValidationError(
                     f"{name}: {p.name} has the {what} {pair!r}; expected two numbers, the lower "
                     "one first"
@@ -98,10 +98,10 @@ def check_declarations(law: type[Element]) -> None:
                 f"{name}: {p.name} has the scan {p.scan!r}; expected a tuple of numbers, such as "
                 "(0.5, 1.0, 2.0)"
             )
-        beyond = [value for value in p.scan if not p.lower <= value <= p.upper]
-        if beyond:
+        outside = [value for value in p.scan if not p.lower <= value <= p.upper]
+        if outside:
             raise ValidationError(
-                f"{name}: {p.name} is scanned at {beyond[0]:g}, which is outside its bounds"
+                f"{name}: {p.name} is scanned at {outside[0]:g}, which is outside its bounds"
             )
         if p.transform not in ("log", "linear"):
             raise ValidationError(
@@ -134,60 +134,60 @@ def check_slope(law: Friction) -> None:
             f"{type(law).__name__} has {law.n_states} states; expected one, the force: leave "
             "n_states out, and add laws in parallel with +"
         )
-    declared = tuple(law.parameters)
-    done = _CHECKED.setdefault(type(law), set())
-    if declared in done:
+    parameters = law.parameters
+    checked = _CHECKED.setdefault(type(law), set())
+    if parameters in checked:
         return
     rng = np.random.default_rng(0)
-    count = 1 if all(p.value is not None for p in declared) else _TRIALS
-    columns = np.array([_tried(p, rng, count) for p in declared]).reshape(len(declared), count)
-    trials = [_Trial(law, values) for values in columns.T]
-    for check in (_Trial.slip, _Trial.constant, _Trial.loops, _Trial.far):
-        reasons = [check(trial) for trial in trials]
-        if all(reasons):
-            raise ModelError(f"{type(law).__name__}.slope {reasons[0]}")
-    _check_overridden(law, list(columns))
-    done.add(declared)
+    count = 1 if all(p.value is not None for p in parameters) else _TRIALS
+    columns = [_trial_values(p, rng, count) for p in parameters]
+    trials = [_Trial(law, values) for values in np.reshape(columns, (len(columns), count)).T]
+    for check in (_Trial.up_to_slip, _Trial.constant, _Trial.energy, _Trial.without_slip):
+        objections = [check(trial) for trial in trials]
+        if all(objections):
+            raise ModelError(f"{type(law).__name__}.slope {objections[0]}")
+    _check_overridden(law, columns)
+    checked.add(parameters)
 
 
 def _check_overridden(law: Friction, values: list[FloatArray]) -> None:
-    """Refuse a method of the user's that does not return as many numbers as the package's does."""
+    """Refuse an overridden method that does not return as many arrays as the original."""
     for method, count in _OVERRIDDEN.items():
         if is_of_package(next(c for c in type(law).__mro__ if method in vars(c))):
             continue
-        name, wanted = f"{type(law).__name__}.{method}", "an array" if count == 1 else "two arrays"
+        name, arrays = f"{type(law).__name__}.{method}", "an array" if count == 1 else "two arrays"
         try:
             with np.errstate(all="ignore"):
                 returned: Any = getattr(law, method)(values)
         except Exception as exc:  # whatever a user's code raises
-            raise ModelError(f"{name} failed: {_in_words(exc)}") from exc
+            raise ModelError(f"{name} failed: {_explanation(exc)}") from exc
         parts = (returned,) if count == 1 else returned
-        fits = isinstance(parts, tuple) and len(parts) == count
-        if not fits or any(np.asarray(part).dtype.kind not in "fiu" for part in parts):
+        complete = isinstance(parts, tuple) and len(parts) == count
+        if not complete or any(np.asarray(part).dtype.kind not in "fiu" for part in parts):
             raise ModelError(
-                f"{name} returned {_shown(returned)}; expected {wanted} of real numbers, one for "
-                "each set of values: end it with return"
+                f"{name} returned {_short_repr(returned)}; expected {arrays} of real numbers, one "
+                "for each set of values: end it with return"
             )
 
 
 def scaling_the_force(law: Friction) -> tuple[str, ...]:
-    """Return the labels of parameters that scale the force together: those with a unit of force.
+    """Return the labels of the parameters with a unit of force, which together scale the force.
 
-    None where their units do not agree with the law.
+    Empty if the slope does not agree with the units.
     """
     if type(law) not in _SCALING:
-        labels = tuple(v for v, p in zip(law.labels, law.parameters, strict=True) if p.dimension[0])
+        labels = tuple(law.label(p) for p in law.parameters if p.dimension[0])
         _SCALING[type(law)] = labels if _agrees_with_units(law) else ()
     return _SCALING[type(law)]
 
 
 def _agrees_with_units(law: Friction) -> bool:
-    """Return whether the slope is in proportion to a unit of force, and to parameters with it."""
+    """Return whether the slope scales with the force and all parameters with a unit of force."""
     powers = [p.dimension[0] for p in law.parameters]
     if not set(powers) <= {0, 1}:
         return False
     rng = np.random.default_rng(2)
-    values = [_tried(p, rng, _TRIALS) for p in law.parameters]
+    values = [_trial_values(p, rng, _TRIALS) for p in law.parameters]
     force = rng.uniform(-1.0, 1.0, _TRIALS) * 10.0 ** rng.uniform(-3.0, 3.0, _TRIALS)
     direction = np.resize([1.0, -1.0], _TRIALS)
     speed = None if law.rate_independent else direction * rng.uniform(0.1, 1.0, _TRIALS)
@@ -196,10 +196,10 @@ def _agrees_with_units(law: Friction) -> bool:
         with np.errstate(all="ignore"):
             slope = np.asarray(law.slope(force, direction, speed, values))
             rescaled = np.asarray(law.slope(_FORCE_UNIT * force, direction, speed, scaled))
-    except Exception as exc:  # what one set of values does not show, such as an if on a value
+    except Exception as exc:  # not seen with one set of values, such as an if on a value
         raise ModelError(
             f"{type(law).__name__}.slope failed for arrays of {_TRIALS} forces and of {_TRIALS} "
-            f"of each value: {_in_words(exc)}"
+            f"of each value: {_explanation(exc)}"
         ) from exc
     return bool(np.allclose(rescaled, _FORCE_UNIT * slope, rtol=1e-12, atol=0.0, equal_nan=True))
 
@@ -210,76 +210,76 @@ class _Trial:
     def __init__(self, law: Friction, values: FloatArray) -> None:
         self._law = law
         self._values = values
-        self._size = np.concatenate([-_MAGNITUDES[::-1], [0.0], _MAGNITUDES])
-        self._wide = [self._slope(s * self._size, s) for s in (1.0, -1.0)]
-        ahead = self._wide[0][_REST:]
-        self._at_rest = ahead[0]
-        self._limits = [self._limit(s, w) for s, w in zip((1.0, -1.0), self._wide, strict=True)]
+        # forces in the direction of motion, and the slopes there for both directions
+        self._forces = np.concatenate([-_MAGNITUDES[::-1], [0.0], _MAGNITUDES])
+        self._slopes = [self._slope(s * self._forces, s) for s in (1.0, -1.0)]
+        ahead = self._slopes[0][_REST:]
+        self._rest_slope = ahead[0]
+        self._limits = [self._limit(s, w) for s, w in zip((1.0, -1.0), self._slopes, strict=True)]
         with np.errstate(all="ignore"):
-            changed = np.abs(ahead / self._at_rest - 1.0) > _CHANGED
-        first = self._size[_REST + changed.argmax()] if changed.any() else np.inf
+            changed = np.abs(ahead / self._rest_slope - 1.0) > _CHANGED
+        first = self._forces[_REST + changed.argmax()] if changed.any() else np.inf
         scale = min(first, *self._limits)
         self._scale = float(scale) if math.isfinite(scale) else 1.0
 
-    def _at(self, force: float, direction: float) -> str:
-        """Return in words where something was found."""
+    def _where(self, force: float, direction: float) -> str:
+        """Return force, direction and parameters in words."""
         where = [f"force = {force + 0.0:.4g} N", f"direction = {direction:+g}"]
-        return f"at {', '.join([*where, *self._numbers()])}"
+        return f"at {', '.join([*where, *self._values_in_words()])}"
 
-    def _numbers(self) -> list[str]:
-        named = zip(self._law.parameters, self._values.tolist(), strict=True)
-        return [f"{p.name} = {v:.4g}" for p, v in named]
+    def _values_in_words(self) -> list[str]:
+        pairs = zip(self._law.parameters, self._values.tolist(), strict=True)
+        return [f"{p.name} = {v:.4g}" for p, v in pairs]
 
     def _slope(self, force: FloatArray, direction: float) -> FloatArray:
-        """Return dF/dx of a row of forces, checked for its form."""
-        law, name = self._law, f"{type(self._law).__name__}.slope"
+        """Return dF/dx at a row of forces; refuse results of a wrong type or shape."""
+        name, rate_independent = f"{type(self._law).__name__}.slope", self._law.rate_independent
         force = force[None]
         heading = np.full(force.shape, direction)
         arguments = f"an array of {force.shape} forces, and {len(self._values)} values"
-        rated = not law.rate_independent
         try:
-            returned = self._called(force, heading, 0.0 if rated else None)
+            returned = self._call(force, heading, None if rate_independent else 0.0)
         except Exception as exc:  # whatever a user's code raises
-            if not rated and self._works_with_velocity(force, heading):
+            if rate_independent and self._works_with_velocity(force, heading):
                 raise ModelError(
                     f"{name} failed without a velocity ({exc}); a law that uses the velocity must "
                     "declare rate_independent = False"
                 ) from exc
-            raise ModelError(f"{name} failed for {arguments}: {_in_words(exc)}") from exc
+            raise ModelError(f"{name} failed for {arguments}: {_explanation(exc)}") from exc
         if returned is None:
             raise ModelError(f"{name} returned None; expected dF/dx, N/m: end it with return")
         array: NDArray[Any] = np.asarray(returned)
         if array.dtype.kind not in "fiub":
             raise ModelError(
-                f"{name} returned {_shown(returned)}, numbers of type {array.dtype}; expected "
+                f"{name} returned {_short_repr(returned)}, numbers of type {array.dtype}; expected "
                 "dF/dx, N/m, as real numbers"
             )
         try:
-            fits = np.broadcast_shapes(array.shape, force.shape) == force.shape
+            return np.asarray(np.broadcast_to(array.astype(np.float64), force.shape)[0])
         except ValueError:
-            fits = False
-        if not fits:
             raise ModelError(
                 f"{name} returned the shape {array.shape} for {arguments}; expected "
                 f"{force.shape}, one number for each force"
-            )
-        return np.asarray(np.broadcast_to(array.astype(np.float64), force.shape)[0])
+            ) from None
 
-    def _called(self, force: FloatArray, direction: FloatArray, velocity: float | None) -> Any:
+    def _call(self, force: FloatArray, direction: FloatArray, velocity: float | None) -> Any:
         with np.errstate(all="ignore"):
             values = [np.full((1, 1), v) for v in self._values]
             return self._law.slope(force.copy(), direction, velocity, values)
 
     def _works_with_velocity(self, force: FloatArray, direction: FloatArray) -> bool:
         try:
-            self._called(force, direction, 0.0)
+            self._call(force, direction, 0.0)
         except Exception:  # whatever a user's code raises
             return False
         return True
 
-    def _limit(self, direction: float, wide: FloatArray) -> float:
-        """Return the size of the force at which the slope ceases to be positive; inf if never."""
-        size, ahead = self._size[_REST:], wide[_REST:]
+    def _limit(self, direction: float, slopes: FloatArray) -> float:
+        """Return the force in the direction of motion at which the slope ceases to be positive.
+
+        inf if there is none.
+        """
+        size, ahead = self._forces[_REST:], slopes[_REST:]
         with np.errstate(invalid="ignore"):
             stops = np.flatnonzero(~((ahead > 0.0) & (ahead < np.inf)))
         before = ahead[: stops[0]] if stops.size else ahead
@@ -287,110 +287,109 @@ class _Trial:
             return np.inf
         low, high = size[max(0, stops[0] - 1)], size[stops[0]]
         for _ in range(4):
-            line = np.linspace(low, high, 33)
+            between = np.linspace(low, high, 33)
             with np.errstate(invalid="ignore"):
-                positive = self._slope(direction * line, direction) > 0.0
+                positive = self._slope(direction * between, direction) > 0.0
             last = 32 if positive.all() else max(int(positive.argmin()), 1)
-            low, high = line[last - 1], line[last]
+            low, high = between[last - 1], between[last]
         return float(high)
 
-    def slip(self) -> str:
-        """Return what is wrong with the slope up to full slip."""
+    def up_to_slip(self) -> str:
+        """Return the objection to the slope up to full slip; without it, up to the scale."""
         ends = [limit if math.isfinite(limit) else self._scale for limit in self._limits]
-        return self._within([end * _SHARES for end in ends])
+        return self._objection([end * _FRACTIONS for end in ends])
 
-    def far(self) -> str:
-        """Return what is wrong with the slope at greater forces, of laws without full slip."""
+    def without_slip(self) -> str:
+        """Return the objection to the slope at larger forces, for laws without full slip."""
         if np.isfinite(self._limits).all():
             return ""
-        return self._within([self._reached(0), self._reached(1)])
+        return self._objection([self._reachable(0), self._reachable(1)])
 
-    def _within(self, reached: list[FloatArray]) -> str:
-        """Return what is wrong with the slope at sizes of forces to either side, from 0 on."""
+    def _objection(self, reachable: list[FloatArray]) -> str:
+        """Return the objection to the slope at the forces that are reached in each direction."""
         for side, direction in enumerate((1.0, -1.0)):
-            # after a reversal, the other side's forces
-            ahead, behind = reached[side], reached[1 - side]
-            size = np.concatenate([-behind[:0:-1], ahead, _BEYOND * ahead[-1:]])
-            slopes = self._slope(direction * size, direction)
-            place, peak = self._peak(size, slopes, direction)
-            size, slopes = np.append(place, size), np.append(peak, slopes)
+            # after a reversal, those of the other direction
+            ahead, behind = reachable[side], reachable[1 - side]
+            forces = np.concatenate([-behind[:0:-1], ahead, _EXCEEDED * ahead[-1:]])
+            slopes = self._slope(direction * forces, direction)
+            steepest, peak = self._peak(forces, slopes, direction)
+            forces, slopes = np.append(steepest, forces), np.append(peak, slopes)
             objection = (
-                self._not_finite(size, slopes, direction)
+                self._not_finite(forces, slopes, direction)
                 or self._positive_again(side, direction)
-                or self._not_positive(size[:-1], slopes[:-1], direction)
+                or self._not_positive(forces[:-1], slopes[:-1], direction)
             )
             if objection:
                 return objection
         return ""
 
-    def _reached(self, side: int) -> FloatArray:
-        """Return sizes of the forces that motions reach on one side, from 0 on.
+    def _reachable(self, side: int) -> FloatArray:
+        """Return the forces that are reached in one direction, from 0.
 
-        Up to full slip; without it, ever farther apart, until one direction's slope overflows.
+        Up to full slip; without it, at growing distances, until the slope in one direction
+        overflows.
         """
         limit, scale = self._limits[side], self._scale
         if math.isfinite(limit):
-            return _SHARES * limit
-        before, after = self._wide[side][_REST + 1 :], self._wide[1 - side][_REST - 1 :: -1]
+            return _FRACTIONS * limit
+        before, after = self._slopes[side][_REST + 1 :], self._slopes[1 - side][_REST - 1 :: -1]
         with np.errstate(invalid="ignore"):
             steepest = np.maximum(np.abs(before), np.abs(after))
-            wild = ~(steepest < _OVERFLOW * self._at_rest) & (scale < _MAGNITUDES)
+            wild = ~(steepest < _OVERFLOW * self._rest_slope) & (scale < _MAGNITUDES)
         farthest = np.where(wild, _MAGNITUDES, _FAR * scale).min()
-        return np.asarray(scale * np.expm1(_SHARES * np.log1p(farthest / scale)))
+        return np.asarray(scale * np.expm1(_FRACTIONS * np.log1p(farthest / scale)))
 
-    def _peak(self, size: FloatArray, slopes: FloatArray, direction: float) -> tuple[float, float]:
-        """Return where the slope is largest, looked at more and more closely, and its size there.
-
-        Infinite where it grows beyond all bounds.
-        """
-        ends, gaps = (size[0], size[-1]), np.pad(np.diff(size), 1)
+    def _peak(
+        self, forces: FloatArray, slopes: FloatArray, direction: float
+    ) -> tuple[float, float]:
+        """Return the force at which the slope is largest, and the slope there; inf at a pole."""
+        ends, gaps = (forces[0], forces[-1]), np.pad(np.diff(forces), 1)
         widths = np.maximum(gaps[:-1], gaps[1:])
-        most = np.sort(np.abs(slopes))[-2]  # the largest may be at a pole
-        for _ in range(_CLOSER):
+        second_largest = np.sort(np.abs(slopes))[-2]  # the largest may be at a pole
+        for _ in range(_ZOOMS):
             largest = np.argmax(np.abs(slopes))
-            place, peak, width = size[largest], slopes[largest], widths[largest]
-            size = np.clip(place + width * np.linspace(-1.0, 1.0, 129), *ends)
-            slopes = self._slope(direction * size, direction)
-            widths = np.full(size.shape, width / 64.0)
-        return place, np.inf if abs(peak) > _OVERFLOW * most else peak
+            force, peak, width = forces[largest], slopes[largest], widths[largest]
+            forces = np.clip(force + width * np.linspace(-1.0, 1.0, 129), *ends)
+            slopes = self._slope(direction * forces, direction)
+            widths = np.full(forces.shape, width / 64.0)
+        return force, np.inf if abs(peak) > _OVERFLOW * second_largest else peak
 
-    def _not_finite(self, size: FloatArray, slopes: FloatArray, direction: float) -> str:
+    def _not_finite(self, forces: FloatArray, slopes: FloatArray, direction: float) -> str:
         wrong = np.flatnonzero(~np.isfinite(slopes))
         if not wrong.size:
             return ""
-        first = wrong[np.argmin(np.abs(size[wrong]))]
+        first = wrong[np.argmin(np.abs(forces[wrong]))]
         return (
-            f"is {slopes[first]} {self._at(direction * size[first], direction)}; expected a "
+            f"is {slopes[first]} {self._where(direction * forces[first], direction)}; expected a "
             "finite number for every force up to full slip, also after the direction has changed, "
             "and a little beyond it, as from np.sign(m) * np.abs(m)**alpha with "
             "m = 1 - direction*force/f_max"
         )
 
-    def _not_positive(self, size: FloatArray, slopes: FloatArray, direction: float) -> str:
-        largest = np.max(np.abs(slopes))
-        negative = np.flatnonzero(slopes < -_ROUNDING * largest)
-        if not self._at_rest > 0.0:
-            where = self._at(0.0, direction)
+    def _not_positive(self, forces: FloatArray, slopes: FloatArray, direction: float) -> str:
+        if not self._rest_slope > 0.0:
+            where = self._where(0.0, direction)
             return (
-                f"is {self._at_rest:.4g} N/m {where}; expected a positive slope at rest and "
+                f"is {self._rest_slope:.4g} N/m {where}; expected a positive slope at rest and "
                 "up to full slip"
             )
-        inner = negative[size[negative] < size[-1] * (1.0 - 1e-3)]
-        if not inner.size:
+        negative = slopes < -_ROUNDING * np.max(np.abs(slopes))
+        before_slip = np.flatnonzero(negative & (forces < forces[-1] * (1.0 - 1e-3)))
+        if not before_slip.size:
             return ""
-        worst = inner[np.argmin(slopes[inner])]
-        where = self._at(direction * size[worst], direction)
+        worst = before_slip[np.argmin(slopes[before_slip])]
+        where = self._where(direction * forces[worst], direction)
         return (
             f"is {slopes[worst]:.4g} N/m, negative before full slip, {where}; expected a positive "
             "slope until full slip, also after the direction has changed"
         )
 
     def _positive_again(self, side: int, direction: float) -> str:
-        """Return what is wrong where a slope is negative, and positive at greater forces."""
-        limit, slopes, size = self._limits[side], self._wide[side], self._size
-        near = (size > limit) & (size < 1e3 * limit)
+        """Return the objection to a slope that is negative, and positive at larger forces."""
+        limit, slopes, forces = self._limits[side], self._slopes[side], self._forces
+        near = (forces > limit) & (forces < 1e3 * limit)
         with np.errstate(invalid="ignore"):
-            smallest = _ROUNDING * self._at_rest
+            smallest = _ROUNDING * self._rest_slope
             negative = np.flatnonzero(near & (slopes < -smallest))
             later = np.flatnonzero(near & (slopes > smallest))
         negative = negative[negative < later.max(initial=-1)]
@@ -399,13 +398,13 @@ class _Trial:
         worst = negative[np.argmin(slopes[negative])]
         return (
             f"is {slopes[worst]:.4g} N/m, negative before full slip, "
-            f"{self._at(direction * size[worst], direction)}, and positive again at larger "
+            f"{self._where(direction * forces[worst], direction)}, and positive again at larger "
             "forces; expected a positive slope until full slip"
         )
 
     def constant(self) -> str:
-        """Return that the slope is the same for all forces and directions, if it is."""
-        slopes = np.concatenate(self._wide)
+        """Return the objection to a slope that is the same for all forces and directions."""
+        slopes = np.concatenate(self._slopes)
         slopes = slopes[np.isfinite(slopes)]  # forces far beyond full slip may overflow
         same = slopes.size and np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
         if not (same and self._law.rate_independent):
@@ -417,46 +416,50 @@ class _Trial:
             "di.Spring"
         )
 
-    def loops(self) -> str:
-        """Return by how much energy grows over a closed loop, if it does.
+    def energy(self) -> str:
+        """Return the objection to a loop between two forces that creates energy.
 
-        Of a loop between two forces, where dx = dF/slope in each direction.
+        In each direction, dx = dF/slope.
         """
-        reach = [limit if math.isfinite(limit) else _SOFT * self._scale for limit in self._limits]
-        upper, lower = _TO_SLIP * _SHARES * reach[0], -_TO_SLIP * _SHARES * reach[1]
+        ends = [
+            _LOOP * limit if math.isfinite(limit) else _LOOP_WITHOUT_SLIP * self._scale
+            for limit in self._limits
+        ]
+        upper, lower = ends[0] * _FRACTIONS, -ends[1] * _FRACTIONS
         with np.errstate(all="ignore"):
-            gap, work, size = self._between(upper)
-            below, taken, whole = self._between(lower)
+            gap, work, size = self._integrals(upper)
+            lower_gap, lower_work, lower_size = self._integrals(lower)
             # the loop closes where both directions need the same displacement
-            after = np.diff(np.sign(below - gap[:, None]), axis=1) != 0.0
-            place = 1 + after.argmax(axis=1)
-            lost = work - taken[place]
-            created = np.where(after.any(axis=1), -lost / (size + np.abs(whole[place])), -np.inf)
+            closes = np.diff(np.sign(lower_gap - gap[:, None]), axis=1) != 0.0
+            turn = 1 + closes.argmax(axis=1)
+            lost = work - lower_work[turn]
+            created = -lost / (size + np.abs(lower_size[turn]))
+        created[~closes.any(axis=1)] = -np.inf
         created[0] = -np.inf
         worst = int(np.nanargmax(created))
         if not created[worst] > _CREATED:
             return ""
         return (
             f"creates energy: {-lost[worst]:.3g} J in each cycle between "
-            f"{lower[place[worst]]:.3g} and {upper[worst]:.3g} N, at {', '.join(self._numbers())}; "
-            "expected a loop that loses energy: the slope after a reversal must not be below "
-            "that before it"
+            f"{lower[turn[worst]]:.3g} and {upper[worst]:.3g} N, at "
+            f"{', '.join(self._values_in_words())}; expected a loop that loses energy: the slope "
+            "after a reversal must not be below that before it"
         )
 
-    def _between(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return three integrals from rest to each force, which the forces of a loop share.
+    def _integrals(self, force: FloatArray) -> FloatArray:
+        """Return three integrals from rest to each force, over both directions of motion.
 
-        Of the difference of dx between the directions, of force times it, and of the work's size.
+        Of the difference in displacement, the difference in work, and the sum of the work's sizes.
         """
+        from scipy.integrate import cumulative_trapezoid
+
         rising, falling = (1.0 / self._slope(force, s) for s in (1.0, -1.0))
         parts = (rising - falling, force * (rising - falling), np.abs(force) * (rising + falling))
-        step = np.diff(force)
-        gap, work, size = (np.append(0.0, np.cumsum(0.5 * (p[1:] + p[:-1]) * step)) for p in parts)
-        return gap, work, size
+        return np.asarray(cumulative_trapezoid(parts, force, initial=0))
 
 
-def _tried(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatArray:
-    """Return values at which a parameter is tried: the one given, else some within its range."""
+def _trial_values(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatArray:
+    """Return trial values of a parameter: its own if it is fixed, else some within its range."""
     if parameter.value is not None and (not parameter.free or count == 1):
         return np.full(count, float(parameter.value))
     if parameter.scan:
@@ -477,8 +480,8 @@ def _tried(parameter: Parameter, rng: np.random.Generator, count: int) -> FloatA
     return np.asarray(spread)
 
 
-def _in_words(exc: Exception) -> str:
-    """Return what a user's code failed with, and what to write instead."""
+def _explanation(exc: Exception) -> str:
+    """Return why a user's code failed, and what to write instead."""
     text = " ".join(str(exc).split())
     if "truth value" in text:
         return (
@@ -496,7 +499,7 @@ def _in_words(exc: Exception) -> str:
     )
 
 
-def _shown(value: Any) -> str:
+def _short_repr(value: Any) -> str:
     text = " ".join(repr(value).split())
     return text if len(text) <= 40 else f"{text[:40]}..."
 
@@ -504,19 +507,19 @@ def _shown(value: Any) -> str:
 def symbolic_mechanics(
     element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
 ) -> Mechanics:
-    """Return an element's part in an equation of motion, in symbols."""
+    """Return an element's part in an equation of motion, in symbols; check a user's."""
     if is_of_package(type(element)):
         return element.mechanics(values, x, v, s, states)
     try:
         part = element.mechanics(values, x, v, s, states)
         _check_part(type(element).__name__, part, len(states))
         if getattr(element, "one_state", False):
-            _compare(element, values, v, s, states[0])
+            _check_symbols(element, values, v, s, states[0])
     except ModelError:
         raise
     except Exception as exc:  # whatever a user's code raises
         raise ModelError(
-            f"{type(element).__name__} cannot be compiled: {_in_words(exc)}, and on symbols"
+            f"{type(element).__name__} cannot be compiled: {_explanation(exc)}, and on symbols"
         ) from exc
     return part
 
@@ -527,34 +530,34 @@ def _check_part(name: str, part: Any, n_states: int) -> None:
 
     if not isinstance(part, Mechanics) or len(part.rates) != n_states:
         raise ModelError(
-            f"{name}.mechanics returned {_shown(part)}; expected an inertia, a force, and as many "
-            f"rates as the element has states, which is {n_states}"
+            f"{name}.mechanics returned {_short_repr(part)}; expected an inertia, a force, and as "
+            f"many rates as the element has states, which is {n_states}"
         )
     for what, value in (
         ("force, or output,", part.force),
         *(("rate", rate) for rate in part.rates),
     ):
         try:
-            fits = ca.SX(value).is_scalar()
-        except (NotImplementedError, TypeError):  # casadi's, for what it cannot take
-            fits = False
-        if not fits:
+            is_scalar = ca.SX(value).is_scalar()
+        except (NotImplementedError, TypeError):  # casadi's, for types that it does not accept
+            is_scalar = False
+        if not is_scalar:
             raise ModelError(
-                f"the {what} of {name} is {_shown(value)} for one force; expected one number, N: "
-                "end the method with return, and use plain arithmetic"
+                f"the {what} of {name} is {_short_repr(value)} for one force; expected one number, "
+                "N: end the method with return, and use plain arithmetic"
             )
 
 
-def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
-    """Refuse what differs between symbols and numbers, and steps that are not comparisons."""
+def _check_symbols(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> None:
+    """Refuse results that differ between symbols and numbers, and steps without comparisons."""
     import casadi as ca
 
     rng = np.random.default_rng(1)
-    numbers = [_tried(p, rng, _TRIALS) for p in law.parameters]
-    free = [(v, n) for v, n in zip(values, numbers, strict=True) if not v.is_constant()]
+    numbers = [_trial_values(p, rng, _TRIALS) for p in law.parameters]
+    free = [i for i, value in enumerate(values) if not value.is_constant()]
     slope = law.slope(force, s, v, values)
     output = law.output(force, slope, v, values)
-    function = ca.Function("law", [force, s, v, *(v for v, _ in free)], [slope, output])
+    function = ca.Function("law", [force, s, v, *(values[i] for i in free)], [slope, output])
     codes = {function.instruction_id(i) for i in range(function.n_instructions())}
     if codes & {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER}:
         raise ModelError(
@@ -567,18 +570,18 @@ def _compare(law: Any, values: Sequence[Any], v: Any, s: Any, force: Any) -> Non
     with np.errstate(all="ignore"):
         slopes = law.slope(forces, direction, None if law.rate_independent else speed, numbers)
         expected = slopes, law.output(forces, slopes, speed, numbers)
-        rows = zip(forces, direction, speed, *(n for _, n in free), strict=True)
+        rows = zip(forces, direction, speed, *(numbers[i] for i in free), strict=True)
         computed = np.array([[float(number) for number in function(*row)] for row in rows]).T
-    for method, one, other in zip(("slope", "output"), computed, expected, strict=True):
+    for method, result, by_numbers in zip(("slope", "output"), computed, expected, strict=True):
         name = f"{type(law).__name__}.{method}"
-        if not np.allclose(one, other, rtol=_AGREE, atol=0.0, equal_nan=True):
+        if not np.allclose(result, by_numbers, rtol=_TOLERANCE, atol=0.0, equal_nan=True):
             raise ModelError(
                 f"{name} cannot be compiled: with symbols in place of numbers it "
                 "gives another result; expected plain arithmetic, comparisons and numpy's "
                 "functions, without math.*, float(), new arrays that are filled, or random numbers"
             )
-        if not np.isfinite(one).any():
+        if not np.isfinite(result).any():
             raise ModelError(
-                f"{name} is {one[0]} at every force that was tried, such as {forces[0]:.3g} N; "
+                f"{name} is {result[0]} at every force that was tried, such as {forces[0]:.3g} N; "
                 "expected finite numbers, N"
             )

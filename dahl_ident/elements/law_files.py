@@ -1,8 +1,9 @@
-"""Laws by their kinds, and files in which users define some: run once, taken along by pickles.
+"""Laws by their kinds, and Python files in which users define laws.
 
-A file becomes a module of a name made from its path and content, so that it can neither hide
-another module nor be mistaken for an earlier version of itself. An element whose class comes from a
-file is pickled with the file's content: whichever process unpickles it has the law.
+A file becomes a module whose name is made from its path and content, so that it can neither hide
+another module nor be mistaken for an earlier version of itself. It is run once in each process. An
+element whose class comes from a file is pickled with the file's content, so that any process can
+unpickle it.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
+import traceback
 from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,7 +32,7 @@ class LawFile(NamedTuple):
     Attributes
     ----------
     path : str
-        Where it was read from.
+        The path from which it was read.
     source : str
         Its content.
     """
@@ -49,22 +52,25 @@ class LawFile(NamedTuple):
 
 
 _FILES: dict[str, LawFile] = {}
-"""Files that were run, by the names of their modules."""
+"""Files that this process has run, by the names of their modules."""
 
 KINDS: dict[str, type[Element]] = {}
-"""Every element class by the name that files and the command line know it by."""
+"""Every element class by its name in files and on the command line."""
 
 
 def register(cls: type[Element]) -> None:
-    """Make a class known by its kind; a file that is run again replaces its own classes."""
-    known = KINDS.get(cls.kind)
-    home, known_home = (known and (source_path(c) or c.__module__) for c in (cls, known or cls))
-    if known and (known_home, known.__qualname__) != (home, cls.__qualname__):
+    """Enter a class under its kind; a file that is run again replaces its own classes."""
+    other = KINDS.get(cls.kind)
+    if other and _origin(other) != _origin(cls):
         raise ModelError(
-            f"{cls.__name__} has the kind {cls.kind!r}, which {known.__module__}."
-            f"{known.__qualname__} has already; choose another"
+            f"{cls.__name__} has the kind {cls.kind!r}, which {other.__module__}."
+            f"{other.__qualname__} has already; choose another"
         )
     KINDS[cls.kind] = cls
+
+
+def _origin(cls: type) -> tuple[str, str]:
+    return source_path(cls) or cls.__module__, cls.__qualname__
 
 
 def class_named(name: str) -> type[Element] | None:
@@ -74,7 +80,7 @@ def class_named(name: str) -> type[Element] | None:
 
 
 def load_laws(path: str | Path) -> tuple[type[Element], ...]:
-    """Run a Python file, and return the laws that it defines; they are known by their kinds.
+    """Run a Python file, register the laws that it defines by their kinds, and return them.
 
     Parameters
     ----------
@@ -85,7 +91,7 @@ def load_laws(path: str | Path) -> tuple[type[Element], ...]:
     Returns
     -------
     tuple of type
-        In the order of the file. A class without a `kind` has its name as kind.
+        In the order of the file. The kind of a class without a `kind` is its name.
 
     Raises
     ------
@@ -111,11 +117,11 @@ def load_laws(path: str | Path) -> tuple[type[Element], ...]:
     >>> [law.kind for law in load_laws(file)]
     ['Hardening']
     """
-    return run(LawFile(str(Path(path).resolve()), read_text(path, "the file of laws")))
+    return run_file(LawFile(str(Path(path).resolve()), read_text(path, "the file of laws")))
 
 
-def run(file: LawFile) -> tuple[type[Element], ...]:
-    """Return the laws of a file, which is run where this process has not done it yet."""
+def run_file(file: LawFile) -> tuple[type[Element], ...]:
+    """Return the laws of a file, which is run unless this process has run it already."""
     from dahl_ident.elements.element import Element
 
     path, name = Path(file.path), file.module
@@ -157,56 +163,55 @@ def run(file: LawFile) -> tuple[type[Element], ...]:
 
 
 def _line(exc: BaseException, path: str) -> str:
-    """Return the line of a file where it failed, such as ":12"."""
-    number = exc.lineno if isinstance(exc, SyntaxError) else None
-    trace = exc.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == path:
-            number = trace.tb_lineno
-        trace = trace.tb_next
-    return "" if number is None else f", line {number}"
+    """Return the line of a file at which it failed, such as ", line 12"."""
+    frames = traceback.extract_tb(exc.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == path]
+    if not lines and isinstance(exc, SyntaxError):
+        lines = [exc.lineno]
+    return f", line {lines[-1]}" if lines and lines[-1] else ""
 
 
 def file_of(law: type) -> LawFile | None:
-    """Return the file of a law that was loaded from one."""
+    """Return the file from which a law was loaded, if it was."""
     return _FILES.get(law.__module__)
 
 
 def source_path(law: type) -> str | None:
-    """Return the path of the file in which a law is defined, however it was loaded."""
+    """Return the path of the file that defines a law, loaded or imported; None if there is none."""
     path = getattr(sys.modules.get(law.__module__), "__file__", None)
     return None if path is None else str(Path(path).resolve())
 
 
-def restored(file: LawFile, name: str) -> Any:
-    """Return an element without its content, of a class that a file defines."""
+def empty_element(file: LawFile, name: str) -> Any:
+    """Return an element without attributes, of a class that a file defines, for pickle to fill."""
     if file.module not in _FILES:
-        run(file)
-    cls: Any = sys.modules[file.module]
-    for part in name.split("."):
-        cls = getattr(cls, part)
-    return object.__new__(cls)
+        run_file(file)
+    return object.__new__(attrgetter(name)(sys.modules[file.module]))
 
 
 def user_laws(elements: Iterable[Element]) -> list[type[Element]]:
-    """Return the classes of a model's laws that are not this package's; those behind gaps too."""
-    both = (type(part) for element in elements for part in (element, *element.inner_elements))
-    return list(dict.fromkeys(law for law in both if not is_of_package(law)))
+    """Return the classes of a model's laws that a user has written, also of those behind gaps."""
+    laws = (type(part) for element in elements for part in (element, *element.inner_elements))
+    return list(dict.fromkeys(law for law in laws if not is_of_package(law)))
 
 
 def describe_laws(elements: Iterable[Element]) -> list[dict[str, Any]]:
-    """Return what to import for the laws of a model that are not this package's, as plain data."""
+    """Return where the laws of a model that a user has written are defined, as plain data."""
     descriptions = []
     for law in user_laws(elements):
-        path, file = source_path(law), file_of(law)
-        module = Path(file.path).stem if file else law.__module__
-        about = {"kind": law.kind, "class": law.__qualname__, "module": module, "file": path}
-        descriptions.append(about)
+        file = file_of(law)
+        description = {
+            "kind": law.kind,
+            "class": law.__qualname__,
+            "module": Path(file.path).stem if file else law.__module__,
+            "file": source_path(law),
+        }
+        descriptions.append(description)
     return descriptions
 
 
 def require_laws(laws: Sequence[Mapping[str, Any]], holder: str) -> None:
-    """Refuse to go on without the laws that :func:`describe_laws` described."""
+    """Raise ModelError if a law that :func:`describe_laws` described is not registered."""
     for law in laws:
         if law["kind"] not in KINDS:
             file = law["file"] or "an interactive session, which no file holds"
