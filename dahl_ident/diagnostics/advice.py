@@ -12,12 +12,12 @@ from dahl_ident.diagnostics.intervals import Interval
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.diagnostics.record_errors import RecordErrors
 from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements.parameter import FORCE, STIFFNESS, Dimension
 from dahl_ident.elements.recursion import Stretches, stretches
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.units import Motion, shown_unit
 
-_FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near reversals that suffices
 _ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
@@ -106,8 +106,8 @@ def _friction_advice(
     share = f"friction's share of the response from {least} to {most}"
     no_most = np.isinf(limits.upper)
     sticks = amplitude.max() < low
-    is_limit, is_stiffness = scales and dimension == _FORCE, scales and dimension == _STIFFNESS
-    limit_lost = any(p.name in lost for p in _scaled(element, _FORCE))
+    is_limit, is_stiffness = scales and dimension == FORCE, scales and dimension == STIFFNESS
+    limit_lost = any(p.name in lost for p in _scaled(element, FORCE))
     if spring and limits.lower <= 0.0 and no_most and limit_lost:
         reason = f"{share},{parallel}, is within the noise"
         remedy = "cover amplitudes where it is larger, reduce the noise"
@@ -130,7 +130,7 @@ def _friction_advice(
     return f"because {reason}: {remedy}{fix}"
 
 
-def _scaled(element: Element, dimension: tuple[int, int, int]) -> list[Parameter]:
+def _scaled(element: Element, dimension: Dimension) -> list[Parameter]:
     """Return the scale parameters of a dimension."""
     scale = (element.parameter(label) for label in element.scale_parameters)
     return [p for p in scale if p.dimension == dimension]
@@ -138,7 +138,7 @@ def _scaled(element: Element, dimension: tuple[int, int, int]) -> list[Parameter
 
 def _spring_advice(optimum: Optimum, lost: frozenset[str]) -> str:
     friction = (e for e in optimum.problem.model.elements if e.has_memory)
-    stiff = [p.name for e in friction for p in _scaled(e, _STIFFNESS) if p.name in lost]
+    stiff = [p.name for e in friction for p in _scaled(e, STIFFNESS) if p.name in lost]
     if stiff:
         return (
             f"because friction's stiffness {stiff[0]} can take its place: measure the spring "

@@ -23,11 +23,11 @@ from dahl_ident.diagnostics.bands import friction_and_slopes
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.physics import is_spring
 from dahl_ident.elements import Parameter
+from dahl_ident.elements.parameter import STIFFNESS
 from dahl_ident.fitting import Optimum
 from dahl_ident.units import shown_unit
 
 _UNITS = ("N", "m", "s")
-_STIFFNESS = (1, -1, 0)  # powers of force, displacement and time
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def candidates(optimum: Optimum) -> list[Candidate]:
             text = element.named(combination.expression)
             formed.append(Candidate(text, unit, value, direction, frozenset(by_name)))
     scale = [{n: e.parameter(n) for n in e.scale_parameters} for e in friction]
-    stiff = (p for labels in scale for p in labels.values() if p.dimension == _STIFFNESS)
+    stiff = (p for labels in scale for p in labels.values() if p.dimension == STIFFNESS)
     pairs = [(p, spring) for p in stiff for spring in springs]
     for (first_element, first), (second_element, second) in combinations(
         zip(friction, scale, strict=True), 2

@@ -17,6 +17,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.optimum import Status
@@ -35,14 +36,14 @@ _FALLING = "fit a law whose force falls with speed (LuGre)"
 _INSTEAD = {
     (1, -1, 2): "a mass: leave it out, or give its value",
     (1, -1, 1): f"a damper: {_FALLING}, leave the damper out, or give its value",
-    (1, -1, 0): "a spring, except a buckled one: leave it out, or give its value",
+    STIFFNESS: "a spring, except a buckled one: leave it out, or give its value",
 }
 # Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.
 _TYPICAL = {"x_c": (1e-9, 0.1), "force limit": (1e-9, 1e8), "contact stiffness": (1e-2, 1e12)}
 _TYPICAL_ROTATION = {
     "x_c": (1e-7, 1.0), "force limit": (1e-10, 1e8), "contact stiffness": (1e-4, 1e12)
 }  # fmt: skip
-_DIMENSIONS = {(1, 0, 0): "force limit", (1, -1, 0): "contact stiffness"}
+_DIMENSIONS = {FORCE: "force limit", STIFFNESS: "contact stiffness"}
 _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
 _ALIKE = 0.05  # largest relative difference from such a ratio
 Estimates = tuple[Mapping[str, float], Mapping[str, float]]
@@ -184,7 +185,7 @@ def beyond_friction_limit(
         if not element.is_linear:
             law_values = [np.asarray(values[p.name]) for p in element.parameters]
             bound += float(element.force_bounds(law_values)[1])
-            forces = (p for p in element.parameters if p.dimension == (1, 0, 0))
+            forces = (p for p in element.parameters if p.dimension == FORCE)
             u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
     if not 0.0 < bound < np.inf:
         return

@@ -25,6 +25,7 @@ import numpy as np
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.elements import Parameter
+from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.asymptotes import Chart, microslip_charts
 from dahl_ident.fitting.global_start import edge_starts
@@ -55,7 +56,6 @@ _FARTHEST_RATIO = 4.0  # the same of a pure number: an exponent or a gain
 _LEAST_X_C = 1e-14  # over the smallest amplitude
 _MOST_X_C, _MOST_X_C_WITH_SPRING = 1e8, 1e5  # over the largest, alone and in parallel with a spring
 _SOFTEST, _STIFFEST = 1e-12, 1e6  # sigma over the median stiffness
-_FORCE, _STIFFNESS = (1, 0, 0), (1, -1, 0)  # powers of force, displacement and time
 
 
 class Bracket:
@@ -388,8 +388,8 @@ class Profiler:
         pairs: list[tuple[Parameter, Parameter]] = []
         for element in self._problem.model.elements if self._problem.response is not None else ():
             scale = {element.parameter(s).dimension: s for s in element.scale_parameters}
-            if element.has_memory and {*scale} == {_FORCE, _STIFFNESS}:
-                force, stiffness = scale[_FORCE], scale[_STIFFNESS]
+            if element.has_memory and {*scale} == {FORCE, STIFFNESS}:
+                force, stiffness = scale[FORCE], scale[STIFFNESS]
                 pairs.append((element.parameter(force), element.parameter(stiffness)))
         return pairs
 

@@ -23,6 +23,7 @@ from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.diagnostics.correlated_residuals import correlated, noise_in
 from dahl_ident.diagnostics.record_sources import LinearFit, blocks_of
 from dahl_ident.elements import Friction
+from dahl_ident.elements.parameter import FORCE
 from dahl_ident.elements.recursion import linear_recursion, stretches
 from dahl_ident.errors import FitError
 from dahl_ident.problem.record_noise import in_band
@@ -153,7 +154,7 @@ def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
         x = x if problem.paths is None else problem.paths[number]
         return _forces(problem, values, x, v if v.size else np.gradient(x, record.time))
     plain = fit.outputs[number]
-    step = _STEP * float(problem.unit_sizes((1, 0, 0))[number])
+    step = _STEP * float(problem.unit_sizes(FORCE)[number])
 
     def moved(force: FloatArray) -> FloatArray:
         driven = problem.driven_more({number: step * force})

@@ -14,8 +14,12 @@ import numpy as np
 from dahl_ident.arrays import LARGEST, SMALLEST, finite_number, positive_number
 from dahl_ident.errors import ValidationError
 
-UNITS = {
-    "N": (1, 0, 0),
+Dimension = tuple[int, int, int]
+"""Powers of force, displacement and time in a unit."""
+FORCE: Dimension = (1, 0, 0)
+STIFFNESS: Dimension = (1, -1, 0)
+UNITS: dict[str, Dimension] = {
+    "N": FORCE,
     "m": (0, 1, 0),
     "s": (0, 0, 1),
     "kg": (1, -1, 2),
@@ -25,7 +29,7 @@ UNITS = {
     "rad": (0, 0, 0),
     "1": (0, 0, 0),
 }
-"""Powers of force, displacement and time in the units that a parameter may have."""
+"""The units from which that of a parameter is made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +115,7 @@ class Parameter:
         return _dimension(self.unit) is not None
 
     @property
-    def dimension(self) -> tuple[int, int, int]:
+    def dimension(self) -> Dimension:
         """Powers of force, displacement and time in the unit: (1, -1, 0) for N/m.
 
         Raises
@@ -191,7 +195,7 @@ class Assumed(float):
 
 
 @lru_cache(maxsize=256)
-def _dimension(unit: str) -> tuple[int, int, int] | None:
+def _dimension(unit: str) -> Dimension | None:
     """Return powers of force, displacement and time in a unit; None if it has other units."""
     total = [0, 0, 0]
     for place, part in enumerate(unit.split("/")):

@@ -15,11 +15,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, Parameter
+from dahl_ident.elements.parameter import STIFFNESS, Dimension
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
-
-Dimension = tuple[int, int, int]
-_STIFFNESS: Dimension = (1, -1, 0)  # force over displacement
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ def is_positive(parameter: Parameter) -> bool:
 def _reference(scale: tuple[Parameter, ...]) -> Parameter | None:
     """Return the divisor of the other scale parameters: a known one, or a stiffness."""
     known = [p for p in scale if not p.free]
-    stiff = [p for p in scale if p.dimension == _STIFFNESS]
+    stiff = [p for p in scale if p.dimension == STIFFNESS]
     return next(iter((*known, *stiff, *scale)), None)
 
 
@@ -146,5 +144,5 @@ def free_springs(problem: TableProblem) -> list[Parameter]:
         for element in problem.model.elements
         if element.is_linear and element.rate_independent
         for p in directions(element).linear
-        if p.dimension == _STIFFNESS and np.isinf(p.lower)
+        if p.dimension == STIFFNESS and np.isinf(p.lower)
     ]

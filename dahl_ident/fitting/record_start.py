@@ -16,6 +16,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import Element, LinearSystem
+from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import FitError, ModelError, argument
 from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
@@ -155,7 +156,7 @@ class _Scan:
         lengths and times: with 1 N/m, a force is the length at which a spring exerts it.
         """
         grids: list[list[float]] = []
-        unit_dimension: tuple[int, int, int] | None = None  # of the parameter that is 1
+        unit_dimension: Dimension | None = None  # of the parameter that is 1
         for label, parameter in zip(element.labels, element.parameters, strict=True):
             fixed = [] if parameter.value is None else [float(parameter.value)]
             if label in element.linear_parameters:

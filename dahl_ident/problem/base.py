@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from dahl_ident.arrays import FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.elements import Model, Parameter
+from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import ValidationError
 from dahl_ident.noise import Rho, squares_of, weighted
 from dahl_ident.problem.space import Space
@@ -120,7 +121,7 @@ class Problem(ABC):
         return {name: float(prior.std()) for name, prior in self.priors.items()}
 
     @abstractmethod
-    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
+    def unit_sizes(self, dimension: Dimension) -> FloatArray:
         """Return sizes that a unit has in the data, by powers of force, displacement and time."""
 
     @property

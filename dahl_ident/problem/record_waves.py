@@ -17,6 +17,7 @@ from dahl_ident.elements import Element, Friction, Model, Parameter
 from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.elements.model import as_model
+from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import DataError, ModelError, ValidationError
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
@@ -173,7 +174,7 @@ class RecordWaves(Problem):
         """The model's parameters, fixed ones included, and what each record adds."""
         return (*self.model.parameters, *self.parameters[self.n_reported :])
 
-    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
+    def unit_sizes(self, dimension: Dimension) -> FloatArray:
         """Return the size of a unit in each record, by powers of force, displacement and time."""
         sizes = []
         for record, y in zip(self.records, self.measured, strict=True):

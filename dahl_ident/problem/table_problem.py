@@ -20,6 +20,7 @@ from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import ACCURACY, STEADY, Shooting, Steady, obstacle
 from dahl_ident.elements.model import as_model
+from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.noise import (
     ROUNDING,
@@ -355,7 +356,7 @@ class TableProblem(Problem):
         changes = [np.broadcast_to(d, shape) for d in prediction.changes]
         return np.array(np.broadcast_to(prediction.value, shape)), np.stack(changes, axis=-1)
 
-    def unit_sizes(self, dimension: tuple[int, int, int]) -> FloatArray:
+    def unit_sizes(self, dimension: Dimension) -> FloatArray:
         """Return the size in each row of a unit of such powers of force, displacement and time."""
         view, (force, displacement, time) = self.stiffness_data, dimension
         size = (np.abs(view.stiffness) * view.amplitude) ** force * view.amplitude**displacement
