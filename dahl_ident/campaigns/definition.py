@@ -187,19 +187,21 @@ def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[st
 
 def _check_options(options: Mapping[str, Any]) -> None:
     """Refuse unknown options before any file is read."""
-    import dahl_ident as di
+    from dahl_ident.data import read_frequency_response, read_record
+    from dahl_ident.extraction import extract
+    from dahl_ident.results import fit, posterior
 
     record = options["kind"] == "record"
     functions: dict[str, Callable[..., Any]] = {
-        "read": di.read_record if record else di.read_frequency_response,
-        "fit": di.fit,
+        "read": read_record if record else read_frequency_response,
+        "fit": fit,
     }
     if record:
-        functions["extract"] = di.extract
+        functions["extract"] = extract
     elif options["extract"]:
         raise ValidationError("[extract] is given, but tables of responses are not extracted")
     if options["posterior"] is not None:
-        functions["posterior"] = di.posterior
+        functions["posterior"] = posterior
     for table, function in functions.items():
         known = set(inspect.signature(function).parameters) - _SET_BY_CAMPAIGN
         _refuse_unknown(f"options in [{table}]", options[table], known)

@@ -107,26 +107,28 @@ def _load(law: str | LawFile) -> None:
 
 
 def _fitted(job: Job, digests: list[str]) -> Row:
-    import dahl_ident as di
     from dahl_ident.elements.model import model_from_description
+    from dahl_ident.results import fit, posterior
 
     options = job.options
     with _on_disk(job, digests) as paths:
         data = _response(paths, job.runs, options)
     model = model_from_description(options["model"])
-    result = di.fit(data, model, throw=False, **options["fit"])
+    result = fit(data, model, throw=False, **options["fit"])
     row = _row(result)
     results: list[Any] = [result]
     if options["posterior"] is not None:
-        posterior = di.posterior(data, model, seed=0, **options["posterior"])
-        results.append(posterior)
-        for name, estimate in posterior.params.items():
+        sampled = posterior(data, model, seed=0, **options["posterior"])
+        results.append(sampled)
+        for name, estimate in sampled.params.items():
             row[f"posterior_{name}"] = estimate.value
             row[f"u_posterior_{name}"] = estimate.stderr
     if job.report is not None:
+        from dahl_ident.reporting import report
+
         path = Path(job.report)
         path.parent.mkdir(parents=True, exist_ok=True)
-        di.report(results, path, title=job.name, overwrite=True)
+        report(results, path, title=job.name, overwrite=True)
         row["report"] = path.name
     return row
 
@@ -134,15 +136,16 @@ def _fitted(job: Job, digests: list[str]) -> Row:
 def _response(
     paths: list[Path], runs: tuple[str, ...], options: Mapping[str, Any]
 ) -> FrequencyResponse:
-    import dahl_ident as di
+    from dahl_ident.data import read_frequency_response, read_record
+    from dahl_ident.extraction import extract
 
     if options["kind"] == "response":
         chosen: Any = paths if len(paths) > 1 else paths[0]
-        return di.read_frequency_response(chosen, **options["read"])
+        return read_frequency_response(chosen, **options["read"])
     records = {
-        run: di.read_record(path, **options["read"]) for run, path in zip(runs, paths, strict=True)
+        run: read_record(path, **options["read"]) for run, path in zip(runs, paths, strict=True)
     }
-    return di.extract(records, **options["extract"])
+    return extract(records, **options["extract"])
 
 
 @contextmanager
