@@ -66,7 +66,7 @@ class Sliders(NamedTuple):
 
 
 class Play(NamedTuple):
-    """Linear Dahl friction behind a gap: its force, and the place in the gap."""
+    """Linear Dahl friction behind a gap: its force, and the position in the gap."""
 
     half: float
 

@@ -1,9 +1,8 @@
 r"""A gap in the link to a friction element.
 
 The link carries no force while the gap is crossed. After a reversal the element unloads along its
-own curve to zero force, the gap is crossed there, then the curve goes on where it stopped. So the
-element moves with the amplitude A - gap/2, and the part of the path between two turning points at
-zero force is the gap.
+own curve to zero force; the gap is crossed; then the element continues on its curve. So the
+element moves with the amplitude A - gap/2.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from dahl_ident.errors import ModelError
 if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
-_CLOSED = 1e-9  # gap over the smallest amplitude that counts as none
-_NARROWEST = 1e-9  # of the path: crossings of a narrower gap cannot be distinguished in time
+_CLOSED = 1e-9  # gap over the smallest amplitude, in the limit of no gap
+_NARROWEST = 1e-9  # gap over the path: the crossing of a narrower gap is not resolved
 
 
 class Backlash(Friction):
@@ -45,8 +44,8 @@ class Backlash(Friction):
     element : Friction
         The law behind the gap, such as ``Dahl()``; its parameters and its name are kept.
     gap : float, optional
-        The whole play between the two contacts, m (rad in rotation): twice the half-gap by which
-        the element's amplitude is smaller. Given: fixed; left out: free.
+        The play between the two contacts, m (rad in rotation); half of it is lost from the
+        element's amplitude. Given: fixed; left out: free.
 
     Raises
     ------
@@ -57,8 +56,8 @@ class Backlash(Friction):
 
     Notes
     -----
-    At amplitudes up to gap/2 the force is zero. A history starts in the middle of the gap,
-    or in contact where it starts with a force.
+    At amplitudes up to gap/2 the force is zero. A history starts in the middle of the gap, or in
+    contact if it starts with a force.
 
     Examples
     --------
@@ -71,7 +70,9 @@ class Backlash(Friction):
     """
 
     kind = "backlash"
-    starts = (("initial_play", "m", "place in the gap at the first sample; beyond it in contact"),)
+    starts = (
+        ("initial_play", "m", "position in the gap at the first sample; beyond the gap in contact"),
+    )
     equation = "F = F_element(y), y = x - play, abs(play) <= gap/2; the play moves at F = 0"
 
     def __init__(self, element: Element, gap: float | None = None) -> None:
@@ -96,7 +97,7 @@ class Backlash(Friction):
 
     @property
     def element(self) -> Friction:
-        """The law behind the gap, with its present parameters."""
+        """The law behind the gap, with its parameters as they are in this element."""
         return self._element.copy_with(self.parameters[:-1])
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
@@ -106,10 +107,10 @@ class Backlash(Friction):
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return force and its change, none while the gap is crossed; the play moves then."""
+        """Return the force, and the rates of force and play, one of which is 0."""
         force, play = states
-        room = 0.5 * values[-1] - direction * play > 0.0
-        crossing = room * (1.0 - (direction * force < 0.0))
+        has_room = 0.5 * values[-1] - direction * play > 0.0
+        crossing = has_room * (1.0 - (direction * force < 0.0))
         slope = self.slope(force, direction, velocity, values)
         return Mechanics(0.0, force, (slope * velocity * (1.0 - crossing), velocity * crossing))
 
@@ -120,17 +121,17 @@ class Backlash(Friction):
 
     @property
     def n_states(self) -> int:
-        """The force, and the place in the gap."""
+        """Number of states: the force, and the position in the gap."""
         return 2
 
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
-        """Return the force and the place in the gap; beyond its ends the element is a spring."""
+        """Return the force and the position in the gap; beyond the gap the element is a spring."""
         (start,) = starts
         play = clipped(start, 0.5 * values[-1])
         return self.slope(0.0, 1.0, 0.0, values) * (start - play), play
 
     def start_with(self, values: Sequence[Any], force: float) -> float:
-        """Return a place in contact, as far beyond the gap as a spring has the force, or 0."""
+        """Return the position beyond the gap at which a spring has the force; 0 for no force."""
         return float(np.sign(force) * 0.5 * values[-1] + force / self._stiffness(values))
 
     def _stiffness(self, values: Sequence[Any]) -> float:
@@ -150,25 +151,24 @@ class Backlash(Friction):
         if float(values[-1]) >= _NARROWEST * float(np.abs(np.diff(path.displacement)).sum()):
             return super().history(values, path, state, slopes=slopes)
         stiffness = self._stiffness(values)
-        behind = self.element.history(values[:-1], path, stiffness * state, slopes=slopes)
-        zero = np.zeros(path.displacement.shape)
-        by_parameter = (*behind.by_parameter, zero)
-        return behind._replace(by_state=stiffness * behind.by_state, by_parameter=by_parameter)
+        result = self.element.history(values[:-1], path, stiffness * state, slopes=slopes)
+        by_parameter = (*result.by_parameter, np.zeros(path.displacement.shape))
+        return result._replace(by_state=stiffness * result.by_state, by_parameter=by_parameter)
 
     def rest_stiffness(self, values: Values) -> FloatArray:
-        """Return 0: small motions do not cross the gap."""
+        """Return 0: small motions stay within the gap."""
         return np.zeros(np.broadcast_shapes(*(np.shape(v) for v in values)))
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return those of the element."""
+        """Return the limits of the element."""
         return self._element.force_limits(values[:-1])
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return those of the element, whose amplitude is smaller."""
+        """Return the bounds of the element, whose amplitude is smaller."""
         return self._element.force_bounds(values[:-1])
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return half the gap, and where the element behind it slips."""
+        """Return half the gap, and the amplitude at which the element behind it slips."""
         low, high = self._element.knee(values[:-1])
         half = 0.5 * np.asarray(values[-1])
         return np.minimum(half, low), high + half
@@ -177,20 +177,20 @@ class Backlash(Friction):
         self, values: Values, amplitude: FloatArray, omega: FloatArray
     ) -> FloatArray:
         """Return the factor by which a deviation shrinks in one cycle: that of the element."""
-        moved = np.maximum(amplitude - 0.5 * np.asarray(values[-1]), 0.0)
-        return self._element.transient_decay(values[:-1], moved, omega)
+        remaining = np.maximum(amplitude - 0.5 * np.asarray(values[-1]), 0.0)
+        return self._element.transient_decay(values[:-1], remaining, omega)
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return those of the element, and a link without a gap."""
+        """Return the limits of the element, and that without a gap."""
         closed = Asymptote("no_gap", "no gap", {"gap": _CLOSED * low}, None, {"gap": 0.0})
         return (*self.element.asymptotes(low, high), closed)
 
     def combinations(self) -> tuple[Combination, ...]:
-        """Return those of the element."""
+        """Return the combinations of the element."""
         return self.element.combinations()
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return those of the element."""
+        """Return the values that the element resolves, and the gap."""
         return [*self.element.resolved(values[:-1], amplitude), values[-1]]
 
     def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
@@ -206,22 +206,18 @@ class Backlash(Friction):
         }
 
     @classmethod
-    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
+    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
         """Return the element that :meth:`describe` described."""
-        if set(rest) != {"element", "gap"} or not (
-            law := class_named(str(rest["element"].get("kind")))
-        ):
+        inner = dict(description.get("element", {}))
+        law = class_named(str(inner.pop("kind", None)))
+        if set(description) != {"element", "gap"} or law is None:
             raise ModelError(
-                f"the backlash element has the keys {', '.join(rest)}; expected element, a table "
-                f"with a kind of {', '.join(KINDS)}, and gap"
+                f"the backlash element has the keys {', '.join(description)}; expected element, a "
+                f"table with a kind of {', '.join(KINDS)}, and gap"
             )
-        inner = dict(rest["element"])
-        del inner["kind"]
-        element = law.from_description(inner, inner.pop("name", name))
-        blank = cls(element)
-        gap = blank.parameters[-1].described(rest["gap"])
-        return blank.copy_with((*blank.parameters[:-1], gap))
+        element = cls(law.from_description(inner, inner.pop("name", name)))
+        gap = element.parameters[-1].described(description["gap"])
+        return element.copy_with((*element.parameters[:-1], gap))
 
     def __repr__(self) -> str:
-        gap = super().__repr__().rpartition("gap=")[2].partition(",")[0].rstrip(")")
-        return f"Backlash({self.element!r}, gap={gap})"
+        return f"Backlash({self.element!r}, {self._argument(self.parameters[-1])})"

@@ -1,7 +1,7 @@
 """The exact steady motion of a plant under a sinusoidal force, by the engine.
 
-The describing function takes the displacement for a sine. Friction makes it another periodic
-motion, with harmonics.
+The describing function assumes a sinusoidal displacement. With friction the motion is periodic, but
+has harmonics.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ if TYPE_CHECKING:
 
 Steady = Literal["exact", "describing function"]
 STEADY: tuple[Steady, ...] = ("exact", "describing function")
-"""How the response to a force that is held is predicted."""
+"""Ways to predict the steady response to a sinusoidal force."""
 
 ACCURACY = 1e-9
-"""Largest relative difference of two solutions of one motion from different starts."""
+"""Largest relative difference between solutions of one motion from different starts."""
 
 NEUTRAL = 1e-6
-"""Beyond 1: the multiplier of a motion that may lie anywhere is 1, to rounding."""
+"""Deviation from 1, by rounding, of the multiplier of a motion that no spring holds in place."""
 
-_STATES, _ALIKE = 24, 1e-9  # where two directions are compared; relative difference of rates
+_STATES = 24  # random states at which the two directions are compared
+_ALIKE = 1e-9  # relative difference of their rates
 
 LINEAR = "the model is linear"
-"""Why there is no exact motion to compute: the response is a sine."""
+"""The obstacle to an exact motion of a plant whose response is a sine."""
 
 
 def obstacle(model: Element) -> str:
-    """Return why a plant has no exact steady motion here; nothing where it has one.
+    """Return why the exact steady motion of a plant cannot be computed; empty if it can.
 
     Examples
     --------
@@ -62,7 +63,7 @@ def obstacle(model: Element) -> str:
 
 
 class Shooting:
-    """The steady motions of one model, its equations compiled when first asked for one.
+    """The steady motions of one model, whose equations are compiled at first use.
 
     Examples
     --------
@@ -78,36 +79,33 @@ class Shooting:
     def __init__(self, model: Element) -> None:
         self._model = as_model(model)
         self._coefficients = Coefficients(self._model)
-        self._system: System | None = None
 
-    @property
+    @cached_property
     def system(self) -> System:
         """The compiled equations."""
-        if self._system is None:
-            from dahl_ident.engine import translate
+        from dahl_ident.engine import translate
 
-            self._system = translate(plant_equations(self._coefficients.model))
-        return self._system
+        return translate(plant_equations(self._coefficients.model))
 
     def drifts(self, values: FloatArray) -> bool:
-        """Return whether the motion goes further in each cycle, at one vector of values.
+        """Return whether the mean displacement grows in each cycle, at one vector of values.
 
-        So it does where no spring brings it back, and friction differs between the directions: no
-        motion has the drive's period then.
+        It does if no spring acts and friction differs between the directions; then no motion has
+        the period of the drive.
         """
-        if self.system.odd or self._compared is None or not np.isfinite(values).all():
+        if self.system.odd or self._rates is None or not np.isfinite(values).all():
             return False
         if not self._coefficients.are_values:
             values = self._coefficients(values[None])[0][0]
         rng = np.random.default_rng(0)
         size = (self.system.order + 1, _STATES)
         states = rng.standard_normal(size) * 10.0 ** rng.uniform(-3.0, 3.0, size)
-        rates, sums = self._compared(np.vstack([states, np.sign(states[1])]), values)
+        rates, sums = self._rates(np.vstack([states, np.sign(states[1])]), values)
         return bool(np.any(np.abs(sums.full()) > _ALIKE * np.abs(rates.full())))
 
     @cached_property
-    def _compared(self) -> Any:
-        """The rates, and their sum with those in the other direction; None if a spring acts."""
+    def _rates(self) -> Any:
+        """The rates of a state, and their sum with the opposite state's; None if a spring acts."""
         import casadi as ca
 
         equations = plant_equations(self._coefficients.model)
@@ -116,7 +114,7 @@ class Shooting:
             return None
         states = ca.vertcat(*equations.states, equations.drive, equations.direction)
         sums = rates + ca.substitute(rates, states, -states)
-        return ca.Function("compared", [states, ca.vertcat(*equations.parameters)], [rates, sums])
+        return ca.Function("rates", [states, ca.vertcat(*equations.parameters)], [rates, sums])
 
     def __call__(
         self,
@@ -125,8 +123,6 @@ class Shooting:
         drive: FloatArray,
         *,
         chosen: Sequence[int] = (),
-        starts: FloatArray | None = None,
-        cycles: int | None = None,
         stable: bool = True,
         **options: Any,
     ) -> SteadyMotion:
@@ -136,24 +132,22 @@ class Shooting:
         :func:`dahl_ident.engine.steady_motions`.
         """
         if omega.size and self.drifts(values[0]):
-            values = np.full(values.shape, np.nan)  # for which none are sought
+            values = np.full(values.shape, np.nan)  # for which no motion is sought
         options["largest"] = 1.0 + NEUTRAL if stable else np.inf
         with np.errstate(all="ignore"):
-            least = self._least_amplitude(values, omega, drive)
-            resolved = np.stack(self._model.resolved(list(values.T), least), axis=-1)
-            rows, held = np.nonzero((resolved < values)[:, list(chosen)])
-        result = self._motions(
-            resolved, omega, drive, chosen, starts=starts, cycles=cycles, **options
-        )
-        result.by_parameter[rows, :, held] = 0.0
+            smallest = self._smallest_amplitude(values, omega, drive)
+            resolved = np.stack(self._model.resolved(list(values.T), smallest), axis=-1)
+            rows, limited = np.nonzero((resolved < values)[:, list(chosen)])
+        result = self._motions(resolved, omega, drive, chosen, **options)
+        result.by_parameter[rows, :, limited] = 0.0
         return result
 
-    def _least_amplitude(
+    def _smallest_amplitude(
         self, values: FloatArray, omega: FloatArray, drive: FloatArray
     ) -> FloatArray:
-        """Return displacements that the motions exceed, whatever their phase and their branch.
+        """Return lower bounds of the amplitudes of displacement.
 
-        Those of the plant whose friction is stuck, and whose linear part does not cancel it.
+        They are those with stuck friction, in phase with the force of the linear part.
         """
         linear, stuck = np.zeros(omega.shape, dtype=np.complex128), np.zeros(omega.shape)
         for element, numbers in self._model.of(list(values.T)):
@@ -172,7 +166,7 @@ class Shooting:
         chosen: Sequence[int],
         **options: Any,
     ) -> SteadyMotion:
-        """Return the steady motions of many rows at these very values."""
+        """Return the steady motions of many rows, at values that the engine resolves."""
         from dahl_ident.engine import steady_motions
 
         if self._coefficients.are_values:

@@ -294,15 +294,17 @@ class Element(ABC):
         return Model(self, other)
 
     def __repr__(self) -> str:
-        parts = []
-        for parameter in self.parameters:
-            value = "free" if parameter.value is None else f"{parameter.value:g}"
-            if parameter.free and parameter.value is not None:
-                value += " free"
-            parts.append(f"{self.label(parameter)}={value}")
+        arguments = [self._argument(p) for p in self.parameters]
         if self.name:
-            parts.append(f"name={self.name!r}")
-        return f"{type(self).__name__}({', '.join(parts)})"
+            arguments.append(f"name={self.name!r}")
+        return f"{type(self).__name__}({', '.join(arguments)})"
+
+    def _argument(self, parameter: Parameter) -> str:
+        """Return a parameter as it is shown in `repr`."""
+        value = "free" if parameter.value is None else f"{parameter.value:g}"
+        if parameter.free and parameter.value is not None:
+            value += " free"
+        return f"{self.label(parameter)}={value}"
 
     # The mathematics, in plain numbers; arguments are not checked.
 

@@ -1,13 +1,14 @@
 r"""Dahl friction in the time domain: the exact force for any displacement history.
 
-Along a stretch of one direction of motion, s = sgn(xdot), Eqn. 2 in the margin to full slip
-z = 1 - s F/f_max and the travelled path d = sigma |x - x_turn|/f_max is dz/dd = -z^alpha, so
+While the direction of motion s = sgn(xdot) is constant, Eqn. 2 reads dz/dd = -z^alpha, with the
+margin to full slip z = 1 - s F/f_max and the path d = sigma |x - x_turn|/f_max since the last
+turning point. At any speed, therefore,
 
     z(d) = z0 exp(-d)                                    alpha = 1
-    z(d) = (z0^(1-alpha) - (1-alpha) d)^(1/(1-alpha))    otherwise; 0 once the bracket is
+    z(d) = (z0^(1-alpha) - (1-alpha) d)^(1/(1-alpha))    otherwise; 0 if the bracket is not above 0
 
-whatever the speed. Where the motion turns back, the margin becomes 2 - z. So a history is two
-steps: carry z over the turning points, then evaluate every sample from the turning point before it.
+At a turning point z becomes 2 - z. So a history takes two steps: z at all turning points, one after
+the other, then every sample from the turning point before it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dahl_ident.elements.general_dahl import turning_force
 from dahl_ident.elements.recursion import linear_recursion, stretches
 
 _TINY = 1e-300  # stands for a margin of 0, which has no negative power
-_HUGE = 1e300  # a path beyond any reach, small enough to be scaled without overflow
+_HUGE = 1e300  # longer than any path, and small enough to be scaled without overflow
 
 
 def force_history(
@@ -46,7 +47,7 @@ def force_history(
     else:
         margin = _turning_margins(1.0 - cut.heading[0] * initial_force / f_max, legs, alpha)
     start = cut.spread(margin)
-    force = (1.0 - start) - margin_change(start, path, alpha)
+    force = (1.0 - start) - _margin_change(start, path, alpha)
     force *= cut.spread(cut.heading * f_max)
     force[0] = initial_force
     return force
@@ -55,10 +56,10 @@ def force_history(
 def linear_history_gradient(
     displacement: FloatArray, f_max: float, sigma: float, initial_force: float
 ) -> HistoryGradient:
-    """Return the force for alpha = 1, and its slopes over the initial force, f_max and sigma.
+    """Return the force for alpha = 1, with the derivatives with respect to f_max and sigma.
 
-    Along a stretch F = s f_max + (F0 - s f_max) exp(-d) with d = sigma path/f_max; the derivatives
-    at the turning points are a linear recursion.
+    While the direction s is constant, F = s f_max + (F0 - s f_max) exp(-d) with
+    d = sigma path/f_max; the derivatives at the turning points follow a linear recursion.
 
     Examples
     --------
@@ -71,8 +72,8 @@ def linear_history_gradient(
     turning = f_max * _linear_turning_forces(initial_force / f_max, cut.heading, legs)
 
     def slopes(start: FloatArray, s: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        left = (s * f_max - start) * d * np.exp(-d)
-        return np.exp(-d), np.column_stack([-s * np.expm1(-d) - left / f_max, left / sigma])
+        by_ln_d = (s * f_max - start) * d * np.exp(-d)
+        return np.exp(-d), np.column_stack([-s * np.expm1(-d) - by_ln_d / f_max, by_ln_d / sigma])
 
     keep, terms = slopes(turning[:-1], cut.heading[:-1], legs)
     first = np.array([1.0, 0.0, 0.0])
@@ -102,19 +103,19 @@ def transient_decay(beta: FloatArray, alpha: FloatArray | float) -> FloatArray:
     return np.asarray(((1.0 - f0) / (1.0 + f0)) ** (2.0 * alpha))
 
 
-def margin_change(margin: FloatArray, path: FloatArray, alpha: float) -> FloatArray:
-    """Return z(d) - z(0), at most 0, after a path d = sigma |dx|/f_max in one direction."""
+def _margin_change(margin: FloatArray, path: FloatArray, alpha: float) -> FloatArray:
+    """Return z(d) - z(0), at most 0, after a path d in one direction."""
     if alpha == 1.0:
         return margin * np.expm1(-path)
     p = 1.0 - alpha
-    used = np.maximum(np.abs(margin), _TINY) ** -p
+    fraction = np.maximum(np.abs(margin), _TINY) ** -p
     with np.errstate(divide="ignore", over="ignore", under="ignore"):
-        used *= p * path
-        return np.asarray(margin * np.expm1(np.log1p(-np.minimum(used, 1.0)) / p))
+        fraction *= p * path
+        return np.asarray(margin * np.expm1(np.log1p(-np.minimum(fraction, 1.0)) / p))
 
 
 def _path(length: FloatArray, rate: float) -> FloatArray:
-    """Return the scaled path, finite even where the product is not: full slip either way."""
+    """Return the scaled path; where it would overflow, one that is as good as infinite."""
     with np.errstate(over="ignore"):
         return np.minimum(length * rate, _HUGE)
 
@@ -126,12 +127,12 @@ def _linear_turning_forces(start: float, heading: FloatArray, legs: FloatArray) 
 
 
 def _turning_margins(start: float, legs: FloatArray, alpha: float) -> FloatArray:
-    """Return the margin after every turn for alpha other than 1: one leg after the other."""
+    """Return the margin after every turning point for alpha other than 1."""
     p = 1.0 - alpha
     z = start
     margins = [z]
     for scaled in (p * legs).tolist():
-        used = scaled * (abs(z) or _TINY) ** -p  # a start may be beyond the limit
-        z = 2.0 - (z + z * expm1(log1p(-used) / p)) if used < 1.0 else 2.0
+        fraction = scaled * (abs(z) or _TINY) ** -p  # a start may be beyond the limit
+        z = 2.0 - (z + z * expm1(log1p(-fraction) / p)) if fraction < 1.0 else 2.0
         margins.append(z)
     return np.asarray(margins)

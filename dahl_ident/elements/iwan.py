@@ -1,22 +1,21 @@
 r"""Segalman's four-parameter Iwan law of a bolted joint: from microslip to macroslip.
 
-The density of slip displacements is a power law up to the largest one, d_m, where a share slips
-at once:
+The density of slip displacements is a power law up to the largest one, d_m, at which a stiffness S
+slips at once:
 
-    rho(d) = R d^chi for d < d_m, and a step of stiffness S at d_m, S = ratio R d_m^g/g.
+    rho(d) = R d^chi for d < d_m;   S = ratio R d_m^g/g at d = d_m,
 
 with g = chi + 1. The backbone curve has the slope
 
     V'(x) = sigma (1 - (x/d_m)^g/(1 + ratio)) for x < d_m, 0 beyond,
     d_m = (f_max/sigma) (1 + ratio)/(ratio + g/(g + 1)).
 
-So N is that of a Jenkins element that slips at d_m, less
+So N is that of a Jenkins element that slips at d_m, less sigma/(1 + ratio) times
 
     P = (2 j/(pi k)) Int_0^t (A u/d_m)^g sin(theta) exp(-j k theta) dtheta,   u = sin^2(theta/2),
 
-times sigma/(1 + ratio), with t = pi or, where A > d_m, arccos(1 - 2 d_m/A), at Gauss points. In
-microslip P is a constant times (A/d_m)^g, the loss in a cycle rises with the amplitude to the power
-chi + 3.
+with t = pi or, if A > d_m, arccos(1 - 2 d_m/A); by Gauss quadrature. In microslip P is a constant
+times (A/d_m)^g, and the loss in a cycle rises with the amplitude to the power chi + 3.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ from dahl_ident.elements.facts import SOFTENED, Sine, StiffnessGradient, Values,
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
 
-_SLIDERS = 30  # Jenkins elements in the place of the law where a force drives it: 2e-4 of f_max
-_FEW_SLIDERS = 8  # 3e-3 of f_max, at a tenth of the cost: near enough for a search to begin with
-_REST = 1e-100  # m, below every amplitude allowed: d_m/A does not overflow
-_NARROWEST = 1e-6  # of the onset: near chi = -1 the stiffness is never all there
+_SLIDERS = 30  # Jenkins elements that replace the law under a driving force; error 2e-4 of f_max
+_FEW_SLIDERS = 8  # error 3e-3 of f_max, at a tenth of the cost: for the first part of a search
+_REST = 1e-100  # m, in place of smaller amplitudes: d_m/A does not overflow
+_SMALLEST_KNEE = 1e-6  # of the onset: near chi = -1 even the smallest amplitudes lose stiffness
 
 
 class Iwan(Masing):
@@ -66,8 +65,8 @@ class Iwan(Masing):
     -----
     D. J. Segalman, A four-parameter Iwan model for lap-type joints, J. Appl. Mech. 72 (2005)
     752-760. Amplitudes of microslip alone determine sigma (with a spring: its sum with the
-    spring's), chi and one coefficient of the power law; f_max and ratio then are not determined.
-    Where a force drives it over time, 30 Jenkins elements take its place.
+    spring's), chi and one coefficient of the power law; f_max and ratio are then not determined.
+    Under a driving force over time, 30 Jenkins elements replace it.
 
     Examples
     --------
@@ -102,32 +101,32 @@ class Iwan(Masing):
 
     @property
     def n_states(self) -> int:
-        """The forces of the Jenkins elements in the law's place."""
+        """Number of Jenkins elements that replace the law under a driving force."""
         return self._count
 
     def coarser(self) -> Iwan:
-        """Return this law with fewer Jenkins elements in its place."""
+        """Return this law with fewer Jenkins elements to replace it."""
         copy = self.copy_with(self.parameters)
         copy._count = _FEW_SLIDERS
         return copy
 
     def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Return stiffnesses and slip displacements whose backbone curve is a polygon in this one.
+        """Return stiffnesses and slip displacements of the Jenkins elements that replace the law.
 
-        The slip displacements are d_m (i/n)^2, and the forces there those of this curve.
+        The slip displacements are d_m (i/n)^2; the forces there are those of the backbone curve.
         """
         _, sigma, chi, ratio = values
         n = self._count
         d = _onset(values)
-        places: list[Any] = [0.0]
+        slips: list[Any] = [0.0]
         forces: list[Any] = [0.0]
-        for share in (np.arange(1, n + 1) / n).tolist():
-            lost = share ** (2.0 * chi + 2.0) / ((1.0 + ratio) * (chi + 2.0))
-            places.append(d * share**2)
-            forces.append(sigma * places[-1] * (1.0 - lost))
-        slopes = [(forces[i + 1] - forces[i]) / (places[i + 1] - places[i]) for i in range(n)]
+        for fraction in (np.arange(1, n + 1) / n).tolist():
+            loss = fraction ** (2.0 * chi + 2.0) / ((1.0 + ratio) * (chi + 2.0))
+            slips.append(d * fraction**2)
+            forces.append(sigma * slips[-1] * (1.0 - loss))
+        slopes = [(forces[i + 1] - forces[i]) / (slips[i + 1] - slips[i]) for i in range(n)]
         stiffnesses = [a - b for a, b in zip(slopes, [*slopes[1:], 0.0], strict=True)]
-        return stiffnesses, places[1:]
+        return stiffnesses, slips[1:]
 
     @property
     def onset(self) -> float:
@@ -139,8 +138,8 @@ class Iwan(Masing):
         f_max, sigma, chi, ratio = values
         d = _onset(values)
         x = np.minimum(displacement, d)
-        lost = (x / d) ** (chi + 1.0) / ((1.0 + ratio) * (chi + 2.0))
-        return np.asarray(np.where(displacement < d, sigma * x * (1.0 - lost), f_max))
+        loss = (x / d) ** (chi + 1.0) / ((1.0 + ratio) * (chi + 2.0))
+        return np.asarray(np.where(displacement < d, sigma * x * (1.0 - loss), f_max))
 
     @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
@@ -149,35 +148,35 @@ class Iwan(Masing):
         A = np.maximum(np.asarray(sine.amplitude, dtype=np.float64), _REST) + 0.0 * sine.omega
         g, m = chi + 1.0, _onset(values) / A
         k = int(sine.harmonic)
-        stick, by_m = jenkins(m, k)
-        lost, lost_by_g = _lost(m, g, k, derivative=derivatives > 1)
-        G = stick - lost / (1.0 + ratio)
-        # by ln A at constant parameters: the ends of both integrals move alike
-        by_lnA = -(m * by_m * ratio + g * lost) / (1.0 + ratio)
-        by: tuple[ComplexArray, ...] = ()
+        jenkins_part, by_m = jenkins(m, k)
+        P, P_by_g = _reduction(m, g, k, derivative=derivatives > 1)
+        G = jenkins_part - P / (1.0 + ratio)
+        # with respect to ln A; the upper ends of both integrals give the same term
+        by_lnA = -(m * by_m * ratio + g * P) / (1.0 + ratio)
+        slopes: tuple[ComplexArray, ...] = ()
         if derivatives > 1:
-            share = g / (g + 1.0)
-            lnA_by_ratio = 1.0 / (ratio + share) - 1.0 / (1.0 + ratio)  # of A/d_m
-            lnA_by_g = 1.0 / ((g + 1.0) ** 2 * (ratio + share))
-            by = (
+            c = ratio + g / (g + 1.0)  # A/d_m = A sigma/f_max c/(1 + ratio)
+            ln_by_ratio = 1.0 / c - 1.0 / (1.0 + ratio)
+            ln_by_g = 1.0 / ((g + 1.0) ** 2 * c)
+            slopes = (
                 -sigma * by_lnA / f_max,
                 G + by_lnA,
-                sigma * (by_lnA * lnA_by_g - lost_by_g / (1.0 + ratio)),
-                sigma * (by_lnA * lnA_by_ratio + lost / (1.0 + ratio) ** 2),
+                sigma * (by_lnA * ln_by_g - P_by_g / (1.0 + ratio)),
+                sigma * (by_lnA * ln_by_ratio + P / (1.0 + ratio) ** 2),
             )
-        return StiffnessGradient(np.asarray(sigma * G), sigma * by_lnA / A, by)
+        return StiffnessGradient(np.asarray(sigma * G), sigma * by_lnA / A, slopes)
 
     def rest_stiffness(self, values: Values) -> FloatArray:
         """Return sigma."""
         return np.asarray(values[1], dtype=np.float64)
 
     def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return where 1 % of the stiffness is gone, and the onset of macroslip."""
+        """Return the amplitude at which 1 % of the stiffness is lost, and the onset of slip."""
+        _, _, chi, ratio = (np.asarray(v) for v in values)
         d = _onset(values)
-        softened = np.minimum(SOFTENED * (1.0 + np.asarray(values[3])), 1.0)
         with np.errstate(divide="ignore", over="ignore"):
-            share = softened ** (1.0 / (np.asarray(values[2]) + 1.0))
-        return d * np.maximum(share, _NARROWEST), d
+            fraction = np.minimum(SOFTENED * (1.0 + ratio), 1.0) ** (1.0 / (chi + 1.0))
+        return d * np.maximum(fraction, _SMALLEST_KNEE), d
 
 
 def _onset(values: Sequence[Any]) -> Any:
@@ -188,37 +187,36 @@ def _onset(values: Sequence[Any]) -> Any:
 
 @lru_cache(maxsize=64)
 def _rule(harmonic: int) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss points over s in theta = t s^3, which smooths theta^(2 g): theta/t, weights.
+    """Return theta/t and weights of Gauss points in s, with theta = t s^3 to smooth theta^(2 g).
 
-    With fewer the harmonic loses digits.
+    Fewer points would lose digits of the harmonic.
     """
     nodes, weights = np.polynomial.legendre.leggauss(48 + 2 * harmonic)
     s = 0.5 * (1.0 + nodes)
     return s**3, 1.5 * weights * s**2
 
 
-def _lost(
+def _reduction(
     m: FloatArray, g: FloatArray, harmonic: int, *, derivative: bool
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return P and, if wanted, its derivative with respect to g at constant m = d_m/A."""
+    """Return P and, if asked for, its derivative with respect to g at constant m = d_m/A."""
     shape = np.broadcast_shapes(np.shape(m), np.shape(g))
     if harmonic % 2 == 0:
         zero = np.zeros(shape, dtype=np.complex128)
         return zero, zero
     t = 2.0 * np.arcsin(np.sqrt(np.minimum(m, 1.0)))[..., None]
-    places, shares = _rule(harmonic)
-    theta = t * places
+    fractions, weights = _rule(harmonic)
+    theta = t * fractions
     with np.errstate(under="ignore"):
         log_u = 2.0 * np.log(np.sin(0.5 * theta)) - np.log(np.asarray(m))[..., None]
         power = np.exp(np.asarray(g)[..., None] * log_u)
-    kernel = t * shares * np.sin(theta)
-    kernel = kernel * power
+    integrand = t * weights * np.sin(theta) * power
     real, imag = np.sin(harmonic * theta), np.cos(harmonic * theta)
     factor = 2.0 / (np.pi * harmonic)
 
-    def total(weight: FloatArray) -> ComplexArray:
-        both = (weight * real).sum(axis=-1) + 1j * (weight * imag).sum(axis=-1)
-        return np.asarray(np.broadcast_to(factor * both, shape))
+    def integral(f: FloatArray) -> ComplexArray:
+        total = (f * real).sum(axis=-1) + 1j * (f * imag).sum(axis=-1)
+        return np.asarray(np.broadcast_to(factor * total, shape))
 
-    value = total(kernel)
-    return value, total(kernel * log_u) if derivative else value
+    value = integral(integrand)
+    return value, integral(integrand * log_u) if derivative else value

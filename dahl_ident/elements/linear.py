@@ -22,22 +22,17 @@ from dahl_ident.units import power_of_s
 
 
 class Lumped(Element):
-    """One parameter p that enters as Z = p (j omega)^order; a sine answers no harmonic."""
+    """An element of one parameter p, with Z = p (j omega)^order."""
 
     order: ClassVar[int]
     is_linear = True
 
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return p (j omega)^n with its derivatives, unchecked; the amplitude does not matter.
-
-        A pure sine of displacement moves a linear element at its own frequency alone.
-        """
+        """Return p (j omega)^order with its derivatives; 0 for harmonics above the fundamental."""
         unit: ComplexArray = power_of_s(sine.omega, self.order) * np.equal(sine.harmonic, 1)
         value = np.asarray(values[0] * unit + 0.0 * sine.amplitude)
-        if not derivatives:
-            return StiffnessGradient(value, unit, ())
-        by = (np.broadcast_to(unit, value.shape),) if derivatives > 1 else ()
-        return StiffnessGradient(value, np.zeros_like(value), by)
+        slopes = (np.broadcast_to(unit, value.shape),) if derivatives > 1 else ()
+        return StiffnessGradient(value, np.zeros_like(value), slopes)
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
@@ -51,13 +46,13 @@ class Lumped(Element):
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return p as inertia, or p times the displacement or velocity as force."""
+        """Return p as the inertia, or p times the displacement or velocity as the force."""
         if self.order == 2:
             return Mechanics(values[0], 0.0)
         return Mechanics(0.0, values[0] * (x, velocity)[self.order])
 
     def rational_stiffness(self) -> tuple[FloatArray, FloatArray]:
-        """Return p s^n over 1."""
+        """Return numerator and denominator of p s^order."""
         (value,) = self.known_values()
         return np.append(value, np.zeros(self.order)), np.ones(1)
 

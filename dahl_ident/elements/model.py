@@ -142,7 +142,7 @@ class Model(Element):
         return slowest
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return the values of all elements, those that no longer matter held where they do."""
+        """Return the values of all elements, each limited to where it has an effect."""
         return [
             v for element, numbers in self.of(values) for v in element.resolved(numbers, amplitude)
         ]
