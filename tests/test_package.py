@@ -178,5 +178,10 @@ def test_every_package_that_is_imported_is_declared():
                 case ast.ImportFrom(module=str(module), level=0):
                     imported.add(module.partition(".")[0])
     known = {"dahl_ident", "typing_extensions", *sys.stdlib_module_names}  # the second: types alone
-    bearing = {"fpdf": "fpdf2", "PIL": "pillow", "python_calamine": "python-calamine"}
+    bearing = {
+        "fpdf": "fpdf2",
+        "tomli_w": "tomli-w",
+        "PIL": "pillow",
+        "python_calamine": "python-calamine",
+    }
     assert {bearing.get(name, name).lower() for name in imported - known} <= declared
