@@ -1,8 +1,8 @@
 """The linear Dahl model (alpha = 1) in closed form.
 
-Everything here is in normalised variables: the amplitude is `beta = sigma A / f_max`, forces
-are over `f_max`, the describing function is over `sigma`. The formulas are those of the page
-"Theory"; for odd `k`, with `c_k = (a_k - j b_k) / f_max` and `h = N/sigma = c_1/beta`,
+All variables are normalised: the amplitude is `beta = sigma A / f_max`, forces are divided by
+`f_max`, the describing function by `sigma`. The formulas are those of the page "Theory"; for odd
+`k`, with `c_k = (a_k - j b_k) / f_max` and `h = N/sigma = c_1/beta`,
 
     Re c_k = 2 I_k(beta) / cosh(beta)
     Im c_k = (2/pi) Int_-1^1 U_(k-1)(t) D(t) dt,       D(t) = 1 - cosh(beta t) / cosh(beta)
@@ -19,7 +19,7 @@ are over `f_max`, the describing function is over `sigma`. The formulas are thos
 - below `beta` of 0.2 from the continued fractions of `beta coth(beta)` and of `I_2/I_1`, whose
   terms are all positive, and from `v = tanh(beta)^2 - q`;
 - above 300, `p` from the asymptotic series of `beta (I_0/I_1 - 1)` in `1/beta`;
-- between from the formulas as they stand, with exponentially scaled Bessel functions,
+- in between, from the formulas above, with exponentially scaled Bessel functions,
   `I_1/cosh(beta) = (1 + tanh beta) I_1 exp(-beta)`.
 
 **Harmonics.** Up to `beta` of 75 (or `k^2/3`, if larger) `Re c_k` is a scaled Bessel function and
@@ -27,8 +27,8 @@ are over `f_max`, the describing function is over `sigma`. The formulas are thos
 
     D(t) = (1 + tanh beta)/2 expm1(-beta (1 - t)) expm1(-beta (1 + t))
 
-Above, `Re c_k` follows from the asymptotic series of `I_k`, and `Im c_k` from integration by
-parts, which ends by itself because `U` is a polynomial.
+Above, `Re c_k` follows from the asymptotic series of `I_k`, and `Im c_k` from repeated integration
+by parts, which ends because `U` is a polynomial.
 """
 
 from __future__ import annotations
@@ -37,21 +37,22 @@ import math
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from scipy import fft, special
 
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 _BLOCK = 8192
-"""Amplitudes in one pass: their intermediate arrays stay in the processor's cache."""
+"""Amplitudes computed together, so that intermediate arrays stay in the processor's cache."""
 
 _BLOCK_NODES = 65536
-"""The same for harmonics: amplitudes times nodes of the quadrature."""
+"""The same for harmonics: number of amplitudes times that of nodes of the quadrature."""
 
 _SMALL, _LARGE = 0.2, 300.0
-"""Below and above these beta the formulas as they stand lose digits."""
+"""Below and above these beta the formulas lose digits."""
 
 _TINY = 1e-200
-"""Stands in for a vanishing beta where the limit of a quotient is meant."""
+"""Replaces beta = 0 in quotients, which then give their limits."""
 
 _COTH_DENOMINATORS = (3.0, 5.0, 7.0, 9.0, 11.0)  # below _SMALL the next, 13, changes 2e-16
 _BESSEL_DENOMINATORS = (4.0, 6.0, 8.0, 10.0, 12.0)  # below _SMALL the next, 14, changes 5e-17
@@ -80,10 +81,10 @@ def describing_function(beta: FloatArray) -> ComplexArray:
 def describing_function_gradient(
     beta: FloatArray,
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return h, -beta h' and h + beta h': N/sigma, its derivatives wrt ln f_max and ln sigma.
+    """Return h, -beta h' and h + beta h': N, dN/d ln f_max and dN/d ln sigma, over sigma.
 
-    Each part is computed without cancellation, so it is accurate by itself except near a change of
-    its sign.
+    Real and imaginary parts are computed without cancellation: each is accurate except near a
+    change of its sign.
 
     Examples
     --------
@@ -115,7 +116,7 @@ def _blocks(size: int, length: int) -> list[slice]:
 
 
 def _indices(condition: BoolArray) -> IntArray:
-    """Return the indices where `condition` holds: quicker to work with than a mask."""
+    """Return the indices where `condition` holds, which are faster to use than a mask."""
     return condition.nonzero()[0]
 
 
@@ -126,7 +127,7 @@ def _bessel_part(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     inverse = 1.0 / positive
     i1e = special.i1e(positive)
     stiffness = 2.0 * (1.0 + tanh) * (i1e * inverse)
-    # rounding must not lift it over its value at rest
+    # rounding must not raise it above its value at rest
     return tanh, inverse, i1e, np.minimum(stiffness, 1.0)
 
 
@@ -166,7 +167,7 @@ def _decay(
         decay[small] = s * (tanh[small] - bessel_ratio)
     large = _indices(b > _LARGE)
     if large.size:
-        decay[large] = 2.0 - _polynomial(inverse[large], _BESSEL_ASYMPTOTICS)
+        decay[large] = 2.0 - polyval(inverse[large], _BESSEL_ASYMPTOTICS)
     return decay
 
 
@@ -179,21 +180,12 @@ def _continued_fraction(t: FloatArray, denominators: tuple[float, ...]) -> Float
     return value
 
 
-def _polynomial(u: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
-    """Return c_0 + c_1 u + c_2 u^2 + ..."""
-    *others, last = coefficients
-    value = others.pop() + u * last
-    for c in reversed(others):
-        value = c + u * value
-    return value
-
-
 def harmonic_gradient(beta: FloatArray, k: int) -> tuple[ComplexArray, ComplexArray]:
     """Return c_k = (a_k - j b_k)/f_max, the k-th Fourier coefficient, and beta dc_k/dbeta.
 
-    Exactly 0 for even `k`; ``beta h(beta)`` for ``k = 1``; else within 1e-12 of the larger part up
-    to ``k = 15`` and 1e-9 at 101. ``a_k - j b_k = f_max c_k`` changes with ln sigma by
-    ``f_max by_ln_beta``, with ln f_max by ``f_max (c_k - by_ln_beta)``.
+    Exactly 0 for even `k`; ``beta h(beta)`` for ``k = 1``; otherwise the error is within 1e-12 of
+    the larger part up to ``k = 15``, and 1e-9 at 101. The derivatives of ``f_max c_k`` with respect
+    to ln sigma and ln f_max are ``f_max beta dc_k/dbeta`` and ``f_max (c_k - beta dc_k/dbeta)``.
 
     Examples
     --------
@@ -219,7 +211,7 @@ def _harmonic_limit(k: int) -> float:
 
 
 def _node_count(k: int) -> int:
-    """Return the nodes in a quarter period that resolve exp(beta cos) up to the limit."""
+    """Return the number of nodes in a quarter period that resolve exp(beta cos) at the limit."""
     return int(math.sqrt(20.0 * _harmonic_limit(k))) + 8
 
 

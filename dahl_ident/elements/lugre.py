@@ -1,7 +1,7 @@
 """LuGre friction: bristles with a sliding force that depends on the speed.
 
-The state is the bristles' force f = sigma z: df/dx = sigma (1 - s f/g(v)), linear in f, which is
-the linear Dahl law with a limit that follows the speed.
+The state is the bristles' force f = sigma z, with df/dx = sigma (1 - s f/g(v)): the linear Dahl law
+with a limit that depends on the speed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dahl_ident.elements.facts import Asymptote, Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
-_FAR = 1e12  # of the data's speeds: exp(-(v/stribeck_speed)^2) is 0 or 1 to every digit
+_FAR = 1e12  # factor on the range of speeds: exp(-(v/stribeck_speed)^2) is 0 or 1 to every digit
 
 
 class LuGre(Friction):
@@ -31,7 +31,7 @@ class LuGre(Friction):
     static_ratio : float, optional
         Static force over `f_max`, from 1 to 100.
     stribeck_speed : float, optional
-        Speed at which 1/e of the difference is left, m/s (rad/s), > 0.
+        Speed at which the static force's excess over `f_max` has fallen to 1/e, m/s (rad/s), > 0.
     micro_damping : float, default 0
         Damping of the bristles, N s/m, >= 0. None: free.
     viscous : float, default 0
@@ -50,7 +50,7 @@ class LuGre(Friction):
     with friction, IEEE Trans. Autom. Control 40 (1995) 419-425. N depends on the frequency. Where
     all peak speeds are far above or far below `stribeck_speed`, or `static_ratio` is near 1,
     settled sines cannot distinguish it from linear Dahl with a damper: see `distance_from_dahl`.
-    A history's state is the bristles' force.
+    The initial force of a history is that of the bristles.
 
     Examples
     --------
@@ -83,21 +83,21 @@ class LuGre(Friction):
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
         """Return df/dx of the bristles' force."""
         f_max, sigma, ratio, speed, *_ = values
-        level = f_max * (1.0 + (ratio - 1.0) * np.exp(-((velocity / speed) ** 2)))
-        return sigma * (1.0 - direction * force / level)
+        limit = f_max * (1.0 + (ratio - 1.0) * np.exp(-((velocity / speed) ** 2)))
+        return sigma * (1.0 - direction * force / limit)
 
     def output(self, force: Any, slope: Any, velocity: Any, values: Sequence[Any]) -> Any:
-        """Return the whole force from that of the bristles and its slope."""
+        """Return the total force from that of the bristles and its slope."""
         _, sigma, *_, micro_damping, viscous = values
         return force + (micro_damping / sigma * slope + viscous) * velocity
 
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the static force, for both directions."""
-        top = np.asarray(values[0] * values[2])
-        return top, top
+        limit = np.asarray(values[0] * values[2])
+        return limit, limit
 
     def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return infinity where there is damping, which grows with the frequency."""
+        """Return the bounds; inf with damping, whose force grows with the frequency."""
         f_max, sigma, ratio, _, micro_damping, viscous = values
         damped = np.asarray(micro_damping + viscous) > 0.0
         steepest = np.where(damped, np.inf, 8.0 / np.pi * np.asarray(sigma))
@@ -109,7 +109,7 @@ class LuGre(Friction):
         return np.asarray(f_max / sigma), np.asarray(f_max * ratio / sigma)
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return both limits of the Stribeck speed, in which the law is linear Dahl."""
+        """Return the limits 0 and inf of the Stribeck speed, in which the law is linear Dahl."""
         fast = {"stribeck_speed": low / _FAR}
         slow = {"stribeck_speed": high * _FAR}
         static = (("f_max*static_ratio", {"f_max": 1.0, "static_ratio": 1.0}),)
@@ -126,11 +126,11 @@ class LuGre(Friction):
         """Return linear Dahl with a damper, and the distance from it."""
         if not np.all(np.isfinite(values)):
             return None
-        known = LuGre(*values, name=self.name)
-        return "linear Dahl with a damper", known.distance_from_dahl(amplitude, omega)
+        law = LuGre(*values, name=self.name)
+        return "linear Dahl with a damper", law.distance_from_dahl(amplitude, omega)
 
     def distance_from_dahl(self, amplitude: FloatArray, omega: FloatArray) -> float:
-        """Return the misfit of the best linear Dahl law with a damper to this law's N.
+        """Return the misfit to this law's N of the linear Dahl law with a damper that fits best.
 
         Parameters
         ----------
@@ -158,13 +158,13 @@ class LuGre(Friction):
         values = self.known_values()
         N = self.stiffness(values, A, w)
 
-        def excess(p: FloatArray) -> FloatArray:
+        def deviation(p: FloatArray) -> FloatArray:
             f_max, sigma, damping = np.exp(p)
             dahl = sigma * describing_function(sigma * A / f_max) + 1j * w * damping
-            miss = (dahl / N - 1.0).ravel()
-            return np.asarray(np.concatenate([miss.real, miss.imag]) / np.sqrt(A.size))
+            relative = (dahl / N - 1.0).ravel()
+            return np.asarray(np.concatenate([relative.real, relative.imag]) / np.sqrt(A.size))
 
         f_max, sigma, ratio = (float(v) for v in values[:3])
         damping = max(float(values[5]), 1e-9 * f_max / float(np.max(A * w) or 1.0))
         starts = [np.log([f, sigma, damping]) for f in (f_max, f_max * ratio)]
-        return min(float(np.linalg.norm(least_squares(excess, s).fun)) for s in starts)
+        return min(float(np.linalg.norm(least_squares(deviation, s).fun)) for s in starts)

@@ -32,11 +32,10 @@ class MaxwellSlip(Masing):
     Parameters
     ----------
     slips : int or array_like
-        Slip displacements, m (rad in rotation), each > 0 and rising: fixed. Or how many there
-        are: free, `slip_1` to `slip_n`, which rise in every
-        estimate.
+        The slip displacements, m (rad in rotation), > 0 and rising, which are then fixed. Or their
+        number n: then `slip_1` to `slip_n` are free, and rise in every estimate.
     stiffnesses : array_like, optional
-        Of the springs, N/m (N m/rad), > 0. Given: fixed; left out: free.
+        Stiffnesses of the springs, N/m (N m/rad), > 0. Given: fixed; left out: free.
     name : str, optional
         Prefix of the parameters' names.
 
@@ -72,18 +71,18 @@ class MaxwellSlip(Masing):
         *,
         name: str | None = None,
     ) -> None:
-        displacements: FloatArray | None = None
+        d: FloatArray | None = None
         if isinstance(slips, int):
             n = whole_number(slips, "slips", 1)
         else:
-            displacements = np.atleast_1d(positive_array(slips, "slips"))
-            n = displacements.size
-            if displacements.ndim != 1 or np.any(np.diff(displacements) <= 0.0):
+            d = np.atleast_1d(positive_array(slips, "slips"))
+            n = d.size
+            if d.ndim != 1 or np.any(np.diff(d) <= 0.0):
                 raise ValidationError(f"slips are {list(slips)}; expected rising displacements")
-        stiff = None if stiffnesses is None else positive_array(stiffnesses, "stiffnesses")
-        if stiff is not None and stiff.shape != (n,):
+        k = None if stiffnesses is None else positive_array(stiffnesses, "stiffnesses")
+        if k is not None and k.shape != (n,):
             raise ValidationError(
-                f"stiffnesses have shape {stiff.shape}; expected one for each of {n} slips"
+                f"stiffnesses have shape {k.shape}; expected one for each of {n} slips"
             )
         self._name = name
         self.parameters = tuple(
@@ -92,8 +91,8 @@ class MaxwellSlip(Masing):
                 None if values is None else float(values[i]), lower=0.0, transform="log",
             )
             for label, unit, meaning, values in (
-                ("stiffness", "N/m", "stiffness of Jenkins element", stiff),
-                ("slip", "m", "slip displacement of Jenkins element", displacements),
+                ("stiffness", "N/m", "stiffness of Jenkins element", k),
+                ("slip", "m", "slip displacement of Jenkins element", d),
             )
             for i in range(n)
         )  # fmt: skip
@@ -101,10 +100,10 @@ class MaxwellSlip(Masing):
         self.like_parts = tuple(zip(self.labels[n:], self.labels[:n], strict=True))
 
     @classmethod
-    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> Element:
+    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
         """Return the element that :meth:`describe` described."""
-        n = max(1, sum(str(label).startswith("slip_") for label in rest))
-        return cls(n, name=name)._described(rest)
+        n = max(1, sum(str(label).startswith("slip_") for label in description))
+        return cls(n, name=name)._described(description)
 
     def backbone(self, values: Values, displacement: FloatArray) -> FloatArray:
         """Return the sum of k_i min(x, d_i)."""
@@ -124,9 +123,9 @@ class MaxwellSlip(Masing):
                 unit, by_ratio = jenkins(np.asarray(d) / A, int(sine.harmonic))
             N += k * unit
             if derivatives:
-                safe = np.where(A > 0.0, A, 1.0)
-                slope = k * by_ratio / safe
-                by_A -= slope * (d / safe)
+                nonzero = np.where(A > 0.0, A, 1.0)
+                slope = k * by_ratio / nonzero
+                by_A -= slope * (d / nonzero)
                 by_k.append(np.broadcast_to(unit, shape))
                 by_d.append(np.broadcast_to(slope, shape))
         return StiffnessGradient(N, by_A, (*by_k, *by_d) if derivatives > 1 else ())
@@ -142,7 +141,7 @@ class MaxwellSlip(Masing):
 
     @property
     def n_states(self) -> int:
-        """The force of every spring is a state."""
+        """Number of springs; the force of each is a state."""
         return len(self.parameters) // 2
 
     def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
@@ -152,7 +151,7 @@ class MaxwellSlip(Masing):
 
     @property
     def starts(self) -> tuple[tuple[str, str, str], ...]:  # type: ignore[override]  # as many as springs
-        """A load of every spring."""
+        """One load for each spring."""
         meaning = "force of a spring at the first sample, over that at which it slips"
         return tuple((f"initial_load_{i + 1}", "", meaning) for i in range(self.n_states))
 
@@ -163,15 +162,8 @@ class MaxwellSlip(Masing):
     def history(
         self, values: Sequence[Any], path: Path, state: float | FloatArray, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force at every sample, unchecked: from a load of every spring, or of all."""
+        """Return the force at every sample; `state` is one load of all springs, or one of each."""
         if not isinstance(state, np.ndarray):
             return super().history(values, path, state, slopes=slopes)
         free = [i for i, p in enumerate(self.parameters) if p.free]
         return force_along(self, values, path, state, free if slopes else None)
-
-    def __repr__(self) -> str:
-        arguments = {
-            self.label(p): "free" if p.value is None else f"{p.value:g}" for p in self.parameters
-        }
-        name = f", name={self.name!r}" if self.name else ""
-        return f"MaxwellSlip({', '.join(f'{k}={v}' for k, v in arguments.items())}{name})"

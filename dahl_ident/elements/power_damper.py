@@ -7,8 +7,8 @@ Under x = A cos(omega t), with s = A omega/v_0,
     N_k = j (c/A) s^p (2/pi) I_k(p),   I_k = pi sin(k pi/2) Gamma(p + 1)
                                              / (2^p Gamma((p + k)/2 + 1) Gamma((p - k)/2 + 1))
 
-for odd k; even harmonics vanish. p = 1 is the viscous damper of c/v_0, and as p goes to 0 the
-force becomes Coulomb's, 4 c/pi of fundamental.
+for odd k; even harmonics vanish. p = 1 is a viscous damper of c/v_0; as p tends to 0, the force
+becomes that of Coulomb friction, whose fundamental is 4 c/pi.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dahl_ident.elements.facts import (
 )
 from dahl_ident.elements.parameter import Parameter
 
-_AT_REST = 1e-12  # square of the speed, over the reference speed, that counts as rest
+_SMOOTHED = 1e-12  # square of the speed over the reference speed, below which the force is smooth
 
 
 class PowerDamper(Element):
@@ -45,10 +45,11 @@ class PowerDamper(Element):
     coefficient : float, optional
         Force at the reference speed, N (N m in rotation), > 0. Given: fixed; left out: free.
     exponent : float, optional
-        From above 0 (Coulomb's friction) over 1 (viscous) to 3. Given: fixed; left out: free.
+        Above 0 (the limit of Coulomb friction), 1 (viscous damping), up to 3. Given: fixed; left
+        out: free.
     reference_speed : float, default 1
-        m/s (rad/s): where the force is the coefficient. At 1 the coefficient is the number that
-        other texts give in N (s/m)^exponent.
+        The speed at which the force is the coefficient, m/s (rad/s). With 1, the coefficient is
+        the number that other texts state in N (s/m)^exponent.
     name : str, optional
         Prefix of the parameters' names.
 
@@ -102,17 +103,16 @@ class PowerDamper(Element):
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
         """Return F_k/X_1 with its derivatives, unchecked; infinite at rest for exponents below 1.
 
-        That with respect to the exponent is by differences of the share of the harmonic.
+        The derivative with respect to the exponent uses differences of the harmonic of sin^p.
         """
         c, p, speed = (np.asarray(v, dtype=np.float64) for v in values)
         A, omega = (np.asarray(v, dtype=np.float64) for v in sine[:2])
         shape = np.broadcast_shapes(*(v.shape for v in (c, p, speed, A, omega)))
         k = int(sine.harmonic)
-        share = _share(p, k)
         with np.errstate(all="ignore"):
             # A^(p - 1) alone, so that p = 1 needs no amplitude
             size = np.where(omega > 0.0, (omega / speed) ** p * A ** (p - 1.0), 0.0)
-            unit = np.broadcast_to(1j * size * share if k % 2 else 0j, shape).copy()
+            unit = np.broadcast_to(1j * size * _harmonic(p, k) if k % 2 else 0j, shape).copy()
             N = c * unit
             by_amplitude = np.where(A > 0.0, (p - 1.0) * N / A, 0.0)
             if derivatives < 2:
@@ -120,14 +120,14 @@ class PowerDamper(Element):
             logarithm = np.log(A * omega / speed)
             by_p = np.where(np.isfinite(logarithm), logarithm * N, 0.0)
         if k % 2:
-            by_share = difference(lambda q: _share(q, k), p, STEP * p)
-            by_p = by_p + 1j * np.where(np.isfinite(size), c * size * by_share, 0.0)
+            slope = difference(lambda q: _harmonic(q, k), p, STEP * p)
+            by_p = by_p + 1j * np.where(np.isfinite(size), c * size * slope, 0.0)
         return StiffnessGradient(N, by_amplitude, (unit, by_p, -p / speed * N))
 
     def history(
         self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
     ) -> HistoryGradient:
-        """Return the force for the velocity at every sample with its derivatives, unchecked."""
+        """Return the force at every sample with its derivatives, unchecked."""
         c, p, speed = values
         v = required_history(path.velocity, "velocity", path.displacement, self) / speed
         unit = np.asarray(np.sign(v) * np.abs(v) ** p)
@@ -136,23 +136,22 @@ class PowerDamper(Element):
             return HistoryGradient(force, force, ())
         with np.errstate(divide="ignore"):
             logarithm = np.where(v == 0.0, 0.0, np.log(np.abs(v)))
-        by = (unit, force * logarithm, -p / speed * force)
-        return HistoryGradient(force, np.zeros(unit.shape), by)
+        by_parameter = (unit, force * logarithm, -p / speed * force)
+        return HistoryGradient(force, np.zeros(unit.shape), by_parameter)
 
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return the force; within 1e-6 of the reference speed from rest it is smooth."""
+        """Return the force, smooth below 1e-6 of the reference speed."""
         c, p, speed = values
         ratio = velocity / speed
-        return Mechanics(0.0, c * ratio * (ratio * ratio + _AT_REST) ** (0.5 * (p - 1.0)))
+        return Mechanics(0.0, c * ratio * (ratio * ratio + _SMOOTHED) ** (0.5 * (p - 1.0)))
 
 
-def _share(p: FloatArray, k: int) -> FloatArray:
-    """Return 2 I_k(p)/pi, the harmonic of sin^p over its height."""
-    p = np.asarray(p)
-    if p.size > 1 and np.all(p == p.flat[0]):  # of one parameter vector at many points
-        return np.broadcast_to(_share(p.ravel()[:1], k), p.shape)
+def _harmonic(p: FloatArray, k: int) -> FloatArray:
+    """Return 2 I_k(p)/pi, the k-th harmonic of sin^p."""
+    if p.size > 1 and np.all(p == p.flat[0]):  # one parameter vector at many points
+        return np.broadcast_to(_harmonic(p.ravel()[:1], k), p.shape)
     sign = (-1.0) ** ((k - 1) // 2)
     upper, lower = rgamma((p + k) / 2.0 + 1.0), rgamma((p - k) / 2.0 + 1.0)
     return np.asarray(2.0 * sign * gamma(p + 1.0) * 2.0**-p * upper * lower)
