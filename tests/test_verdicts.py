@@ -28,6 +28,8 @@ from dahl_ident import (
 from dahl_ident.diagnostics import Verdict
 from tests.friction_tables import FRICTION, X_C, relative_noise, table
 
+STEPS = np.geomspace(1e-3, 1e-1, 8)  # too few rows for a comparison of bands
+
 
 def stiffened(rise, noise=0.01, seed=1):
     """Return microslip on a spring whose stiffness rises by a share over the upper half."""
@@ -69,6 +71,8 @@ class TestStiffening:
     def test_it_needs_friction_and_points(self):
         assert rise(stiffened(0.2), Spring()) is None
         assert rise(table(n=4), Dahl(alpha=1.0)) is None
+        few = FrequencyResponse(np.ones(8), np.geomspace(30.0, 1.0, 8) * (1.0 + 0.2j), STEPS)
+        assert rise(few, Dahl(alpha=1.0) + Spring() + Mass()) is None
 
 
 class TestTrust:

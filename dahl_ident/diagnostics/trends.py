@@ -77,6 +77,8 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
     kept, band = _bands(np.log(view.amplitude[rows]))
     rows = rows[kept]
     count = int(band.max(initial=-1)) + 1
+    if count < 2:
+        return None
     in_band = (band[:, None] == np.arange(count)).astype(np.float64)
     x = np.log(view.amplitude[rows])
     weights = view.weights[rows]
@@ -87,7 +89,7 @@ def stiffening(optimum: Optimum) -> Stiffening | None:
         square = view.omega[rows] ** 2
         design = np.column_stack([design, square / square.mean() - 1.0])
     dof = len(rows) - design.shape[1]
-    if count < 2 or dof < LEAST_DOF:
+    if dof < LEAST_DOF:
         return None
     stiffness = friction_stiffness(optimum, with_springs=True).real[rows]
     inverse = np.linalg.pinv(weights[:, None] * design)
