@@ -64,7 +64,7 @@ class _LinearEquation(LinearSystem):
     def __init__(self, system: LinearSystem) -> None:
         self.__dict__.update(system.__dict__)
         self._origin = system
-        Z = system.stiffness_near()
+        Z = system.typical_stiffness()
         self._above, self._below = Z.degrees
         self._rate = typical_rate(Z.denominator)
         order = range(1, self._below + 1)

@@ -1,14 +1,15 @@
 """Any linear system from python-control as an element: fixed, or with named free parameters.
 
 A structure's linear part is often known as a transfer function, a state-space model or measured
-frequency response data (FRD). Its response R is one of the six standard quantities, which has to be
-given and is never guessed. FRD is interpolated by a cubic spline of Z, which is exact for one mode,
-where a spline of the receptance overshoots its peak; and only between its first and last frequency.
+frequency response data (FRD). Which of the six standard quantities its response R is has to be
+stated; it is never guessed. FRD is interpolated, between its first and last frequency, by a cubic
+spline of Z. This is exact for one mode; a spline of the receptance would overshoot the peak.
 """
 
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -37,8 +38,8 @@ from dahl_ident.elements.recursion import matrix_recursion
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.units import DEFINITIONS, QUANTITIES, Quantity, converted
 
-_VANISHES = 1e-12  # of its terms: a sum that is 0 but for rounding
-_UNSTABLE = 1e-9  # of the fastest pole: a real part above grows
+_VANISHES = 1e-12  # of the terms of a sum: below it the sum is 0 but for rounding
+_UNSTABLE = 1e-9  # of the fastest pole: with a larger real part, a pole is unstable
 _FORCE_OVER_MOTION = ("dynamic_stiffness", "mechanical_impedance", "apparent_mass")
 
 
@@ -51,32 +52,40 @@ class LinearSystem(Element):
         One input and one output; continuous, or discrete with a known sampling time. A
         callable takes the `parameters` by keyword and returns such a system.
     quantity : str
-        What the system's response is: "receptance" (displacement over force), "mobility",
-        "accelerance", "dynamic_stiffness" (force over displacement), "mechanical_impedance" or
-        "apparent_mass".
+        The quantity that is the system's response: "receptance" (displacement over force),
+        "mobility", "accelerance", "dynamic_stiffness" (force over displacement),
+        "mechanical_impedance" or "apparent_mass".
     parameters : mapping of str to float, None or Parameter, optional
         Arguments of a callable `system`. A number fixes the argument; None leaves it free; a
         Parameter gives unit, bounds and search coordinate as well.
     name : str, optional
         Prefix of the parameters' names.
 
+    Attributes
+    ----------
+    system : control.TransferFunction, control.StateSpace, control.FRD or callable
+        As given.
+    quantity : str
+        As given.
+
     Raises
     ------
     ValidationError
         If `system` is none of these, has several inputs or outputs or no sampling time,
-        `quantity` is unknown, or `parameters` and a callable do not go together.
+        `quantity` is unknown, or there are `parameters` without a callable, or the reverse.
 
     Notes
     -----
-    A continuous system has an equation of motion: its Z(s) is a stiffness, a damper, a mass, and
-    poles. So a receptance with inertia is driven by a force without `Mass`; an absorber needs one
-    in parallel. In records the states of its poles at the first sample are unknowns of the fit;
-    where the force is fitted, only a system without free parameters has one over time.
+    A continuous system has an equation of motion: its Z(s) consists of a stiffness, a damper, a
+    mass, and poles. So a receptance with inertia can be driven by a force without a `Mass`; an
+    absorber needs one in parallel. In fits to records the states of its poles at the first sample
+    are unknowns; if the force is fitted, the system's parameters must be fixed.
 
-    Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the
-    response determines no stiffness, raises ValidationError. Derivatives by the arguments
-    of a callable are central differences of fourth order with steps of 1e-3 of the argument,
-    good to about 1e-12 abs(Z/p) where Z is smooth; an argument of exactly 0 has no such step.
+    Evaluating outside the frequencies of an FRD, above half a sampling rate, or where the response
+    does not determine the stiffness, raises ValidationError. Derivatives with respect to the
+    arguments of a callable are central differences of fourth order with steps of 1e-3 of the
+    argument, accurate to about 1e-12 abs(Z/p) where Z is smooth; an argument of exactly 0 has no
+    such step.
 
     Examples
     --------
@@ -113,107 +122,106 @@ class LinearSystem(Element):
                 "expected a python-control system without parameters, or a function of all of them"
             )
         self._name = name
-        self._system = system
-        self._quantity = quantity
-        self._labels = tuple(arguments)
+        self.system = system
+        self.quantity = quantity
         self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in arguments.items())
-        self._last: tuple[FloatArray, ComplexArray] | None = None
-        self._known: tuple[tuple[float, ...], Equation] | None = None
+        self._last_curve: tuple[FloatArray, ComplexArray] | None = None
+        self._last_equation: tuple[tuple[float, ...], Equation] | None = None
         if not is_function:
             check_system(system, "system")
 
-    @property
-    def system(self) -> Any:
-        """The python-control system, or the function that returns one."""
-        return self._system
-
-    @property
-    def quantity(self) -> Quantity:
-        """What the system's response is."""
-        return self._quantity
-
     @each_harmonic
     def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return Z(omega) with its derivatives; a sine answers no harmonic."""
-        rows = 1 + len(self._labels) if derivatives > 1 else 1
-        table = np.asarray(self._for_each_vector(values, sine, rows))
+        """Return Z(omega) with its derivatives; 0 for harmonics above the fundamental."""
+        batch = np.broadcast_shapes(*(np.shape(v) for v in values))
+        shape = np.broadcast_shapes(batch, np.shape(sine.omega))
+        curves = self._curve_and_slopes if derivatives > 1 else self._curve
+        table = np.zeros((1 + len(values) * (derivatives > 1), *shape), dtype=np.complex128)
+        if sine.harmonic == 1:
+            columns = [np.broadcast_to(v, batch).ravel() for v in values]
+            vectors = np.reshape(columns, (len(values), math.prod(batch))).T
+            which = np.broadcast_to(np.arange(len(vectors)).reshape(batch), shape)
+            omega = np.broadcast_to(sine.omega, shape)
+            for i, vector in enumerate(vectors.tolist()):
+                rows = which == i
+                finite = np.isfinite(vector).all()  # a search may try others
+                table[:, rows] = curves(tuple(vector), omega[rows]) if finite else np.nan
         Z, *slopes = (row + 0.0 * sine.amplitude for row in table)
         return StiffnessGradient(Z, np.zeros_like(Z), tuple(slopes))
 
     def equation_at(self, values: Sequence[Any]) -> Equation:
-        """Return the equation of motion at values of the parameters, what cancels left out."""
-        at = tuple(float(v) for v in values)
-        if self._known is None or self._known[0] != at:
+        """Return the equation of motion at `values`, without poles and zeros that cancel."""
+        vector = tuple(float(v) for v in values)
+        if self._last_equation is None or self._last_equation[0] != vector:
             control = importlib.import_module("control")
-            Z = Rational(*self.rational_stiffness(at)).without_common_zeros_at_0().trimmed()
-            lean = control.tf(Z.numerator, Z.denominator).minreal()
-            if lean.den[0][0].size < Z.denominator.size:
-                Z = Rational(lean.num[0][0], lean.den[0][0])
-            self.check_growth(Z)
+            Z = self._rational(vector)
+            minimal = control.tf(Z.numerator, Z.denominator).minreal()
+            if minimal.den[0][0].size < Z.denominator.size:
+                Z = Rational(minimal.num[0][0], minimal.den[0][0])
             rate = typical_rate(Z.denominator)
-            self._known = at, Equation(rate, Z.degrees[1], coefficients_of(Z, rate).tolist())
-        return self._known[1]
+            equation = Equation(rate, Z.degrees[1], coefficients_of(Z, rate).tolist())
+            self._last_equation = vector, equation
+        return self._last_equation[1]
 
     @property
     def _equation(self) -> Equation:
         """The equation of motion of a fixed system."""
-        free = [p.name for p in self.parameters if p.free]
-        if free:
+        if self._free_names:
             raise ModelError(
-                f"{self!r} leaves {', '.join(free)} free, and only a fixed system has a force over "
-                "time; fix it, fit the motion, or build what is unknown from Mass, Damper and "
-                "Spring"
+                f"{self!r} leaves {', '.join(self._free_names)} free, and only a fixed system has "
+                "a force over time; fix it, fit the motion, or build what is unknown from Mass, "
+                "Damper and Spring"
             )
         return self.equation_at(self.known_values())
 
-    def check_growth(self, Z: Rational) -> None:
-        """Refuse a dynamic stiffness that grows faster than that of a mass."""
+    def _rational(self, values: Sequence[float]) -> Rational:
+        """Return Z(s) without vanishing terms; refuse one that grows faster than a mass."""
+        Z = Rational(*self.rational_stiffness(values)).without_common_zeros_at_0().trimmed()
         power = Z.degrees[0] - Z.degrees[1]
         if power > 2:
             raise ModelError(
                 f"the dynamic stiffness of {self!r} grows as s^{power}; an equation "
                 "of motion allows s^2, a mass: give the system at its point of drive"
             )
+        return Z
 
-    def stiffness_near(self) -> Rational:
-        """Return Z(s) at values near the parameters' own, so that no term vanishes by chance."""
+    def typical_stiffness(self) -> Rational:
+        """Return Z(s) near the present values, but where no term vanishes by chance."""
         shifts = np.random.default_rng(1).uniform(0.8, 1.2, len(self.parameters))
         near = [
             float(np.clip(shift * (1.0 if p.value is None else p.value), p.lower, p.upper))
             for p, shift in zip(self.parameters, shifts, strict=True)
         ]
-        Z = Rational(*self.rational_stiffness(near)).without_common_zeros_at_0().trimmed()
-        self.check_growth(Z)
-        return Z
+        return self._rational(near)
 
     @property
-    def _has_free(self) -> bool:
-        return any(p.free for p in self.parameters)
+    def _free_names(self) -> list[str]:
+        return [p.name for p in self.parameters if p.free]
 
     @property
     def n_states(self) -> int:
-        """Poles of the dynamic stiffness."""
-        return self.stiffness_near().degrees[1] if self._has_free else self._equation.order
+        """Number of poles of the dynamic stiffness."""
+        return self.typical_stiffness().degrees[1] if self._free_names else self._equation.order
 
     @property
     def has_inertia(self) -> bool:
         """Whether Z(s) grows as s^2."""
-        if not self._has_free:
+        if not self._free_names:
             return bool(self._equation.coefficients[2] != 0.0)
-        above, below = self.stiffness_near().degrees
+        above, below = self.typical_stiffness().degrees
         return above - below == 2
 
     def mechanics(
         self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
     ) -> Mechanics:
-        """Return mass, the rest of the force, and the changes of the states, in metres."""
+        """Return mass, the remaining force, and the rates of the states, in metres."""
         return self._equation.mechanics(x, velocity, states)
 
     def free_responses(self, time: FloatArray) -> FloatArray:
-        """Return the force from each state at the first sample, (n, states)."""
+        """Return the force from a unit of each initial state, (n, states)."""
         equation = self._equation
         undriven = np.zeros((time.size - 1, 6))
-        states = self._histories(equation, self._step(time), undriven, np.eye(equation.order))
+        states = equation.states(self._step(time), undriven, np.eye(equation.order))
         return np.asarray(states @ equation.output)
 
     def history(
@@ -221,7 +229,7 @@ class LinearSystem(Element):
     ) -> HistoryGradient:
         """Return the force, from rest; between samples the motion is a polynomial of degree 5.
 
-        Fixed parameters do not change it.
+        Its derivatives are 0: it has them only if all parameters are fixed.
         """
         equation = self._equation if slopes else self.equation_at(values)
         k, c, m = equation.coefficients[:3]
@@ -239,32 +247,15 @@ class LinearSystem(Element):
                     f"under a prescribed displacement the force of {self!r} grows beyond all "
                     "bounds; give records in which a force drives a mass"
                 )
-            at_rest = np.zeros((equation.order, 1))
-            h = self._step(path.time)
-            paths = Path(x, v, a).polynomials(np.full(x.size - 1, h)).T
-            states = self._histories(equation, h, paths, at_rest)
+            step = self._step(path.time)
+            paths = Path(x, v, a).polynomials(np.full(x.size - 1, step)).T
+            states = equation.states(step, paths, np.zeros((equation.order, 1)))
             force = np.asarray(force + states[:, 0] @ equation.output)
         zero = np.zeros(force.shape)
         return HistoryGradient(force, zero, (zero,) * len(self.parameters))
 
-    def _histories(
-        self, equation: Equation, h: float, paths: FloatArray, first: FloatArray
-    ) -> FloatArray:
-        """Return the states, (n, c, order), driven by polynomials from `first`, (order, c)."""
-        from scipy.linalg import expm
-
-        order = equation.order
-        chain = np.zeros((order + 6, order + 6))
-        chain[:order, :order] = h * equation.matrix
-        chain[:1, order] = h * equation.rate
-        chain[np.arange(order, order + 5), np.arange(order + 1, order + 6)] = 1.0
-        whole = expm(chain)[:order]
-        moved = paths @ (whole[:, order:] * [1.0, 1.0, 2.0, 6.0, 24.0, 120.0]).T
-        term = np.broadcast_to(moved[:, :, None], (len(paths), *first.shape))
-        keep = np.broadcast_to(whole[:, :order], (len(paths), order, order))
-        return matrix_recursion(keep, term, first).transpose(0, 2, 1)
-
     def _step(self, time: FloatArray | None) -> float:
+        """Return the sampling interval; refuse uneven times."""
         if time is None or not is_even(time):
             raise ValidationError(
                 f"{self!r} needs evenly spaced times to give its force; pass time="
@@ -272,7 +263,7 @@ class LinearSystem(Element):
         return float(time[-1] - time[0]) / (time.size - 1)
 
     def describe(self) -> dict[str, Any]:
-        """Return quantity and system as plain data; a function cannot be written to a file."""
+        """Return quantity and system as plain data; refuse a function."""
         if self.parameters:
             raise ModelError(
                 f"{self!r} is built by a function, which no file can hold; give it as a fixed "
@@ -297,58 +288,42 @@ class LinearSystem(Element):
         return entry | {key: np.asarray(getattr(system, key)).tolist() for key in "ABCD"}
 
     @classmethod
-    def from_description(cls, rest: Mapping[str, Any], name: str | None) -> LinearSystem:
+    def from_description(cls, description: Mapping[str, Any], name: str | None) -> LinearSystem:
         """Return the linear system that :meth:`describe` described."""
         control = importlib.import_module("control")
+
+        def parts(*keys: str) -> list[Any]:
+            return [description[key] for key in keys]
+
         try:
-            if "omega" in rest:
-                response = np.asarray(rest["real"]) + 1j * np.asarray(rest["imag"])
-                system = control.FRD(response, rest["omega"])
-            elif "numerator" in rest:
-                system = control.TransferFunction(
-                    rest["numerator"], rest["denominator"], rest["dt"]
-                )
+            if "omega" in description:
+                real, imag, omega = map(np.asarray, parts("real", "imag", "omega"))
+                system = control.FRD(real + 1j * imag, omega)
+            elif "numerator" in description:
+                system = control.TransferFunction(*parts("numerator", "denominator", "dt"))
             else:
-                system = control.StateSpace(rest["A"], rest["B"], rest["C"], rest["D"], rest["dt"])
-            return cls(system, quantity=rest["quantity"], name=name)
+                system = control.StateSpace(*parts("A", "B", "C", "D", "dt"))
+            return cls(system, quantity=description["quantity"], name=name)
         except KeyError as exc:
             raise ModelError(
                 f"the linear_system element has no {exc.args[0]}; expected quantity with omega, "
                 "real and imag, with numerator, denominator and dt, or with A, B, C, D and dt"
             ) from None
 
-    def _for_each_vector(self, values: Values, sine: Sine, size: int) -> ComplexArray:
-        """Return Z for every parameter vector, and its slopes where `size` asks, (size, ...)."""
-        batch = np.broadcast_shapes(*(np.shape(v) for v in values))
-        shape = np.broadcast_shapes(batch, np.shape(sine.omega))
-        result = np.zeros((size, *shape), dtype=np.complex128)
-        if sine.harmonic != 1:
-            return result
-        vectors = np.stack([np.broadcast_to(v, batch).ravel() for v in (*values, np.zeros(batch))])
-        which = np.broadcast_to(np.arange(vectors.shape[1]).reshape(batch), shape)
-        frequencies = np.broadcast_to(sine.omega, shape)
-        for i, vector in enumerate(vectors[:-1].T.tolist()):
-            rows = which == i
-            result[:, rows] = np.nan
-            if np.isfinite(vector).all():  # a search may try others
-                work = self._curve if size == 1 else self._curve_and_slopes
-                result[:, rows] = work(tuple(vector), frequencies[rows])
-        return result
-
     def system_at(self, values: Sequence[float]) -> Any:
         """Return the python-control system at `values` of the parameters, in their order."""
-        if not self._labels:
-            return self._system
-        system = self._system(**dict(zip(self._labels, values, strict=True)))
+        if not self.parameters:
+            return self.system
+        system = self.system(**dict(zip(self.labels, values, strict=True)))
         check_system(system, "system")
         return system
 
     def rational_stiffness(
         self, values: Sequence[float] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return numerator and denominator of Z(s), from the highest power of s down.
+        """Return numerator and denominator of Z(s), highest power first.
 
-        At the given `values` of the parameters, or those that they have.
+        The parameters are at `values`, by default their own.
         """
         control = importlib.import_module("control")
         if values is None:
@@ -364,46 +339,47 @@ class LinearSystem(Element):
             np.asarray(p[0][0], np.float64) for p in (transfer.num, transfer.den)
         )
         if isinstance(system, control.StateSpace):
-            # its conversion leaves rounding errors where there is no coefficient
+            # its conversion leaves rounding errors in place of zeros
             numerator = numerator[max(0, numerator.size - _degree(system) - 1) :]
             sizes = np.abs(numerator) * typical_rate(denominator) ** np.arange(numerator.size)[::-1]
             numerator = np.where(sizes > _VANISHES * sizes.max(), numerator, 0.0)
         definition = DEFINITIONS[self.quantity]
-        above, below = (numerator, denominator)[:: definition.exponent]
+        if definition.exponent < 0:
+            numerator, denominator = denominator, numerator
         power = definition.power_in_stiffness
         return (
-            np.append(above, np.zeros(max(power, 0))),
-            np.append(below, np.zeros(max(-power, 0))),
+            np.append(numerator, np.zeros(max(power, 0))),
+            np.append(denominator, np.zeros(max(-power, 0))),
         )
 
     def _curve(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
-        """Return Z at angular frequencies, shape (n,); a fixed system remembers the last."""
-        if self._labels:
-            return dynamic_stiffness(self.system_at(vector), self._quantity, omega)
-        if self._last is None or not np.array_equal(self._last[0], omega):
-            self._last = omega.copy(), dynamic_stiffness(self._system, self._quantity, omega)
-        return self._last[1]
+        """Return Z at angular frequencies, shape (n,); for a fixed system, the last is kept."""
+        if self.parameters:
+            return dynamic_stiffness(self.system_at(vector), self.quantity, omega)
+        if self._last_curve is None or not np.array_equal(self._last_curve[0], omega):
+            self._last_curve = omega.copy(), dynamic_stiffness(self.system, self.quantity, omega)
+        return self._last_curve[1]
 
     def _curve_and_slopes(self, vector: tuple[float, ...], omega: FloatArray) -> ComplexArray:
-        slopes = differences(lambda at: self._curve(at, omega), vector, self._labels)
+        slopes = differences(lambda moved: self._curve(moved, omega), vector, self.labels)
         return np.stack([self._curve(vector, omega), *slopes])
 
     def __repr__(self) -> str:
-        what = getattr(self._system, "__name__", type(self._system).__name__)
+        system = getattr(self.system, "__name__", type(self.system).__name__)
         _, _, arguments = super().__repr__().partition("(")
         separator = "" if arguments == ")" else ", "
-        return f"LinearSystem({self._quantity} of {what}{separator}{arguments}"
+        return f"LinearSystem({self.quantity} of {system}{separator}{arguments}"
 
 
 class Equation(NamedTuple):
     """Z(s) = k + c s + m s^2 + (b_1 p^(n-1) + ... + b_n)/(p^n + a_1 p^(n-1) + ... + a_n).
 
-    Of p = s/rate.
+    Here p = s/rate.
 
     Attributes
     ----------
     rate : float
-        rad/s: that of the poles, so that the coefficients are even.
+        Typical rate of the poles, rad/s, so that the coefficients are of similar size.
     order : int
         n.
     coefficients : sequence
@@ -415,30 +391,48 @@ class Equation(NamedTuple):
     coefficients: Sequence[Any]
 
     def mechanics(self, x: Any, velocity: Any, states: Sequence[Any]) -> Mechanics:
-        """Return mass, the rest of the force, and the changes of the states, in metres."""
+        """Return mass, the remaining force, and the rates of the states, in metres."""
         k, c, m, *others = self.coefficients
         a, b = others[: self.order], others[self.order :]
-        inputs = [x, *states][: self.order]
+        rates = [x, *states][: self.order]
         if self.order:
-            inputs[0] = x - sum(p * z for p, z in zip(a, states, strict=True))
+            rates[0] = x - sum(p * z for p, z in zip(a, states, strict=True))
         force = k * x + c * velocity + sum(p * z for p, z in zip(b, states, strict=True))
-        return Mechanics(m, force, [self.rate * z for z in inputs])
+        return Mechanics(m, force, [self.rate * z for z in rates])
 
     @property
     def matrix(self) -> FloatArray:
-        """The states' own changes, (order, order), of an equation of numbers."""
+        """The matrix of the states' rates, (order, order), 1/s; coefficients are numbers."""
         matrix = np.diag(np.ones(max(self.order - 1, 0)), -1)[: self.order, : self.order]
         matrix[:1] = -np.asarray(self.coefficients[3 : 3 + self.order])
         return self.rate * matrix
 
     @property
     def output(self) -> FloatArray:
-        """The force of each state."""
+        """The force from a unit of each state; coefficients are numbers."""
         return np.asarray(self.coefficients[3 + self.order :])
+
+    def states(self, step: float, paths: FloatArray, first: FloatArray) -> FloatArray:
+        """Return the states at samples, (n, c, order), from `first`, (order, c).
+
+        `paths` are the coefficients of the displacement as a polynomial of degree 5 in each `step`.
+        """
+        from scipy.linalg import expm
+
+        n = self.order
+        augmented = np.zeros((n + 6, n + 6))  # by the derivatives of the displacement
+        augmented[:n, :n] = step * self.matrix
+        augmented[:1, n] = step * self.rate
+        augmented[np.arange(n, n + 5), np.arange(n + 1, n + 6)] = 1.0
+        transition = expm(augmented)[:n]
+        driven = paths @ (transition[:, n:] * [1.0, 1.0, 2.0, 6.0, 24.0, 120.0]).T
+        term = np.broadcast_to(driven[:, :, None], (len(paths), *first.shape))
+        keep = np.broadcast_to(transition[:, :n], (len(paths), n, n))
+        return matrix_recursion(keep, term, first).transpose(0, 2, 1)
 
 
 def coefficients_of(Z: Rational, rate: float) -> FloatArray:
-    """Return the coefficients of :class:`Equation` of a function that grows no faster than s^2."""
+    """Return the coefficients of :class:`Equation`, of a function that grows at most as s^2."""
     n = Z.degrees[1]
     polynomial, proper = Z.split()
     k, c, m = [*polynomial[::-1].tolist(), 0.0, 0.0][:3]
@@ -457,8 +451,9 @@ def dynamic_stiffness(system: Any, quantity: Quantity, omega: FloatArray) -> Com
         return _to_stiffness(_evaluate(system, omega), quantity, omega)
     from scipy.interpolate import make_interp_spline
 
-    known = np.asarray(system.omega, dtype=np.float64)
-    nodes = known[np.argsort(known)]
+    frequencies = np.asarray(system.omega, dtype=np.float64)
+    order = np.argsort(frequencies)
+    nodes = frequencies[order]
     if np.any(np.diff(nodes) == 0.0):
         raise ValidationError("the FRD has a frequency twice; average its values there")
     outside = (omega < nodes[0] * (1.0 - 1e-12)) | (omega > nodes[-1] * (1.0 + 1e-12))
@@ -467,14 +462,13 @@ def dynamic_stiffness(system: Any, quantity: Quantity, omega: FloatArray) -> Com
             f"the FRD reaches from {nodes[0]:g} to {nodes[-1]:g} rad/s and was asked for "
             f"{omega[outside][0]:g} rad/s; leave that frequency out, or give a wider FRD"
         )
-    R = np.ravel(system(1j * known))[np.argsort(known)]
-    Z = _to_stiffness(R, quantity, nodes)
+    Z = _to_stiffness(np.ravel(system(1j * frequencies))[order], quantity, nodes)
     return np.asarray(make_interp_spline(nodes, Z, k=min(3, len(nodes) - 1))(omega))
 
 
 def _evaluate(system: Any, omega: FloatArray) -> ComplexArray:
     """Return the response of a TransferFunction or StateSpace; not finite at a pole."""
-    place = 1j * omega
+    s = 1j * omega
     if system.isdtime(strict=True):
         limit = np.pi / system.dt
         if np.any(omega > limit):
@@ -482,13 +476,13 @@ def _evaluate(system: Any, omega: FloatArray) -> ComplexArray:
                 f"the discrete system ends at half its sampling rate, {limit:g} rad/s, and was "
                 f"asked for {np.max(omega):g} rad/s"
             )
-        place = np.exp(place * system.dt)
+        s = np.exp(s * system.dt)
     with np.errstate(all="ignore"):
-        return np.ravel(system(place, warn_infinite=False))
+        return np.ravel(system(s, warn_infinite=False))
 
 
 def _to_stiffness(R: ComplexArray, quantity: Quantity, omega: FloatArray) -> ComplexArray:
-    """Return Z from the system's response, 0 at a pole of X/F, or say where there is none."""
+    """Return Z from the system's response, 0 at a pole of X/F; refuse other poles."""
     pole = np.isinf(R)
     bad = np.isnan(R) & ~pole | (pole & (quantity in _FORCE_OVER_MOTION))
     if bad.any():
@@ -503,7 +497,7 @@ def _to_stiffness(R: ComplexArray, quantity: Quantity, omega: FloatArray) -> Com
 def _degree(system: Any) -> int:
     """Return the degree in s of the numerator of a state-space system's response.
 
-    It follows from the response to an impulse, D, C B, C A B, ..., the first of which may vanish.
+    It follows from the number of Markov parameters, D, C B, C A B, ..., that vanish.
     """
     A, B, row, D = (np.asarray(getattr(system, key), np.float64) for key in "ABCD")
     size, degree = np.abs(row), len(A)
@@ -518,7 +512,7 @@ def _degree(system: Any) -> int:
 
 
 def check_system(system: Any, name: str) -> None:
-    """Refuse anything but a python-control system with one input, one output and a known time."""
+    """Refuse all but python-control systems with one input, one output and a sampling time."""
     if not _is_system(system):
         raise ValidationError(
             f"{name} is a {type(system).__name__}; expected a python-control TransferFunction, "
@@ -557,7 +551,7 @@ def differences(
                 "number, or write the function with an offset"
             )
 
-        def moved(number: float, i: int = i) -> NDArray[Any]:
+        def of_one(number: float, i: int = i) -> NDArray[Any]:
             return function((*vector[:i], number, *vector[i + 1 :]))
 
-        yield difference(moved, value, STEP * value)
+        yield difference(of_one, value, STEP * value)
