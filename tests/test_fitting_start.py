@@ -82,7 +82,9 @@ def test_curves_of_many_rows_are_interpolated(law, error):
     values = [
         np.ones(2) if p.name == "alpha" else v for p, v in zip(law.parameters, values, strict=True)
     ]
-    found = TableProblem(table, law, noise="relative").stiffness_data.of(law, values, at_nodes=True)
+    found = TableProblem(table, law, noise="relative").stiffness_data.stiffness_of(
+        law, values, at_nodes=True
+    )
     for node, curve in enumerate(found):
         exact = law.stiffness([v[node] for v in values], many, np.ones(()))
         assert np.max(np.abs(curve - exact)) < error * np.max(np.abs(exact))

@@ -76,7 +76,7 @@ class Decorrelation:
         by_name = dict(zip(names, self.problem.to_values(x[:, : len(names)]).T, strict=True))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
             N = sum(
-                view.of(
+                view.stiffness_of(
                     e,
                     [by_name.get(p.name, np.asarray(p.value)) for p in e.parameters],
                     at_nodes=True,
@@ -213,7 +213,9 @@ def decorrelation_of(problem: TableProblem) -> Decorrelation | None:
     if not friction or not linear:
         return None
     weights = np.repeat(view.weights, 2)
-    columns = np.stack([interleaved(view.of(e, [np.ones(())])) for e, _ in linear], axis=-1)
+    columns = np.stack(
+        [interleaved(view.stiffness_of(e, [np.ones(())])) for e, _ in linear], axis=-1
+    )
     weighted = columns * weights[:, None]
     size = np.sqrt((weighted**2).sum(axis=0))
     projection = np.linalg.pinv(weighted / size) * weights / size[:, None]

@@ -79,9 +79,8 @@ class Assessment(ABC):
 
     def __getattr__(self, name: str) -> Any:
         if name in _SPECIFIC:
-            raise ValidationError(
-                f"a fit of {self.problem.called} has no {_SPECIFIC[name]}; {self.alternative}"
-            )
+            data = self.problem.kind_in_words
+            raise ValidationError(f"a fit of {data} has no {_SPECIFIC[name]}; {self.alternative}")
         raise AttributeError(name)
 
     @property
@@ -370,7 +369,7 @@ class TableAssessment(Assessment):
         """Return the rms stiffness of an element of one parameter over that of the whole."""
         view = self.problem.stiffness_data
         rows = view.harmonic == 1
-        part = view.of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
+        part = view.stiffness_of(element, [np.asarray(value)])[rows] / view.stiffness[rows]
         return float(np.sqrt(np.mean(np.abs(part) ** 2)))
 
     def design(self, *, counted: bool) -> dict[str, Any]:

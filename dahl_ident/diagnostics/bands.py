@@ -194,7 +194,7 @@ def problem_at(
         f, np.ones(f.shape), **levels, controlled="displacement" if drive is None else "force",
         quantity=quantity or default, motion=problem.motion,
     )  # fmt: skip
-    moved: TableProblem = problem.at(grid)
+    moved: TableProblem = problem.for_table(grid)
     return moved
 
 

@@ -43,7 +43,7 @@ _AT_LIMIT = 0.01  # share of diverging replicates above which the interval is sy
 def _replicate(optimum: Optimum, replicates: int | None, seed: int) -> FloatArray:
     """Return t* of simulated repetitions, (S, P); NaN if one diverges or is not determined."""
     if replicates is None:
-        replicates = optimum.problem.repetitions
+        replicates = optimum.problem.n_simulations
     count = whole_number(replicates, "replicates", _FEWEST)
     if optimum.loss != "linear":
         raise ValidationError(

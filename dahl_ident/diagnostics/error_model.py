@@ -131,7 +131,7 @@ class ErrorModel(ErrorContributions):
     @property
     def distinguishes_noise(self) -> bool:
         """Whether there are enough residuals to distinguish a model error from noise."""
-        return self.problem.n_numbers - len(self.names) + len(self.assumed) >= _LEAST_DOF
+        return self.problem.n_nonzero - len(self.names) + len(self.assumed) >= _LEAST_DOF
 
     @property
     def labels(self) -> list[str]:
@@ -321,7 +321,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
     if not (determined or of_combinations):
         return None
     problem = optimum.problem
-    if problem.n_numbers - len(optimum.names) <= 0:
+    if problem.n_nonzero - len(optimum.names) <= 0:
         return None
     try:
         errors = _with_sources(optimum, problem, determined=determined)
@@ -336,7 +336,7 @@ def error_model(optimum: Optimum, *, of_combinations: bool = False) -> ErrorMode
 def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) -> ErrorModel:
     problem, assumed = with_assumed(problem)
     estimate = weighted_estimate(optimum, problem, determined=determined)
-    few = problem.n_numbers - len(problem.names) + len(assumed) < _LEAST_DOF
+    few = problem.n_nonzero - len(problem.names) + len(assumed) < _LEAST_DOF
     sources: tuple[Source, ...] = ()
     if not few:
         sources = (

@@ -405,7 +405,7 @@ def _minimum(
 ) -> WeightedEstimate:
     """Return the minimum at which a search from theta ends."""
     stated, basis = problem.widened(np.zeros(problem.data.n)), Basis.every(len(theta))
-    loss, m = loss_named(optimum.loss, problem.parts), problem.n_residuals
+    loss, m = loss_named(optimum.loss, problem.residuals_per_row), problem.n_residuals
     if not determined:
         _, J = stated.residuals_and_jacobian(theta)
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
@@ -520,7 +520,7 @@ def _weights(
     if stated.scale_known:
         square = LinearRows.at(stated, theta).squares(loss)
         return square * fundamental_sizes(stated.data) ** 2, 1.0
-    m, dof = stated.n_residuals, stated.n_numbers - len(stated.names)
+    m, dof = stated.n_residuals, stated.n_nonzero - len(stated.names)
     # with the derivatives, which the weighted ones will need
     y = stated.residuals_and_jacobian(theta, tails=loss is None)[0]
     scale = max(float(np.sqrt(y[:m] @ y[:m] / max(dof, 1))), float(stated.rounding), 1e-300)

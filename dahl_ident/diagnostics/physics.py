@@ -241,7 +241,9 @@ def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> Compl
     values = parameter_values(optimum)
     for element in problem.model.elements:
         if element.is_linear and not (with_springs and is_spring(element)):
-            linear += view.of(element, [np.asarray(values[p.name]) for p in element.parameters])
+            linear += view.stiffness_of(
+                element, [np.asarray(values[p.name]) for p in element.parameters]
+            )
     return np.asarray(view.stiffness * _sensor_factor(optimum) - linear)
 
 

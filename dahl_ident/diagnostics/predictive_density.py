@@ -127,7 +127,7 @@ def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:
     robust = optimum.loss != "linear"
     predicted = [problem.predict(optimum.values, i) for i in range(len(problem.records))]
     pairs = list(zip(problem.measured, predicted, strict=True))
-    residuals = [weighed.filtered((y - p.output) / problem.sizes[0]) for y, p in pairs]
+    residuals = [weighed.filtered((y - p.output) / problem.output_std) for y, p in pairs]
     y, blocks = np.concatenate(residuals), blocks_of(residuals)
     Q = orthonormal(np.concatenate([weighed.filtered(p.by) for p in predicted]), _RANK)
     variance = float(y @ y) / max(y.size - Q.shape[1], 1) + _EXACT**2
@@ -143,7 +143,7 @@ def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:
         volume = np.log(values[shared]).sum() - n * np.log(2.0 * np.pi * variance)
         tests[number] = _log_density(squares, float(volume), e.size, robust=robust)
     deviation = np.concatenate([y - p.output for y, p in pairs])
-    share = float(np.sqrt(np.mean(deviation**2))) / problem.sizes[0]
+    share = float(np.sqrt(np.mean(deviation**2))) / problem.output_std
     run = np.array([problem.runs[record] for record, _ in blocks])
     return PredictiveDensity(tests, np.unique(run, return_inverse=True)[1], share, float("nan"))
 

@@ -136,7 +136,7 @@ class Profiler:
         self._optimum, self._problem = optimum, optimum.problem
         self._searched = self._problem.near(optimum.theta)
         self._scale = 1.0 if optimum.scale_known else optimum.scale
-        self._loss = loss_named(optimum.loss, self._problem.parts)
+        self._loss = loss_named(optimum.loss, self._problem.residuals_per_row)
         self._logarithmic = self._problem.space.positive
         self._low, self._high = self._problem.bounds()
 

@@ -121,13 +121,12 @@ class RecordAssessment(Assessment):
     def errors(self) -> RecordErrors:
         """The estimate's uncertainty by source."""
         jacobians, residuals = self._evaluated
-        loss = loss_named(self.optimum.loss, self.problem.parts)
+        loss = loss_named(self.optimum.loss, self.problem.residuals_per_row)
         if loss is not None:  # to first order it is least squares of the scores
-            units = [size * self.optimum.scale for size in self.problem.sizes]
-            scaled = np.concatenate([e / unit for e, unit in zip(residuals, units, strict=True)])
+            unit = self.problem.output_std * self.optimum.scale
             ends = np.cumsum([e.size for e in residuals])[:-1]
-            scores = np.split(loss.scores(scaled), ends)
-            residuals = [unit * part for unit, part in zip(units, scores, strict=True)]
+            scores = loss.scores(np.concatenate(residuals) / unit)
+            residuals = np.split(unit * scores, ends)
         if self.first_order:
             return errors_on_constraints(self.optimum, jacobians, residuals)
         return record_errors(self.problem, self.optimum.values, jacobians, residuals)
@@ -294,7 +293,7 @@ class RecordAssessment(Assessment):
     def device(self) -> tuple[Optimum, None, None]:
         """The estimate as that of a table of one row, whose noise is the model's misfit."""
         row = FrequencyResponse([1.0], [1.0], [1.0], motion=self.problem.motion)
-        problem: TableProblem = self.problem.at(row).like(noise="relative")
+        problem: TableProblem = self.problem.for_table(row).like(noise="relative")
         count = self.problem.n_reported
         values = self.optimum.values[:count]
         least = np.where(problem.space.positive, _LEAST, -np.inf)
@@ -331,7 +330,7 @@ class RecordAssessment(Assessment):
         self, record: Record, values: FloatArray, initial: str
     ) -> tuple[RecordProblem, FloatArray]:
         """Return the problem of another record, and the model's `values` with those it adds."""
-        problem = self.problem.of([record])
+        problem = self.problem.for_records([record])
         if initial == "fitted":
             return problem, hold_model(problem, values)
         if initial != "rest":

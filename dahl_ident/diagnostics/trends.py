@@ -304,7 +304,7 @@ def _friction_parts(optimum: Optimum) -> tuple[ComplexArray, ComplexArray]:
     total, stiffness, loss = np.zeros((3, len(view.amplitude)), dtype=np.complex128)
     for element in problem.model.elements:
         law_values = [np.asarray(values[p.name]) for p in element.parameters]
-        part = view.of(element, law_values)
+        part = view.stiffness_of(element, law_values)
         total += part
         if not element.is_linear or (optimum.status.at_infinity and is_spring(element)):
             stiffness += part.real

@@ -34,7 +34,7 @@ def optima(
         reordered = (ordered != theta).any(axis=1)
         reordered[list(at_limit)] = False  # a limit refers to parameters by name
         theta[reordered] = ordered[reordered]
-    dof = problem.n_numbers + len(problem.priors) - end.determined
+    dof = problem.n_nonzero + len(problem.priors) - end.determined
     final = np.full(S, scale)
     if not problem.scale_known and loss is None and not problem.priors:
         final = estimated_scale(problem, end.cost, dof)

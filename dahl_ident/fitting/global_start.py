@@ -338,7 +338,7 @@ def _columns(
                 value = float("nan") if p.value is None else p.value
             numbers.append(np.asarray(value, dtype=np.float64))
         with np.errstate(all="ignore"):  # a law may overflow far out, where it is not a start
-            return view.of(d.element, numbers, at_nodes=bool(values))
+            return view.stiffness_of(d.element, numbers, at_nodes=bool(values))
 
     columns = []
     if not d.linear:

@@ -97,7 +97,7 @@ class Relations:
 
         if constraints is None:
             return cls((), (), None)
-        symbols = _Symbols((p.name, ca.SX.sym(p.name)) for p in problem.every_parameter)
+        symbols = _Symbols((p.name, ca.SX.sym(p.name)) for p in problem.all_parameters)
         free = ca.vertcat(*(symbols[name] for name in problem.names))
         texts, equal, differences = [], [], []
         for index, item in enumerate(_comparisons(constraints, symbols)):
@@ -128,7 +128,7 @@ class Relations:
         if self.differences is None:
             return ca.SX(0, 1)
         values = []
-        for parameter in problem.every_parameter:
+        for parameter in problem.all_parameters:
             if parameter.name in problem.names:
                 index = problem.names.index(parameter.name)
                 values.append(problem.space.value(index, theta[index], ca))
@@ -253,7 +253,7 @@ class _Descent:
 
     def __init__(self, problem: Problem, relations: Relations, loss: str, scale: float) -> None:
         self.problem, self.relations, self.scale = problem, relations, scale
-        self.loss = loss_named(loss, problem.parts)
+        self.loss = loss_named(loss, problem.residuals_per_row)
         self.evaluations = 0
 
     @property
@@ -261,7 +261,7 @@ class _Descent:
         """Degrees of freedom of the residuals; every equality adds one."""
         problem = self.problem
         free = len(problem.names) - sum(self.relations.equal)
-        return problem.n_numbers + len(problem.priors) - free
+        return problem.n_nonzero + len(problem.priors) - free
 
     def at(self, theta: FloatArray) -> Quadratic:
         """Return half the sum of losses at theta, with its derivatives."""

@@ -348,7 +348,7 @@ def minimise_by_scipy(
             return np.full((1 + theta.size, m + problem.n_priors), np.nan)
         at = problem.rows(theta, scale, tails=loss is None)
         if loss is not None:
-            at = bend(at, m, loss, problem.parts)
+            at = bend(at, m, loss, problem.residuals_per_row)
         if not np.isfinite(at).all():
             at[0] = np.nan  # scipy then rejects the step
         return at

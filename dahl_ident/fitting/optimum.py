@@ -207,7 +207,7 @@ class Optimum:
         With a robust loss, the density is the one proportional to exp(-rho/2).
         """
         problem = self.problem
-        loss = loss_named(self.loss, problem.parts)
+        loss = loss_named(self.loss, problem.residuals_per_row)
         if loss is None:
             return float(problem.log_likelihood(self.theta))
         z, scale = problem.squares(self.theta, tails=False), None
@@ -227,11 +227,11 @@ class Optimum:
     @property
     def bic(self) -> float:
         """Schwarz's criterion, -2 ln L + k ln n, for n residuals and k as in `aic`."""
-        return -2.0 * self.log_likelihood + float(np.log(self.problem.n_numbers)) * self._counted
+        return -2.0 * self.log_likelihood + float(np.log(self.problem.n_nonzero)) * self._counted
 
     @property
     def _counted(self) -> int:
-        determined: int = self.problem.n_numbers + self.problem.n_priors - self.dof
+        determined: int = self.problem.n_nonzero + self.problem.n_priors - self.dof
         return determined + (not self.scale_known)
 
     @property
@@ -438,7 +438,7 @@ def information_of(
     m = problem.n_residuals
     kappa = 1.0
     if not _is_rounding(problem, scale):
-        kappa = loss.inflation((r[:m] ** 2).reshape(-1, problem.parts).sum(axis=1), dof)
+        kappa = loss.inflation((r[:m] ** 2).reshape(-1, problem.residuals_per_row).sum(axis=1), dof)
     return np.asarray(J[:m].T @ J[:m] / kappa + J[m:].T @ J[m:])
 
 

@@ -109,7 +109,7 @@ def solve_repetitions(
         drawn = [size * rng.standard_normal(y.size + _SETTLING) for y in outputs]
         errors = [lfilter([1.0], noise, e)[_SETTLING:] for e in drawn]
         noisy = tuple(y + e for y, e in zip(outputs, errors, strict=True))
-        repetition = problem.altered(sizes=problem.sizes, measured=noisy)
+        repetition = problem.altered(output_std=problem.output_std, measured=noisy)
         end = search.descend(repetition, optimum.theta, STEPS)
         if end.converged[0]:
             theta[row] = end.theta[0]
@@ -299,7 +299,7 @@ class RecordSearch:
         before = share_in_band(drives, problem.measured, residuals)
         white, end = problem, plain
         for _ in range(_REPEATS):
-            white = white.weighted(prediction_error_filter(residuals))
+            white = white.with_whitening(prediction_error_filter(residuals))
             theta = end.theta
             end = self.minimise(white, theta, STEPS)
             if not end.converged[0]:
@@ -317,7 +317,7 @@ class RecordSearch:
         """Return the Gauss-Newton step of the delay, s, and the fall of the sum of squares."""
         residual, jacobian = problem.residuals_and_jacobian(theta)
         waves = problem.delay_slopes(problem.to_values(theta))
-        slope = np.concatenate([problem.filtered(wave / -problem.sizes[0]) for wave in waves])
+        slope = np.concatenate([problem.filtered(wave / -problem.output_std) for wave in waves])
         columns = np.column_stack([jacobian, np.pad(slope, (0, len(residual) - len(slope)))])
         normal, size = unit_diagonal(columns.T @ columns)
         self.evaluations += 1 if problem.output == "motion" else 3
@@ -357,7 +357,7 @@ class RecordSearch:
             cost, _, hessian = problem.quadratic(theta, self.scale, self.rho)
             end = replace(end, theta=theta, cost=cost, hessian=hessian)
         end = replace(end, evaluations=np.array([self.evaluations]))
-        rho = loss_named(self.loss, problem.parts)
+        rho = loss_named(self.loss, problem.residuals_per_row)
         return optima(problem, end, self.scale, rho, self.method)[0]
 
     def freed(self, problem: RecordProblem, fixed: Minima) -> tuple[RecordProblem, Minima]:
@@ -389,7 +389,7 @@ class RecordSearch:
 
     def robust(self, problem: RecordProblem, plain: Minima) -> Minima:
         """Return the end of searches with a robust loss, and estimate the noise's scale."""
-        self.rho, end = loss_named(self.loss, problem.parts), plain
+        self.rho, end = loss_named(self.loss, problem.residuals_per_row), plain
         dof = problem.n_residuals - plain.theta.shape[1]
 
         def again(scale: float) -> tuple[FloatArray, int]:

@@ -305,7 +305,7 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
     full = np.zeros(len(problem.parameters))
     full[: len(values)] = values
     for number, measured in enumerate(problem.measured):
-        of_record = problem.own(full, number)
+        of_record = problem.record_values(full, number)
         if problem.output == "motion":
             x, v, _ = in_band(problem.records[number], measured)
             of_record[0], of_record[1] = x[0], v[0]
@@ -318,7 +318,7 @@ def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:
 
 def _load_springs(problem: RecordProblem, full: FloatArray, number: int) -> None:
     """Set the initial loads of laws with several springs to match the record's first samples."""
-    of_record, start = problem.own(full, number), 2 if problem.output == "motion" else 0
+    of_record, start = problem.record_values(full, number), 2 if problem.output == "motion" else 0
 
     def misfit() -> float:
         try:

@@ -113,7 +113,9 @@ def _solve_table(
     problem: TableProblem, method: str, loss: str, start: Mapping[str, float], *, limits: bool
 ) -> Optimum:
     """Return the optimum of one table."""
-    search = TableSearch(problem, loss_named(loss, problem.parts), method=method, limits=limits)
+    search = TableSearch(
+        problem, loss_named(loss, problem.residuals_per_row), method=method, limits=limits
+    )
     stated = [p.value for p in problem.parameters if p.value is not None]
     if not limits and len(stated) == len(problem.parameters):
         return search.run(Starts(np.zeros(1, np.intp), problem.to_search(stated)[None]))[0]

@@ -12,7 +12,7 @@ known, after division by scale^2 where it is not.
 """
 
 from dahl_ident.problem.base import EXPLICIT, Problem, Quadratic
-from dahl_ident.problem.from_data import ProblemBatch, kind_of, problem_of, refuse_options
+from dahl_ident.problem.from_data import ProblemBatch, problem_class, problem_of, refuse_options
 from dahl_ident.problem.prediction import Prediction
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.table_problem import TableProblem
@@ -25,7 +25,7 @@ __all__ = [
     "Quadratic",
     "RecordProblem",
     "TableProblem",
-    "kind_of",
+    "problem_class",
     "problem_of",
     "refuse_options",
 ]

@@ -1,4 +1,4 @@
-"""What every search, sampler and test uses of a problem, for tables and for records."""
+"""The interface of problems, of tables and of records, for every search, sampler and test."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ class Problem(ABC):
     """Residuals as functions of search coordinates, and what is known of their noise."""
 
     arguments: ClassVar[tuple[str, ...]]
-    """Names of the class's arguments; each is also an attribute."""
+    """Names of the constructor's arguments; each is also an attribute."""
     kind: ClassVar[str]
-    """The kind of data: "table" or "records"; `called` names it in a sentence."""
-    called: ClassVar[str]
-    refused: ClassVar[Mapping[str, str]]
+    """The kind of data: "table" or "records"."""
+    kind_in_words: ClassVar[str]
+    """The kind of data as a sentence names it."""
+    refused_options: ClassVar[Mapping[str, str]]
     """Options of estimates that such data do not take, and why."""
     around_optimum: ClassVar[bool] = False
     """Whether a posterior is centred on the least-squares optimum, which then has to exist."""
@@ -50,14 +51,14 @@ class Problem(ABC):
     space: Space
     motion: Motion
     n_residuals: int
-    """Number of residuals of the data; those of priors are added."""
-    n_numbers: int
+    """Number of residuals of the data, without those of priors."""
+    n_nonzero: int
     """Number of residuals that can differ from zero."""
     runs: tuple[Any, ...]
     """The run of each row or record."""
     sensors: Sensors = EXACT
-    parts: int = 2
-    """Residuals of each row, which count in a robust loss as one."""
+    residuals_per_row: int = 2
+    """Number of residuals that a robust loss takes together."""
     priors: Mapping[str, Prior] = {}
     """Priors of free sensor parameters."""
     ranges: Mapping[str, tuple[float, float]] = {}
@@ -65,28 +66,28 @@ class Problem(ABC):
     scale_known: bool = False
     """Whether the residuals have unit variance as they are."""
     has_misfit: bool = False
-    """Whether covariances hold a misfit in addition to the stated noise."""
+    """Whether covariances include a misfit in addition to the stated noise."""
     tail: Rho | None = None
-    """The loss of rows whose covariance has few degrees of freedom; else they are Gaussian."""
-    repetitions: int = 4999
-    """That are simulated: seven of them lie beyond either limit of the 99.73 % interval."""
+    """The loss of rows whose covariance has few degrees of freedom; None if they are Gaussian."""
+    n_simulations: int = 4999
+    """Number of simulated experiments: seven lie beyond either limit of the 99.73 % interval."""
 
     @property
     def gaussian(self) -> bool:
-        """Whether residuals are Gaussian; not where a covariance has few degrees of freedom."""
+        """Whether residuals are Gaussian: no covariance has few degrees of freedom."""
         return self.tail is None
 
     @property
     def response(self) -> FrequencyResponse | None:
-        """The table, where the data are one."""
+        """The table, if the data are one."""
         return None
 
     @abstractmethod
-    def at(self, table: FrequencyResponse) -> Any:
-        """Return what model and sensors predict for a table, its covariance left out."""
+    def for_table(self, table: FrequencyResponse) -> Any:
+        """Return the problem of the same model and sensors for a table, without its covariance."""
 
-    def unpredicted(self, residuals: FloatArray) -> str:
-        """Return why residuals are not finite; nothing where they are."""
+    def why_not_finite(self, residuals: FloatArray) -> str:
+        """Return why residuals are not finite; empty if they are."""
         return ""
 
     @property
@@ -96,14 +97,14 @@ class Problem(ABC):
 
     @property
     def n_reported(self) -> int:
-        """How many parameters, the first ones, are those of the device."""
+        """Number of free parameters of model and sensors; unknowns of records follow them."""
         return len(self.names)
 
     @property
-    def of_device(self) -> tuple[str, ...]:
+    def device_parameters(self) -> tuple[str, ...]:
         """Names of the parameters of model and sensors, fixed ones included."""
-        added = self.names[self.n_reported :]
-        return tuple(p.name for p in self.every_parameter if p.name not in added)
+        of_records = self.names[self.n_reported :]
+        return tuple(p.name for p in self.all_parameters if p.name not in of_records)
 
     @property
     @abstractmethod
@@ -122,7 +123,7 @@ class Problem(ABC):
 
     @abstractmethod
     def unit_sizes(self, dimension: Dimension) -> FloatArray:
-        """Return sizes that a unit has in the data, by powers of force, displacement and time."""
+        """Return the sizes in the data of a unit with these powers of force, length and time."""
 
     @property
     @abstractmethod
@@ -137,7 +138,7 @@ class Problem(ABC):
         return 1
 
     def take(self, tables: IntArray | slice) -> Self:
-        """Return this problem: one table stands for as many as are asked for."""
+        """Return this problem: all the tables of a search are this one."""
         return self
 
     def table(self, index: int) -> Any:
@@ -157,7 +158,7 @@ class Problem(ABC):
         return self.space.names
 
     @property
-    def every_parameter(self) -> tuple[Parameter, ...]:
+    def all_parameters(self) -> tuple[Parameter, ...]:
         """The parameters of model and sensors, fixed ones included."""
         sensors = () if self.sensors.are_exact else self.sensors.parameters
         return (*self.model.parameters, *sensors)
@@ -184,11 +185,11 @@ class Problem(ABC):
         return self.space.is_bounded
 
     def near(self, theta: FloatArray) -> Problem:
-        """Return a faster problem that predicts as this one does near theta, if there is one."""
+        """Return a faster problem with nearly the same predictions near theta, if there is one."""
         return self
 
     def in_order(self, theta: ArrayLike) -> FloatArray:
-        """Return theta with interchangeable elements in order, where there are some."""
+        """Return theta with interchangeable elements, if any, in order."""
         return self.space.checked(theta)
 
     def like(self, **changes: Any) -> Self:
@@ -196,7 +197,7 @@ class Problem(ABC):
         return type(self)(**{name: getattr(self, name) for name in self.arguments} | changes)
 
     def altered(self, *stale: str, **changes: Any) -> Self:
-        """Return this problem with other attributes, without the `stale` ones that it computed."""
+        """Return this problem with other attributes, and without the cached `stale` ones."""
         changed = copy(self)
         for name in stale:
             changed.__dict__.pop(name, None)
@@ -205,7 +206,7 @@ class Problem(ABC):
 
     @abstractmethod
     def fitted(self, theta: FloatArray) -> Any:
-        """Return what should have been measured: a response, or a wave for each record."""
+        """Return the predicted measurement: a response, or a wave for each record."""
 
     # Residuals
 
@@ -213,20 +214,20 @@ class Problem(ABC):
         """Return residuals and their derivatives, (..., 1 or 1 + P, m), with those of priors."""
         if not self.n_priors:
             return rows
-        more = np.zeros((*rows.shape[:-1], self.n_priors))
+        prior_rows = np.zeros((*rows.shape[:-1], self.n_priors))
         values = self.space.to_values(theta)
         slopes = self.space.slopes(values)
-        known = [(name, _normal_moments(name, prior)) for name, prior in self.priors.items()]
-        known += self.ranges.items()
-        for place, (name, (mean, std)) in enumerate(known):
+        moments = [(name, _normal_moments(name, prior)) for name, prior in self.priors.items()]
+        moments += self.ranges.items()
+        for column, (name, (mean, std)) in enumerate(moments):
             index = self.names.index(name)
-            at, slope = values[..., index], slopes[..., index]
+            value, slope = values[..., index], slopes[..., index]
             if name in self.ranges:
-                at, slope = np.log(np.abs(at)), slope / at
-            more[..., 0, place] = (at - mean) / std
+                value, slope = np.log(np.abs(value)), slope / value
+            prior_rows[..., 0, column] = (value - mean) / std
             if rows.shape[-2] > 1:
-                more[..., 1 + index, place] = slope / std
-        return np.concatenate([rows, more], axis=-1)
+                prior_rows[..., 1 + index, column] = slope / std
+        return np.concatenate([rows, prior_rows], axis=-1)
 
     @property
     @abstractmethod
@@ -256,7 +257,7 @@ class Problem(ABC):
         derivatives: bool = True,
         tails: bool = True,
     ) -> FloatArray:
-        """Return the same over the noise's scale, () or (S,), followed by the rows of priors."""
+        """Return ``data_rows`` over the noise's scale, () or (S,), followed by those of priors."""
         rows = self.data_rows(theta, derivatives=derivatives, tails=tails)
         size = np.asarray(scale)[..., None, None]
         if self.scaled_priors:
@@ -277,8 +278,8 @@ class Problem(ABC):
         Derivatives are with respect to theta, or with `chart` = dtheta/dphi, (P, Q) or (S, P, Q),
         with respect to phi.
 
-        Cost of shape () or (S,), infinite where there is no prediction. Where rows count as
-        rho(z), the gradient is exact and the Hessian is that of rho at a linear model,
+        The cost has shape () or (S,), and is infinite where there is no prediction. With a loss
+        rho(z) of each row, the gradient is exact, and the Hessian that of rho for a linear model,
         rho' d' d + 2 rho'' (y' d)(y' d)', as far as that is positive.
         """
         rho = rho or self.tail
@@ -287,23 +288,24 @@ class Problem(ABC):
         if chart is not None:
             r, J = rows[..., :1, :], rows[..., 1:, :]
             rows = np.concatenate([r, chart.swapaxes(-1, -2) @ J], axis=-2)
-        with np.errstate(over="ignore", invalid="ignore"):  # far out a law may overflow
+        with np.errstate(over="ignore", invalid="ignore"):  # a law may overflow at extreme theta
             if rho is None:
                 products = rows @ rows.swapaxes(-1, -2)
                 cost = 0.5 * products[..., 0, 0]
             else:
-                z = squares_of(rows[..., 0, :m], self.parts)
+                z = squares_of(rows[..., 0, :m], self.residuals_per_row)
                 loss, slope, curvature = rho(z)
                 cost = 0.5 * (loss.sum(axis=-1) + (rows[..., 0, m:] ** 2).sum(axis=-1))
                 along = np.maximum(2.0 * curvature, -slope / np.maximum(z, 1e-300))
-                products = weighted(rows, m, slope, along, self.parts) @ rows.swapaxes(-1, -2)
+                weighted_rows = weighted(rows, m, slope, along, self.residuals_per_row)
+                products = weighted_rows @ rows.swapaxes(-1, -2)
         cost = np.where(cost < np.inf, cost, np.inf)
         return Quadratic(cost, products[..., 0, 1:], products[..., 1:, 1:])
 
     def residuals(self, theta: ArrayLike, scale: ArrayLike = 1.0) -> FloatArray:
         """Return the whitened residuals, measured minus predicted, over `scale`, (m,) or (S, m).
 
-        Then (value - mean)/std of each prior.
+        They are followed by (value - mean)/std of each prior.
         """
         return self.rows(self.space.checked(theta), scale, derivatives=False)[..., 0, :]
 
@@ -321,34 +323,35 @@ class Problem(ABC):
     def squares(self, theta: FloatArray, *, tails: bool = True) -> FloatArray:
         """Return the sum of squared residuals of every row, (..., n), without priors, unchecked."""
         with np.errstate(over="ignore"):
-            return squares_of(self.whitened(theta, tails=tails), self.parts)
+            return squares_of(self.whitened(theta, tails=tails), self.residuals_per_row)
 
     @property
     @abstractmethod
     def log_area(self) -> Any:
-        """Return ln of the size of the residuals' units, in those of the data."""
+        """Return ln of the volume of a unit cube of residuals, in the units of the data."""
 
     def log_likelihood(self, theta: ArrayLike, scale: ArrayLike | None = None) -> FloatArray:
         """Return ln of the density of the data: of Re R and Im R of every row, or of samples.
 
-        `scale` is the noise's, where it is unknown: the standard deviation of ln gain and of phase
-        (rad) for "relative", of Re R and Im R for "absolute", of samples over `sizes` for records.
-        Left out, it is that of the highest likelihood, (sum of squares / n_residuals)^(1/2), at
-        each theta.
+        `scale` is that of the noise, if unknown: the standard deviation of ln gain and of phase
+        (rad) for "relative", of Re R and Im R for "absolute", of samples over `output_std` for
+        records. By default it maximizes the likelihood at each theta:
+        (sum of squares / n_residuals)^(1/2).
 
-        Priors are not included; -inf where the model has no prediction. All noise models give
-        densities of the same numbers, so their likelihoods compare. Where a covariance has few
-        degrees of freedom it is a likelihood up to a constant: the loss of :mod:`dahl_ident.noise`
-        in place of the sum of squares. Residuals of records count as independent once they are
-        filtered.
+        Priors are not included; the result is -inf where the model has no prediction. All noise
+        models give densities of the same numbers, so their likelihoods can be compared. If a
+        covariance has few degrees of freedom, the result is a likelihood up to a constant: the loss
+        of :mod:`dahl_ident.noise` replaces the sum of squares. The filtered residuals of records
+        count as independent.
         """
         theta = self.space.checked(theta)
         if self.scale_known and scale is not None:
             raise ValidationError("scale is given, but the noise has a known scale; leave it out")
         total, m = self.squares(theta).sum(axis=-1), self.n_residuals
-        s2 = np.asarray(1.0 if scale is None else scale) ** 2
-        if scale is None and not self.scale_known:
-            s2 = total / m
+        if scale is None:
+            s2 = np.asarray(1.0) if self.scale_known else total / m
+        else:
+            s2 = np.asarray(scale) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             result = self.log_area - 0.5 * (m * np.log(2.0 * np.pi * s2) + total / s2)
         return np.where(np.isnan(result), -np.inf, result)[()]
@@ -366,6 +369,6 @@ def _normal_moments(name: str, prior: Prior) -> tuple[float, float]:
     if kind != "norm":
         raise ValidationError(
             f"the prior of {name} is {kind}; least squares takes normal priors "
-            "(scipy.stats.norm), any other needs sampling"
+            "(scipy.stats.norm); any other needs sampling"
         )
     return float(prior.mean()), float(prior.std())

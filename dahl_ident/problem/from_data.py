@@ -1,4 +1,4 @@
-"""Problems for all kinds of data: a table, records, many tables of one shape."""
+"""Problems from data of all kinds: a table, records, many tables of one shape."""
 
 from __future__ import annotations
 
@@ -27,19 +27,24 @@ if TYPE_CHECKING:
     from dahl_ident.problem.record_waves import Output
 
 
-def kind_of(data: object) -> type[TableProblem] | type[RecordProblem]:
-    """Return the class of the problem that data make."""
-    is_table = isinstance(data, FrequencyResponse) or hasattr(data, "iloc")  # without pandas
+def problem_class(data: object) -> type[TableProblem] | type[RecordProblem]:
+    """Return the class of the problem for some data."""
+    # pandas has iloc; it is not imported, because that is slow
+    is_table = isinstance(data, FrequencyResponse) or hasattr(data, "iloc")
     return TableProblem if is_table else RecordProblem
 
 
-def refuse_options(kind: type[Problem], options: Mapping[str, Any], of: Callable[..., Any]) -> None:
-    """Refuse options that a kind of data does not take, unless they are as they are in `of`."""
-    usual = signature(of).parameters
-    for name, reason in kind.refused.items():
-        if name in options and options[name] != usual[name].default:
-            named = argument(name).rstrip("=")
-            raise ValidationError(f"{named} is given with {kind.called}: {reason}; leave it out")
+def refuse_options(
+    problem: type[Problem], options: Mapping[str, Any], function: Callable[..., Any]
+) -> None:
+    """Refuse options that such data do not take, unless they are at the function's defaults."""
+    parameters = signature(function).parameters
+    for name, reason in problem.refused_options.items():
+        if name in options and options[name] != parameters[name].default:
+            option = argument(name).rstrip("=")
+            raise ValidationError(
+                f"{option} is given with {problem.kind_in_words}: {reason}; leave it out"
+            )
 
 
 def problem_of(
@@ -54,8 +59,8 @@ def problem_of(
     output: Output | None = None,
     excitation: Excitation = "force",
 ) -> Any:
-    """Return the problem of a table, in memory of pandas too, of a record or of several."""
-    if kind_of(data) is TableProblem:
+    """Return the problem of a table, which may be a pandas one, of a record or of several."""
+    if problem_class(data) is TableProblem:
         table = data if isinstance(data, FrequencyResponse) else read_frequency_response(data)
         return TableProblem(
             without_copies(table),
@@ -78,7 +83,7 @@ def problem_of(
 def without_copies(data: FrequencyResponse) -> FrequencyResponse:
     """Return a table without exact copies of other rows, which add no information.
 
-    Its provenance says how many there were.
+    Its provenance states their number.
 
     Examples
     --------
@@ -93,16 +98,16 @@ def without_copies(data: FrequencyResponse) -> FrequencyResponse:
     copies = data.n - len(first)
     if not copies:
         return data
-    known = dict(data.provenance or {})
-    are = "is a copy of another" if copies == 1 else "are copies of others"
-    text = f"{copies} of {data.n} rows {are}, identical to the digit: copies are left out"
-    known["warnings"] = [*known.get("warnings", ()), text]
-    kept = np.isin(np.arange(data.n), first)
-    return replace(data.select(rows=kept), provenance=known)
+    provenance = dict(data.provenance or {})
+    verb = "is a copy of another" if copies == 1 else "are copies of others"
+    text = f"{copies} of {data.n} rows {verb}, identical to the digit: copies are left out"
+    provenance["warnings"] = [*provenance.get("warnings", ()), text]
+    is_first = np.isin(np.arange(data.n), first)
+    return replace(data.select(rows=is_first), provenance=provenance)
 
 
 class ProblemBatch(TableProblem):
-    """The same estimate for S tables: theta has shape (S, P), one row for each table.
+    """The same estimate for S tables.
 
     Every method of :class:`TableProblem` takes theta of shape (S, P) and applies row s to table s.
     The tables have the same number of rows, quantity, harmonics and controlled variable.
@@ -124,8 +129,8 @@ class ProblemBatch(TableProblem):
 
     def _checked(self, data: Any) -> list[FrequencyResponse]:
         if isinstance(data, FrequencyResponse) or not len(data):
-            shown = "one table" if isinstance(data, FrequencyResponse) else "empty"
-            raise DataError(f"data is {shown}; expected a sequence of at least one")
+            fault = "one table" if isinstance(data, FrequencyResponse) else "empty"
+            raise DataError(f"data is {fault}; expected a sequence of at least one table")
         return [checked_table(table) for table in data]
 
     def _rows_of(self, tables: list[FrequencyResponse]) -> Rows:
@@ -137,7 +142,7 @@ class ProblemBatch(TableProblem):
     def replicates(cls, problem: TableProblem, responses: ComplexArray) -> ProblemBatch:
         """Return `problem` with each of S sets of responses, shape (S, n), as the data.
 
-        Everything else, covariance included, stays as it is.
+        Everything else, including the covariance, stays the same.
         """
         n = problem.n_residuals // 2
         if responses.ndim != 2 or responses.shape[1] != n:
@@ -154,7 +159,7 @@ class ProblemBatch(TableProblem):
     def table(self, index: int) -> TableProblem:
         """Return the problem of one table."""
         problem = self._with_rows(TableProblem, self._rows.take(index))
-        if "tables" in self.__dict__:  # replicates are responses alone
+        if "tables" in self.__dict__:  # replicates have responses only
             problem.data = self.tables[index]
         return problem
 

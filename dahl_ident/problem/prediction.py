@@ -1,4 +1,4 @@
-"""From parameters to the response that a table holds, with exact derivatives.
+"""From parameters to the response in a table, with exact derivatives.
 
 The model gives the dynamic stiffness Z_k(A, omega) = F_k/X_1. From it follow, with the sensors'
 factor g (see :mod:`dahl_ident.sensors`), all six quantities:
@@ -11,11 +11,11 @@ derivatives come from the implicit function theorem,
 
     d ln A = (d ln u_0 - Re(dZ/Z)) / (1 + Re(A Z_A/Z)).
 
-The measured amplitude of such a row serves only to choose among several solutions.
+The measured amplitude of such a row only serves to choose among several solutions.
 
-That balance assumes a sinusoidal displacement. Where the model has an equation of motion, and
-unless the describing function was asked for, rows whose force was controlled are predicted by the
-exact steady motion instead (:mod:`dahl_ident.problem.steady_rows`).
+That balance assumes a sinusoidal displacement. If the model has an equation of motion, rows whose
+force was controlled are predicted by the exact steady motion instead
+(:mod:`dahl_ident.problem.steady_rows`), unless the describing function was requested.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ _NONE: ComplexArray = np.zeros((), dtype=np.complex128)
 
 
 class Prediction(NamedTuple):
-    """The response R, its derivatives with respect to theta, and to ln A (explicit rows)."""
+    """The response R, and its derivatives with respect to theta and to ln A or ln u_0."""
 
     value: ComplexArray
-    changes: list[ComplexArray]
+    by_theta: list[ComplexArray]
     by_ln_amplitude: ComplexArray
 
     @property
     def arrays(self) -> list[ComplexArray]:
         """The response, and its derivatives with respect to ln A and to theta."""
-        return [self.value, self.by_ln_amplitude, *self.changes]
+        return [self.value, self.by_ln_amplitude, *self.by_theta]
 
     @classmethod
     def of(cls, arrays: list[ComplexArray]) -> Prediction:
@@ -62,27 +62,28 @@ class Prediction(NamedTuple):
         return cls(arrays[0], arrays[2:], arrays[1])
 
 
-class Nearby:
-    """The prediction near a point: that of the describing function, corrected to the exact one.
+class NearbyPredictor:
+    """The prediction near a point: the describing function, corrected to the exact motion.
 
-    The logarithm of the ratio of both is taken as linear in the search coordinates and in the
-    logarithm of the drive. The error is of second order in the distance, and small, because only
-    the correction is linearized. It costs as much as the describing function. Harmonics of the
-    displacement, which the describing function does not have, are taken as linear.
+    The logarithm of the exact over the approximate response is linearized in the search coordinates
+    and in the logarithm of the drive. The error is of second order in the distance, and small,
+    because only the correction is linearized. A prediction costs as much as the describing
+    function. Harmonics of the displacement, which the describing function does not have, are
+    linearized themselves.
     """
 
     def __init__(self, exact: Predictor, approximate: Predictor, theta: FloatArray) -> None:
         self._approximate, self._theta = approximate, theta
-        at, near = exact(theta), approximate(theta)
-        self._alone = alone = exact.rows.of_displacement
-        self._correction = np.where(alone, at.value, np.log(at.value / near.value))
+        a, b = exact(theta), approximate(theta)
+        self._linear = linear = exact.rows.of_displacement  # rows that are linearized themselves
+        self._correction = np.where(linear, a.value, np.log(a.value / b.value))
         self._slopes = [
-            np.where(alone, a, a / at.value - b / near.value)
-            for a, b in zip(at.changes, near.changes, strict=True)
+            np.where(linear, da, da / a.value - db / b.value)
+            for da, db in zip(a.by_theta, b.by_theta, strict=True)
         ]
-        level = at.by_ln_amplitude / at.value - near.by_ln_amplitude / near.value
-        level = np.where(alone, at.by_ln_amplitude, level)
-        self._by_level = np.where(exact.rows.forced, level, 0.0)
+        slope = a.by_ln_amplitude / a.value - b.by_ln_amplitude / b.value
+        slope = np.where(linear, a.by_ln_amplitude, slope)
+        self._drive_slope = np.where(exact.rows.forced, slope, 0.0)
 
     def __call__(
         self,
@@ -92,24 +93,24 @@ class Nearby:
         amplitude_error: FloatArray | None = None,
     ) -> Prediction:
         """Return the prediction, as a predictor does."""
-        near = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
-        alone, change = self._alone, self._correction
-        for place, slope in enumerate(self._slopes):
-            change = change + slope * (theta[..., place, None] - self._theta[place])
+        sine = self._approximate(theta, derivatives=derivatives, amplitude_error=amplitude_error)
+        linear, correction = self._linear, self._correction
+        for i, slope in enumerate(self._slopes):
+            correction = correction + slope * (theta[..., i, None] - self._theta[i])
         if amplitude_error is not None:
-            change = change - self._by_level * amplitude_error
+            correction = correction - self._drive_slope * amplitude_error
         with np.errstate(over="ignore", invalid="ignore"):
-            factor = np.exp(change)
-            value = np.where(alone, change, near.value * factor)
-            size = np.where(alone, 1.0, value)
-            changes = [
-                np.where(alone, 0.0, d * factor) + size * slope
-                for d, slope in zip(near.changes, self._slopes, strict=False)
+            factor = np.exp(correction)
+            value = np.where(linear, correction, sine.value * factor)
+            scale = np.where(linear, 1.0, value)
+            by_theta = [
+                np.where(linear, 0.0, d * factor) + scale * slope
+                for d, slope in zip(sine.by_theta, self._slopes, strict=False)
             ]
-            level = near.by_ln_amplitude
+            by_level = sine.by_ln_amplitude
             if derivatives:
-                level = np.where(alone, 0.0, level * factor) + size * self._by_level
-        return Prediction(value, changes, level)
+                by_level = np.where(linear, 0.0, by_level * factor) + scale * self._drive_slope
+        return Prediction(value, by_theta, by_level)
 
     def as_stiffness(
         self, weights: FloatArray, predicted: ComplexArray | None = None
@@ -130,11 +131,11 @@ class _Group:
     amplitude: FloatArray
     drive: FloatArray | None
     steady: SteadyRows | None
-    """Steady motions of rows that are predicted by these."""
+    """Steady motions of the rows, if these predict them."""
 
     @cached_property
     def orders(self) -> int | NDArray[np.int64]:
-        """The harmonic of each row, or that of all."""
+        """The harmonic of each row, or one number if they have the same."""
         first = int(self.harmonic[0])
         return first if (self.harmonic == first).all() else self.harmonic
 
@@ -143,7 +144,7 @@ class Predictor:
     """Prediction of a model with its sensors for the operating points of `rows`.
 
     `shooting` solves for the exact steady motion of rows whose force was controlled; without it
-    the describing function does. It starts from `orbits`, which are kept up to date.
+    they are predicted by the describing function. It starts from `orbits`, which it updates.
     """
 
     def __init__(
@@ -158,14 +159,14 @@ class Predictor:
         self._model, self._sensors, self._space = model, sensors, space
         self._shooting = shooting
         self._orbits = {} if orbits is None else orbits
-        self._neutral = sensors.are_exact
+        self._exact_sensors = sensors.are_exact
         names = space.names
         self._slots = [_slot(p, names) for p in (*model.parameters, *sensors.parameters)]
         self.rows = rows
         _check(rows, self._model)
         power, self._exponent = DEFINITIONS[rows.quantity]
         self._operator = power_of_s(rows.omega, power)
-        self._guess = _measured_amplitude(rows, self._operator, self._exponent)
+        self._measured = _measured_amplitude(rows, self._operator, self._exponent)
         self._groups = [
             _Group(
                 part,
@@ -173,11 +174,11 @@ class Predictor:
                 forced,
                 rows.omega[..., part],
                 self._operator[..., part],
-                self._guess[..., part],
+                self._measured[..., part],
                 None if rows.drive is None else rows.drive[..., part],
                 self._steady_rows(part) if forced else None,
             )
-            for part, forced in _parts(rows)
+            for part, forced in _rows_by_control(rows)
         ]
 
     def unstable_rows(self, theta: FloatArray) -> list[int]:
@@ -199,11 +200,11 @@ class Predictor:
         with np.errstate(divide="ignore", invalid="ignore"):
             measured = rows.drive * (ratio if self._exponent == -1 else 1.0 / ratio)
         drive, omega = np.broadcast_arrays(rows.drive, rows.omega)
-        every = np.arange(rows.n)
-        first = np.atleast_2d(np.where(rows.of_displacement, rows.fundamental, every))[0]
+        indices = np.arange(rows.n)
+        fundamental = np.atleast_2d(np.where(rows.of_displacement, rows.fundamental, indices))[0]
         return SteadyRows(
             self._model, self._shooting, drive[..., part], omega[..., part], measured[..., part],
-            rows.harmonic[part], np.searchsorted(every[part], first[part]), self._orbits,
+            rows.harmonic[part], np.searchsorted(indices[part], fundamental[part]), self._orbits,
         )  # fmt: skip
 
     def as_stiffness(
@@ -211,8 +212,9 @@ class Predictor:
     ) -> StiffnessData:
         """Return the data as dynamic stiffness; `weights` are those of the response.
 
-        With `predicted` responses in place of the measured ones, driven amplitudes are theirs too.
-        A harmonic of the displacement stands for its fundamental, without a weight.
+        With `predicted` responses in place of the measured ones, amplitudes of force-controlled
+        rows are predicted too. A harmonic of the displacement is replaced by its fundamental, with
+        a weight of zero.
         """
         rows = self.rows
         response = _fundamental(rows, rows.response if predicted is None else predicted)
@@ -220,13 +222,13 @@ class Predictor:
         weights = np.where(rows.of_displacement, 0.0, weights)
         ratio = response / self._operator
         Z = ratio if self._exponent == 1 else 1.0 / ratio
-        amplitude = self._guess
+        amplitude = self._measured
         if predicted is not None and rows.drive is not None:
             amplitude = np.where(rows.forced, rows.drive / np.abs(Z), amplitude)
-        if not self._neutral:
-            starts = [np.asarray(p.value) for p in self._sensors.parameters]
-            Z = Z / measured_stiffness_factor(starts, rows.omega, harmonic)
-            amplitude = amplitude / starts[1]
+        if not self._exact_sensors:
+            sensor_values = [np.asarray(p.value) for p in self._sensors.parameters]
+            Z = Z / measured_stiffness_factor(sensor_values, rows.omega, harmonic)
+            amplitude = amplitude / sensor_values[1]
         if rows.quantity != "dynamic_stiffness":
             weights = weights * np.abs(response / Z)
         return StiffnessData(Z, amplitude, rows.omega, harmonic, weights)
@@ -240,9 +242,9 @@ class Predictor:
     ) -> Prediction:
         """Return the response and its derivatives at search coordinates, (P,) or (S, P).
 
-        With as many `derivatives` as are asked for: 0 none, 1 that with respect to ln A, 2 all.
-        `amplitude_error` is the error of ln A, or of ln of the drive where that is controlled:
-        the true one is the measured one over its exponential.
+        `derivatives` is 0 for none, 1 for that with respect to ln A, 2 for all. `amplitude_error`
+        is the error of ln A, or of ln u_0 in force-controlled rows: the true value is the measured
+        one over its exponential.
         """
         values = self._values(theta)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
@@ -252,14 +254,14 @@ class Predictor:
         if len(parts) == 1:
             return parts[0]
         shape = np.broadcast_shapes((*theta.shape[:-1], 1), self.rows.response.shape)
-        whole = [np.empty(shape, dtype=np.complex128) for _ in parts[0].arrays]
+        arrays = [np.empty(shape, dtype=np.complex128) for _ in parts[0].arrays]
         for group, part in zip(self._groups, parts, strict=True):
-            for target, piece in zip(whole, part.arrays, strict=True):
-                target[..., group.rows] = piece
-        return Prediction.of(whole)
+            for array, values_of_part in zip(arrays, part.arrays, strict=True):
+                array[..., group.rows] = values_of_part
+        return Prediction.of(arrays)
 
     def _values(self, theta: FloatArray) -> list[FloatArray]:
-        """Return the value of every parameter, those of the three of the sensors last."""
+        """Return the values of all parameters, those of the three sensor parameters last."""
         columns = self._space.to_values(theta)[..., None]
         return [constant if i is None else columns[..., i, :] for i, constant in self._slots]
 
@@ -277,8 +279,9 @@ class Predictor:
             return self._predict_sine(group, values, derivatives, amplitude_error)
         if not linear.any():
             return self._predict_steady(group, group.steady, values, derivatives, amplitude_error)
-        moving = [*(np.where(linear, np.nan, v) for v in values[:-3]), *values[-3:]]
-        exact = self._predict_steady(group, group.steady, moving, derivatives, amplitude_error)
+        # no motions are computed for values that are NaN
+        nonlinear = [*(np.where(linear, np.nan, v) for v in values[:-3]), *values[-3:]]
+        exact = self._predict_steady(group, group.steady, nonlinear, derivatives, amplitude_error)
         sine = self._predict_sine(group, values, derivatives, amplitude_error)
         pairs = zip(sine.arrays, exact.arrays, strict=True)
         return Prediction.of([np.where(linear, a, b) for a, b in pairs])
@@ -290,36 +293,37 @@ class Predictor:
         derivatives: int,
         amplitude_error: FloatArray | None,
     ) -> Prediction:
-        """Return the response by the describing function; it has no harmonics of the motion."""
-        of_model, sensed = values[:-3], values[-3:]
-        amplitude, exists = self._amplitude(group, of_model, sensed, amplitude_error)
+        """Return the response by the describing function, which has no harmonics of the motion."""
+        model_values, sensor_values = values[:-3], values[-3:]
+        amplitude, exists = self._amplitude(group, model_values, sensor_values, amplitude_error)
         harmonic = 1 if group.forced else group.orders
         factor = group.operator * (group.harmonic == harmonic)
-        if not self._neutral:
-            sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
+        if not self._exact_sensors:
+            sensor = measured_stiffness_factor(sensor_values, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         if not derivatives:
-            Z = self._model.stiffness(of_model, amplitude, group.omega, harmonic)
+            Z = self._model.stiffness(model_values, amplitude, group.omega, harmonic)
             return Prediction(factor * _where(exists, Z) ** self._exponent, [], _NONE)
         sine = Sine(amplitude, group.omega, harmonic)
-        Z, by_amplitude, by_parameter = self._model.settled(of_model, sine, derivatives)
+        Z, by_amplitude, by_parameter = self._model.settled(model_values, sine, derivatives)
         Z = _where(exists, Z)
         by_ln_amplitude = amplitude * by_amplitude
         response = factor * Z if self._exponent == 1 else factor / Z
-        slope = factor if self._exponent == 1 else -response / Z
-        stretch = 1.0 / (1.0 + (by_ln_amplitude / Z).real) if group.forced else None
-        changes = []
-        for (index, _), value, d in zip(self._slots, of_model, by_parameter, strict=False):
+        slope = factor if self._exponent == 1 else -response / Z  # dR/dZ
+        # d ln A / d ln u_0
+        by_ln_drive = 1.0 / (1.0 + (by_ln_amplitude / Z).real) if group.forced else None
+        by_theta = []
+        for (index, _), value, d in zip(self._slots, model_values, by_parameter, strict=False):
             if index is None or derivatives < 2:
                 continue
             change = d * value if self._space.positive[index] else d
-            if stretch is not None:
-                change = change - by_ln_amplitude * ((change / Z).real * stretch)
-            changes.append(slope * change)
-        by_level = slope * by_ln_amplitude * (1.0 if stretch is None else stretch)
-        if not self._neutral and derivatives > 1:
-            changes += self._sensor_changes(group, response, by_level)
-        return Prediction(response, changes, by_level)
+            if by_ln_drive is not None:
+                change = change - by_ln_amplitude * ((change / Z).real * by_ln_drive)
+            by_theta.append(slope * change)
+        by_level = slope * by_ln_amplitude * (1.0 if by_ln_drive is None else by_ln_drive)
+        if not self._exact_sensors and derivatives > 1:
+            by_theta += self._by_sensors(group, response, by_level)
+        return Prediction(response, by_theta, by_level)
 
     def _predict_steady(
         self,
@@ -330,43 +334,43 @@ class Predictor:
         error: FloatArray | None,
     ) -> Prediction:
         """Return the response of the exact steady motion: R = (j omega)^p (g u_0/X_k)^q."""
-        of_model, sensed = values[:-3], values[-3:]
-        factor, drive = group.operator, self._true_drive(group, sensed, error)
-        if not self._neutral:
-            sensor = measured_stiffness_factor(sensed, group.omega, group.harmonic)
+        model_values, sensor_values = values[:-3], values[-3:]
+        factor, drive = group.operator, self._true_drive(group, sensor_values, error)
+        if not self._exact_sensors:
+            sensor = measured_stiffness_factor(sensor_values, group.omega, group.harmonic)
             factor = factor * sensor**self._exponent
         free = [i for i, (index, _) in enumerate(self._slots[:-3]) if index is not None]
-        motion = rows.at(of_model, drive, free if derivatives > 1 else [])
+        motion = rows.at(model_values, drive, free if derivatives > 1 else [])
         response = factor * (motion.displacement / drive) ** -self._exponent
         if not derivatives:
             return Prediction(response, [], _NONE)
         slope = factor / drive if self._exponent == -1 else -response / motion.displacement
-        changes = []
-        for place, i in enumerate(free if derivatives > 1 else []):
+        by_theta = []
+        for column, i in enumerate(free if derivatives > 1 else []):
             positive = self._space.positive[self._slots[i][0]]
-            change = motion.by_parameter[..., place]
-            changes.append(slope * (change * of_model[i] if positive else change))
+            change = motion.by_parameter[..., column]
+            by_theta.append(slope * (change * model_values[i] if positive else change))
         by_level = slope * drive * motion.by_drive + self._exponent * response
-        if not self._neutral and derivatives > 1:
-            changes += self._sensor_changes(group, response, by_level)
-        return Prediction(response, changes, by_level)
+        if not self._exact_sensors and derivatives > 1:
+            by_theta += self._by_sensors(group, response, by_level)
+        return Prediction(response, by_theta, by_level)
 
     def _true_drive(
-        self, group: _Group, sensed: Sequence[FloatArray], error: FloatArray | None
+        self, group: _Group, sensor_values: Sequence[FloatArray], error: FloatArray | None
     ) -> FloatArray:
         """Return the true drive of force-controlled rows."""
         assert group.drive is not None
-        drive = group.drive / sensed[0]
+        drive = group.drive / sensor_values[0]
         return drive if error is None else np.asarray(drive * np.exp(-error[..., group.rows]))
 
-    def _sensor_changes(
-        self, group: _Group, response: ComplexArray, direct: ComplexArray
+    def _by_sensors(
+        self, group: _Group, response: ComplexArray, by_level: ComplexArray
     ) -> list[ComplexArray]:
-        """Return dR/d(free sensor parameters); `direct` is dR/dln A or dR/dln u_0."""
+        """Return dR/d(free sensor parameters); `by_level` is dR/dln A or dR/dln u_0."""
         by_gain = self._exponent * response
         by_sensor = (
-            by_gain - direct if group.forced else by_gain,
-            -by_gain if group.forced else -by_gain - direct,
+            by_gain - by_level if group.forced else by_gain,
+            -by_gain if group.forced else -by_gain - by_level,
             1j * group.harmonic * group.omega * by_gain,
         )
         slots = self._slots[-3:]
@@ -375,16 +379,16 @@ class Predictor:
     def _amplitude(
         self,
         group: _Group,
-        of_model: Sequence[FloatArray],
-        sensed: Sequence[FloatArray],
+        model_values: Sequence[FloatArray],
+        sensor_values: Sequence[FloatArray],
         error: FloatArray | None,
     ) -> tuple[FloatArray, BoolArray | None]:
-        """Return the true amplitude of each row, and where it exists; None if everywhere."""
-        amplitude = group.amplitude if self._neutral else group.amplitude / sensed[1]
+        """Return the true amplitude of each row, and whether it exists; None if all do."""
+        amplitude = group.amplitude if self._exact_sensors else group.amplitude / sensor_values[1]
         if not group.forced:
             return amplitude if error is None else amplitude * np.exp(-error[..., group.rows]), None
-        drive = self._true_drive(group, sensed, error)
-        amplitude = solve(self._model, of_model, group.omega, drive, amplitude)
+        drive = self._true_drive(group, sensor_values, error)
+        amplitude = solve(self._model, model_values, group.omega, drive, amplitude)
         exists = np.isfinite(amplitude)
         return (amplitude, None) if exists.all() else (np.where(exists, amplitude, 1.0), exists)
 
@@ -394,14 +398,14 @@ def _where(exists: BoolArray | None, Z: ComplexArray) -> ComplexArray:
 
 
 def _slot(parameter: Parameter, names: tuple[str, ...]) -> tuple[int | None, FloatArray]:
-    """Return where a parameter's value comes from: an index into theta, or a constant."""
+    """Return the source of a parameter's value: an index into theta, or a constant."""
     if parameter.free:
         return names.index(parameter.name), np.empty(0)
     return None, np.asarray(parameter.value)
 
 
 def _check(rows: Rows, model: Model) -> None:
-    """Check that every row can be predicted, and that some depend on the model."""
+    """Check that every row can be predicted, and that some of them depend on the model."""
     if rows.amplitude is None:
         _require(~rows.forced, "displacement", "amplitude")
     if rows.drive is None:
@@ -411,18 +415,18 @@ def _check(rows: Rows, model: Model) -> None:
             f"the rows hold the harmonics {', '.join(map(str, rows.orders))}, and no element of "
             f"{model!r} has any of them; give odd ones as well, or use a law that is asymmetric"
         )
-    bad = rows.of_displacement
-    if bad.any() and rows.quantity != "receptance":
-        row = int(np.argmax(bad))
+    higher = rows.of_displacement
+    if higher.any() and rows.quantity != "receptance":
+        row = int(np.argmax(higher))
         raise DataError(
             f"row {row} is force-controlled and holds harmonic {rows.harmonic[row]} of the force, "
             "which is a sine there: give harmonics of the displacement, X_k/F_1, in a table of "
             f"receptance, leave such rows out, or say {argument('controlled', 'displacement')} if "
             "the measured amplitude is to be used"
         )
-    lost = bad & (np.atleast_2d(rows.fundamental) < 0).any(axis=0)
-    if lost.any():
-        row = int(np.argmax(lost))
+    without_fundamental = higher & (np.atleast_2d(rows.fundamental) < 0).any(axis=0)
+    if without_fundamental.any():
+        row = int(np.argmax(without_fundamental))
         raise DataError(
             f"row {row} is harmonic {rows.harmonic[row]} of the displacement, but no row holds the "
             "fundamental of the same frequency and drive; add it"
@@ -430,14 +434,14 @@ def _check(rows: Rows, model: Model) -> None:
 
 
 def _fundamental(rows: Rows, response: ComplexArray) -> ComplexArray:
-    """Return the responses; rows of other harmonics of the displacement have the fundamental's."""
+    """Return the responses, those of the fundamental for higher harmonics of the displacement."""
     if not rows.of_displacement.any():
         return response
     return np.where(rows.of_displacement, rows.of_fundamental(response), response)
 
 
-def _parts(rows: Rows) -> Iterator[tuple[slice | IntArray, bool]]:
-    """Yield rows, and whether force-controlled, for each kind of row."""
+def _rows_by_control(rows: Rows) -> Iterator[tuple[slice | IntArray, bool]]:
+    """Yield the displacement-controlled and the force-controlled rows, each with their kind."""
     kinds = np.unique(rows.forced).tolist()
     for forced in kinds:
         yield slice(None) if len(kinds) == 1 else np.flatnonzero(rows.forced == forced), forced

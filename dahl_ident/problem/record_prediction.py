@@ -31,7 +31,7 @@ def force_of(
     x, v, a = problem.motions[number]
     path = x if problem.paths is None else problem.paths[number]
     record = problem.records[number]
-    of_record = problem.own(values, number)
+    of_record = problem.record_values(values, number)
     time = record.time - record.time[0]
     offset, drift = of_record[-2:].tolist()
     total = offset + drift * time
@@ -71,7 +71,7 @@ def motion_of(
     """Return the motion of a driven plant at the samples of record `number`."""
     from dahl_ident.engine import march
 
-    of_record, free = problem.own(values, number), values[: len(problem.free)]
+    of_record, free = problem.record_values(values, number), values[: len(problem.free)]
     starts = of_record.size - 1
     at, slopes = (part[0] for part in problem.coefficients(np.array([problem.full_values(values)])))
     slopes = slopes[:, [p.free for p in problem.model.parameters]]

@@ -1,7 +1,7 @@
 """Records of any motion: residuals sample by sample, with exact derivatives.
 
-Two kinds. Where the force is the output, the measured displacement goes into the elements, and
-their forces are added. Where the motion is the output, the measured force or base motion drives the
+There are two kinds. If the output is the force, it is the sum of the elements' forces at the
+measured displacement. If the output is the motion, the measured force or base motion drives the
 plant's equation of motion. Every record adds unknowns: the state at its first sample, an offset
 and, for forces, a drift.
 """
@@ -28,22 +28,22 @@ from dahl_ident.problem.record_waves import SHORTEST, RecordWaves, bends
 from dahl_ident.problem.space import Space
 from dahl_ident.problem.table_problem import TableProblem
 
-_PER_CYCLE = 100.0  # samples of a cycle that a record keeps where it is thinned
-_DELAY_STEP = 0.02  # step of the delay, in samples, for differences
-_LEAST = 1e-300  # stands for a positive value that is zero, which has no logarithm
-_VANISHED = 1e4  # gradient over curvature from which a value has vanished: its steps never end
+_SAMPLES_PER_CYCLE = 100.0  # of a record that is thinned
+_DELAY_STEP = 0.02  # step of the delay, in samples, for difference quotients
+_TINY = 1e-300  # replaces a positive value that is zero, which has no logarithm
+_VANISHED = 1e4  # gradient over curvature of a value that has vanished: its steps never end
 
 
 class RecordProblem(RecordWaves):
     """Records of one device and a model: residuals, Jacobian and cost.
 
     Residuals are measured minus predicted samples over the standard deviation of the output, so
-    that their scale is unknown. Each record is a run, or each a level of one run. Where the model
-    integrates, differentiates or has memory, a record is cut at its gaps into parts with a first
-    state each; where anything is integrated or differentiated, unevenly sampled parts are
-    resampled. Both with a warning. The `output` that is predicted is by default "motion" where the
-    model has inertia, else "force". For the output "motion" the records' force channel is, by
-    `excitation`, a force, or the acceleration of the base, m/s^2, the motion being relative to it.
+    that their scale is unknown. Either each record is a run, or all are levels of one run. If the
+    model integrates, differentiates or has memory, a record is cut at its gaps into parts, each
+    with its first state; if it integrates or differentiates, unevenly sampled parts are resampled.
+    Both raise a warning. The predicted `output` is by default "motion" if the model has inertia,
+    otherwise "force". For the output "motion", `excitation` says what the records' force channel
+    is: a force, or the acceleration of the base, m/s^2, to which the motion is relative.
 
     Examples
     --------
@@ -56,9 +56,9 @@ class RecordProblem(RecordWaves):
     """
 
     arguments = ("records", "model", "output", "excitation", "calibration")
-    parts, scaled_priors = 1, True
-    kind, called = "records", "records"
-    refused: ClassVar[Mapping[str, str]] = {
+    residuals_per_row, scaled_priors = 1, True
+    kind, kind_in_words = "records", "records"
+    refused_options: ClassVar[Mapping[str, str]] = {
         "noise": "their noise is estimated from the residuals",
         "steady": "any motion is predicted, sample by sample",
         "drive_std": "noise of the drive is estimated from the record, and counted",
@@ -67,48 +67,48 @@ class RecordProblem(RecordWaves):
         "pool": "their posterior needs no predictions",
     }
     around_optimum = True
-    repetitions = 199  # each of which is searched alone: enough for the 95.45 % interval
+    n_simulations = 199  # each needs a search of its own; enough for the 95.45 % interval
 
     @property
     def noise(self) -> str:
-        """The model of the residuals: "white", or filtered by their "spectrum"."""
+        """The model of the residuals: "white", or with a "spectrum", which filters them."""
         return "spectrum" if self.whitening.size > 1 else "white"
 
-    def at(self, table: FrequencyResponse) -> TableProblem:
-        """Return what the model predicts for a table."""
+    def for_table(self, table: FrequencyResponse) -> TableProblem:
+        """Return the problem of the same model for a table."""
         return TableProblem(table, self.model, noise="absolute")
 
     def shortened(self, samples: int) -> RecordProblem:
         """Return the problem with about `samples` samples in all.
 
-        Measured displacements are thinned as far as slow cycles allow; records still too long are
-        cut to their liveliest part.
+        Measured displacements are thinned as far as slow cycles allow; records that are still too
+        long are cut to the part with the largest mean square.
         """
         parts = []
-        spare = self.n_residuals / samples
+        reduction = self.n_residuals / samples
         for record, y in zip(self.records, self.measured, strict=True):
             step = 1
             if self.output == "force":
                 x = np.asarray(record.displacement)
                 per_cycle = 2.0 * np.pi * np.std(x) / (np.std(np.diff(x)) or 1.0)
-                step = int(np.clip(per_cycle / _PER_CYCLE, 1.0, np.ceil(spare)))
+                step = int(np.clip(per_cycle / _SAMPLES_PER_CYCLE, 1.0, np.ceil(reduction)))
             n = max(SHORTEST, int(samples * len(record) // self.n_residuals))
-            thin, wave = cut(record, slice(None, None, step)), y[::step]
+            thinned, wave = cut(record, slice(None, None, step)), y[::step]
             energy = np.concatenate([[0.0], np.cumsum((wave - wave.mean()) ** 2)])
             start = int(np.argmax(energy[n:] - energy[:-n])) if n < wave.size else 0
-            parts.append(cut(thin, slice(start, start + n)))
+            parts.append(cut(thinned, slice(start, start + n)))
         return self.like(records=parts)
 
-    def of(self, records: Sequence[Record]) -> RecordProblem:
-        """Return the problem of other records, freed of this one's delay and noise."""
+    def for_records(self, records: Sequence[Record]) -> RecordProblem:
+        """Return the problem of other records, corrected for this one's delay and noise."""
         return self.like(records=records).delayed(self.delay).without_noise(self.displacement_noise)
 
-    def weighted(self, whitening: FloatArray) -> RecordProblem:
+    def with_whitening(self, whitening: FloatArray) -> RecordProblem:
         """Return the same problem with filtered residuals."""
         return self.altered(whitening=whitening)
 
     def with_fixed(self, values: Mapping[str, float]) -> RecordProblem:
-        """Return the same problem with other values of parameters that are fixed."""
+        """Return the same problem with other values of fixed parameters."""
         model = self.model.with_values(values)  # equations are shorter where a value is 0 or 1
         return self.altered("system", "coefficients", "first", "latest", model=model)
 
@@ -122,32 +122,32 @@ class RecordProblem(RecordWaves):
 
     @property
     def exponents(self) -> list[Parameter]:
-        """The exponents that the model holds, stated or not."""
-        known = [p for p in self.model.parameters if p.prior is not None and not p.free]
-        return [p for p in known if p.positive]
+        """The fixed exponents of the model, stated or assumed."""
+        fixed = [p for p in self.model.parameters if p.prior is not None and not p.free]
+        return [p for p in fixed if p.positive]
 
     def freed(self, names: Iterable[str], noise: float | None = None) -> RecordProblem:
         """Return the same problem with some exponents free.
 
-        With the `noise` of the residuals their ranges are priors, and bounds.
+        If the `noise` of the residuals is given, the exponents' ranges are priors, and bounds.
         """
-        chosen = {p.name: p.freed() for p in self.exponents if p.name in names}
+        freed = {p.name: p.freed() for p in self.exponents if p.name in names}
         ranges = {}
         if noise is not None:
-            for name, p in chosen.items():
-                usual, (low, high) = float(p.value or 1.0), p.prior or (1.0, 1.0)
-                low, high = min(low, usual), max(high, usual)
-                ranges[name] = np.log(usual), np.log(high / low) / 12.0**0.5 / noise
-        return self._of_model(self.model.with_parameters(chosen), ranges)
+            for name, p in freed.items():
+                value, (low, high) = float(p.value or 1.0), p.prior or (1.0, 1.0)
+                low, high = min(low, value), max(high, value)
+                ranges[name] = np.log(value), np.log(high / low) / 12.0**0.5 / noise
+        return self._with_free(self.model.with_parameters(freed), ranges)
 
     def held(self, values: Mapping[str, float]) -> RecordProblem:
-        """Return the same problem with free parameters held, as assumed ones, at some values."""
-        known = {p.name: p for p in self.model.parameters}
-        fixed = {n: replace(known[n].fixed(v), assumed=True) for n, v in values.items()}
-        return self._of_model(self.model.with_parameters(fixed), {})
+        """Return the same problem with free parameters assumed to have some values."""
+        parameters = {p.name: p for p in self.model.parameters}
+        fixed = {n: replace(parameters[n].fixed(v), assumed=True) for n, v in values.items()}
+        return self._with_free(self.model.with_parameters(fixed), {})
 
-    def _of_model(self, model: Model, ranges: dict[str, tuple[float, float]]) -> RecordProblem:
-        """Return the same problem with other parameters of the model free."""
+    def _with_free(self, model: Model, ranges: dict[str, tuple[float, float]]) -> RecordProblem:
+        """Return the same problem with a model of which other parameters are free."""
         free = [p for p in model.parameters if p.free]
         parameters = (*free, *self.parameters[self.n_reported :])
         inside = np.array([p.name not in ranges for p in parameters])
@@ -157,7 +157,7 @@ class RecordProblem(RecordWaves):
         return self.altered(*stale, model=model, **changes)
 
     def filtered(self, waves: FloatArray) -> FloatArray:
-        """Return residuals or derivatives, (n, ...), filtered; the first `order` are left out."""
+        """Return residuals or derivatives, (n, ...), filtered; the filter's start is left out."""
         if self.whitening.size == 1:
             return waves
         from scipy.signal import lfilter
@@ -166,66 +166,66 @@ class RecordProblem(RecordWaves):
 
     @property
     def n_residuals(self) -> int:  # type: ignore[override]
-        """Number of residuals: all samples except those with which the filter begins."""
+        """Number of residuals: of all samples except those with which the filter begins."""
         return self.n_samples - len(self.records) * (self.whitening.size - 1)
 
-    n_numbers = n_residuals
+    n_nonzero = n_residuals
 
     def to_search(self, values: ArrayLike) -> FloatArray:
-        """Return search coordinates; values that have vanished are as small as numbers can be."""
+        """Return search coordinates; positive values that have vanished count as tiny."""
         array = np.asarray(values, dtype=np.float64)
-        return self.space.to_search(np.where(self.space.positive & (array == 0.0), _LEAST, array))
+        return self.space.to_search(np.where(self.space.positive & (array == 0.0), _TINY, array))
 
     def step_bounds(self, values: FloatArray, *, of_starts: bool) -> tuple[FloatArray, FloatArray]:
         """Return the limits of the search coordinates.
 
-        Exponents with a prior stay within their ranges, loads of several springs at the first
-        sample below slip, and on request other friction there below full slip at the values.
+        Exponents with a prior stay within their ranges. Loads of several springs at the first
+        sample stay below slip, and with `of_starts` other friction stays below full slip there.
         """
         low, high = np.full((2, values.size), np.inf) * [[-1.0], [1.0]]
-        for name, (usual, _) in self.ranges.items():
+        for name, (mean, _) in self.ranges.items():
             i = self.names.index(name)
-            span = [usual, *np.log(self.parameters[i].prior or (1.0, 1.0))]
+            span = [mean, *np.log(self.parameters[i].prior or (1.0, 1.0))]
             low[i], high[i] = min(span), max(span)
-        of_model = zip(self.model.parameters, self.full_values(values), strict=True)
-        by_name = {p.name: np.asarray(value) for p, value in of_model}
+        pairs = zip(self.model.parameters, self.full_values(values), strict=True)
+        by_name = {p.name: np.asarray(value) for p, value in pairs}
         for element in self.with_memory:
             if element.one_state and not of_starts:
                 continue
-            ends = element.start_bounds([by_name[p.name] for p in element.parameters])
+            bounds = element.start_bounds([by_name[p.name] for p in element.parameters])
             prefix = f"{element.name}_" if element.name else ""
             for start, *_ in element.starts:
-                for i, known in enumerate(self.names):
-                    if known == f"{prefix}{start}" or known.startswith(f"{prefix}{start}_"):
-                        low[i], high[i] = ends
+                for i, name in enumerate(self.names):
+                    if name == f"{prefix}{start}" or name.startswith(f"{prefix}{start}_"):
+                        low[i], high[i] = bounds
         return low, high
 
     def predict(self, values: FloatArray, number: int, *, derivatives: bool = True) -> Predicted:
         """Return the predicted samples of record `number`."""
-        predicted = force_of if self.output == "force" else motion_of
+        predict = force_of if self.output == "force" else motion_of
         names = self.names if derivatives else ()
-        key = np.append(self.full_values(values), self.own(values, number)).tobytes()
-        known = self.latest.get(number)
-        if known is None or known[0] != key or not set(names) <= set(known[1]):
-            known = key, names, predicted(self, values, number, derivatives=derivatives)
-            self.latest[number] = known
-        _, columns, at = known
+        key = np.append(self.full_values(values), self.record_values(values, number)).tobytes()
+        latest = self.latest.get(number)
+        if latest is None or latest[0] != key or not set(names) <= set(latest[1]):
+            latest = key, names, predict(self, values, number, derivatives=derivatives)
+            self.latest[number] = latest
+        _, columns, prediction = latest
         if not names or names == columns:
-            return at
-        return replace(at, by=at.by[:, [columns.index(name) for name in names]])
+            return prediction
+        return replace(prediction, by=prediction.by[:, [columns.index(name) for name in names]])
 
     @cached_property
     def latest(self) -> dict[int, tuple[bytes, tuple[str, ...], Predicted]]:
         """The last prediction of each record: values, and names of the differentiated parameters.
 
-        It is asked for more than once, also by problems in which other parameters are free.
+        It is needed again, even by problems in which other parameters are free.
         """
         return {}
 
     def outputs(self, values: FloatArray) -> list[FloatArray]:
         """Return the predicted output of each record."""
-        every = range(len(self.records))
-        return [self.predict(values, i, derivatives=False).output for i in every]
+        numbers = range(len(self.records))
+        return [self.predict(values, i, derivatives=False).output for i in numbers]
 
     def fitted(self, theta: FloatArray) -> tuple[FloatArray, ...]:
         """Return the predicted output of each record."""
@@ -242,16 +242,16 @@ class RecordProblem(RecordWaves):
         rho: Rho | None = None,
         chart: FloatArray | None = None,
     ) -> Quadratic:
-        """Return cost, gradient and Hessian, see ``Problem``; what has vanished is held."""
+        """Return cost, gradient and Hessian, see ``Problem``; vanished values are held."""
         if theta.ndim == 2:
             parts = [self.quadratic(row, scale, rho, chart) for row in theta]
             return Quadratic(*(np.stack(column) for column in zip(*parts, strict=True)))
         cost, gradient, hessian = super().quadratic(theta, scale, rho)
-        if not (np.isfinite(cost) and np.isfinite(hessian).all()):  # a motion beyond all bounds
+        if not (np.isfinite(cost) and np.isfinite(hessian).all()):  # the motion is unbounded
             return Quadratic(np.asarray(np.inf), np.zeros(theta.size), np.eye(theta.size))
-        far = _VANISHED * hessian.diagonal()
-        vanished = self.space.positive & (gradient >= far)
-        vanished |= self.space.angular & (np.abs(gradient) >= far)
+        threshold = _VANISHED * hessian.diagonal()
+        vanished = self.space.positive & (gradient >= threshold)
+        vanished |= self.space.angular & (np.abs(gradient) >= threshold)
         gradient[vanished], hessian[vanished], hessian[:, vanished] = 0.0, 0.0, 0.0
         hessian[vanished, vanished] = 1.0
         if chart is not None:
@@ -266,17 +266,17 @@ class RecordProblem(RecordWaves):
             return np.stack([self.data_rows(row, derivatives=derivatives) for row in theta])
         values = self.space.to_values(theta)
         waves = []
-        lost = np.full((1 + derivatives * theta.size, self.n_residuals), np.nan)
+        no_rows = np.full((1 + derivatives * theta.size, self.n_residuals), np.nan)
         if not np.isfinite(values).all():
-            return lost
-        for number, (measured, size) in enumerate(zip(self.measured, self.sizes, strict=True)):
+            return no_rows
+        for number, measured in enumerate(self.measured):
             try:
                 predicted = self.predict(values, number, derivatives=derivatives)
             except FitError:
-                return lost
-            wave = (measured - predicted.output)[:, None] / size
+                return no_rows
+            wave = (measured - predicted.output)[:, None] / self.output_std
             if derivatives:
-                slopes = predicted.by * (self.space.slopes(values) / -size)
+                slopes = predicted.by * (self.space.slopes(values) / -self.output_std)
                 wave = np.concatenate([wave, slopes], axis=1)
             waves.append(self.filtered(wave))
         return np.concatenate(waves).T
@@ -288,13 +288,13 @@ class RecordProblem(RecordWaves):
 
     @property
     def log_area(self) -> float:
-        """Return ln of the size of the residuals' units, in that of the output."""
-        return -self.n_residuals * float(np.log(self.sizes[0]))
+        """Return ln of the volume of a unit cube of residuals, in the units of the output."""
+        return -self.n_residuals * float(np.log(self.output_std))
 
     @cached_property
-    def sizes(self) -> tuple[float, ...]:
-        """Standard deviation of all records' output: one unit for every residual."""
-        size = float(np.std(np.concatenate([y - y.mean() for y in self.measured])))
-        if size == 0.0:
+    def output_std(self) -> float:
+        """Standard deviation of all records' output, the unit of the residuals."""
+        std = float(np.std(np.concatenate([y - y.mean() for y in self.measured])))
+        if std == 0.0:
             raise DataError("the output of the records is constant; nothing can be fitted to it")
-        return (size,) * len(self.records)
+        return std

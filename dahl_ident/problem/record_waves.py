@@ -170,7 +170,7 @@ class RecordWaves(Problem):
         return self.calibration
 
     @property
-    def every_parameter(self) -> tuple[Parameter, ...]:
+    def all_parameters(self) -> tuple[Parameter, ...]:
         """The model's parameters, fixed ones included, and what each record adds."""
         return (*self.model.parameters, *self.parameters[self.n_reported :])
 
@@ -316,7 +316,7 @@ class RecordWaves(Problem):
         by_name = dict(zip(self.names, values.tolist(), strict=True))
         return [float(by_name.get(p.name, p.value or 0.0)) for p in self.model.parameters]
 
-    def own(self, values: FloatArray, number: int) -> FloatArray:
+    def record_values(self, values: FloatArray, number: int) -> FloatArray:
         """Return the values that belong to one record alone."""
         start = len(self.free) + number * self.per_record
         return values[start : start + self.per_record]

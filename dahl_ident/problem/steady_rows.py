@@ -1,12 +1,11 @@
 """Rows whose force was controlled, predicted by the exact steady motion of the plant.
 
-Shooting starts from the row's orbit at the previous parameters, on which the result depends far
-less than on any noise: where no friction law and no damper feeds energy in, the motion is unique.
-Elsewhere there may be several, and the rows are followed as a sweep is measured: in the order of
-the rows, at one level each from the orbit of the row before. Where an orbit is no longer stable, a
-stable one is taken: the jump of the response. Where no stable one exists, as for a row that should
-not be in the table, the unstable one is used, so that a search can go on; a verdict names such
-rows.
+If no friction law and no damper feeds energy in, the motion is unique. Shooting then starts from
+the row's orbit at the previous parameters, which affects the result far less than any noise.
+Otherwise there may be several motions, and the rows of each level are followed as a sweep is
+measured: in their order, from the orbit of the row before. Where an orbit is no longer stable, a
+stable one is taken: the jump of the response. If none is stable, as for a row that should not be in
+the table, the unstable one is used, so that a search can continue; a verdict names such rows.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements import Model
 from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
 
-_LEVEL = 0.1  # difference of ln of the drive between two levels; a held one varies less
-# knee over the largest displacement from which friction is a spring: its third harmonic is 1e-3,
-# and a sine errs by the square
+_LEVEL_STEP = 0.1  # least difference of ln of the drive between levels; a held one varies less
+# knee over the largest displacement from which friction counts as a spring: its third harmonic is
+# 1e-3 of the force, and the error of a sine is the square of that
 _MICROSLIP = 1e3
-_SLIP = 1e-9  # knee over the smallest displacement, below which its size has no effect
-_ELSEWHERE = 0.2  # relative distance from the measurement that may mean another branch
+_SLIP = 1e-9  # knee over the smallest displacement, below which the knee has no effect
+_OTHER_BRANCH = 0.2  # relative distance from the measurement that may mean another branch
 
 
 class RowMotion(NamedTuple):
-    """The harmonic X_k of each row, its derivatives with respect to drive and parameters."""
+    """The harmonic X_k of each row, and its derivatives with respect to drive and parameters."""
 
     displacement: ComplexArray
     by_drive: ComplexArray
@@ -39,7 +38,7 @@ class RowMotion(NamedTuple):
 
 
 class _SteadyMotions(NamedTuple):
-    """Of some points: X_k with derivatives, (points, K, ...), orbits, X_1, multipliers."""
+    """Motions at some points: X_k with derivatives, (points, K, ...), orbits, X_1, multipliers."""
 
     X: ComplexArray
     orbits: FloatArray
@@ -48,12 +47,12 @@ class _SteadyMotions(NamedTuple):
 
 
 class SteadyRows:
-    """Steady motions of some rows at any parameters, with the orbits where they were last found.
+    """Steady motions of some rows at any parameters, with their last orbits.
 
     `drive` and `omega`, (n,) or (S, n), are as measured; levels are distinguished by the drive. The
     `measured` fundamental of the displacement chooses among several motions. `harmonic` is the k of
-    each row, `fundamental` the row, of these, that holds its fundamental. `orbits` are those last
-    found, (n, order), by their order; kept up to date.
+    each row, `fundamental` the index of the row with the fundamental of the same motion. `orbits`
+    are the last ones, (n, order), for each order of the equations; they are updated.
     """
 
     def __init__(
@@ -71,16 +70,15 @@ class SteadyRows:
         self._drive, self._omega, self._measured = drive, omega, measured
         self._unique_laws = all(e.is_linear or e.unique_response for e in model.elements)
         self._harmonics = (1, *sorted(set(harmonic.tolist()) - {1}))
-        self._place = np.array([self._harmonics.index(k) for k in harmonic.tolist()])
-        self._sweep = np.argsort(fundamental, kind="stable")
+        self._column = np.array([self._harmonics.index(k) for k in harmonic.tolist()])
         self._fundamental = fundamental
         self._orbits = orbits
 
     def at(self, values: Sequence[FloatArray], drive: FloatArray, chosen: list[int]) -> RowMotion:
         """Return the motions at values of all parameters, each (1,) or (S, 1).
 
-        `chosen` are the parameters whose derivatives are wanted, by index. Harmonics of one motion
-        are solved for together where their rows have the same drive.
+        `chosen` are the indices of the parameters to differentiate by. Harmonics of one motion are
+        computed together if their rows have the same drive.
         """
         shape = np.broadcast_shapes(
             self._omega.shape, np.shape(drive), *(np.shape(v) for v in values)
@@ -94,64 +92,64 @@ class SteadyRows:
         p = np.stack([np.broadcast_to(v, (*shape[:-1], m)).ravel() for v in values], axis=-1)
         u, w = (v[..., points].ravel() for v in (u, w))
         measured = np.broadcast_to(self._measured, shape)[..., points].ravel()
-        several = ~self._is_unique(values, shape).reshape(-1, shape[-1]).all(axis=1)
+        is_unique = self._is_unique(values, shape).reshape(-1, shape[-1]).all(axis=1)  # (S,)
         X = np.full((u.size, len(self._harmonics), 2 + len(chosen)), np.nan, dtype=np.complex128)
         stable = np.ones(u.size, dtype=np.bool_)
-        alone = np.flatnonzero(np.repeat(~several, m))
-        if alone.size:
+        unique = np.flatnonzero(np.repeat(is_unique, m))
+        if unique.size:
             order = self._shooting.system.order
             last = self._orbits.get(order)
-            starts = None if last is None else last[points][alone % m]
-            motions = self._solve(p[alone], w[alone], u[alone], chosen, starts, stable=False)
-            X[alone] = motions.X
+            starts = None if last is None else last[points][unique % m]
+            motions = self._solve(p[unique], w[unique], u[unique], chosen, starts, stable=False)
+            X[unique] = motions.X
             if last is None:
                 last = self._orbits[order] = np.full((shape[-1], order), np.nan)
             orbits = motions.orbits[:m][point]
             last[:] = np.where(np.isfinite(orbits), orbits, last)
-        for table in np.flatnonzero(several):
-            rows = slice(table * m, (table + 1) * m)
-            X[rows], stable[rows] = self._followed(
-                points, p[rows], w[rows], u[rows], measured[rows], chosen
+        for table in np.flatnonzero(~is_unique):
+            part = slice(table * m, (table + 1) * m)
+            X[part], stable[part] = self._followed(
+                points, p[part], w[part], u[part], measured[part], chosen
             )
-        X = X.reshape(*shape[:-1], m, *X.shape[1:])[..., point, self._place, :]
+        X = X.reshape(*shape[:-1], m, *X.shape[1:])[..., point, self._column, :]
         stable = stable.reshape(*shape[:-1], m)[..., point]
         return RowMotion(X[..., 0], X[..., 1], X[..., 2:], stable)
 
     def is_linear(self, values: Sequence[FloatArray]) -> BoolArray:
-        """Return whether friction is hardly more than a spring at every row, () or (S,).
+        """Return whether friction is almost a spring in every row, () or (S,).
 
-        Searches for limits go there. The motion is then a sine, while shooting would lose it to
-        rounding relative to the spring.
+        Searches for limits get there. The motion is then a sine, but shooting would lose friction's
+        losses to rounding relative to the spring.
         """
-        low = np.full((), np.inf)
+        lowest_knee = np.full((), np.inf)
         for element, law_values in self._model.of(values):
             if not element.is_linear:
                 with np.errstate(all="ignore"):
-                    low = np.minimum(low, element.knee(law_values)[0])
+                    lowest_knee = np.minimum(lowest_knee, element.knee(law_values)[0])
+        largest = np.nanmax(np.abs(self._measured), axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
-            far = low > _MICROSLIP * np.nanmax(np.abs(self._measured), axis=-1, keepdims=True)
-        return np.asarray(far.all(axis=-1))
+            return np.asarray((lowest_knee > _MICROSLIP * largest).all(axis=-1))
 
     def _within_reach(self, values: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return values with a higher knee where friction slips at far smaller displacements.
+        """Return values with a higher knee if friction slips at far smaller displacements.
 
-        All lengths of the law grow in proportion, and so its forces stay.
+        All lengths of the law are scaled by one factor, so that its forces do not change.
         """
         smallest = np.nanmin(np.abs(self._measured), axis=-1, keepdims=True)
         reachable = []
         for element, law_values in self._model.of(values):
-            longer = np.ones(())
+            factor = np.ones(())
             if not element.is_linear:
                 with np.errstate(all="ignore"):
-                    longer = np.fmax(_SLIP * smallest / element.knee(law_values)[1], 1.0)
+                    factor = np.fmax(_SLIP * smallest / element.knee(law_values)[1], 1.0)
             for parameter, value in zip(element.parameters, law_values, strict=True):
                 _, length, time = parameter.dimension
-                scaled = length != 0 and time == 0 and (longer > 1.0).any()
-                reachable.append(value * longer**length if scaled else value)
+                is_scaled = length != 0 and time == 0 and (factor > 1.0).any()
+                reachable.append(value * factor**length if is_scaled else value)
         return reachable
 
     def _is_unique(self, values: Sequence[FloatArray], shape: tuple[int, ...]) -> BoolArray:
-        """Return where the response is unique: no part of the plant feeds energy in."""
+        """Return whether each response is unique: no part of the plant feeds energy in."""
         if not self._unique_laws:
             return np.zeros(shape, dtype=np.bool_)
         loss = np.zeros(())
@@ -192,58 +190,56 @@ class SteadyRows:
     ) -> tuple[ComplexArray, BoolArray]:
         """Return the motions of one table's points, and which are stable.
 
-        Each level is followed in the order of its rows; with derivatives as far as there are
-        motions: a search needs all rows, or none.
+        Each level is followed in the order of its rows. With derivatives the computation stops at
+        the first motion that does not exist: a search needs all rows, or none.
         """
-        place_of = np.full(self._sweep.size, -1)
-        place_of[points] = np.arange(points.size)
-        sweep = place_of[self._sweep]
+        point_of_row = np.full(self._fundamental.size, -1)
+        point_of_row[points] = np.arange(points.size)
+        sweep = point_of_row[np.argsort(self._fundamental, kind="stable")]
         sweep = sweep[sweep >= 0]
-        order_of_levels = [
-            sweep[rows] for rows in levels(np.atleast_2d(self._drive)[0][points[sweep]])
-        ]
+        sweeps = [sweep[level] for level in levels(np.atleast_2d(self._drive)[0][points[sweep]])]
         shape = (drive.size, len(self._harmonics), 2 + len(chosen))
         stable = np.ones(drive.size, dtype=np.bool_)
         result = np.full(shape, np.nan, dtype=np.complex128)
         order = self._shooting.system.order
-        orbits = np.full((len(order_of_levels), order), np.nan)
-        for place in range(max(map(len, order_of_levels))):
-            sweeps = [i for i, level in enumerate(order_of_levels) if place < len(level)]
-            rows = np.array([order_of_levels[i][place] for i in sweeps])
-            X, reached, first, _ = self._solve(
-                values[rows], omega[rows], drive[rows], chosen, orbits[sweeps]
+        orbits = np.full((len(sweeps), order), np.nan)
+        for step in range(max(map(len, sweeps))):
+            running = [i for i, sweep in enumerate(sweeps) if step < len(sweep)]
+            now = np.array([sweeps[i][step] for i in running])
+            X, new_orbits, fundamental, _ = self._solve(
+                values[now], omega[now], drive[now], chosen, orbits[running]
             )
-            apart = np.abs(first - measured[rows])
-            far = np.flatnonzero(~(apart < _ELSEWHERE * np.abs(measured[rows])))
+            distance = np.abs(fundamental - measured[now])
+            far = np.flatnonzero(~(distance < _OTHER_BRANCH * np.abs(measured[now])))
             if far.size:  # the row may have been measured on another branch
-                begin = np.zeros((far.size, order))
-                at = measured[rows[far]]
-                begin[:, 0], begin[:, 1] = at.real, -omega[rows[far]] * at.imag
-                there = rows[far]
-                X_there, orbits_there, first, _ = self._solve(
-                    values[there], omega[there], drive[there], chosen, begin, again=False
+                retried = now[far]
+                target = measured[retried]
+                starts = np.zeros((far.size, order))
+                starts[:, 0], starts[:, 1] = target.real, -omega[retried] * target.imag
+                other = self._solve(
+                    values[retried], omega[retried], drive[retried], chosen, starts, again=False
                 )
-                nearer = ~(apart[far] <= np.abs(first - at)) & np.isfinite(first)
-                X[far[nearer]] = X_there[nearer]
-                reached[far[nearer]] = orbits_there[nearer]
-            lost = np.flatnonzero(np.isnan(X[:, 0, 0]))
-            if lost.size:
-                there = rows[lost]
-                X[lost], reached[lost], _, multiplier = self._solve(
-                    values[there], omega[there], drive[there], chosen, orbits[sweeps][lost],
-                    stable=False,
+                other_distance = np.abs(other.fundamental - target)
+                nearer = ~(distance[far] <= other_distance) & np.isfinite(other.fundamental)
+                X[far[nearer]] = other.X[nearer]
+                new_orbits[far[nearer]] = other.orbits[nearer]
+            missing = np.flatnonzero(np.isnan(X[:, 0, 0]))
+            if missing.size:
+                retried = now[missing]
+                X[missing], new_orbits[missing], _, multiplier = self._solve(
+                    values[retried], omega[retried], drive[retried], chosen,
+                    orbits[running][missing], stable=False,
                 )  # fmt: skip
-                stable[there] = ~(multiplier > 1.0 + NEUTRAL)
-            result[rows] = X
+                stable[retried] = ~(multiplier > 1.0 + NEUTRAL)
+            result[now] = X
             if chosen and np.isnan(X).any():
-                break  # of no use to a search
-            orbits[sweeps] = reached
+                break
+            orbits[running] = new_orbits
         return result, stable
 
 
 def levels(drive: FloatArray) -> list[IntArray]:
-    """Return the rows of every level, in their order; a level is held to within a tenth."""
+    """Return the points of every level, in their order; a level is held to within a tenth."""
     rising = np.argsort(drive, kind="stable")
-    level = np.empty(drive.size, dtype=np.intp)
-    level[rising] = np.cumsum(np.diff(np.log(drive[rising]), prepend=np.log(drive.min())) > _LEVEL)
-    return [np.flatnonzero(level == i) for i in range(int(level.max()) + 1)]
+    steps = np.flatnonzero(np.diff(np.log(drive[rising])) > _LEVEL_STEP)
+    return [np.sort(level) for level in np.split(rising, steps + 1)]

@@ -34,7 +34,7 @@ from dahl_ident.noise import (
     weighted,
 )
 from dahl_ident.problem.base import EXPLICIT, Problem
-from dahl_ident.problem.prediction import Nearby, Prediction, Predictor
+from dahl_ident.problem.prediction import NearbyPredictor, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
 from dahl_ident.sensors import EXACT, Prior, Sensors
@@ -74,8 +74,8 @@ class TableProblem(Problem):
     """
 
     arguments = ("data", "model", "noise", "sensors", "steady")
-    kind, called = "table", "a table"
-    refused: ClassVar[Mapping[str, str]] = {
+    kind, kind_in_words = "table", "a table"
+    refused_options: ClassVar[Mapping[str, str]] = {
         "output": "it follows from the quantity that was controlled in each row",
         "excitation": "rows are responses to a force",
     }
@@ -140,11 +140,11 @@ class TableProblem(Problem):
 
     def _set_rows(self, rows: Rows, noise: str | None) -> None:
         self._rows = rows
-        self._predictor: Predictor | Nearby = self._predicting(exact=self.is_exact)
+        self._predictor: Predictor | NearbyPredictor = self._predicting(exact=self.is_exact)
         self._latest: tuple[bytes, Prediction] | None = None
         self._set_noise(noise_for(rows, noise))
         self.n_residuals = 2 * rows.n
-        self.n_numbers = self.n_residuals - int(np.count_nonzero(rows.harmonic == 0))
+        self.n_nonzero = self.n_residuals - int(np.count_nonzero(rows.harmonic == 0))
 
     def _set_noise(self, noise: Noise) -> None:
         if self._misfit is not None and isinstance(noise, Measured) and noise.scale_known:
@@ -191,11 +191,11 @@ class TableProblem(Problem):
         """The table."""
         return self.data
 
-    def at(self, table: FrequencyResponse) -> TableProblem:
+    def for_table(self, table: FrequencyResponse) -> TableProblem:
         """Return the problem of the same model and sensors for another table."""
         return self.like(data=table, noise="absolute")
 
-    def unpredicted(self, residuals: FloatArray) -> str:
+    def why_not_finite(self, residuals: FloatArray) -> str:
         """Return why residuals are not finite, and what to do; empty if they are."""
         lost = np.flatnonzero(~np.isfinite(residuals))
         if not lost.size:
@@ -276,14 +276,15 @@ class TableProblem(Problem):
     def near(self, theta: FloatArray) -> TableProblem:
         """Return a problem that predicts nearly the same near theta, (P,), and much faster.
 
-        Exact steady motions are computed to second order in the distance from theta; see ``Nearby``
-        in problem/prediction.py. Returns the problem itself if it has no exact steady motions.
+        Exact steady motions are computed to second order in the distance from theta; see
+        ``NearbyPredictor`` in problem/prediction.py. Returns the problem itself if it has no exact
+        steady motions.
         """
-        if not self.is_exact or isinstance(self._predictor, Nearby):
+        if not self.is_exact or isinstance(self._predictor, NearbyPredictor):
             return self
         nearby = self.with_steady(self.steady)
         with np.errstate(all="ignore"):
-            nearby._predictor = Nearby(
+            nearby._predictor = NearbyPredictor(
                 self._predicting(exact=True), self._predicting(exact=False), theta
             )
         return nearby
@@ -341,7 +342,7 @@ class TableProblem(Problem):
         if theta.ndim > 1:
             return self._predictor(theta, derivatives=derivatives)
         key, latest = theta.tobytes(), self._latest
-        if latest is None or latest[0] != key or (derivatives and not latest[1].changes):
+        if latest is None or latest[0] != key or (derivatives and not latest[1].by_theta):
             latest = self._latest = key, self._predictor(theta, derivatives=derivatives)
         return latest[1]
 
@@ -353,7 +354,7 @@ class TableProblem(Problem):
         """Return R, shape (n,) or (S, n), and dR/dtheta, (n, P) or (S, n, P)."""
         theta = self.space.checked(theta)
         prediction, shape = self._prediction(theta, 2), self._shape(theta)
-        changes = [np.broadcast_to(d, shape) for d in prediction.changes]
+        changes = [np.broadcast_to(d, shape) for d in prediction.by_theta]
         return np.array(np.broadcast_to(prediction.value, shape)), np.stack(changes, axis=-1)
 
     def unit_sizes(self, dimension: Dimension) -> FloatArray:
@@ -420,7 +421,7 @@ class TableProblem(Problem):
                 changes = [-whiten(d) for d in by]
             else:
                 y, whiten, error = correct_amplitude(noise, value_and_slope)
-                by = self._predictor(theta, amplitude_error=error).changes if derivatives else []
+                by = self._predictor(theta, amplitude_error=error).by_theta if derivatives else []
                 changes = [-whiten(d) for d in by]
             pairs = np.empty((*self._shape(theta)[:-1], len(changes) + 1, self._rows.n), complex)
             for index, column in enumerate((y, *changes)):

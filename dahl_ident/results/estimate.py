@@ -31,7 +31,7 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
-from dahl_ident.problem import ProblemBatch, kind_of, problem_of, refuse_options
+from dahl_ident.problem import ProblemBatch, problem_class, problem_of, refuse_options
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
@@ -149,7 +149,7 @@ def fit(
     >>> result.params["f_max"].value.__round__(9), result.success
     (0.1, True)
     """
-    refuse_options(kind_of(data), locals(), fit)
+    refuse_options(problem_class(data), locals(), fit)
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
     ipopt_options: dict[str, Any] = {
@@ -179,7 +179,7 @@ def fit(
             f"{stop}; this exception's `result` holds the best values so far",
             FitResult(stop.result),
         ) from stop
-    if cause := problem.unpredicted(optimum.residuals):
+    if cause := problem.why_not_finite(optimum.residuals):
         raise FitError(cause)
     if throw and not result.success:
         raise FitError(f"{result.goodness.cause} {result.message}".strip(), result)
@@ -352,7 +352,9 @@ def posterior(
     options = {**locals()}
     one_of(method, "method", METHODS)
     source = data if isinstance(data, FitResult) else None
-    refuse_options(kind_of(data) if source is None else type(source.problem), options, posterior)
+    refuse_options(
+        problem_class(data) if source is None else type(source.problem), options, posterior
+    )
     defaults = signature(posterior).parameters
     refused = [n for n in _NOT_OF_METHODS[method] if options[n] != defaults[n].default]
     if refused:

@@ -41,7 +41,7 @@ def fit_report(fit: FittedModel, intervals: ConfidenceIntervals, *, details: boo
     if details:
         return "\n".join(_lines(sections))
     title, verdict = next(sections)
-    parameters = _parameters(fit, intervals, fit.problem.of_device)
+    parameters = _parameters(fit, intervals, fit.problem.device_parameters)
     numbers = list(_lines([("Parameters", parameters)]))[: _BRIEF - 2]
     room = _BRIEF - 1 - len(numbers)
     if len(verdict) > room:

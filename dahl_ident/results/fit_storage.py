@@ -154,7 +154,7 @@ def _record_problem(content: Mapping[str, Any]) -> RecordProblem:
         **{name: content[name] for name in _OF_PROBLEM},
     )
     problem.runs = tuple(content["runs"])
-    problem = problem.weighted(_floats(content["whitening"]))
+    problem = problem.with_whitening(_floats(content["whitening"]))
     return problem.delayed(content["delay"]).without_noise(content["displacement_noise"])
 
 

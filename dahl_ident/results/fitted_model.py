@@ -70,7 +70,7 @@ class FittedModel(Result):
     method: str = part("optimum.method", "The solver.")
     message: str = part("optimum.message", "How the search ended, in words.")
     scale_known: bool = part("optimum.scale_known", "Whether the noise's scale was known.")
-    ndata: int = part("problem.n_numbers", "Real numbers: two a row, one that of a mean force.")
+    ndata: int = part("problem.n_nonzero", "Real numbers: two a row, one that of a mean force.")
     nfree: int = part("optimum.dof", "Degrees of freedom.")
     nfev: int = part("optimum.nfev", "Evaluations of the residuals.")
     combinations: tuple[DeterminedCombination, ...] = part(

@@ -109,7 +109,7 @@ class PosteriorDraws(Result):
         values = dict(zip(self.names, self.mean().tolist(), strict=True))
         stderr = dict(zip(self.names, self.std().tolist(), strict=True))
         every = Parameters.of(self.problem, values, stderr)
-        shown = {name: every[name] for name in self.problem.of_device}
+        shown = {name: every[name] for name in self.problem.device_parameters}
         if SCALE in values:
             at = values[SCALE], stderr[SCALE]
             shown[SCALE] = Estimate(SCALE, "", "noise scale", *at, None, 0.0, math.inf, True)

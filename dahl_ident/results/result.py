@@ -69,7 +69,7 @@ class Parameters(dict[str, Estimate]):
     ) -> Parameters:
         """Return every parameter of a problem, with the values that were estimated."""
         estimates = {}
-        for p in problem.every_parameter:
+        for p in problem.all_parameters:
             value = values.get(p.name, p.value)
             estimates[p.name] = Estimate(
                 p.name, shown_unit(p.unit, problem.motion), p.description,
