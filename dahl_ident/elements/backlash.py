@@ -84,13 +84,13 @@ class Backlash(Friction):
         if isinstance(element, Backlash):
             raise ModelError(f"Backlash got {element!r}, which has a gap already; widen that one")
         self._element = element
-        self._name = element.name
+        self.name = element.name
         self.equation = f"{element.equation}; {type(self).equation}"
         self.scale_parameters = element.scale_parameters
         self.parameters = (
             *element.parameters,
             Parameter(
-                prefixed(self._name, "gap"), "m", "play of the link", gap, lower=0.0,
+                prefixed(self.name, "gap"), "m", "play of the link", gap, lower=0.0,
                 transform="log",
             ),
         )  # fmt: skip

@@ -18,7 +18,6 @@ from dahl_ident.arrays import (
     finite_array,
     finite_number,
     non_negative_array,
-    real_array,
     whole_number,
 )
 from dahl_ident.elements.facts import (
@@ -64,10 +63,12 @@ class Element(ABC):
     unique_response : bool
         True: in parallel with a passive linear part the response to a sine force is unique, because
         A abs(L + N(A)) rises with A.
+    name : str or None
+        The element's name, which prefixes those of its parameters.
     parameters : tuple of Parameter
         In the order of the constructor: declarations on the class, with values on an element.
     optional : (Parameter, float) or None
-        One more parameter, and the number that means: without this parameter.
+        One more parameter, and the argument with which an element does not have it.
     linear_parameters : tuple of str
         Labels of parameters in which the force is linear.
     scale_parameters : tuple of str
@@ -98,7 +99,7 @@ class Element(ABC):
     starts: tuple[tuple[str, str, str], ...] = (
         ("initial_force", "N", "friction at the first sample"),
     )
-    _name: str | None = None
+    name: str | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -113,7 +114,7 @@ class Element(ABC):
 
     def _bind(self, arguments: Mapping[str, float | None], name: str | None) -> None:
         """Give the declared parameters their full names and values."""
-        self._name = name
+        self.name = name
         declared = type(self).parameters
         if self.optional and arguments[self.optional[0].name] != self.optional[1]:
             declared = (*declared, self.optional[0])
@@ -196,7 +197,7 @@ class Element(ABC):
         ModelError
             If a parameter has no value.
         ValidationError
-            If `amplitude` is negative, or either argument is NaN, infinite or complex.
+            If an argument is negative, NaN, infinite or complex.
 
         Examples
         --------
@@ -307,11 +308,6 @@ class Element(ABC):
         return f"{self.label(parameter)}={value}"
 
     # The mathematics, in plain numbers; arguments are not checked.
-
-    @property
-    def name(self) -> str | None:
-        """The element's name, which prefixes its parameters, or None."""
-        return self._name
 
     def label(self, parameter: Parameter) -> str:
         """Return a parameter's name without the element's prefix."""
@@ -522,14 +518,14 @@ def prefixed(name: str | None, label: str) -> str:
 
 
 def required_history(
-    value: ArrayLike | None, name: str, displacement: ArrayLike, needed_by: Element
+    value: ArrayLike | None, name: str, displacement: FloatArray, element: Element
 ) -> FloatArray:
-    """Return a history, checked to be there and as long as `displacement`."""
+    """Return a history that an element needs, checked to be as long as `displacement`."""
     if value is None:
-        raise ValidationError(f"{needed_by!r} needs {name} to give its force; pass {name}=")
-    history, x = finite_array(value, name), real_array(displacement, "displacement")
-    if history.shape != x.shape:
+        raise ValidationError(f"{element!r} needs {name} to give its force; pass {name}=")
+    history = finite_array(value, name)
+    if history.shape != displacement.shape:
         raise ValidationError(
-            f"{name} has shape {history.shape}; expected that of displacement, {x.shape}"
+            f"{name} has shape {history.shape}; expected that of displacement, {displacement.shape}"
         )
     return history

@@ -124,7 +124,7 @@ class Friction(Element):
         """
 
     def output(self, force: Any, slope: Any, velocity: Any, values: Sequence[Any]) -> Any:
-        """Return the whole force from the state `force`, its slope dF/dx and the velocity.
+        """Return the total force from the state `force`, its slope dF/dx and the velocity.
 
         The state itself, except in a velocity-dependent law that damps in addition.
         """
@@ -269,7 +269,7 @@ class Friction(Element):
         return np.asarray(low), np.asarray(high)
 
     def has_harmonic(self, harmonic: int) -> bool:
-        """Return whether the force may have this harmonic: even ones where directions differ."""
+        """Return whether the force may have this harmonic: an even one if the directions differ."""
         return harmonic % 2 == 1 or not same_both_ways(self)
 
     def transient_decay(

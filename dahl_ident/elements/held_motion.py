@@ -71,7 +71,7 @@ def form_of(law: Element) -> Hashable:
     attributes = tuple(
         (name, form_of(value) if isinstance(value, Element) else repr(value))
         for name, value in sorted(law.__dict__.items())
-        if name not in ("parameters", "_name")
+        if name not in ("parameters", "name")
     )
     return (type(law), tuple(c if c in (0.0, 1.0) else None for c in constants), attributes)
 

@@ -215,7 +215,8 @@ class _Trial:
         self._slopes = [self._slope(s * self._forces, s) for s in (1.0, -1.0)]
         ahead = self._slopes[0][_REST:]
         self._rest_slope = ahead[0]
-        self._limits = [self._limit(s, w) for s, w in zip((1.0, -1.0), self._slopes, strict=True)]
+        both = zip((1.0, -1.0), self._slopes, strict=True)
+        self._limits = [self._limit(direction, slopes) for direction, slopes in both]
         with np.errstate(all="ignore"):
             changed = np.abs(ahead / self._rest_slope - 1.0) > _CHANGED
         first = self._forces[_REST + changed.argmax()] if changed.any() else np.inf
@@ -279,19 +280,19 @@ class _Trial:
 
         inf if there is none.
         """
-        size, ahead = self._forces[_REST:], slopes[_REST:]
+        forces, ahead = self._forces[_REST:], slopes[_REST:]
         with np.errstate(invalid="ignore"):
             stops = np.flatnonzero(~((ahead > 0.0) & (ahead < np.inf)))
         before = ahead[: stops[0]] if stops.size else ahead
         if not stops.size or (before.size and before[-1] > _OVERFLOW * before[0]):
             return np.inf
-        low, high = size[max(0, stops[0] - 1)], size[stops[0]]
+        low, high = forces[max(0, stops[0] - 1)], forces[stops[0]]
         for _ in range(4):
             between = np.linspace(low, high, 33)
             with np.errstate(invalid="ignore"):
                 positive = self._slope(direction * between, direction) > 0.0
-            last = 32 if positive.all() else max(int(positive.argmin()), 1)
-            low, high = between[last - 1], between[last]
+            stop = 32 if positive.all() else max(int(positive.argmin()), 1)
+            low, high = between[stop - 1], between[stop]
         return float(high)
 
     def up_to_slip(self) -> str:

@@ -121,7 +121,7 @@ class LinearSystem(Element):
                 f"system is a {type(system).__name__} with the parameters {list(arguments)}; "
                 "expected a python-control system without parameters, or a function of all of them"
             )
-        self._name = name
+        self.name = name
         self.system = system
         self.quantity = quantity
         self.parameters = tuple(_parameter(prefixed(name, k), v) for k, v in arguments.items())

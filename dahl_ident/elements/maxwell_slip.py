@@ -84,7 +84,7 @@ class MaxwellSlip(Masing):
             raise ValidationError(
                 f"stiffnesses have shape {k.shape}; expected one for each of {n} slips"
             )
-        self._name = name
+        self.name = name
         self.parameters = tuple(
             Parameter(
                 prefixed(name, f"{label}_{i + 1}"), unit, f"{meaning} {i + 1}",
