@@ -74,6 +74,7 @@ class Backlash(Friction):
         ("initial_play", "m", "position in the gap at the first sample; beyond the gap in contact"),
     )
     equation = "F = F_element(y), y = x - play, abs(play) <= gap/2; the play moves at F = 0"
+    n_states = 2  # the force, and the position in the gap
 
     def __init__(self, element: Element, gap: float | None = None) -> None:
         if not (isinstance(element, Friction) and element.rate_independent and element.one_state):
@@ -118,11 +119,6 @@ class Backlash(Friction):
     def inner_elements(self) -> tuple[Any, ...]:
         """The element behind the gap."""
         return (self._element,)
-
-    @property
-    def n_states(self) -> int:
-        """Number of states: the force, and the position in the gap."""
-        return 2
 
     def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
         """Return the force and the position in the gap; beyond the gap the element is a spring."""

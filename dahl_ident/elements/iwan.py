@@ -97,17 +97,12 @@ class Iwan(Masing):
         ),
     )  # fmt: skip
 
-    _count = _SLIDERS
-
-    @property
-    def n_states(self) -> int:
-        """Number of Jenkins elements that replace the law under a driving force."""
-        return self._count
+    n_states = _SLIDERS
 
     def coarser(self) -> Iwan:
         """Return this law with fewer Jenkins elements to replace it."""
         copy = self.copy_with(self.parameters)
-        copy._count = _FEW_SLIDERS
+        copy.n_states = _FEW_SLIDERS
         return copy
 
     def sliders(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
@@ -116,7 +111,7 @@ class Iwan(Masing):
         The slip displacements are d_m (i/n)^2; the forces there are those of the backbone curve.
         """
         _, sigma, chi, ratio = values
-        n = self._count
+        n = self.n_states
         d = _onset(values)
         slips: list[Any] = [0.0]
         forces: list[Any] = [0.0]
