@@ -88,7 +88,7 @@ class Shooting:
         return translate(plant_equations(self._coefficients.model))
 
     def drifts(self, values: FloatArray) -> bool:
-        """Return whether the mean displacement moves on in each cycle, at one vector of values.
+        """Return whether the mean displacement drifts from cycle to cycle, at one vector of values.
 
         It does if no spring acts and friction differs between the directions; then no motion has
         the period of the drive.

@@ -12,6 +12,7 @@ import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,7 +187,7 @@ class LinearSystem(Element):
         return Z
 
     def typical_stiffness(self) -> Rational:
-        """Return Z(s) near the present values, but where no term vanishes by chance."""
+        """Return Z(s) at values near those of the parameters, so that no term is 0 by chance."""
         shifts = np.random.default_rng(1).uniform(0.8, 1.2, len(self.parameters))
         near = [
             float(np.clip(shift * (1.0 if p.value is None else p.value), p.lower, p.upper))
@@ -291,18 +292,17 @@ class LinearSystem(Element):
     def from_description(cls, description: Mapping[str, Any], name: str | None) -> LinearSystem:
         """Return the linear system that :meth:`describe` described."""
         control = importlib.import_module("control")
-
-        def parts(*keys: str) -> list[Any]:
-            return [description[key] for key in keys]
-
         try:
             if "omega" in description:
-                real, imag, omega = map(np.asarray, parts("real", "imag", "omega"))
+                parts = itemgetter("real", "imag", "omega")(description)
+                real, imag, omega = (np.asarray(part) for part in parts)
                 system = control.FRD(real + 1j * imag, omega)
             elif "numerator" in description:
-                system = control.TransferFunction(*parts("numerator", "denominator", "dt"))
+                parts = itemgetter("numerator", "denominator", "dt")(description)
+                system = control.TransferFunction(*parts)
             else:
-                system = control.StateSpace(*parts("A", "B", "C", "D", "dt"))
+                parts = itemgetter("A", "B", "C", "D", "dt")(description)
+                system = control.StateSpace(*parts)
             return cls(system, quantity=description["quantity"], name=name)
         except KeyError as exc:
             raise ModelError(
