@@ -1,8 +1,9 @@
 """Settled motion under a sine: of a law under its displacement, or of a plant under its drive.
 
-The settled motion is the fixed point of one cycle's map, y(T) = y(0), which Newton's method finds
-with the map's own derivatives (shooting). Equations that are the same in both directions need half
-a cycle: y(T/2) = -y(0). Derivatives of the fixed point follow from the implicit function theorem.
+The settled motion is the fixed point of the map of one cycle, y(T) = y(0), which is solved by
+Newton's method with the derivatives of that map (shooting). Equations that are the same in both
+directions need half a cycle: y(T/2) = -y(0). Derivatives of the fixed point follow from the
+implicit function theorem.
 """
 
 from __future__ import annotations
@@ -26,23 +27,24 @@ from dahl_ident.engine.radau import (
     restart,
 )
 
-_ITERATIONS = 40  # of shooting; five are the rule
-_CONVERGED = 1e-4  # change of the first state over the largest one; its square is corrected
-_FAR = 1.0  # the same; a longer Newton step is replaced by a cycle
-_AGREED = 1e-3  # change by the last cycle; where it is more, rounding decides: nothing settles
-_FOLLOWS = 1e-9  # of their sizes: two changes by a cycle that are in proportion
+_ITERATIONS = 40  # of shooting; five are typical
+# Changes of the initial states over the largest states:
+_CONVERGED = 1e-4  # the last cycle corrects the error, which is the square of this
+_FAR = 1.0  # a larger change by Newton's method is replaced by a cycle,
+_NEWTON_EVERY = 4  # except every fourth: in a sharp resonance cycles alone take too long
+_AGREED = 1e-3  # a larger change by the last cycle is due to rounding: nothing settles
+_FOLLOWS = 1e-9  # relative difference of two changes by a cycle that count as proportional
 _UNDECIDED = 1e-9  # change of all states by a cycle that is an error of its steps
-_FADING = 0.1  # share of the sizes of earlier cycles, which may have gone far astray
-_DARING = 4  # but not every fourth: in a sharp resonance cycles alone take too long
+_FADING = 0.1  # weight of the sizes in earlier cycles, which may have been far too large
 _COARSE = 300.0  # errors of steps while shooting, over those of the last cycle
-_SHORTEST = 12.0  # steps of a cycle, and of one of the highest harmonic, at least
+_SHORTEST = 12.0  # least number of steps in a cycle of the highest harmonic
 
 
 @compiled
 def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
-    """Let what follows the displacement through a whole cycle keep its offset from it.
+    """Let states that follow the displacement through a whole cycle keep their offset from it.
 
-    It returns to where it was, whatever that is: an equation that says nothing, and is replaced.
+    They return to any initial value: the equation is trivial, and is replaced.
     """
     n, o = at.n, at.outputs
     m = n + 1 + at.k
@@ -51,8 +53,9 @@ def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
         g = w[o + i]
         follows = g != 0.0
         for j in range(n):
-            apart = abs(matrix[i, j] - g * matrix[0, j]) * w[at.scale + j]
-            follows = follows and apart <= _FOLLOWS * (w[at.scale + i] + abs(g) * w[at.scale])
+            difference = abs(matrix[i, j] - g * matrix[0, j]) * w[at.scale + j]
+            size = w[at.scale + i] + abs(g) * w[at.scale]
+            follows = follows and difference <= _FOLLOWS * size
         if follows:
             matrix[i] = 0.0
             matrix[i, i], matrix[i, 0] = 1.0, -g
@@ -71,14 +74,14 @@ def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
 )  # fmt: skip
 def cycles(
     f, sizes, solved, followers, odd, amplitudes, omegas, parameters, starts, chosen, harmonics,
-    plain, tolerance,
+    initial_cycles, tolerance,
 ):  # fmt: skip
     """Return settled motions, row by row.
 
-    Whether each was found; harmonics c_k of ``output = sum of Re c_k exp(j k omega t)`` with their
-    derivatives with respect to the signal's amplitude and the parameters `chosen`; the first
-    states; the map of a cycle, or of half a cycle with its sign where the system is odd. The first
-    `plain` iterations are cycles without Newton's method.
+    Whether each converged; harmonics c_k of ``output = sum of Re c_k exp(j k omega t)`` with their
+    derivatives with respect to the signal's amplitude and the parameters `chosen`; the initial
+    states; the map of a cycle, or of half a cycle with its sign if the system is odd. The first
+    `initial_cycles` iterations are cycles without Newton's method.
     """
     n, held, rows = sizes[0], sizes[3], amplitudes.size
     begin = 2 if held else 0
@@ -89,11 +92,11 @@ def cycles(
     w = np.zeros(at.length)
     size = STAGES * n
     block, sides = np.zeros((size, size)), np.zeros((size, max(1, q)))
-    found = np.zeros(rows, dtype=np.int64)
+    converged = np.zeros(rows, dtype=np.int64)
     result = np.zeros((rows, harmonics.size, 2 + chosen.size), dtype=np.complex128)
     first, maps = starts.copy(), np.zeros((rows, n, n))
-    none, nobody = np.empty(0), np.empty(0, dtype=np.int64)
-    nothing, empty = np.empty((0, 0)), np.empty((0, 1 + q), dtype=np.complex128)
+    no_array, no_parameters = np.empty(0), np.empty(0, dtype=np.int64)
+    no_table, no_sums = np.empty((0, 0)), np.empty((0, 1 + q), dtype=np.complex128)
     sums = np.zeros((harmonics.size, 1 + q), dtype=np.complex128)
     matrix, columns = np.zeros((free, free)), np.zeros((free, 2 + chosen.size))
     highest = 1.0
@@ -102,7 +105,7 @@ def cycles(
     for row in range(rows):
         put_parameters(f, parameters[row], w, at)
         restart(w, at)
-        signal = Signal(True, amplitudes[row], omegas[row], none, nothing)
+        signal = Signal(True, amplitudes[row], omegas[row], no_array, no_table)
         period = 2.0 * np.pi / omegas[row]
         times = np.array([0.0, 0.5 * period if odd else period])
         longest = period / (_SHORTEST * highest)
@@ -110,16 +113,17 @@ def cycles(
         y = first[row]
         if held:
             y[0], y[1] = amplitudes[row], 0.0
-        for coarse in (_COARSE, 1.0):  # what coarse steps miss, fine ones find
-            found[row] = 0
+        for coarse in (_COARSE, 1.0):  # if coarse steps fail, fine ones may not
+            converged[row] = 0
             for iteration in range(_ITERATIONS):
                 w[at.scale : at.scale + n] *= _FADING
                 x, S = y.copy(), np.zeros((n, free + 1))
                 for i in range(free):
                     S[begin + i, i] = 1.0
                 step = advance(
-                    f, solved, followers, signal, times, x, S, nobody, coarse * tolerance, longest,
-                    step, none, empty, none, none, nothing, nothing, w, at, block, sides,
+                    f, solved, followers, signal, times, x, S, no_parameters, coarse * tolerance,
+                    longest, step, no_array, no_sums, no_array, no_array, no_table, no_table, w, at,
+                    block, sides,
                 )  # fmt: skip
                 if step <= 0.0:
                     break
@@ -128,22 +132,23 @@ def cycles(
                         matrix[i, j] = (1.0 if i == j else 0.0) - sign * S[begin + i, j]
                     columns[i, 0] = sign * x[begin + i] - y[begin + i]
                 if not held:
-                    keep_offsets(f, signal, y, nobody, w, at, matrix, columns)
+                    keep_offsets(f, signal, y, no_parameters, w, at, matrix, columns)
                 largest = 0.0
-                if iteration < plain or not eliminate(matrix, columns, free, 1):
+                if iteration < initial_cycles or not eliminate(matrix, columns, free, 1):
                     largest = np.inf
-                for i in range(free if iteration >= plain else 0):
+                for i in range(free if iteration >= initial_cycles else 0):
                     if columns[i, 0] != 0.0:
                         largest = max(largest, abs(columns[i, 0]) / w[at.scale + begin + i])
                 for i in range(free):
-                    if largest <= _FAR or (largest < np.inf and iteration % _DARING == _DARING - 1):
+                    is_forced = largest < np.inf and iteration % _NEWTON_EVERY == _NEWTON_EVERY - 1
+                    if largest <= _FAR or is_forced:
                         y[begin + i] += columns[i, 0]
                     else:
                         y[begin + i] = sign * x[begin + i]
                 if largest < _CONVERGED:
-                    found[row] = 1
+                    converged[row] = 1
                     break
-            if not found[row]:
+            if not converged[row]:
                 continue
             x, S = y.copy(), np.zeros((n, q))
             for i in range(free):
@@ -153,10 +158,10 @@ def cycles(
             sums[:] = 0.0
             step = advance(
                 f, solved, followers, signal, times, x, S, chosen, tolerance, longest, step,
-                harmonics, sums, none, none, nothing, nothing, w, at, block, sides,
+                harmonics, sums, no_array, no_array, no_table, no_table, w, at, block, sides,
             )  # fmt: skip
             if step <= 0.0:
-                found[row] = 0
+                converged[row] = 0
                 continue
             largest = 0.0
             for i in range(free):
@@ -172,14 +177,14 @@ def cycles(
             if not eliminate(matrix, columns, free, 2 + chosen.size):
                 columns[:] = np.inf
             if free and largest < _UNDECIDED:
-                found[row] = 0
+                converged[row] = 0
             for i in range(free):
                 if abs(columns[i, 0]) > _AGREED * w[at.scale + begin + i]:
-                    found[row] = 0
+                    converged[row] = 0
                 y[begin + i] += columns[i, 0]
-            if found[row]:
+            if converged[row]:
                 break
-        if not found[row]:
+        if not converged[row]:
             continue
         for a in range(harmonics.size):
             k = harmonics[a]
@@ -191,4 +196,4 @@ def cycles(
                 for i in range(free):
                     value += sums[a, 1 + i] * columns[i, z]
                 result[row, a, z] = factor * value
-    return found, result, first, maps
+    return converged, result, first, maps

@@ -6,9 +6,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 
-_DEGREE = 4  # of the polynomials: the acceleration is one of second degree
-_POWER = 0.9999  # share of the velocity's power below the band's end
-_MARGIN = 4.0  # the filter passes this times the band: at twice, a mass is 2 % wrong
+_DEGREE = 4  # of the polynomials; that of the acceleration is 2
+_POWER = 0.9999  # share of the velocity's power in the band of the signal
+_MARGIN = 4.0  # pass band of the filter over that band: at 2 a mass has an error of 2 %
 
 
 def differentiated(
@@ -18,8 +18,8 @@ def differentiated(
 
     A polynomial of degree 4 is fitted to a moving window (Savitzky and Golay, Anal. Chem. 36
     (1964) 1627-1639). The window is the longest odd number of samples, at least 5, whose pass
-    band, about (degree + 1)/(3.2 half-width - 4.6) of half the sampling rate, holds four times that
-    below which 99.99 % of the velocity's power lies.
+    band, about (degree + 1)/(3.2 half-width - 4.6) of half the sampling rate, is four times as wide
+    as the band with 99.99 % of the velocity's power. `stretch` is a factor on its length.
 
     Examples
     --------
@@ -28,7 +28,7 @@ def differentiated(
     >>> bool(abs(a[200] + (2.0 * np.pi) ** 2 * np.sin(2.0 * np.pi * t[200])) < 0.05)
     True
     """
-    from scipy.signal import savgol_filter  # loads for long, and few need it
+    from scipy.signal import savgol_filter  # slow to import, and rarely needed
 
     half = max(2, round(stretch * (filter_window(samples) // 2)))
     window = min(2 * half + 1, samples.size - 1 + samples.size % 2)
@@ -42,7 +42,8 @@ def differentiated(
 def filter_window(samples: FloatArray) -> int:
     """Return the number of samples in the moving window for these values."""
     steps = np.diff(samples)
-    power = np.abs(np.fft.rfft(np.hanning(steps.size) * (steps - steps.mean()))) ** 2  # no leakage
+    # the window prevents leakage
+    power = np.abs(np.fft.rfft(np.hanning(steps.size) * (steps - steps.mean()))) ** 2
     total = power.sum()
     if total == 0.0:
         return 5

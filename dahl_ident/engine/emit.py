@@ -1,7 +1,7 @@
-"""From an expression graph to machine code: every operation is one instruction, written directly.
+"""From an expression graph to machine code: every operation is one LLVM instruction.
 
-numba links the result and gives it the type of a C function. Its own compiler would infer types of
-thousands of lines first, all of which are numbers.
+numba links the result and gives it the type of a C function. Its own compiler would first infer the
+types of thousands of lines, all of which are numbers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from dahl_ident.errors import ModelError
 
 _BINARY = {"ADD": "fadd", "SUB": "fsub", "MUL": "fmul", "DIV": "fdiv"}
-_COMPARED = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
+_COMPARISONS = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
 _INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs", "floor", "ceil")
 _LIBRARY = (
     "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf",
@@ -24,7 +24,7 @@ _LIBRARY = (
 _NAMES = {
     code: name
     for name in (
-        *_BINARY, *_COMPARED, *(n.upper() for n in (*_INTRINSIC, *_LIBRARY)), "ASSIGN", "NEG",
+        *_BINARY, *_COMPARISONS, *(n.upper() for n in (*_INTRINSIC, *_LIBRARY)), "ASSIGN", "NEG",
         "SQ", "TWICE", "INV", "FMIN", "FMAX", "SIGN", "NOT", "AND", "OR", "IF_ELSE_ZERO", "POW",
         "CONSTPOW",
     )
@@ -33,21 +33,25 @@ _NAMES = {
 
 
 class Step(NamedTuple):
-    """One operation: its name, what it works on, and where the result goes.
+    """One operation: its name and its arguments.
 
-    Names: "CONST" with a number, "INPUT" and "OUTPUT" with a place in the array, "LEVEL" with the
-    level below which the function returns, "BEGIN" where those end that are made at level -1 alone,
-    or an operation of casadi with earlier results.
+    The name is that of an operation of casadi, with the numbers of earlier steps, whose results it
+    uses; "CONST" with a number; "INPUT" with an index of the array; "OUTPUT" with an index and a
+    step; "LEVEL" with the level below which the function returns; or "BEGIN", which ends the
+    operations of level -1.
     """
 
     name: str
     arguments: tuple[float, ...]
 
 
-def steps_of(graph: ca.Function, places: Sequence[Sequence[int]]) -> tuple[Step, ...]:
-    """Return the operations of a function of one vector, whose outputs are levels."""
-    found: list[Step] = []
-    latest: dict[int, int] = {}  # step that set a place of casadi's memory
+def steps_of(graph: ca.Function, indices: Sequence[Sequence[int]]) -> tuple[Step, ...]:
+    """Return the operations of a function of one vector, whose outputs are levels.
+
+    `indices` are those of the array at which the nonzeros of each output are written.
+    """
+    steps: list[Step] = []
+    latest: dict[int, int] = {}  # the last step that wrote to an element of casadi's memory
     level = 0
     for k in range(graph.n_instructions()):
         code, target = graph.instruction_id(k), graph.instruction_output(k)
@@ -55,8 +59,8 @@ def steps_of(graph: ca.Function, places: Sequence[Sequence[int]]) -> tuple[Step,
         if code == ca.OP_OUTPUT:
             while level < target[0]:
                 level += 1
-                found.append(Step("LEVEL", (level,)))
-            found.append(Step("OUTPUT", (places[level][target[1]], latest[source[0]])))
+                steps.append(Step("LEVEL", (level,)))
+            steps.append(Step("OUTPUT", (indices[level][target[1]], latest[source[0]])))
             continue
         if code == ca.OP_CONST:
             step = Step("CONST", (graph.instruction_constant(k),))
@@ -69,16 +73,16 @@ def steps_of(graph: ca.Function, places: Sequence[Sequence[int]]) -> tuple[Step,
                 f"the equations use the casadi operation {code}, which has no translation; use "
                 f"arithmetic, comparisons, {', '.join((*_INTRINSIC, *_LIBRARY))}"
             )
-        latest[target[0]] = len(found)
-        found.append(step)
-    return tuple(found)
+        latest[target[0]] = len(steps)
+        steps.append(step)
+    return tuple(steps)
 
 
 def prepared(steps: Sequence[Step], first: int, last: int) -> tuple[tuple[Step, ...], int]:
-    """Return the operations with those apart that depend on the inputs from first to last alone.
+    """Return the steps, those first that depend on constants and inputs `first` to `last` only.
 
-    They are made once for many calls, at level -1; their results are kept in places from `last` on,
-    behind which the outputs move. Their number is returned too.
+    Those are executed once for many calls, at level -1. Their results are stored in the array from
+    index `last` on, before the outputs. The number of these results is returned too.
     """
     fixed = [False] * len(steps)
     for i, (name, values) in enumerate(steps):
@@ -92,31 +96,31 @@ def prepared(steps: Sequence[Step], first: int, last: int) -> tuple[tuple[Step, 
         if not fixed[i] and name not in ("INPUT", "LEVEL")
         for j in (values[1:] if name == "OUTPUT" else values)
     }
-    kept = [i for i in sorted(needed) if fixed[i] and steps[i].name not in ("CONST", "INPUT")]
-    made: dict[int, int] = {}
+    stored = [i for i in sorted(needed) if fixed[i] and steps[i].name not in ("CONST", "INPUT")]
+    new_number: dict[int, int] = {}
     result: list[Step] = []
 
     def add(i: int) -> None:
         name, values = steps[i]
         if name == "OUTPUT":
-            values = (values[0] + len(kept), made[int(values[1])])
+            values = (values[0] + len(stored), new_number[int(values[1])])
         elif name not in ("CONST", "INPUT", "LEVEL"):
-            values = tuple(made[int(j)] for j in values)
-        made[i] = len(result)
+            values = tuple(new_number[int(j)] for j in values)
+        new_number[i] = len(result)
         result.append(Step(name, values))
 
-    for i in range(len(steps) if kept else 0):
+    for i in range(len(steps) if stored else 0):
         if fixed[i]:
             add(i)
-    result += [Step("OUTPUT", (last + slot, made[i])) for slot, i in enumerate(kept)]
+    result += [Step("OUTPUT", (last + slot, new_number[i])) for slot, i in enumerate(stored)]
     result.append(Step("BEGIN", ()))
-    for slot, i in enumerate(kept):
-        made[i] = len(result)
+    for slot, i in enumerate(stored):
+        new_number[i] = len(result)
         result.append(Step("INPUT", (last + slot,)))
     for i in range(len(steps)):
         if not fixed[i] or steps[i].name in ("CONST", "INPUT"):
             add(i)
-    return tuple(result), len(kept)
+    return tuple(result), len(stored)
 
 
 def compiled(steps: Sequence[Step]) -> Any:
@@ -140,7 +144,7 @@ def compiled(steps: Sequence[Step]) -> Any:
 
 
 def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
-    """Write the instructions of all steps at a builder of numba's."""
+    """Write the instructions of all steps with a builder of numba."""
     from llvmlite import ir
 
     number, whole = ir.DoubleType(), ir.IntType(32)
@@ -149,7 +153,7 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
     end, begin = (builder.append_basic_block(name) for name in ("end", "begin"))
     prepare = builder.append_basic_block("prepare")
 
-    def place(i: float) -> Any:
+    def address(i: float) -> Any:
         return builder.gep(array, [ir.Constant(whole, int(i))])
 
     def call(name: str, *arguments: Any) -> Any:
@@ -163,20 +167,20 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
     def holds(a: Any) -> Any:
         return builder.fcmp_unordered("!=", a, zero)
 
-    def power(a: Any, b: Any) -> Any:  # rest on a kink has no slope
+    def power(a: Any, b: Any) -> Any:  # at 0 it is 0 unless b is: at rest on a kink slopes are 0
         at_zero = as_number(builder.fcmp_ordered("==", b, zero))
         positive = call("llvm.exp.f64", builder.fmul(b, logarithm(a)))  # shares the logarithm
         before = builder.block
         with builder.if_then(builder.fcmp_ordered("<", a, zero), likely=False):
-            negative, there = call("llvm.pow.f64", a, b), builder.block
+            negative, inside = call("llvm.pow.f64", a, b), builder.block
         result = builder.phi(number)
         result.add_incoming(positive, before)
-        result.add_incoming(negative, there)
+        result.add_incoming(negative, inside)
         return builder.select(builder.fcmp_ordered("==", a, zero), at_zero, result)
 
-    def not_zero(a: Any) -> Any:  # at 0 a logarithm and the slope of a root stay finite
-        least = ir.Constant(number, float(np.finfo(np.float64).tiny))
-        return builder.select(builder.fcmp_ordered("==", a, zero), least, a)
+    def not_zero(a: Any) -> Any:  # so that a logarithm and the slope of a root are finite at 0
+        tiny = ir.Constant(number, float(np.finfo(np.float64).tiny))
+        return builder.select(builder.fcmp_ordered("==", a, zero), tiny, a)
 
     def logarithm(a: Any) -> Any:
         return call("llvm.log.f64", not_zero(a))
@@ -202,8 +206,8 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
         "POW": power,
         "CONSTPOW": power,
     }
-    once = builder.fcmp_ordered("<", builder.load(place(0)), zero)
-    builder.cbranch(once, prepare, begin)
+    is_preparation = builder.fcmp_ordered("<", builder.load(address(0)), zero)
+    builder.cbranch(is_preparation, prepare, begin)
     builder.position_at_end(prepare)
     for name, values in steps:
         result = None
@@ -213,27 +217,28 @@ def _write(steps: Sequence[Step], builder: Any, array: Any) -> None:
         elif name == "CONST":
             result = ir.Constant(number, values[0])
         elif name == "INPUT":
-            result = builder.load(place(values[0]))
+            result = builder.load(address(values[0]))
         elif name == "OUTPUT":
-            builder.store(results[int(values[1])], place(values[0]))
+            builder.store(results[int(values[1])], address(values[0]))
         elif name == "LEVEL":
-            enough = builder.fcmp_ordered(
-                "<", builder.load(place(0)), ir.Constant(number, values[0])
+            is_enough = builder.fcmp_ordered(
+                "<", builder.load(address(0)), ir.Constant(number, values[0])
             )
             more = builder.append_basic_block("more")
-            builder.cbranch(enough, end, more)
+            builder.cbranch(is_enough, end, more)
             builder.position_at_end(more)
         else:
-            own = [results[int(i)] for i in values]
+            operands = [results[int(i)] for i in values]
             if name in operations:
-                result = operations[name](*own)
+                result = operations[name](*operands)
             elif name in _BINARY:
-                result = getattr(builder, _BINARY[name])(*own)
-            elif name in _COMPARED:
-                result = as_number(builder.fcmp_ordered(_COMPARED[name], *own))
+                result = getattr(builder, _BINARY[name])(*operands)
+            elif name in _COMPARISONS:
+                result = as_number(builder.fcmp_ordered(_COMPARISONS[name], *operands))
             else:
-                low = name.lower()
-                result = call(f"llvm.{low}.f64" if low in _INTRINSIC else low, *own)
+                function = name.lower()
+                is_intrinsic = function in _INTRINSIC
+                result = call(f"llvm.{function}.f64" if is_intrinsic else function, *operands)
         results.append(result)
     builder.branch(end)
     builder.position_at_end(end)

@@ -1,4 +1,4 @@
-"""Where the velocity or a switching function passes through zero, and what changes there.
+"""Events: zeros of the velocity or of a switching function, and the change of branch there.
 
 A step is shortened to end at the event, and the next one begins on the other branch of the laws;
 sensitivities jump where the rates do. Arguments are those of :mod:`dahl_ident.engine.radau`.
@@ -14,33 +14,35 @@ from dahl_ident.engine.radau import (
     STAGES,
     compiled,
     evaluate,
-    put,
-    put_place,
+    put_interpolated,
+    put_states,
     read_stage,
     shorten,
     signal_at,
     solve_stages,
 )
 
-LOCATED = 1e-13  # of the span: shorter steps, and times that differ by less, are none
-DECADE, LEFT = 0.1, 1e-11  # of the distance to a limit: left after a step; at the end
-FADED = 0.6  # of a slope after a step that comes so near
+LOCATED = 1e-13  # of the span: shorter steps, and smaller differences of time, count as zero
+# Distances to a limit over that at the beginning of a step, and over the largest one:
+DECADE = 0.1  # a step that ends nearer is checked for a slope that fades
+LEFT = 1e-11  # at a smaller distance the limit counts as reached
+FADED = 0.6  # share of the slope left after such a step, below which it fades
 _BISECTIONS = 60
 _AT_REST = 1e-14  # of the largest velocity: rounding
-_SMALL = 1e-6  # of a state, or of a step: nothing has changed
-_REPEATS = 12  # of a step that is shortened to an event; two are the rule
-PLACES = np.concatenate(
+_SMALL = 1e-6  # relative change of a state, or of a step, that counts as none
+_REPEATS = 12  # of a step that is shortened to an event; two are typical
+POSITIONS = np.concatenate(
     [a + (b - a) * np.arange(1, 5) / 4 for a, b in zip([0.0, *NODES[:-1]], NODES, strict=True)]
 )
 _POWERS = np.arange(STAGES + 1)
-WITHIN = PLACES[:, None] ** _POWERS @ np.linalg.inv(np.append(0.0, NODES)[:, None] ** _POWERS)
-"""Weights of values at the beginning and the stages in those at the places between them."""
+WEIGHTS = POSITIONS[:, None] ** _POWERS @ np.linalg.inv(np.append(0.0, NODES)[:, None] ** _POWERS)
+"""Weights of values at the beginning and the stages in those at `POSITIONS`."""
 
 
 @compiled
 def choose_branch(f, signal, t, y, w, at):
-    """Set direction and sides at a state; where a function is zero, what it is about to become."""
-    put(y, w)
+    """Set the direction and the sides at a state; a zero counts as what it is about to become."""
+    put_states(y, w)
     evaluate(f, signal, t, 1.0, w, at)
     size = w[at.scale + 1]
     if at.held and signal.sine:
@@ -54,10 +56,10 @@ def choose_branch(f, signal, t, y, w, at):
 
 @compiled
 def choose_sides(f, signal, t, y, w, at):
-    """Set the sides of the switches at a state, on the way in the present direction."""
+    """Set the sides of the switches at a state, for motion in the present direction."""
     n, k, o = at.n, at.k, at.outputs
-    for _ in range(2 if k else 0):  # the side of one may depend on that of another
-        put(y, w)
+    for _ in range(2 if k else 0):  # the side of one switch may depend on that of another
+        put_states(y, w)
         evaluate(f, signal, t, 1.0, w, at)
         for i in range(k):
             value, scale = w[o + n + 1 + i], at.scale + n + 1 + i
@@ -85,26 +87,26 @@ def slope_of(e, w, at):
 @compiled
 def slope_at(f, signal, t, y, e, w, at):
     """Return the rate of change of switching function e at a state."""
-    put(y, w)
+    put_states(y, w)
     evaluate(f, signal, t, 1.0, w, at)
     return slope_of(e, w, at)
 
 
 @compiled
-def function_at(f, signal, t, h, y, place, e, w, at):
-    """Return the velocity (e = 0) or switching function e at a place of the step."""
-    put_place(y, place, w, at)
-    evaluate(f, signal, t + place * h, 0.0, w, at)
+def function_at(f, signal, t, h, y, position, e, w, at):
+    """Return the velocity (e = 0) or switching function e at a position of the step."""
+    put_interpolated(y, position, w, at)
+    evaluate(f, signal, t + position * h, 0.0, w, at)
     return w[2] if e == 0 else w[at.outputs + at.n + e]
 
 
 @compiled
-def goes_on(f, signal, t, h, y, e, w, at):
-    """Return whether function e, near zero at the step's end, goes on to the other side.
+def crosses_over(f, signal, t, h, y, e, w, at):
+    """Return whether function e, near zero at the step's end, continues to the other side.
 
-    On its own branch it may rest there, as a force does that unloads at once.
+    On the present branch it may stay at zero, as a force does that unloads immediately.
     """
-    put_place(y, 1.0, w, at)
+    put_interpolated(y, 1.0, w, at)
     if e == 0 and (at.held or abs(w[2]) < _AT_REST * w[at.scale + 1]):
         return False
     w[at.sides + e] *= -1.0
@@ -115,9 +117,9 @@ def goes_on(f, signal, t, h, y, e, w, at):
 
 @compiled
 def first_event(f, signal, t, h, y, w, at):
-    """Return which function passes through zero first in the step, or -1, and at which place.
+    """Return which function passes through zero first in the step, or -1, and at which position.
 
-    A function is looked at by its polynomial between the stages; where it is smallest, itself.
+    The polynomials through the stages are examined; at their minima, the functions themselves.
     """
     n, m = at.n, at.n + 1 + at.k
     which, where = -1, 1.0
@@ -127,25 +129,25 @@ def first_event(f, signal, t, h, y, w, at):
             continue
         near = NEAR * w[at.scale + row]
         older, old, low, middle = np.inf, w[at.before + e] * side, 0.0, 0.0
-        for i in range(WITHIN.shape[0]):
-            high, value = PLACES[i], WITHIN[i, 0] * w[at.before + e] * side
+        for i in range(WEIGHTS.shape[0]):
+            high, value = POSITIONS[i], WEIGHTS[i, 0] * w[at.before + e] * side
             for j in range(STAGES):
-                there = w[at.values + j * m + row] if e else y[1] + w[at.stages + j * n + 1]
-                value += WITHIN[i, 1 + j] * there * side
+                stage = w[at.values + j * m + row] if e else y[1] + w[at.stages + j * n + 1]
+                value += WEIGHTS[i, 1 + j] * stage * side
             crossed = value < -near
             if not crossed and i and older > old < value and 2.0 * old < older + value:
-                one, two = (old - older) / (middle - low), (value - old) / (high - middle)
-                least = 0.5 * (low + middle - one * (high - low) / (two - one))
-                crossed = function_at(f, signal, t, h, y, least, e, w, at) * side < -near
-                high = least if crossed else high
+                slope1, slope2 = (old - older) / (middle - low), (value - old) / (high - middle)
+                minimum = 0.5 * (low + middle - slope1 * (high - low) / (slope2 - slope1))
+                crossed = function_at(f, signal, t, h, y, minimum, e, w, at) * side < -near
+                high = minimum if crossed else high
             else:
                 low = middle
             if not crossed and high == 1.0 and value <= 0.0 < w[at.before + e] * side:
-                crossed, low = goes_on(f, signal, t, h, y, e, w, at), 0.0
+                crossed, low = crosses_over(f, signal, t, h, y, e, w, at), 0.0
             if not crossed:
                 older, old, low, middle = old, value, middle, high
                 continue
-            if low == 0.0 and w[at.before + e] * side <= 0.0:  # zero first: does it rise?
+            if low == 0.0 and w[at.before + e] * side <= 0.0:  # does it rise from zero?
                 low = 1e-3 * high
                 if function_at(f, signal, t, h, y, low, e, w, at) * side <= 0.0:
                     return e, 0.0
@@ -164,9 +166,9 @@ def first_event(f, signal, t, h, y, w, at):
 
 
 @compiled
-def falls(place, y, w, at):
-    """Return whether a state has changed at a place of a step that takes no time."""
-    put_place(y, place, w, at)
+def state_jumps(position, y, w, at):
+    """Return whether a state has changed by a position in a step that takes no time."""
+    put_interpolated(y, position, w, at)
     for r in range(at.n):
         size = max(abs(y[r]), w[at.scale + r])
         if size > 0.0 and abs(w[1 + r] - y[r]) > _SMALL * size:
@@ -175,33 +177,33 @@ def falls(place, y, w, at):
 
 
 @compiled
-def fades(solved, y, w, at):
-    """Return whether a rate dies away with a switching function by more than a step resolves.
+def slope_fades(solved, y, w, at):
+    """Return whether a rate decreases with a switching function by more than a step resolves.
 
-    Where a force comes to its limit as a power of the distance left, errors stay.
+    If a force approaches its limit as a power of the remaining distance, errors do not decay.
     """
     n, late = at.n, (STAGES - 2) * (at.n + 1 + at.k)
-    one, other = y[1] + w[at.stages + 1], y[1] + w[at.stages + (STAGES - 2) * n + 1]
+    v_first, v_late = y[1] + w[at.stages + 1], y[1] + w[at.stages + (STAGES - 2) * n + 1]
     for e in range(1, at.k + 1):
         row, side = at.values + n + e, w[at.sides + e]
         old, new = w[row] * side, w[row + late] * side
         for r in solved if old > LEFT * w[at.scale + n + e] and new < DECADE * old else solved[:0]:
-            if abs(w[at.values + late + r] * one) < FADED * abs(w[at.values + r] * other):
+            if abs(w[at.values + late + r] * v_first) < FADED * abs(w[at.values + r] * v_late):
                 return True
     return False
 
 
 @compiled
 def step_to_event(
-    f, solved, followers, signal, t, h, share, e, y, span, w, at, matrix, columns
+    f, solved, followers, signal, t, h, position, e, y, span, w, at, matrix, columns
 ):  # fmt: skip
-    """Solve for the step that ends where function e is zero; return its length, and whether it is.
+    """Solve for a step that ends at a zero of function e; return its length, and whether it does.
 
-    The length is 0 where there is no such step. Where the function is no longer zero in the step,
-    because it hardly was and the shorter step is more accurate, the step ends before it.
+    The length is 0 if there is no such step. If the more accurate shorter step shows that the
+    function hardly reaches zero, the step ends before that.
     """
-    length = share * h
-    shorten(share, w, at)
+    length = position * h
+    shorten(position, w, at)
     row = at.n + e if e else 1
     value, change, near = 0.0, np.inf, NEAR * w[at.scale + row]
     for _ in range(_REPEATS):
@@ -226,7 +228,7 @@ def step_to_event(
 
 @compiled
 def passed_another(e, w, at):
-    """Return whether, where function e was found to be zero, another one has passed through it."""
+    """Return whether another function has passed through zero before the zero of function e."""
     for j in range(at.k + 1):
         row = at.n + j if j else 1
         value = w[at.outputs + at.n + j] if j else w[2]
@@ -238,14 +240,14 @@ def passed_another(e, w, at):
 
 @compiled
 def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
-    """Change the branch where function e is zero; sensitivities jump where the rates do."""
+    """Change the branch at a zero of function e; sensitivities jump where the rates do."""
     n, o, q = at.n, at.outputs, S.shape[1]
     m = n + 1 + at.k
-    moves = q > 0 and (e > 0 or not at.held)  # turning points of a held motion do not move
+    moves = q > 0 and (e > 0 or not at.held)  # the times of a held motion's turning points do not
     if e == 0 and not at.held:
         y[1] = 0.0
     if moves:
-        put(y, w)
+        put_states(y, w)
         evaluate(f, signal, t, 2.0, w, at)
         for r in range(n):
             w[at.jump + r] = w[o + r]
@@ -264,7 +266,7 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
                 elif z == first and not at.held:
                     value += w[row] * along
             w[at.late + z] = -value / slope
-    if e > 0:  # others may be zero here too, such as y < a and y >= a
+    if e > 0:  # other functions may be zero here too, such as those of y < a and y >= a
         slope_at(f, signal, t, y, e, w, at)
         for j in range(1, 1 + at.k):
             zero = abs(w[o + n + j]) <= NEAR * w[at.scale + n + j]
@@ -275,15 +277,15 @@ def pass_event(f, signal, t, e, y, S, first, chosen, w, at):
         choose_sides(f, signal, t, y, w, at)
     else:
         rate, row = slope_at(f, signal, t, y, e, w, at), at.scale + n + e
-        if rate == 0.0:  # it stays as rounding left it, and counts as zero
+        if rate == 0.0:  # the function keeps a value that is rounding, and counts as zero
             w[row] = max(w[row], 2.0 * abs(w[o + n + e]) / NEAR)
-        # both branches lead here, and not because nothing moves
+        # both branches lead to the event, and not because nothing moves
         if rate * w[at.sides + e] <= 0.0 and abs(w[2]) > NEAR * w[at.scale + 1]:
             side, w[at.sides + e] = w[at.sides + e], 0.0
             if slope_at(f, signal, t, y, e, w, at) != 0.0:
                 w[at.sides + e] = side
     if moves:
-        put(y, w)
+        put_states(y, w)
         evaluate(f, signal, t, 0.0, w, at)
         for r in range(n):
             jump = w[at.jump + r] - w[o + r]

@@ -10,16 +10,19 @@ import numpy as np
 from dahl_ident.engine.events import (
     LOCATED,
     choose_branch,
-    fades,
-    falls,
     first_event,
     pass_event,
     passed_another,
+    slope_fades,
+    state_jumps,
     step_to_event,
 )
 from dahl_ident.engine.radau import (
+    GROW,
     MATRIX,
     NODES,
+    SAFETY,
+    SHRINK,
     SLOPE_AFTER,
     STAGES,
     at_unit_velocity,
@@ -28,29 +31,28 @@ from dahl_ident.engine.radau import (
     evaluate,
     guess_stages,
     keep_interval,
-    put,
-    put_place,
+    put_interpolated,
+    put_states,
     read_stage,
     sensitivities,
     signal_at,
     solve_stages,
 )
 
-_SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
-_TURNING = 10.0  # errors next to a turning point, where laws are least smooth, count as so many
-_FAILED = 0.25  # of a step whose stages were not found
+_TURNING = 10.0  # factor on errors next to a turning point, where laws are least smooth
+_FAILED = 0.25  # factor on a step whose stages did not converge
 _SMALLEST = 1e-14  # of the span: a shorter step cannot advance the time
-_DENSE = 1e-2  # of the tolerance: the same for a polynomial that is read between its ends
-_SHARE = _DENSE ** (1.0 / (STAGES + 1))  # of the step
-_TOGETHER = 1e-8  # of the span: events that are as near to each other may change places
-_NEAREST = 0.005  # before a turning point, rad of a sine, or of an interval: the last step
-_MOST, _PER_SAMPLE = 20_000, 200  # steps: more is not a motion
-_BEYOND_BOUNDS = 1e100  # m/s: far beyond any motion, and its square is still a number
+_DENSE = 1e-2  # factor on the tolerance of a polynomial that is read between its ends
+_DENSE_STEP = _DENSE ** (1.0 / (STAGES + 1))  # factor on the step for that
+_TOGETHER = 1e-8  # of the span: events that are as near to each other may exchange their order
+_NEAREST = 0.005  # rad of a sine, or of an interval: the last step before a turning point
+_MOST, _PER_SAMPLE = 20_000, 200  # steps at most
+_BEYOND_BOUNDS = 1e100  # m/s: far beyond any motion, and its square is still finite
 
 
 @compiled
-def begin(f, followers, signal, t, y, w, at):
-    """Set what a step on another branch than the last begins with."""
+def begin_branch(f, followers, signal, t, y, w, at):
+    """Set the initial values of the first step on a branch."""
     n, k, o = at.n, at.k, at.outputs
     m = n + 1 + k
     if followers.size:
@@ -61,7 +63,7 @@ def begin(f, followers, signal, t, y, w, at):
                 slope = w[o + m * (1 + n) + b * (1 + at.P) + z]
                 w[at.follow_slopes + b * (1 + at.P) + z] = slope
     w[at.stiff] = 0.0
-    put(y, w)
+    put_states(y, w)
     evaluate(f, signal, t, 0.0, w, at)
     for q in range(n):
         w[at.rates + q] = w[o + q]
@@ -71,8 +73,8 @@ def begin(f, followers, signal, t, y, w, at):
 
 
 @compiled
-def stop_of(signal, t, end, span, w, at):
-    """Return where the step must end at the latest, so that the signal is smooth within it."""
+def next_stop(signal, t, end, span, w, at):
+    """Return the latest end of the step for which the signal is smooth within it."""
     if not at.held:
         return end
     if signal.sine:
@@ -89,7 +91,7 @@ def stop_of(signal, t, end, span, w, at):
 
 @compiled
 def add_harmonics(signal, t, h, S, first, chosen, harmonics, sums, w, at):
-    """Add the step's part of the integrals of output exp(-j k omega t), and their derivatives."""
+    """Add the step's part of the integrals of output exp(-j k omega t), and its derivatives."""
     n, P, q = at.n, at.P, S.shape[1]
     m = n + 1 + at.k
     for i in range(STAGES):
@@ -115,13 +117,13 @@ def add_harmonics(signal, t, h, S, first, chosen, harmonics, sums, w, at):
 
 @compiled
 def write_samples(f, signal, t, h, y, S, first, chosen, samples, i, output, by, path, w, at):
-    """Write what happens at the samples within the step; return the first sample beyond it."""
+    """Write outputs and states at the samples in the step; return the first sample beyond it."""
     n, P, q, o = at.n, at.P, S.shape[1], at.outputs
     m = n + 1 + at.k
     while i < samples.size and samples[i] <= t + h * (1.0 + 1e-12):
-        share = min(1.0, max(0.0, (samples[i] - t) / h))
-        put_place(y, share, w, at)
-        evaluate(f, signal, t + share * h, 2.0 if q else 0.0, w, at)
+        position = min(1.0, max(0.0, (samples[i] - t) / h))
+        put_interpolated(y, position, w, at)
+        evaluate(f, signal, t + position * h, 2.0 if q else 0.0, w, at)
         output[i] = w[o + n]
         for b in range(n if path.size else 0):
             path[i, b] = w[1 + b]
@@ -145,7 +147,7 @@ def write_samples(f, signal, t, h, y, S, first, chosen, samples, i, output, by, 
 
 @compiled
 def finish_step(h, y, S, w, at):
-    """Move on to the end of the step, and keep what the next one begins with."""
+    """Advance the states to the end of the step, and set the initial values of the next one."""
     n, k, q = at.n, at.k, S.shape[1]
     m = n + 1 + k
     for r in range(n):
@@ -174,91 +176,95 @@ def advance(
 ):  # fmt: skip
     """Integrate from times[0] to times[1], in place; return a length of step, 0 if it fails.
 
-    `longest`: of a step. `step`: of the first step and of the first after a turning point, as a
-    guess; a better one is returned. Harmonics of the output are added to `sums`; the output at
-    `samples`, its derivatives and the states are written to `output`, `by` and `path`.
+    `longest` is the longest step. `step` is a guess of the first step, and of the first after a
+    turning point; a better one is returned. Harmonics of the output are added to `sums`; the output
+    at `samples`, its derivatives and the states are written to `output`, `by` and `path`.
     """
     q = S.shape[1]
     first = q - chosen.size - 1
     t, end = times[0], times[1]
     span = end - t
     sample, stuck, last = 0, 0, 0.0
-    read = harmonics.size > 0
-    fresh, turned, after_turn = True, True, step
+    integrates_output = harmonics.size > 0
+    new_branch, turned, after_turn = True, True, step
     dense = at.held and samples.size > 0
-    stop_of(signal, t, end, span, w, at)
+    next_stop(signal, t, end, span, w, at)
     choose_branch(f, signal, t, y, w, at)
     for _ in range(_MOST + _PER_SAMPLE * samples.size):
         if t >= end - LOCATED * span:
             return after_turn
-        stop = stop_of(signal, t, end, span, w, at)
-        if fresh:
-            begin(f, followers, signal, t, y, w, at)
-            fresh, last = False, 0.0
+        stop = next_stop(signal, t, end, span, w, at)
+        if new_branch:
+            begin_branch(f, followers, signal, t, y, w, at)
+            new_branch, last = False, 0.0
         step = min(step, longest)
         wanted, allowed = step, tolerance
-        if sample < samples.size:  # read samples between the ends, or end at the next one
+        if sample < samples.size:  # read samples within the step, or end at the next one
             gap = samples[sample] - t
-            if _SHARE * step > gap:
-                wanted, allowed = _SHARE * step, _DENSE * tolerance
+            if _DENSE_STEP * step > gap:
+                wanted, allowed = _DENSE_STEP * step, _DENSE * tolerance
             else:
                 wanted = min(step, gap)
         h = stop - t if t + 1.1 * wanted >= stop else wanted
-        if at.rated and signal.sine:  # what happens near rest is as short as the way there
+        if at.rated and signal.sine:  # changes are as fast as the turning point is near
             h = min(h, max(0.5 * (stop - t), _NEAREST / signal.omega))
         if sample < samples.size and allowed == tolerance:
             h = min(h, samples[sample] - t)
         guess_stages(h, last, w, at)
-        found = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
-        if not found and last > 0.0:
+        converged = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
+        if not converged and last > 0.0:
             guess_stages(h, 0.0, w, at)
-            found = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
-        if not found:
+            converged = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
+        if not converged:
             step, last = h * _FAILED, 0.0
             if step < _SMALLEST * span:
                 return 0.0
             continue
-        error = error_of(f, solved, followers, dense, read, signal, t, h, y, w, at) / tolerance
+        error = error_of(
+            f, solved, followers, dense, integrates_output, signal, t, h, y, w, at
+        ) / tolerance  # fmt: skip
         if turned:
             error *= _TURNING
-        factor = _GROW
+        factor = GROW
         if error > 0.0:
-            factor = min(_GROW, max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))))
+            factor = min(GROW, max(SHRINK, SAFETY * error ** (-1.0 / (STAGES + 1))))
         if error * tolerance > allowed and h > LOCATED * span:
             step, last = h * factor, 0.0
             continue
         which, where = first_event(f, signal, t, h, y, w, at)
-        if at.held and h > LOCATED * span and fades(solved, y, w, at):
+        if at.held and h > LOCATED * span and slope_fades(solved, y, w, at):
             step, last = 0.5 * h, 0.0
             continue
-        if which >= 0 and where * h <= LOCATED * span and not falls(where, y, w, at):
+        if which >= 0 and where * h <= LOCATED * span and not state_jumps(where, y, w, at):
             stuck += 1
             if stuck > 2 * (at.k + 2):
                 return 0.0  # the motion is stuck between two branches
             pass_event(f, signal, t, which, y, S, first, chosen, w, at)
-            fresh = True
+            new_branch = True
             continue
         stuck = 0
         if which >= 0:
-            whole = h
-            h, there = step_to_event(
+            full = h
+            h, at_event = step_to_event(
                 f, solved, followers, signal, t, h, where, which, y, span, w, at, matrix, columns
             )
             if h <= 0.0 or (h > _TOGETHER * span and passed_another(which, w, at)):
-                step, last = 0.5 * where * whole, 0.0
+                step, last = 0.5 * where * full, 0.0
                 continue
-            error = error_of(f, solved, followers, dense, read, signal, t, h, y, w, at) / tolerance
+            error = error_of(
+                f, solved, followers, dense, integrates_output, signal, t, h, y, w, at
+            ) / tolerance  # fmt: skip
             if which == 0:
                 error *= _TURNING
             if error * tolerance > allowed and h > LOCATED * span:
-                step, last = h * max(_SHRINK, _SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
+                step, last = h * max(SHRINK, SAFETY * error ** (-1.0 / (STAGES + 1))), 0.0
                 continue
             nearest = _NEAREST * (w[at.interval + 2] - w[at.interval + 1])
-            # what happens near rest is short; a step is stretched by a tenth to end at a knot
+            # changes are fast near rest; steps may be longer by a tenth, to end at a knot
             if which == 0 and at.rated and h > 1.2 * nearest:
                 step, last = max(0.5 * h, nearest), 0.0
                 continue
-            if not there:
+            if not at_event:
                 which = -1
         if q:
             if not sensitivities(
@@ -285,14 +291,14 @@ def advance(
         step = max(step, h * factor) if h < step else h * factor
         if which >= 0:
             pass_event(f, signal, t, which, y, S, first, chosen, w, at)
-            fresh = True
+            new_branch = True
             if which == 0:
                 step, turned = after_turn, True
-        elif at.held and at_stop and t < end:  # the held motion turns, or has another formula
+        elif at.held and at_stop and t < end:  # the held motion turns, or has another polynomial
             direction = w[at.sides]
-            stop_of(signal, t, end, span, w, at)
+            next_stop(signal, t, end, span, w, at)
             choose_branch(f, signal, t, y, w, at)
-            fresh = True
+            new_branch = True
             if w[at.sides] != direction:
                 step, turned = after_turn, True
     return 0.0

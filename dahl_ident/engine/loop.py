@@ -1,14 +1,15 @@
 """Settled loops of laws with one state, under a sine of displacement.
 
-A half cycle begins at a turning point and is run through in its angle psi, from 0 to pi:
+A half cycle begins at a turning point; its variable is the angle psi, from 0 to pi:
 ``x = -s A cos(psi)`` with the direction s. The force obeys dF/dpsi = rate(F, psi)/omega, one
-equation, solved by Radau IIA steps of order 9 that follow the error and end at every kink of the
-law. The settled force at the turning point is the fixed point of a cycle, by Newton's method with
-the cycle's own derivative, from a guess by the loops at smaller amplitudes. A law that is the same
-in both directions needs half a cycle. The last pass gives the harmonics and all derivatives.
+equation, which is solved by Radau IIA steps of order 9. Their length is controlled by the error,
+and they end at every kink of the law. The settled force at the turning point is the fixed point of
+a cycle. It is solved by Newton's method with the derivative of the cycle, from a guess by the loops
+at smaller amplitudes. A law that is the same in both directions needs half a cycle. The last pass
+gives the harmonics and all derivatives.
 
-A gap in the link to the law is crossed at zero force: there the angle jumps. The gap is then the
-last of the parameters, which the law's own function does not know.
+A gap in the link to the law is crossed at zero force, where the angle jumps. The gap is then the
+last of the parameters; the law's function does not have it.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from collections import namedtuple
 import numpy as np
 from numba import boolean, complex128, float64, njit, types
 
-from dahl_ident.engine.events import PLACES, WITHIN
+from dahl_ident.engine.events import DECADE, FADED, LEFT, POSITIONS, WEIGHTS
 from dahl_ident.engine.radau import (
     CHECKED,
     FUNCTION,
+    GROW,
     MATRIX,
     NEAR,
     NODES,
     NUMBERS,
+    SAFETY,
+    SHRINK,
     SIDED,
     SLOPE_CHECKED,
     STAGES,
@@ -36,31 +40,31 @@ from dahl_ident.engine.radau import (
     eliminate,
 )
 
-_NEWTON, _SOLVED = 15, 1e-7  # iterations of the stages; the change whose square is rounding
-_SHRINK, _GROW, _SAFETY = 0.1, 6.0, 0.8  # of the next step
-_LOCATED = 1e-14  # rad: shorter steps are none
-_MOST = 500  # steps of a half cycle, but for those that the highest harmonic takes
-_ITERATIONS = 60  # of shooting with coarse steps; one is the rule, three without a guess
-_CONVERGED = 1e-5  # change of the first force over the largest; its square is left
-_CLOSE = 1e-7  # the same in the last pass: derivatives err by as much
-_PREDICTED = 1e-6  # bend of a guess over the force: what follows it is below _CLOSE
-_AGREED = 1e-3  # change by the last pass; where it is more, nothing settles
+_NEWTON = 15  # iterations of the stages
+_SOLVED = 1e-7  # last relative change of the stages, whose error is rounding: its square
+_LOCATED = 1e-14  # rad: shorter steps count as zero
+_MOST = 500  # steps of a half cycle, in addition to those for the highest harmonic
+_ITERATIONS = 60  # of shooting with coarse steps; one is typical, three without a guess
+# Changes of the initial force over the largest force:
+_CONVERGED = 1e-5  # with coarse steps; the error is its square
+_CLOSE = 1e-7  # in the last pass: derivatives have errors of this size
+_PREDICTED = 1e-6  # second-order part of a guess whose error is below _CLOSE
+_AGREED = 1e-3  # a larger change by the last pass means that nothing settles
 _COARSE = 10.0  # errors of steps while shooting, over those of the last pass
-_SHORTEST = 12.0  # steps of a cycle of the highest harmonic, at least
+_SHORTEST = 12.0  # least number of steps in a cycle of the highest harmonic
 _FLOOR = 1e-6  # of the largest force: smaller local forces are no scale for errors
 _BEYOND_BOUNDS = 1e200  # N: far beyond any force
-_FIRST = 0.05  # rad, first step after a turning point that is tried
-_EXPANDS = 3.0  # beyond its limit a branch would; no step that follows the error spans more
-_PASSES = 4  # with fine steps, where coarse ones ended elsewhere; one is the rule
-_REPEATS, _BISECTIONS = 8, 60  # of a step that ends at an event; two are the rule
-_DECADE, _LEFT = 0.1, 1e-11  # of the distance to a limit: left after a step; at the end
-_APPROACH = 0.6  # of the way to the turning point, for a law that depends on the speed
-_NEAREST = 1e-3  # rad before it: the last step
+_FIRST = 0.05  # rad, guess of the first step after a turning point
+_EXPANDS = 3.0  # largest ln of a step's growth; steps controlled by the error grow less
+_PASSES = 4  # with fine steps, if coarse ones ended elsewhere; one is typical
+_REPEATS, _BISECTIONS = 8, 60  # of a step that ends at an event; two are typical
+_APPROACH = 0.6  # of the way to the turning point: largest step if a law depends on the speed
+_NEAREST = 1e-3  # rad before the turning point: the last such step
 
-_WITHIN_CHECKED = CHECKED[:, None] ** np.arange(1, STAGES + 1) @ np.linalg.inv(
+_WEIGHTS_CHECKED = CHECKED[:, None] ** np.arange(1, STAGES + 1) @ np.linalg.inv(
     NODES[:, None] ** np.arange(1, STAGES + 1)
 )
-"""Weights of the changes at the stages in those at the places where rates are compared."""
+"""Weights of the changes at the stages in those at `CHECKED`."""
 
 Work = namedtuple(
     "Work",
@@ -72,7 +76,7 @@ Work = namedtuple(
 
 @compiled
 def _evaluate(f, level, cosine, sine, F, at):
-    """Evaluate the law at a place of the half cycle."""
+    """Evaluate the law at a position of the half cycle."""
     w, amplitude, omega, heading = at.w, at.numbers[0], at.numbers[1], at.numbers[2]
     w[0] = level
     w[1] = -heading * amplitude * cosine
@@ -99,9 +103,9 @@ def _function_rate(i, cosine, sine, at):
 
 @compiled
 def _choose_sides(f, cosine, sine, F, at):
-    """Set the sides of the switches; where a function is zero, what it is about to become."""
+    """Set the sides of the switches; a zero counts as what it is about to become."""
     w, o = at.w, at.o
-    for _ in range(2 if at.k else 0):  # the side of one may depend on that of another
+    for _ in range(2 if at.k else 0):  # the side of one switch may depend on that of another
         for i in range(at.k):
             _evaluate(f, 1.0, cosine, sine, F, at)
             value = w[o + 4 + i]
@@ -119,8 +123,8 @@ def _choose_sides(f, cosine, sine, F, at):
 
 @compiled
 def _solve(f, psi, h, F, at):
-    """Solve for the changes of the force at the stages from a guess; False if not found."""
-    w, o, omega, found = at.w, at.o, at.numbers[1], False
+    """Solve for the changes of the force at the stages from a guess; False if that fails."""
+    w, o, omega, converged = at.w, at.o, at.numbers[1], False
     for i in range(STAGES):
         at.cosines[i], at.sines[i] = np.cos(psi + NODES[i] * h), np.sin(psi + NODES[i] * h)
     for _ in range(_NEWTON):
@@ -152,26 +156,26 @@ def _solve(f, psi, h, F, at):
                 sided = sided and abs(change) <= SIDED * value
             largest = max(largest, abs(at.columns[i, 0]))
             size = max(size, abs(F + at.stages[i]))
-        if not total < np.inf:  # nor not a number
+        if not total < np.inf:  # or NaN
             return False
-        found = largest <= _SOLVED * max(size, _FLOOR * at.numbers[3])
-        if found and sided:
+        converged = largest <= _SOLVED * max(size, _FLOOR * at.numbers[3])
+        if converged and sided:
             break
-    return found
+    return converged
 
 
 @compiled
 def _error(f, psi, h, F, output, at):
-    """Return by how far slopes of the polynomial differ from rates, over the local force."""
+    """Return the difference of the polynomial's slopes from the rates, over the local force."""
     largest, size = 0.0, max(abs(F), _FLOOR * at.numbers[3])
     for j in range(STAGES):
         size = max(size, abs(F + at.stages[j]))
     for i in range(CHECKED.size):
-        place, there, change = psi + CHECKED[i] * h, F, 0.0
+        angle, force, change = psi + CHECKED[i] * h, F, 0.0
         for j in range(STAGES):
-            there += _WITHIN_CHECKED[i, j] * at.stages[j]
+            force += _WEIGHTS_CHECKED[i, j] * at.stages[j]
             change += SLOPE_CHECKED[i, j] * at.stages[j]
-        _evaluate(f, 0.0, np.cos(place), np.sin(place), there, at)
+        _evaluate(f, 0.0, np.cos(angle), np.sin(angle), force, at)
         change -= h * at.w[at.o + 2] / at.numbers[1]
         if not abs(change) < np.inf:
             return np.inf
@@ -186,7 +190,7 @@ def _error(f, psi, h, F, output, at):
 
 @compiled
 def _change(x, changes):
-    """Return the change of the force at a place x of a step, 0 to 1, from those at the stages."""
+    """Return the change of the force at position x of a step, 0 to 1, from those at the stages."""
     value = 0.0
     for j in range(STAGES):
         weight = x / NODES[j]
@@ -199,7 +203,7 @@ def _change(x, changes):
 
 @compiled
 def _guess(h, last, rate, at):
-    """Set the stages to the last step's polynomial, or where there is none to a constant rate."""
+    """Extrapolate the stages from the last step's polynomial, or without one at a constant rate."""
     for i in range(STAGES):
         if last > 0.0:
             at.stages[i] = _change(1.0 + NODES[i] * h / last, at.last) - at.last[STAGES - 1]
@@ -209,10 +213,10 @@ def _guess(h, last, rate, at):
 
 @compiled
 def _first_event(f, psi, h, F, gap, at):
-    """Return which function passes through zero first in the step, or -1, and at which place.
+    """Return which function passes through zero first in the step, or -1, and at which position.
 
-    A function is looked at by its polynomial between the stages; where it is smallest, itself.
-    Functions beyond the switches: the force where a gap is to be crossed.
+    The polynomials through the stages are examined; at their minima, the functions themselves.
+    Function k, after the switches, is the force, if a gap is to be crossed.
     """
     which, where = -1, 2.0
     for e in range(at.k + 1):
@@ -225,22 +229,22 @@ def _first_event(f, psi, h, F, gap, at):
         if side == 0.0:
             continue
         lower, older, low, old = 0.0, np.inf, 0.0, before * side
-        for i in range(WITHIN.shape[0]):
-            high, value = PLACES[i], WITHIN[i, 0] * before * side
+        for i in range(WEIGHTS.shape[0]):
+            high, value = POSITIONS[i], WEIGHTS[i, 0] * before * side
             for j in range(STAGES):
-                there = at.numbers[2] * (F + at.stages[j]) if e == at.k else at.functions[j, e]
-                value += WITHIN[i, 1 + j] * there * side
+                stage = at.numbers[2] * (F + at.stages[j]) if e == at.k else at.functions[j, e]
+                value += WEIGHTS[i, 1 + j] * stage * side
             if low >= where:
                 break
             if i and e < at.k and older > old < value:
-                one, two = (old - older) / (low - lower), (value - old) / (high - low)
-                least = 0.5 * (lower + low - one * (high - lower) / (two - one))
-                angle, there = psi + least * h, F + _change(least, at.stages)
-                _evaluate(f, 0.0, np.cos(angle), np.sin(angle), there, at)
+                slope1, slope2 = (old - older) / (low - lower), (value - old) / (high - low)
+                minimum = 0.5 * (lower + low - slope1 * (high - lower) / (slope2 - slope1))
+                angle, force = psi + minimum * h, F + _change(minimum, at.stages)
+                _evaluate(f, 0.0, np.cos(angle), np.sin(angle), force, at)
                 if at.w[at.o + 4 + e] * side < -near:
-                    low, old, high, value = lower, older, least, at.w[at.o + 4 + e] * side
+                    low, old, high, value = lower, older, minimum, at.w[at.o + 4 + e] * side
             if value < -near or (e == at.k and value <= 0.0):
-                if old > 0.0:  # by the chord: the step that ends there is then solved
+                if old > 0.0:  # by the chord: the step to the event is solved later
                     high = low + (high - low) * old / (old - value)
                 elif low == 0.0:
                     high = 0.0 if i == 0 and value < old else high
@@ -252,23 +256,23 @@ def _first_event(f, psi, h, F, gap, at):
 
 
 @compiled
-def _fades(at):
-    """Return whether the slope dies away with a switching function by more than a step resolves.
+def _slope_fades(at):
+    """Return whether the slope decreases with a switching function by more than a step resolves.
 
-    Where the force comes to its limit as a power of the distance left, errors stay.
+    If the force approaches its limit as a power of the remaining distance, errors do not decay.
     """
     for e in range(at.k):
         old, new = at.functions[0, e] * at.w[6 + e], at.functions[STAGES - 2, e] * at.w[6 + e]
-        if old > _LEFT * at.scale[e] and new < _DECADE * old:
+        if old > LEFT * at.scale[e] and new < DECADE * old:
             before = at.rates[0] * at.sines[STAGES - 2]
-            if abs(at.rates[STAGES - 2] * at.sines[0]) < 0.6 * abs(before):
+            if abs(at.rates[STAGES - 2] * at.sines[0]) < FADED * abs(before):
                 return True
     return False
 
 
 @compiled
 def _event_at(f, psi, F, e, at):
-    """Return value and rate of function e at a place, its side, and what counts as zero."""
+    """Return value and rate of function e, its side, and the size that counts as zero."""
     c, s = np.cos(psi), np.sin(psi)
     _evaluate(f, 1.0, c, s, F, at)
     if e == at.k:
@@ -278,7 +282,7 @@ def _event_at(f, psi, F, e, at):
 
 @compiled
 def _passed_before(event, at):
-    """Return which other function has passed through zero where this one is zero, or -1."""
+    """Return which other function has passed through zero before the event, or -1."""
     for e in range(at.k):
         value, near, side = at.w[at.o + 4 + e], NEAR * at.scale[e], at.w[6 + e]
         if e != event and value * side < -near and at.before[e] * side > near:
@@ -288,7 +292,7 @@ def _passed_before(event, at):
 
 @compiled
 def _pass_switch(f, e, cosine, sine, F, chosen, columns, at):
-    """Change the branch where switching function e is zero; sensitivities jump with the rates."""
+    """Change the branch at a zero of switching function e; sensitivities jump with the rates."""
     w, o, omega = at.w, at.o, at.numbers[1]
     _evaluate(f, 2.0, cosine, sine, F, at)
     before, rate = w[o + 2] / omega, _function_rate(e, cosine, sine, at)
@@ -301,13 +305,14 @@ def _pass_switch(f, e, cosine, sine, F, chosen, columns, at):
         elif z > 1 and chosen[z - 2] < at.P:
             value += w[o + 4 * at.m + (4 + e) * (1 + at.P) + 1 + chosen[z - 2]]
         late[z] = -value / rate if rate != 0.0 else 0.0
-    for i in range(at.k):  # others may be zero here too, such as y < a and y >= a
+    for i in range(at.k):  # other functions may be zero here too, such as those of y < a and y >= a
         zero = i != e and abs(w[o + 4 + i]) <= NEAR * at.scale[i]
         if zero and _function_rate(i, cosine, sine, at) * w[6 + i] < 0.0:
             w[6 + i] *= -1.0
     w[6 + e] *= -1.0
     _evaluate(f, 1.0, cosine, sine, F, at)
-    if _function_rate(e, cosine, sine, at) * w[6 + e] <= 0.0 < sine:  # both branches lead here
+    # do both branches lead to the event?
+    if _function_rate(e, cosine, sine, at) * w[6 + e] <= 0.0 < sine:
         side, w[6 + e] = w[6 + e], 0.0
         _evaluate(f, 1.0, cosine, sine, F, at)
         if w[o + 2] != 0.0:
@@ -320,14 +325,14 @@ def _pass_switch(f, e, cosine, sine, F, chosen, columns, at):
 
 @compiled
 def _cross_gap(f, gap, psi, chosen, columns, at):
-    """Return the angle behind the gap, and change the sensitivities; pi where it ends within."""
+    """Return the angle behind the gap, or pi if the motion turns in it; change sensitivities."""
     amplitude, heading = at.numbers[0], at.numbers[2]
     before = _slope(f, 0.0, at)
-    versed = np.sin(0.5 * psi) ** 2 + 0.5 * gap / amplitude
-    if versed >= 1.0:
+    haversine = np.sin(0.5 * psi) ** 2 + 0.5 * gap / amplitude
+    if haversine >= 1.0:
         at.S[:columns] = 0.0
         return np.pi
-    beyond = 2.0 * np.arcsin(np.sqrt(versed))
+    beyond = 2.0 * np.arcsin(np.sqrt(haversine))
     _choose_sides(f, np.cos(beyond), np.sin(beyond), 0.0, at)
     after = _slope(f, 0.0, at)
     for z in range(columns):
@@ -342,15 +347,16 @@ def _cross_gap(f, gap, psi, chosen, columns, at):
 
 @compiled
 def _last_step(f, h, F, chosen, columns, harmonics, turned, sums, at):
-    """Set changes of the sensitivities to the stages of the solved step; False if singular.
+    """Set the changes of the sensitivities up to the stages of the step; False if singular.
 
     The step's part of the integrals of output exp(-j k theta), and of their derivatives, is added.
     """
     w, o, omega = at.w, at.o, at.numbers[1]
     for j in range(STAGES):
         _evaluate(f, 2.0, at.cosines[j], at.sines[j], F + at.stages[j], at)
-        rates, outputs = o + at.m + 6, o + at.m + 9  # derivatives with respect to x, v and force
-        by_rate = o + 4 * at.m + 2 * (1 + at.P) + 1  # and by the parameters
+        # derivatives with respect to x, v and force, and below with respect to the parameters
+        rates, outputs = o + at.m + 6, o + at.m + 9
+        by_rate = o + 4 * at.m + 2 * (1 + at.P) + 1
         by_output = by_rate + 1 + at.P
         at.slopes[j], at.last[j], at.output[j] = w[rates + 2] / omega, w[outputs + 2], w[o + 3]
         for z in range(columns):
@@ -389,9 +395,9 @@ def _last_step(f, h, F, chosen, columns, harmonics, turned, sums, at):
 
 @compiled
 def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longest, first, at):
-    """Return the force at the end of a half cycle and its first step, 0 where there is no end.
+    """Return the force at the end of a half cycle and its first step, 0 if the end is not reached.
 
-    The sensitivities in `at` are carried along: one column, or all in the last pass.
+    The sensitivities in `at` are integrated too: one column, or all in the last pass.
     """
     columns = 2 + chosen.size if last_pass else 1
     w, o, omega, heading = at.w, at.o, at.numbers[1], at.numbers[2]
@@ -400,7 +406,7 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
     psi, last, step, stuck, after_turn = 0.0, 0.0, first, 0, 0.0
     w[6 : 6 + at.k] = heading
     _choose_sides(f, 1.0, 0.0, F, at)
-    crossing, fresh, output, rate = gap > 0.0, True, 0.0, 0.0
+    crossing, new_branch, output, rate = gap > 0.0, True, 0.0, 0.0
     event, tries, low, high, h = -1, 0, 0.0, 0.0, 0.0
     if crossing and heading * F >= 0.0:
         psi = _cross_gap(f, gap, psi, chosen, columns, at)
@@ -408,17 +414,17 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
     for _ in range(_MOST + int(2.0 * np.pi / longest)):
         if np.pi - psi <= _LOCATED:
             return F, after_turn
-        if tries == 0:  # else the step's end is being moved to an event
+        if tries == 0:  # otherwise the step's end is being moved to an event
             h = min(step, longest)
             h = np.pi - psi if psi + 1.1 * h >= np.pi else h
-            if at.rated:  # what happens near rest is as short as the way there
+            if at.rated:  # changes are as fast as the turning point is near
                 h = min(h, max(_APPROACH * (np.pi - psi), _NEAREST))
-        if fresh:
+        if new_branch:
             _evaluate(f, 0.0, np.cos(psi), np.sin(psi), F, at)
             rate, output = w[o + 2] / omega, w[o + 3]
             for i in range(at.k):
                 at.before[i] = w[o + 4 + i]
-            fresh, last = False, 0.0
+            new_branch, last = False, 0.0
         _guess(h, last if tries == 0 else 0.0, rate, at)
         if not _solve(f, psi, h, F, at):
             if last > 0.0:
@@ -430,18 +436,18 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
             tries, event = 0, -1
             continue
         error = _error(f, psi, h, F, output, at) / tolerance
-        factor = min(_GROW, max(_SHRINK, _SAFETY * (error + 1e-30) ** (-1.0 / (STAGES + 1))))
+        factor = min(GROW, max(SHRINK, SAFETY * (error + 1e-30) ** (-1.0 / (STAGES + 1))))
         if error > 1.0 and h > _LOCATED:
             step, last, tries, event = h * factor, 0.0, 0, -1
             continue
         if tries == 0:
-            event, place = _first_event(f, psi, h, F, crossing, at)
-            if _fades(at):
+            event, position = _first_event(f, psi, h, F, crossing, at)
+            if _slope_fades(at):
                 step, last = 0.5 * h, 0.0
                 continue
             if event >= 0:
                 low, high = 0.0, h
-                h *= place
+                h *= position
                 if h > _LOCATED:
                     tries = 1
                     continue
@@ -497,10 +503,10 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
             step = max(step, h * factor) if h < step else h * factor
         if event == at.k:
             psi = _cross_gap(f, gap, psi, chosen, columns, at)
-            crossing, F, fresh = False, 0.0, True
+            crossing, F, new_branch = False, 0.0, True
         elif event >= 0:
             _pass_switch(f, event, np.cos(psi), np.sin(psi), F, chosen, columns, at)
-            fresh = True
+            new_branch = True
     return F, 0.0
 
 
@@ -508,11 +514,12 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
 def _settle(
     f, y, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, longest, steps, at
 ):  # fmt: skip
-    """Return whether the loop settles, its first force, the remaining correction, and 1 - map.
+    """Return whether the loop settles, its initial force, the remaining correction, and 1 - map.
 
-    By coarse passes, unless the guess y is `sure`, then by fine ones with all derivatives.
+    Coarse passes, which are left out if the guess y is `sure`, are followed by fine ones with all
+    derivatives.
     """
-    change, rest, start = np.inf, 1.0, y
+    change, one_minus_map, start = np.inf, 1.0, y
     at.scale[:], at.numbers[3] = 0.0, 0.0
     for last_pass in (False, True):
         if sure and not last_pass:
@@ -532,20 +539,20 @@ def _settle(
                 if first == 0.0:
                     return False, y, np.inf, 1.0
                 steps[half] = first
-            excess, rest = sign * F - y, 1.0 - sign * at.S[0]
-            change = excess / rest if rest != 0.0 else np.inf
+            excess, one_minus_map = sign * F - y, 1.0 - sign * at.S[0]
+            change = excess / one_minus_map if one_minus_map != 0.0 else np.inf
             near = abs(change) <= (_CLOSE if last_pass else _CONVERGED) * at.numbers[3]
             if near and last_pass:
-                return True, y, change, rest
+                return True, y, change, one_minus_map
             start, y = y, y + (change if abs(change) < np.inf else excess)
             if near:
                 break
-    return abs(change) <= _AGREED * at.numbers[3], start, change, rest
+    return abs(change) <= _AGREED * at.numbers[3], start, change, one_minus_map
 
 
 @compiled
 def _continues(row, other, omegas, parameters):
-    """Return whether two rows differ in the amplitude alone."""
+    """Return whether two rows differ in the amplitude only."""
     same = omegas[row] == omegas[other]
     for i in range(parameters.shape[1]):
         same = same and parameters[row, i] == parameters[other, i]
@@ -560,9 +567,9 @@ def _continues(row, other, omegas, parameters):
     error_model="numpy",
 )  # fmt: skip
 def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics, tolerance):
-    """Return settled loops, row by row, each from a guess by the row before at a smaller amplitude.
+    """Return settled loops, row by row, each from a guess by the rows before it.
 
-    Whether each was found; harmonics c_k of ``output = sum of Re c_k exp(j k theta)``, for rising
+    Whether each converged; harmonics c_k of ``output = sum of Re c_k exp(j k theta)``, for rising
     k, with their derivatives with respect to the amplitude and the parameters `chosen`; the force
     at the upper turning point; and the factor by which a deviation shrinks in a cycle.
     """
@@ -575,7 +582,7 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
         np.zeros((STAGES, STAGES)), np.zeros((STAGES, columns)), np.zeros((STAGES, columns)),
         np.zeros((STAGES, columns)), np.zeros(columns), np.zeros(4),
     )  # fmt: skip
-    found = np.zeros(rows, dtype=np.int64)
+    converged = np.zeros(rows, dtype=np.int64)
     result = np.zeros((rows, harmonics.size, columns), dtype=np.complex128)
     tops, decays = np.zeros(rows), np.zeros(rows)
     sums = np.zeros((harmonics.size, 1 + columns), dtype=np.complex128)
@@ -588,20 +595,20 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
     for row in range(rows):
         amplitude, gap = amplitudes[row], parameters[row, P] if gaps else 0.0
         if 2.0 * amplitude <= gap:
-            found[row] = 1
+            converged[row] = 1
             continue
         at.w[6 + k : 6 + k + P] = parameters[row, :P]
         at.w[0] = -1.0
         f(at.w.ctypes)
         at.numbers[0], at.numbers[1] = amplitude, omegas[row]
-        y, settles, sure, change, rest = 0.0, False, False, 0.0, 1.0
+        y, settles, sure, change, one_minus_map = 0.0, False, False, 0.0, 1.0
         if last >= 0 and _continues(row, last, omegas, parameters):
-            further, bend = amplitude - amplitudes[last], 0.0
-            if older > 0.0:  # from the slopes at the two amplitudes before
+            increase, bend = amplitude - amplitudes[last], 0.0
+            if older > 0.0:  # from the slopes at the two amplitudes before this one
                 bend = 0.5 * (rise - older_rise) / (amplitudes[last] - older)
-            guess = tops[last] + further * (rise + further * bend)
-            sure = older > 0.0 and abs(further * further * bend) <= _PREDICTED * abs(tops[last])
-            settles, y, change, rest = _settle(
+            guess = tops[last] + increase * (rise + increase * bend)
+            sure = older > 0.0 and abs(increase * increase * bend) <= _PREDICTED * abs(tops[last])
+            settles, y, change, one_minus_map = _settle(
                 f, guess, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, longest,
                 steps, at,
             )  # fmt: skip
@@ -609,22 +616,22 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
             last = -1
         if not settles:
             steps[:] = _FIRST
-            settles, y, change, rest = _settle(
+            settles, y, change, one_minus_map = _settle(
                 f, 0.0, False, halves, sign, gap, chosen, harmonics, sums, tolerance, longest,
                 steps, at,
             )  # fmt: skip
         if not settles:
             last = -1
             continue
-        found[row], tops[row], decays[row] = 1, y + change, at.S[0] ** (2 // halves)
+        converged[row], tops[row], decays[row] = 1, y + change, at.S[0] ** (2 // halves)
         older, older_rise = (amplitudes[last], rise) if last >= 0 else (0.0, 0.0)
-        last, rise = row, sign * at.S[1] / rest if rest != 0.0 else 0.0
+        last, rise = row, sign * at.S[1] / one_minus_map if one_minus_map != 0.0 else 0.0
         for a in range(harmonics.size):
             factor = (1.0 if harmonics[a] else 0.5) / np.pi
             if odd:
                 factor *= 2.0 * (harmonics[a] % 2)
             result[row, a, 0] = factor * (sums[a, 0] + sums[a, 1] * change)
             for z in range(1, columns):
-                by_start = sign * at.S[z] / rest if rest != 0.0 else 0.0
+                by_start = sign * at.S[z] / one_minus_map if one_minus_map != 0.0 else 0.0
                 result[row, a, z] = factor * (sums[a, 1 + z] + sums[a, 1] * by_start)
-    return found, result, tops, decays
+    return converged, result, tops, decays

@@ -1,4 +1,4 @@
-"""What the kernels give, in arrays: settled motions under sines, and motions along samples."""
+"""The kernels called with arrays: settled motions under sines, and motions along samples."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.engine.translate import System
 from dahl_ident.errors import FitError
 
-_SETTLED = 1e-6  # error of a step's polynomial; that of harmonics is then below 1e-10
-_SAMPLED = 5e-6  # the same where motions end at samples; a hundredth of it between
-_HELD = 10.0  # finer, where the displacement is held: forces to 1e-9, and motions to 1e-8
-_LOOP = 1e-6  # the same for loops of laws with one state, over the local force
-_RATED = 10.0  # finer, where the law depends on the speed: it changes most near rest
-_CYCLES = 4  # before Newton's method, from rest: a plant is then near its settled motion
+# Tolerances of the error of a step's polynomial:
+_SETTLED = 1e-6  # of settled motions; the error of harmonics is then below 1e-10
+_SAMPLED = 5e-6  # of steps that end at samples; a hundredth of it if samples lie between
+_LOOP = 1e-6  # of loops of laws with one state, over the local force
+# Factors by which they are smaller:
+_HELD = 10.0  # if the displacement is held: forces to 1e-9, and motions to 1e-8
+_RATED = 10.0  # if the law depends on the speed: it changes most near rest
+_CYCLES = 4  # from rest before Newton's method: a plant is then near its settled motion
 _KERNELS = ("radau", "events", "integrate", "samples", "cycle", "loop")
 
 
@@ -78,7 +80,7 @@ class Marched(NamedTuple):
     by_first : ndarray, shape (n, order)
         Derivatives of the output with respect to the first state.
     by_delay : ndarray, shape (n,)
-        With respect to the time by which the drive comes later; zero where the motion is held.
+        With respect to the time by which the drive comes later; zero if the motion is held.
     by_parameter : ndarray, shape (n, chosen)
     states : ndarray, shape (n, order)
     map : ndarray, shape (order, order)
@@ -107,19 +109,18 @@ def settled(
 ) -> Settled:
     """Return the settled motions of a system under sines, one for each row, by shooting.
 
-    With derivatives with respect to the parameters `chosen`. They begin from `starts`, such as
-    those of nearby parameters, else from rest, and go through some `cycles` before Newton's method.
-    The error of a step is as many times smaller than usual as `finer` says.
+    Derivatives are with respect to the parameters `chosen`. Shooting begins from the states
+    `starts`, such as those of nearby parameters, or from rest. A number of `cycles` precede
+    Newton's method. The tolerance of a step's error is divided by `finer`.
     """
-    rows = amplitude.size
-    plain = (1 if system.held else _CYCLES) if starts is None else 0
-    plain = plain if cycles is None else cycles
-    first = np.zeros((rows, system.order)) if starts is None else starts
+    if cycles is None:
+        cycles = 0 if starts is not None else 1 if system.held else _CYCLES
+    first = np.zeros((amplitude.size, system.order)) if starts is None else starts
     found, result, first, maps = _run(
         kernels("cycle").cycles,
         system.function, system.sizes, system.solved, system.followers, system.odd,
         _numbers(amplitude), _numbers(omega), _numbers(parameters), _numbers(first),
-        np.asarray(chosen, dtype=np.int64), np.asarray(harmonics, dtype=np.float64), plain,
+        np.asarray(chosen, dtype=np.int64), np.asarray(harmonics, dtype=np.float64), cycles,
         _SETTLED / finer,
     )  # fmt: skip
     found = found.astype(bool)
@@ -140,8 +141,8 @@ def loops(
 ) -> Loops:
     """Return the settled loops of a law with one state under sines of displacement.
 
-    As :func:`settled`, for rising harmonics. With a `gap` in the link to the law, that is the last
-    of the parameters.
+    Arguments are those of :func:`settled`; harmonics must rise. If the link to the law has a `gap`,
+    that is the last parameter.
     """
     found, result, tops, decays = kernels("loop").loops(
         system.function, system.sizes, system.odd, gap, _numbers(amplitude), _numbers(omega),
@@ -168,9 +169,9 @@ def march(
 ) -> Marched:
     """Return the motion of a system whose drive, or held displacement, is polynomials in time.
 
-    `coefficients`, (degree + 1, m), are those of powers of the place, 0 to 1, between two of the
+    `coefficients`, (degree + 1, m), are those of powers of the position, 0 to 1, between two of the
     `knots`, (m + 1,). The motion starts from the states `first` at the first of the `samples`.
-    FitError where it grows beyond all bounds.
+    FitError is raised if it grows beyond all bounds.
     """
     found, output, by, states, last = _run(
         kernels("samples").march,
@@ -190,7 +191,7 @@ def march(
 
 
 def _run(kernel: Callable[..., Any], *arguments: Any) -> Any:
-    """Return what a kernel returns; an interrupt of compiled code is an interrupt."""
+    """Return what a kernel returns; an interrupt of compiled code raises KeyboardInterrupt."""
     try:
         return kernel(*arguments)
     except SystemError as error:
@@ -213,17 +214,17 @@ def _say_that_it_compiles() -> None:
 
 @cache
 def kernels(name: str) -> ModuleType:
-    """Return the module of a compiled kernel, from a cache on disk where that can be written.
+    """Return the module of a compiled kernel, from a cache on disk if that can be written.
 
-    The cache belongs to this version of the kernels, so that none is used that was compiled from
-    other source.
+    The cache belongs to this version of the kernels, so that no kernel compiled from another source
+    is used.
     """
     from importlib import import_module
 
     from numba import __version__, config
 
-    here = Path(__file__).absolute().parent  # as numba names it
-    source = b"".join((here / f"{n}.py").read_bytes() for n in _KERNELS)
+    engine = Path(__file__).absolute().parent  # the path that numba uses
+    source = b"".join((engine / f"{n}.py").read_bytes() for n in _KERNELS)
     key = hashlib.sha256(source + __version__.encode()).hexdigest()[:16]
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(home) / "dahl_ident" / f"engine-{key}"
@@ -235,9 +236,9 @@ def kernels(name: str) -> ModuleType:
     if not writable:
         folder = Path(tempfile.mkdtemp(prefix="dahl_ident-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    # numba has one folder in it for each installation
-    kept = folder / f"{here.name}_{hashlib.sha1(str(here).encode()).hexdigest()}"
-    if not any(kept.glob(f"{name}.*.nbi")):
+    # numba makes one subfolder for each installation
+    subfolder = folder / f"{engine.name}_{hashlib.sha1(str(engine).encode()).hexdigest()}"
+    if not any(subfolder.glob(f"{name}.*.nbi")):
         _say_that_it_compiles()
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:

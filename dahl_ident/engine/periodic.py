@@ -1,7 +1,7 @@
 """The exact steady motion of a driven system, with all harmonics, and its stability, by shooting.
 
-The state after one cycle of the drive is that before. The eigenvalues of that cycle's derivative,
-Floquet's multipliers, say whether a motion near it comes back.
+The state after one cycle of the drive equals that before it. The eigenvalues of the cycle's
+derivative, the Floquet multipliers, decide whether a neighbouring motion returns to it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.engine.motion import settled
 from dahl_ident.engine.translate import System
 
-_FINER = 10.0  # times: a motion that hardly turns is lost where steps pass over its two turns
-_LONG = 30  # cycles by which a motion leaves an unstable branch for a stable one
-_PATIENT, _ALONE = 3, 1000  # runs of cycles without Newton's method, each until the kernel ends it
+_FINER = 10.0  # factor: coarse steps may pass over two turning points that are close together
+_LONG = 30  # cycles in which a motion leaves an unstable branch for a stable one
+# runs of cycles without Newton's method, and cycles of each, more than the kernel computes
+_LONG_RUNS, _ALL_CYCLES = 3, 1000
 
 
 class SteadyMotion(NamedTuple):
@@ -62,11 +63,11 @@ def steady_motions(
 ) -> SteadyMotion:
     """Return the steady motions of a system at rows of parameters, frequency and drive.
 
-    They begin from the states `starts` at t = 0, NaN for rest, and go through some `cycles` before
-    they are solved for; a row that leads nowhere is started `again`, from rest. A motion with a
-    multiplier above `largest` counts as none. If `one_sided`, motions are sought that differ in
-    both directions even if the law does not: they come in pairs, of one fundamental, where the
-    motion between them is not stable.
+    Each row begins from its states `starts` at t = 0, NaN for rest, and runs through some `cycles`
+    before it is solved for; if that fails, it is started `again`, from rest. A motion with a
+    multiplier above `largest` is rejected. If `one_sided`, the motion may differ in both directions
+    even if the law does not: such motions come in pairs with the same fundamental if the symmetric
+    motion is unstable.
     """
     rows, K = omega.size, len(harmonics)
     result = SteadyMotion(
@@ -87,47 +88,46 @@ def steady_motions(
     ) -> None:
         """Put the motions of some rows into the result; each run begins where the last one ended.
 
-        A run is its number of cycles before Newton's method.
+        `runs` are the numbers of cycles before Newton's method.
         """
-        at = np.flatnonzero(which)
-        if not at.size:
+        solved = np.flatnonzero(which)
+        if not solved.size:
             return
         symmetric = replace(system, odd=system.odd and not one_sided)
-        begin = None if starts is None else starts[at]
+        states = None if starts is None else starts[solved]
         for count in runs or (None,):
             with np.errstate(all="ignore"):
                 motions = settled(
-                    symmetric, drive[at], omega[at], parameters[at], chosen=chosen,
-                    harmonics=harmonics, starts=begin, cycles=count, finer=finer,
+                    symmetric, drive[solved], omega[solved], parameters[solved], chosen=chosen,
+                    harmonics=harmonics, starts=states, cycles=count, finer=finer,
                 )  # fmt: skip
-            begin = motions.starts
-        multiplier = np.full(at.size, np.nan)
+            states = motions.starts
+        multiplier = np.full(solved.size, np.nan)
         ok = motions.found & np.isfinite(motions.maps).all(axis=(1, 2))
-        sizes = np.abs(np.linalg.eigvals(motions.maps[ok])).max(axis=1, initial=0.0)
-        multiplier[ok] = sizes**2 if symmetric.odd else sizes  # the map of half a cycle
-        result.multiplier[at] = multiplier
+        moduli = np.abs(np.linalg.eigvals(motions.maps[ok])).max(axis=1, initial=0.0)
+        multiplier[ok] = moduli**2 if symmetric.odd else moduli  # the map of half a cycle
+        result.multiplier[solved] = multiplier
         with np.errstate(invalid="ignore"):
             good = ok & (multiplier <= largest)
-        for whole, part in zip(
-            result[:5], (good, *motions[1:5]), strict=True
-        ):  # settled motions hold the same, in the same order
-            whole[at[good]] = part[good]
+        # the first five fields of both tuples correspond
+        for array, part in zip(result[:5], (good, *motions[1:5]), strict=True):
+            array[solved[good]] = part[good]
 
-    stable = largest < np.inf
+    must_be_stable = largest < np.inf
     possible = np.isfinite(parameters).all(axis=1) & np.isfinite(omega) & np.isfinite(drive)
     if starts is not None:
-        known = possible & np.isfinite(starts).all(axis=1)
-        solve(known, starts, cycles)
-        possible &= again | ~known
+        started = possible & np.isfinite(starts).all(axis=1)
+        solve(started, starts, cycles)
+        possible &= again | ~started
     solve(possible & ~result.found)
     unstable = np.isfinite(result.multiplier)
-    lost = possible & ~result.found & ~unstable
-    # a search passes values at which nothing settles; a few rows may take as long as the others
-    if stable or np.all(parameters == parameters[0]) or _FINER * lost.sum() <= rows:
-        solve(lost, finer=_FINER)
+    failed = possible & ~result.found & ~unstable
+    # a search passes values at which nothing settles; then only a few rows are worth the time
+    if must_be_stable or np.all(parameters == parameters[0]) or _FINER * failed.sum() <= rows:
+        solve(failed, finer=_FINER)
     solve(possible & ~result.found & unstable, None, _LONG)
-    if stable and system.odd:
+    if must_be_stable and system.odd:
         unstable = np.isfinite(result.multiplier)
-        patient = (_ALONE,) * (_PATIENT if one_sided else 0)
-        solve(possible & ~result.found & unstable, None, *patient, _LONG, one_sided=True)
+        long_runs = (_ALL_CYCLES,) * (_LONG_RUNS if one_sided else 0)
+        solve(possible & ~result.found & unstable, None, *long_runs, _LONG, one_sided=True)
     return result

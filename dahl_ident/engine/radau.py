@@ -1,21 +1,21 @@
 """One Radau IIA step on one branch of the laws, with its error and exact sensitivities.
 
 The method is collocation at five Radau points: order 9, stiffly accurate and L-stable, so that
-steps grow with neither A/x_c nor the speed of the friction. Sensitivities are the exact derivatives
-of the stages, from one more factorisation of a step.
+the number of steps grows with neither A/x_c nor the speed of the friction. Sensitivities are the
+exact derivatives of the stages, from one more factorization for each step.
 
 States that follow the displacement (:class:`dahl_ident.engine.translate.System`) are not solved
-for: over a step they change in proportion to it, and so does the displacement of a driven plant,
-being the integral of the velocity.
+for, because they change in proportion to it during a step. Neither is the displacement of a driven
+plant, the integral of the velocity.
 
 E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed., Springer 1996,
 sections IV.5 and IV.8.
 
-In the functions below `w` is one array of numbers and `at` says where in it each quantity begins
-(:class:`Layout`): numba takes longer to pass twenty arrays than to compute with them. `y` are the
-states, `S` their sensitivities, one column each: with respect to initial states, to the amplitude
-of a sine or to the time by which another drive comes earlier (column `first`), and to the
-parameters `chosen`.
+In the functions below `w` is one array of numbers, and `at` (:class:`Layout`) has the index at
+which each quantity begins: numba takes longer to pass twenty arrays than to compute with them. `y`
+are the states, `S` their sensitivities. Their columns are derivatives with respect to the initial
+states; to the amplitude of a sine, or the time by which another drive comes earlier (column
+`first`); and to the parameters `chosen`.
 """
 
 from __future__ import annotations
@@ -29,21 +29,23 @@ from numpy.polynomial import legendre
 from dahl_ident.arrays import FloatArray
 
 STAGES = 5
-_ITERATIONS = 20  # of the stages; two of Newton's method are the rule
-_NEAR, _FAST = 1e-2, 0.2  # first change of a fixed-point iteration, and its fall, at most
-_EXACT = 1e-11  # its last change, of which a tenth is left
-_HARDLY = 1e-6  # of the displacement: a follower that has moved less is no scale for errors
-_PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is no pivot
-NEAR = 1e-10  # of a switching function's largest value: zero, to rounding
-SIDED = 0.1  # change over a switching function, whose sign is then known
-_SOLVED = 1e-7  # change of the stages, over the states' sizes, whose square is rounding
+SHRINK, GROW, SAFETY = 0.1, 6.0, 0.8  # limits and safety of the factor to the next step
+_ITERATIONS = 20  # of the stages; two of Newton's method are typical
+# Relative changes of the stages in an iteration:
+_NEAR, _FAST = 1e-2, 0.2  # largest first one of fixed-point iterations, and largest ratio of two
+_EXACT = 1e-11  # last one of fixed-point iterations, whose error is a tenth of it
+_SOLVED = 1e-7  # last one of Newton's method, whose error is rounding: its square
+_HARDLY = 1e-6  # of the displacement: a smaller follower is no scale for errors
+_PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is not a pivot
+NEAR = 1e-10  # of a switching function's largest value: counts as zero
+SIDED = 0.1  # largest relative change of a switching function whose sign is certain
 
 
 def _tables() -> tuple[FloatArray, ...]:
-    """Return nodes and matrix of the method, and how its polynomials go on to both ends.
+    """Return nodes and matrix of the method, and weights of the stages at both ends of a step.
 
-    The last three: weights of the changes at the stages in the slope at the beginning and the end,
-    and weights of values at the stages in that at the beginning.
+    The last three are weights of the changes at the stages in the slope at the beginning and at the
+    end, and weights of values at the stages in the value at the beginning.
     """
     series = np.zeros(STAGES + 1)
     series[STAGES - 1 :] = -1.0, 1.0  # P_s - P_(s-1), whose roots are the nodes
@@ -60,13 +62,13 @@ def _tables() -> tuple[FloatArray, ...]:
 
 
 NODES, MATRIX, SLOPE_BEFORE, SLOPE_AFTER, VALUE_BEFORE = _tables()
-_SHARES = tuple(
+_FACTORS = tuple(
     1.0 / np.prod([NODES[j]] + [NODES[j] - NODES[k] for k in range(STAGES) if k != j])
     for j in range(STAGES)
 )
-"""Of the polynomials that are 1 at one node, and 0 at the others and the beginning."""
+"""Leading coefficients of the polynomials that are 1 at one node, 0 at the others and at 0."""
 
-CHECKED = np.array([0.5 * NODES[0], 0.5 * (NODES[-2] + NODES[-1])])  # where rates are compared
+CHECKED = np.array([0.5 * NODES[0], 0.5 * (NODES[-2] + NODES[-1])])  # positions of error checks
 _POWERS = np.arange(1, STAGES + 1)
 SLOPE_CHECKED = (_POWERS * CHECKED[:, None] ** (_POWERS - 1)) @ np.linalg.inv(
     NODES[:, None] ** _POWERS
@@ -80,16 +82,16 @@ OPTIONS = {
     "error_model": "numpy",
     "no_cpython_wrapper": True,
     "no_cfunc_wrapper": True,
-    "_nrt": False,  # counting who uses an array takes longer than to compute with it
+    "_nrt": False,  # counting references to an array takes longer than computing with it
 }
 compiled = njit(**OPTIONS)
 inlined = njit(inline="always", **OPTIONS)
 
 Signal = namedtuple("Signal", "sine amplitude omega knots coefficients")
-"""What drives the system: its drive, or its displacement where that is held.
+"""The drive, or the displacement if that is held.
 
-A sine ``amplitude cos(omega t)``, or polynomials between knots in the place, 0 to 1, coefficients
-of shape (degree + 1, n - 1).
+A sine ``amplitude cos(omega t)``, or polynomials between knots in the position, 0 to 1, with
+coefficients of shape (degree + 1, n - 1).
 """
 
 Layout = namedtuple(
@@ -98,33 +100,33 @@ Layout = namedtuple(
     "follow follow_slopes stages last changes scale sides before output weights jump late signal "
     "stiff interval length",
 )
-"""Numbers of states, switches, parameters; then where each quantity begins in `w`."""
+"""Numbers of states, switches, parameters; then the index in `w` at which each quantity begins."""
 
 
 @compiled
 def layout(sizes, columns, degree):
-    """Return where each quantity begins, for that many columns of sensitivities."""
+    """Return the layout for some columns of sensitivities and degree of the signal."""
     n, k, P = sizes[0], sizes[1], sizes[2]
     m, s = n + 1 + k, STAGES
     outputs = 3 + n + k + P + sizes[5]  # the function's inputs come first
     values = outputs + m * (2 + n + P)  # rates, output and switching functions at stages, (s, m)
     rates = values + s * m  # at the beginning of a step, (n)
-    state_slopes = rates + n  # derivatives of the values by the states, (s, m, n)
-    drive_slopes = state_slopes + s * m * n  # and by drive and parameters, (s, m, 1 + P)
-    solved_slopes = drive_slopes + s * m * (1 + P)  # solved rates by solved states, (s, n, n)
-    coupling = solved_slopes + s * n * n  # and by the displacement, followers included, (s, n)
-    follow = coupling + s * n  # change of followers by displacement, (n)
-    follow_slopes = follow + n  # derivatives with respect to drive and parameters
-    stages = follow_slopes + n * (1 + P)  # changes of the states to the stages, (s, n)
+    state_slopes = rates + n  # d values / d states, (s, m, n)
+    drive_slopes = state_slopes + s * m * n  # d values / d drive and parameters, (s, m, 1 + P)
+    solved_slopes = drive_slopes + s * m * (1 + P)  # d solved rates / d solved states, (s, n, n)
+    coupling = solved_slopes + s * n * n  # d solved rates / d x, followers included, (s, n)
+    follow = coupling + s * n  # d followers / d x, (n)
+    follow_slopes = follow + n  # their derivatives with respect to drive and parameters
+    stages = follow_slopes + n * (1 + P)  # changes of the states up to the stages, (s, n)
     last = stages + s * n  # those of the last step, (s, n)
-    changes = last + s * n  # changes of the sensitivities to the stages, (s, n, columns)
+    changes = last + s * n  # changes of the sensitivities up to the stages, (s, n, columns)
     scale = changes + s * n * columns  # largest size of each of the values, (m)
     sides = scale + m  # direction of the motion, then sides of the switches, (1 + k)
     before = sides + 1 + k  # velocity and switching functions at the beginning, (1 + k)
-    output = before + 1 + k  # at the beginning
-    weights = output + 1  # of the stages in a polynomial's value, (s)
+    output = before + 1 + k  # output at the beginning
+    weights = output + 1  # weights of the stages in a polynomial's value, (s)
     jump = weights + s  # rates before an event, (n)
-    late = jump + n  # derivatives of its time, (columns)
+    late = jump + n  # derivatives of the time of an event, (columns)
     signal = late + columns  # value, rate and second derivative at the stages, (s, 3)
     stiff = signal + 3 * s  # 1 where fixed-point iterations did not converge, until an event
     interval = stiff + 1  # the signal's: number, begin, end, 1 where pinned, coefficients
@@ -139,7 +141,7 @@ def layout(sizes, columns, degree):
 
 @compiled
 def restart(w, at):
-    """Forget the motion before."""
+    """Reset all that is stored of an earlier motion."""
     w[at.outputs :] = 0.0
     w[at.sides : at.sides + 1 + at.k] = 1.0
     w[at.interval] = -1.0
@@ -147,7 +149,7 @@ def restart(w, at):
 
 @compiled
 def put_parameters(f, p, w, at):
-    """Put parameters into the inputs, with all that follows from them alone."""
+    """Put parameters into the inputs, with all quantities that depend on them only."""
     for i in range(at.P):
         w[3 + at.n + at.k + i] = p[i]
     w[0] = -1.0
@@ -156,7 +158,7 @@ def put_parameters(f, p, w, at):
 
 @compiled
 def find_interval(signal, t, w, at):
-    """Keep the signal's polynomial at time t."""
+    """Store the signal's polynomial at time t."""
     knots, i = signal.knots, max(0, int(w[at.interval]))
     while i + 2 < knots.size and t > knots[i + 1]:
         i += 1
@@ -167,7 +169,7 @@ def find_interval(signal, t, w, at):
 
 @compiled
 def keep_interval(signal, i, w, at):
-    """Keep the signal's polynomial in interval i."""
+    """Store the signal's polynomial in interval i."""
     w[at.interval] = i
     w[at.interval + 1], w[at.interval + 2] = signal.knots[i], signal.knots[i + 1]
     for j in range(at.degree + 1):
@@ -196,7 +198,7 @@ def signal_at(signal, t, w, at):
 
 @inlined
 def evaluate(f, signal, t, level, w, at):
-    """Evaluate the function at time t and the states in the inputs; held motion is put in."""
+    """Evaluate the function at time t and the states in the inputs; a held motion replaces them."""
     value, rate, second = signal_at(signal, t, w, at)
     call(f, value, rate, second, level, w, at)
 
@@ -220,7 +222,7 @@ def call(f, value, rate, second, level, w, at):
 
 
 @compiled
-def put(y, w):
+def put_states(y, w):
     """Put states into the inputs."""
     for q in range(y.size):
         w[1 + q] = y[q]
@@ -228,17 +230,17 @@ def put(y, w):
 
 @compiled
 def at_unit_velocity(f, signal, t, y, w, at):
-    """Evaluate the function at the states y and unit velocity, where rates are changes by x."""
-    put(y, w)
+    """Evaluate the function at the states y and unit velocity, so that rates are d / d x."""
+    put_states(y, w)
     evaluate(f, signal, t, 0.0, w, at)
     w[0], w[2] = 2.0, 1.0
     f(w.ctypes)
 
 
 @compiled
-def put_place(y, place, w, at):
-    """Put the state at a place of the step, 0 to 1, into the inputs."""
-    weigh(place, w, at)
+def put_interpolated(y, position, w, at):
+    """Put the state at a position of the step, 0 to 1, into the inputs."""
+    set_weights(position, w, at)
     for q in range(at.n):
         value = y[q]
         for j in range(STAGES):
@@ -247,44 +249,44 @@ def put_place(y, place, w, at):
 
 
 @compiled
-def weigh(place, w, at):
-    """Set the weights with which changes at the stages give the change at `place`, 0 to 1."""
+def set_weights(position, w, at):
+    """Set the weights of the changes at the stages in the change at a position, 0 to 1."""
     for j in range(STAGES):
-        value = place * _SHARES[j]
+        value = position * _FACTORS[j]
         for k in range(STAGES):
             if k != j:
-                value *= place - NODES[k]
+                value *= position - NODES[k]
         w[at.weights + j] = value
 
 
 @inlined
-def copy(w, place, first, count):
-    """Copy some numbers to another place."""
-    to, numbers = w[place : place + count], w[first : first + count]
+def copy(w, target, source, count):
+    """Copy `count` numbers within w, from one index to another."""
+    to, numbers = w[target : target + count], w[source : source + count]
     for z in range(count):
         to[z] = numbers[z]
 
 
 @inlined
-def add(target, place, factor, array, first, count):
-    """Add a multiple of some numbers of one array to as many of another."""
-    to, numbers = target[place : place + count], array[first : first + count]
+def add(target, start, factor, source, first, count):
+    """Add `factor` times `count` numbers of `source` to those of `target`, each from an index."""
+    to, numbers = target[start : start + count], source[first : first + count]
     for z in range(count):
         to[z] += factor * numbers[z]
 
 
 @compiled
 def eliminate(matrix, columns, n, q):
-    """Solve matrix x = columns in place by Gauss's method with pivots; False if singular.
+    """Solve matrix x = columns in place by Gaussian elimination; False if singular.
 
-    A row whose diagonal is its largest number stays: in place of one with larger numbers, such as
-    accelerations, rounding would leave some force where there is none.
+    A row with a large diagonal is not exchanged for one with larger numbers, such as accelerations:
+    rounding would then leave some force where there is none.
     """
     for k in range(n):
-        pivot, largest, beside = k, abs(matrix[k, k]), 0.0
+        pivot, largest, off_diagonal = k, abs(matrix[k, k]), 0.0
         for j in range(k + 1, n):
-            beside = max(beside, abs(matrix[k, j]))
-        for i in range(k + 1, n if largest < _PIVOT * beside else 0):
+            off_diagonal = max(off_diagonal, abs(matrix[k, j]))
+        for i in range(k + 1, n if largest < _PIVOT * off_diagonal else 0):
             if abs(matrix[i, k]) > largest:
                 pivot, largest = i, abs(matrix[i, k])
         if not 0.0 < largest < np.inf:
@@ -315,11 +317,11 @@ def eliminate(matrix, columns, n, q):
 
 @compiled
 def guess_stages(h, last, w, at):
-    """Set the stages to the last step's polynomial, or where there is none to constant rates."""
+    """Extrapolate the stages from the last step's polynomial, or without one at constant rates."""
     n = at.n
     for i in range(STAGES):
         if last > 0.0:
-            weigh(1.0 + NODES[i] * h / last, w, at)
+            set_weights(1.0 + NODES[i] * h / last, w, at)
             for q in range(n):
                 value = -w[at.last + (STAGES - 1) * n + q]
                 for j in range(STAGES):
@@ -331,13 +333,13 @@ def guess_stages(h, last, w, at):
 
 
 @compiled
-def shorten(share, w, at):
-    """Set the stages to those of a share of the step, on the same polynomial."""
+def shorten(fraction, w, at):
+    """Set the stages to those of a fraction of the step, on the same polynomial."""
     n = at.n
     for i in range(STAGES * n):
         w[at.last + i] = w[at.stages + i]
     for i in range(STAGES):
-        weigh(share * NODES[i], w, at)
+        set_weights(fraction * NODES[i], w, at)
         for q in range(n):
             value = 0.0
             for j in range(STAGES):
@@ -347,10 +349,10 @@ def shorten(share, w, at):
 
 @compiled
 def keep_signal(signal, t, h, w, at):
-    """Keep the signal at the stages."""
+    """Store the signal at the stages."""
     for i in range(STAGES):
-        there = at.signal + 3 * i
-        w[there], w[there + 1], w[there + 2] = signal_at(signal, t + NODES[i] * h, w, at)
+        s = at.signal + 3 * i
+        w[s], w[s + 1], w[s + 2] = signal_at(signal, t + NODES[i] * h, w, at)
 
 
 @compiled
@@ -372,13 +374,13 @@ def complete_stages(followers, h, y, w, at):
 
 @compiled
 def read_stage(f, solved, followers, level, i, y, w, at):
-    """Evaluate the function at stage i, and keep its outputs."""
+    """Evaluate the function at stage i, and store its outputs."""
     n, P, R, o = at.n, at.P, solved.size, at.outputs
     m = n + 1 + at.k
     for q in range(n):
         w[1 + q] = y[q] + w[at.stages + i * n + q]
-    there = at.signal + 3 * i
-    call(f, w[there], w[there + 1], w[there + 2], level, w, at)
+    s = at.signal + 3 * i
+    call(f, w[s], w[s + 1], w[s + 2], level, w, at)
     copy(w, at.values + i * m, o, m)
     for a in range(R if level else 0):
         row = o + m + solved[a] * n
@@ -418,9 +420,10 @@ def fill_matrix(R, h, w, at, matrix):
 
 @compiled
 def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
-    """Solve for the stages of a step from a guess of them; False if they are not found.
+    """Solve for the stages of a step from a guess; False if the iterations do not converge.
 
-    By fixed-point iterations where these converge fast, which few steps tell; else by Newton's.
+    Fixed-point iterations are used if they converge fast, which the first ones show; otherwise
+    Newton's method.
     """
     n, R, z = at.n, solved.size, at.stages
     m = n + 1 + at.k
@@ -456,7 +459,7 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
             newton = True
             w[at.stiff] = 1.0 if count else 0.0
             continue
-        if not total < np.inf:  # nor not a number, which a maximum does not show
+        if not total < np.inf:  # or NaN, which a maximum does not show
             return False
         before = largest
         for i in range(STAGES):
@@ -464,7 +467,7 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
                 w[z + i * n + solved[a]] += columns[i * R + a, 0]
         complete_stages(followers, h, y, w, at)
         done = largest < (_SOLVED if newton else _EXACT)
-        for e in range(at.k if done and newton else 0):  # laws bend most next to a switch
+        for e in range(at.k if done and newton else 0):  # laws are least linear next to a switch
             size = w[at.scale + n + 1 + e]
             for i in range(STAGES):
                 value = max(abs(w[at.values + i * m + n + 1 + e]), NEAR * size)
@@ -475,26 +478,26 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
 
 
 @compiled
-def error_of(f, solved, followers, dense, read, signal, t, h, y, w, at):
+def error_of(f, solved, followers, dense, integrates_output, signal, t, h, y, w, at):
     """Return the error of the step's polynomials, over the largest sizes.
 
-    By how far a state's slope at the beginning is from the rate there: of order 6 in the step, and
-    larger than the error at the step's end. The same before the first stage and the last one, which
-    finds what is as short as that. Where the output is integrated, which is `read` then, by how far
-    the polynomial of its values at the stages is from it at the beginning. Followers count where
-    the polynomials are read between the stages, which is `dense` then.
+    For each state it is the difference between the slope of the polynomial and the rate: at the
+    beginning, where it is of order 6 in the step, and larger than the error at the step's end; and
+    before the first and the last stage, which detects changes of such short duration. If the output
+    is integrated, the polynomial of its values at the stages is compared with it at the beginning.
+    Followers count if the polynomials are read between the stages: if the step is `dense`.
     """
     largest, m = 0.0, at.n + 1 + at.k
     R = solved.size
     for i in range(-1, CHECKED.size):
         if i >= 0:
-            put_place(y, CHECKED[i], w, at)
+            put_interpolated(y, CHECKED[i], w, at)
             evaluate(f, signal, t + CHECKED[i] * h, 0.0, w, at)
         for a in range(R + (followers.size if dense else 0)):
             r = solved[a] if a < R else followers[a - R]
             change = -h * (w[at.outputs + r] if i >= 0 else w[at.rates + r])
             size = max(w[at.scale + r], abs(y[r]))
-            if a >= R:  # it takes the displacement's rounding
+            if a >= R:  # a follower takes over the displacement's rounding
                 size = max(size, _HARDLY * abs(w[at.follow + r]) * max(w[at.scale], abs(y[0])))
             for j in range(STAGES):
                 moved = w[at.stages + j * at.n + r]
@@ -502,7 +505,7 @@ def error_of(f, solved, followers, dense, read, signal, t, h, y, w, at):
                 size = max(size, abs(y[r] + moved))
             if size > 0.0:
                 largest = max(largest, abs(change) / size)
-    if read:
+    if integrates_output:
         change = -w[at.output]
         size = max(w[at.scale + at.n], abs(change))
         for j in range(STAGES):
@@ -518,13 +521,13 @@ def error_of(f, solved, followers, dense, read, signal, t, h, y, w, at):
 def sensitivities(
     f, solved, followers, signal, t, h, y, S, first, chosen, w, at, matrix, columns
 ):  # fmt: skip
-    """Set the changes of the sensitivities to the stages of the solved step."""
+    """Set the changes of the sensitivities up to the stages of the solved step."""
     n, P, R, q, held = at.n, at.P, solved.size, S.shape[1], at.held
     m, d = n + 1 + at.k, at.changes
     for i in range(STAGES):
         read_stage(f, solved, followers, 2, i, y, w, at)
     w[d : d + STAGES * n * q] = 0.0
-    for i in range(STAGES):  # first what does not depend on the solved states
+    for i in range(STAGES):  # first the terms that do not depend on the solved states
         row, phase = d + i * n * q, signal.omega * (t + NODES[i] * h)
         if held:
             add(w, row, -1.0, S[0], 0, q)
@@ -540,21 +543,21 @@ def sensitivities(
                 slope = w[at.follow_slopes + b * (1 + P) + 1 + chosen[z]]
                 w[row + b * q + first + 1 + z] += slope * w[at.stages + i * n]
         for a in range(R):
-            own = row + solved[a] * q
+            target = row + solved[a] * q
             slopes = at.state_slopes + (i * m + solved[a]) * n
             drives = at.drive_slopes + (i * m + solved[a]) * (1 + P)
             for b in range(n):
-                add(w, own, w[slopes + b], S[b], 0, q)
-            add(w, own, w[slopes], w, row, q)
+                add(w, target, w[slopes + b], S[b], 0, q)
+            add(w, target, w[slopes], w, row, q)
             if held:
-                add(w, own, w[slopes + 1], w, row + q, q)
+                add(w, target, w[slopes + 1], w, row + q, q)
             for b in followers:
-                add(w, own, w[slopes + b], w, row + b * q, q)
+                add(w, target, w[slopes + b], w, row + b * q, q)
             for z in range(chosen.size):
-                w[own + first + 1 + z] += w[drives + 1 + chosen[z]]
+                w[target + first + 1 + z] += w[drives + 1 + chosen[z]]
             if not held:
                 along = np.cos(phase) if signal.sine else w[at.signal + 3 * i + 1]
-                w[own + first] += w[drives] * along
+                w[target + first] += w[drives] * along
     if R:
         columns[:] = 0.0
         for i in range(STAGES):

@@ -28,22 +28,21 @@ from dahl_ident.engine.radau import (
     error_model="numpy",
 )  # fmt: skip
 def march(
-    f, sizes, solved, followers, knots, coefficients, samples, first, p, chosen, initial, tolerance
-):
-    """Return whether the motion was found, output at the samples, its derivatives, the states.
+    f, sizes, solved, followers, knots, coefficients, samples, first, parameters, chosen,
+    derivatives, tolerance,
+):  # fmt: skip
+    """Return success; output at the samples, its derivatives, states; derivatives of the last one.
 
-    Last are the derivatives of the state at the last sample.
-
-    The signal is polynomials between knots. Derivatives, where `initial` is 1, with respect to the
+    The signal is polynomials between knots. If `derivatives` is 1, these are with respect to the
     initial states, the time by which a drive comes earlier, and the parameters `chosen`.
     """
     n, N = sizes[0], samples.size
-    q = n + 1 + chosen.size if initial else 0
+    q = n + 1 + chosen.size if derivatives else 0
     at = layout(sizes, q, coefficients.shape[0] - 1)
     w = np.zeros(at.length)
     matrix, columns = np.zeros((STAGES * n, STAGES * n)), np.zeros((STAGES * n, max(1, q)))
     restart(w, at)
-    put_parameters(f, p, w, at)
+    put_parameters(f, parameters, w, at)
     signal = Signal(False, 0.0, 1.0, knots, coefficients)
     y, S = first.copy(), np.zeros((n, q))
     for i in range(n if q else 0):

@@ -1,14 +1,14 @@
-"""Equations once, as casadi symbols; from them one compiled function with exact derivatives.
+"""From equations in casadi symbols to one compiled function with exact derivatives.
 
 A system has states y, of which the first two are displacement and velocity, a drive u, a direction
 s = sgn(v), parameters p, and
 
     dy/dt = rates(y, u, s, p),    output(y, u, s, p).
 
-casadi differentiates both, and finds the kinks: comparisons, signs and absolute values in the
-expression are switching functions, whose sides are held between two events
-(:mod:`dahl_ident.engine.switches`). The expression graph is then compiled as a C function of one
-fixed signature (:mod:`dahl_ident.engine.emit`). So the kernels are compiled once, for all systems.
+casadi differentiates both. Comparisons, signs and absolute values in the expression are switching
+functions, whose sides are constant between two events (:mod:`dahl_ident.engine.switches`). The
+expression graph is then compiled as a C function with a fixed signature
+(:mod:`dahl_ident.engine.emit`), so that the kernels are compiled once for all systems.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ class Equations(NamedTuple):
     states : sequence of SX
         Displacement, velocity, then any others.
     drive : SX
-        What acts on the system; unused where the displacement is held.
+        The force or acceleration on the system; unused if the displacement is held.
     direction : SX
         Sign of the velocity.
     parameters : sequence of SX
     rates : SX
         Derivatives of the states with respect to time. Those of displacement and velocity are not
-        used where the displacement is held.
+        used if the displacement is held.
     output : SX
-        What is measured.
+        The measured quantity.
     held : bool
-        Whether the displacement is prescribed, rather than found from the drive.
+        Whether the displacement is prescribed, not a response to the drive.
     """
 
     states: Sequence[ca.SX]
@@ -57,28 +57,29 @@ class Equations(NamedTuple):
 
 @dataclass(frozen=True)
 class System:
-    """Compiled equations; what the kernels take.
+    """Compiled equations for the kernels.
 
     Attributes
     ----------
     function : callable
-        ``f(numbers)``, a numba C function of one array: inputs, then outputs. Inputs: how much is
-        wanted (0 values, 1 also the derivatives with respect to the states, 2 also with respect to
-        drive and parameters), states, drive, direction, sides of the switches, parameters. At
-        level -1, to be called once for the parameters, only what follows from them: it is kept
-        behind them. Outputs: rates, output and switching functions; their derivatives with respect
-        to the states, row by row; those with respect to drive and parameters, row by row. Zeros are
-        not written.
+        ``f(numbers)``, a numba C function of one array: inputs, then outputs. Inputs: the level (0
+        for values, 1 also for derivatives with respect to the states, 2 also with respect to drive
+        and parameters), states, drive, direction, sides of the switches, parameters. Level -1, to
+        be called once for the parameters, computes the quantities that depend on them only, and
+        stores these after the inputs. Outputs: rates, output and switching functions; their
+        derivatives with respect to the states, row by row; those with respect to drive and
+        parameters, row by row. Zeros are not written.
     sizes : ndarray of int, shape (6,)
-        States, switches, parameters; 1 where the displacement is held, and 1 where the output for a
-        held displacement depends on its speed, else 0; numbers kept that follow from parameters.
+        Numbers of states, switches, parameters; 1 if the displacement is held, otherwise 0; 1 if
+        the output for a held displacement depends on its speed, otherwise 0; number of stored
+        quantities that depend on parameters only.
     solved : ndarray of int
         States for which the stages of a step are solved.
     followers : ndarray of int
         States that change in proportion to the displacement while no switch changes its side, such
         as the forces of Jenkins elements. They need no integration.
     odd : bool
-        Whether the equations stay the same where states, drive and direction change sign.
+        Whether the equations stay the same if states, drive and direction change sign.
     """
 
     function: Any
@@ -109,30 +110,29 @@ def translate(equations: Equations) -> System:
     (3, [2], True)
     """
     states, drive, parameters = equations.states, equations.drive, equations.parameters
-    whole = ca.vertcat(equations.rates, equations.output)
-    held, switches, sides = on_one_branch(
-        [*states, drive, equations.direction], whole, (states[1], equations.direction), parameters
+    outputs = ca.vertcat(equations.rates, equations.output)
+    smooth, switches, sides = on_one_branch(
+        [*states, drive, equations.direction], outputs, (states[1], equations.direction), parameters
     )
-    rows = ca.vertcat(held, *switches)
+    rows = ca.vertcat(smooth, *switches)
     y = ca.vertcat(*states)
     by_state = ca.jacobian(rows, y)
     by_parameter = ca.jacobian(rows, ca.vertcat(drive, *parameters))
     numbers = ca.vertcat(*states, drive, equations.direction, *sides, *parameters)
     graph = ca.Function("f", [numbers], [ca.densify(rows), by_state, by_parameter])
     last = 1 + numbers.numel()
-    steps, kept = prepared(
-        steps_of(graph, _places(numbers.numel(), rows.numel(), graph)), last - len(parameters), last
-    )
+    indices = _output_indices(numbers.numel(), rows.numel(), graph)
+    steps, stored = prepared(steps_of(graph, indices), last - len(parameters), last)
     order = len(states)
-    followers = _followers(by_state, rows, states, drive, order)
+    followers = _followers(by_state, rows, states, drive)
     if steps not in _COMPILED:
         _COMPILED[steps] = compiled(steps)
     solved = [i for i in range(1 + equations.held, order) if i not in followers]
-    rated = equations.held and not _goes_with_speed(equations)
+    rated = equations.held and not _is_rate_independent(equations)
     return System(
         _COMPILED[steps],
         np.array(
-            [order, len(switches), len(parameters), equations.held, rated, kept], dtype=np.int64
+            [order, len(switches), len(parameters), equations.held, rated, stored], dtype=np.int64
         ),
         np.array(solved, dtype=np.int64),
         np.array(followers, dtype=np.int64),
@@ -144,17 +144,15 @@ _COMPILED: dict[tuple[Step, ...], Any] = {}
 """Compiled functions by their steps."""
 
 
-def _followers(
-    by_state: ca.SX, rows: ca.SX, states: Sequence[ca.SX], drive: ca.SX, order: int
-) -> list[int]:
-    """Return the states whose rate is the velocity times something constant on a branch."""
-    moving = ca.vertcat(*states, drive)
-    found = []
-    for i in range(2, order):
+def _followers(by_state: ca.SX, rows: ca.SX, states: Sequence[ca.SX], drive: ca.SX) -> list[int]:
+    """Return the states whose rate is the velocity times a constant of the branch."""
+    variables = ca.vertcat(*states, drive)
+    followers = []
+    for i in range(2, len(states)):
         at_rest = ca.substitute(rows[i], states[1], ca.SX(0.0))
-        if not ca.depends_on(ca.vertcat(at_rest, by_state[i, 1]), moving):
-            found.append(i)
-    return found
+        if not ca.depends_on(ca.vertcat(at_rest, by_state[i, 1]), variables):
+            followers.append(i)
+    return followers
 
 
 _ODD = (
@@ -165,67 +163,67 @@ _EVEN = (ca.OP_COS, ca.OP_COSH)
 
 
 def _factors(equations: Equations, states: Sequence[float], others: float) -> list[float]:
-    """Return by which factors rates and output change where states, drive and direction do.
+    """Return the factors of rates and output when the states, and drive and direction, have some.
 
-    That is read from the expression, whatever the numbers: NaN where it is not a factor, or does
-    not show as one; 0 where the output is zero.
+    They follow from the expression, for all numbers: NaN if there is no such factor, or the
+    expression does not show it; 0 if the result is zero.
     """
     symbols = [*equations.states, equations.drive, equations.direction, *equations.parameters]
     outputs = ca.vertcat(equations.rates, equations.output)
     function = ca.Function("f", symbols, [outputs])
     inputs = [*states, others, others, *[1.0] * len(equations.parameters)]
     work: dict[int, float] = {}
-    power: dict[int, float] = {}  # constants
-    found = [0.0] * function.nnz_out(0)
+    constants: dict[int, float] = {}
+    result = [0.0] * function.nnz_out(0)
     for k in range(function.n_instructions()):
         code, source = function.instruction_id(k), function.instruction_input(k)
         (*_, target), factor = function.instruction_output(k), np.nan
         if code == ca.OP_OUTPUT:
-            found[target] = work[source[0]]
+            result[target] = work[source[0]]
             continue
-        exponent = power.get(source[-1], np.nan) if source else np.nan
-        power.pop(target, None)
+        exponent = constants.get(source[-1], np.nan) if source else np.nan
+        constants.pop(target, None)
         if code == ca.OP_CONST:
-            power[target] = function.instruction_constant(k)
-            factor = float(power[target] != 0.0)
+            constants[target] = function.instruction_constant(k)
+            factor = float(constants[target] != 0.0)
         elif code == ca.OP_INPUT:
             factor = inputs[source[0]]
         else:
-            a = [work[i] for i in source]
-            one, other = a[0], a[-1]
-            alike = one if one == other else np.nan
+            factors = [work[i] for i in source]
+            a, b = factors[0], factors[-1]
+            common = a if a == b else np.nan
             if code in (ca.OP_ADD, ca.OP_SUB):
-                factor = one + other if 0.0 in a else alike
+                factor = a + b if 0.0 in factors else common
             elif code == ca.OP_MUL:
-                factor = 0.0 if 0.0 in a else one * other
-            elif code == ca.OP_DIV and other:
-                factor = one / other
-            elif code == ca.OP_INV and one:
-                factor = 1.0 / one
-            elif code == ca.OP_IF_ELSE_ZERO and one == 1.0:
-                factor = other
+                factor = 0.0 if 0.0 in factors else a * b
+            elif code == ca.OP_DIV and b:
+                factor = a / b
+            elif code == ca.OP_INV and a:
+                factor = 1.0 / a
+            elif code == ca.OP_IF_ELSE_ZERO and a == 1.0:
+                factor = b
             elif code in (ca.OP_NEG, ca.OP_TWICE):
-                factor = one
+                factor = a
             elif code == ca.OP_SQ:
-                factor = one**2
+                factor = a**2
             elif code == ca.OP_FABS:
-                factor = abs(one)
+                factor = abs(a)
             elif code == ca.OP_SIGN:
-                factor = np.sign(one)
-            elif code in (ca.OP_FMIN, ca.OP_FMAX) and alike > 0.0:
-                factor = one
-            elif code in (ca.OP_POW, ca.OP_CONSTPOW) and one and exponent.is_integer():
-                factor = one**exponent
-            elif code in _ODD and abs(one) == 1.0:
-                factor = one
+                factor = np.sign(a)
+            elif code in (ca.OP_FMIN, ca.OP_FMAX) and common > 0.0:
+                factor = a
+            elif code in (ca.OP_POW, ca.OP_CONSTPOW) and a and exponent.is_integer():
+                factor = a**exponent
+            elif code in _ODD and abs(a) == 1.0:
+                factor = a
             elif (
-                (code in (ca.OP_LT, ca.OP_LE) and alike > 0.0)
-                or (code in _EVEN and one == -1.0)
-                or all(value in (0.0, 1.0) for value in a)
+                (code in (ca.OP_LT, ca.OP_LE) and common > 0.0)
+                or (code in _EVEN and a == -1.0)
+                or all(factor in (0.0, 1.0) for factor in factors)
             ):
                 factor = 1.0
         work[target] = factor
-    return found
+    return result
 
 
 def is_odd(equations: Equations) -> bool:
@@ -234,19 +232,19 @@ def is_odd(equations: Equations) -> bool:
     return all(factor in (-1.0, 0.0) for factor in factors)
 
 
-def _goes_with_speed(equations: Equations) -> bool:
-    """Return whether rates are in proportion to the speed, and the output does not depend on it."""
+def _is_rate_independent(equations: Equations) -> bool:
+    """Return whether rates are proportional to the speed, and the output does not depend on it."""
     *rates, output = _factors(equations, [1.0, 2.0] + [1.0] * (len(equations.states) - 2), 1.0)
     return output in (0.0, 1.0) and all(rate in (2.0, 0.0) for rate in rates)
 
 
-def _places(n_inputs: int, n_rows: int, graph: ca.Function) -> list[list[int]]:
-    """Return where the nonzeros of each level go, behind the level and the inputs."""
-    found, start = [], 1 + n_inputs
+def _output_indices(n_inputs: int, n_rows: int, graph: ca.Function) -> list[list[int]]:
+    """Return the indices of each level's nonzeros in the array, after the level and the inputs."""
+    indices, start = [], 1 + n_inputs
     for level in range(3):
         sparsity = graph.sparsity_out(level)
         columns = sparsity.size2()
         row, column = sparsity.get_triplet()
-        found.append([start + r * columns + c for r, c in zip(row, column, strict=True)])
+        indices.append([start + r * columns + c for r, c in zip(row, column, strict=True)])
         start += n_rows * columns
-    return found
+    return indices

@@ -232,7 +232,7 @@ class Problem(ABC):
     @property
     @abstractmethod
     def rounding(self) -> FloatArray:
-        """Size of residuals that may be rounding errors alone; no estimated scale is smaller."""
+        """Size of residuals that may be pure rounding errors; no estimated scale is smaller."""
 
     @property
     def accuracy(self) -> float:
@@ -245,8 +245,8 @@ class Problem(ABC):
     ) -> FloatArray:
         """Return the data's residuals and, below them, their derivatives, (..., 1 or 1 + P, m).
 
-        Unchecked; not finite where there is no prediction. Without `tails`, a covariance of few
-        degrees of freedom counts as if it were known.
+        Theta is not checked; residuals without a prediction are not finite. Without `tails`, a
+        covariance with few degrees of freedom counts as known.
         """
 
     def rows(

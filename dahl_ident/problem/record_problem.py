@@ -283,7 +283,7 @@ class RecordProblem(RecordWaves):
 
     @property
     def rounding(self) -> FloatArray:
-        """Size of residuals that may be rounding errors alone."""
+        """Size of residuals that may be pure rounding errors."""
         return np.asarray(self.accuracy)
 
     @property
