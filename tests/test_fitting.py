@@ -14,6 +14,7 @@ from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, solve, solve_many
 from dahl_ident.fitting.levenberg_marquardt import minimise
 from dahl_ident.problem import ProblemBatch, Quadratic, TableProblem
+from tests.friction_tables import relative_noise
 
 n = 20
 A = np.geomspace(1e-4, 1e-1, n)
@@ -344,6 +345,19 @@ def test_whatever_is_measured_ends_in_words_and_is_not_trusted(name, model):
     assert not found.trusted
     assert f"    {found.status.capitalize()}. " in found.fit_report()
     assert not np.isnan(found.optimum.values).any()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+@pytest.mark.parametrize("loss", ["linear", "huber"])
+def test_three_rows_of_two_runs_end_in_words(noise, loss):
+    few = np.array([1e-3, 2e-2, 1e-2]) if noise else np.full(3, 5e-3)
+    data = FrequencyResponse(
+        np.ones(3), Dahl(0.1, 30.0).describing_function(few) * relative_noise(3, noise, 1), few,
+        run=["a", "b", "b"],
+    )  # fmt: skip
+    found = fit(data, Dahl(alpha=1.0) + Spring() + Damper(), loss=loss, throw=False)
+    assert not found.trusted
+    assert f"    {found.status.capitalize()}. " in str(found)
 
 
 def test_columns_alike_to_rounding_end_no_search():

@@ -126,7 +126,10 @@ class MixedModel:
             if (state.gradient - price) @ (aim - s) < _CLOSE:
                 break
             for length in _LENGTHS:
-                trial = self.at(s + length * (aim - s))
+                try:
+                    trial = self.at(s + length * (aim - s))
+                except np.linalg.LinAlgError:  # of sources far larger than the noise
+                    continue
                 rise = trial.log_likelihood - price @ trial.variances - before
                 if rise > 0.0:
                     break

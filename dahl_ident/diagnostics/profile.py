@@ -456,15 +456,15 @@ def _along_valley(
     target = (theta + change)[np.arange(len(index)), index]
     phi = chart.phi(theta)
     ln_kappa, total = phi[:, sigma], phi[:, spring]
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):  # beyond the total stiffness
         ln_x_c: dict[int, FloatArray] = {
             f_max: 0.5 * (target - ln_kappa),
             sigma: target - ln_kappa,
             spring: np.log(total - target) - ln_kappa,
         }
-    for column, value in ln_x_c.items():
-        phi[:, f_max] = np.where(index == column, value, phi[:, f_max])
-    moved = chart.theta(phi)
+        for column, value in ln_x_c.items():
+            phi[:, f_max] = np.where(index == column, value, phi[:, f_max])
+        moved = chart.theta(phi)
     moved[np.arange(len(index)), index] = target
     applies = np.isin(index, np.array([*ln_x_c])) & (phi[:, f_max] > least)
     return moved, applies & np.isfinite(moved).all(axis=1)

@@ -231,7 +231,7 @@ class ResidualSpace(_Complement):
             inflation = np.sqrt(loss.inflation(z[0::2], max(self.dof, 1)))
             slope = loss.slope(z)
             spread = np.sqrt((slope**2 * z).sum() / (2.0 * max(self.dof, 1)))
-            return np.full(y.shape, 1.0 / inflation), slope / (spread if spread > 0.0 else 1.0)
+            return np.full(y.shape, 1.0 / (inflation or 1.0)), slope / (spread or 1.0)
         if self._problem.gaussian or dof is None:
             return np.ones(y.shape), np.ones(y.shape)
         nu = np.minimum(np.repeat(dof, 2), _GAUSSIAN)
