@@ -204,7 +204,8 @@ class Backlash(Friction):
     @classmethod
     def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
         """Return the element that :meth:`describe` described."""
-        inner = dict(description.get("element", {}))
+        entry = description.get("element")
+        inner = dict(entry) if isinstance(entry, Mapping) else {}
         law = class_named(str(inner.pop("kind", None)))
         if set(description) != {"element", "gap"} or law is None:
             raise ModelError(
