@@ -143,15 +143,12 @@ def datasets(
         else:
             console.write(repr(data))
         return
+    entries = data_sets().values()
     if general.json:
-        console.write_json(
-            [
-                {k: v for k, v in vars(entry).items() if k != "experiment"} | {"kind": entry.kind}
-                for entry in data_sets().values()
-            ]
-        )
+        kinds = [vars(entry) | {"kind": entry.kind} for entry in entries]
+        console.write_json([{k: v for k, v in one.items() if k != "experiment"} for one in kinds])
         return
-    for entry in data_sets().values():
+    for entry in entries:
         console.write_wrapped(
             f"{entry.name} ({entry.kind.replace('_', ' ')}): {entry.teaches}. "
             f"Determines {', '.join(entry.identifiable)}."
@@ -269,17 +266,14 @@ class Reporting:
             if column not in allowed:
                 existing = ", ".join(sorted(common)) or "none"
                 raise ValidationError(f"{name} {column}: the fits have the covariates {existing}")
-        texts = {
-            column: [v for values in covariates if isinstance(v := values[column], str)]
-            for column in common
-        }
+        pairs = [pair for values in reversed(covariates) for pair in values.items()]
+        texts = {column: value for column, value in pairs if isinstance(value, str)}  # the first
         for column in columns:
-            if texts[column]:
+            if column in texts:
                 raise ValidationError(
-                    f"--covariate {column} is {texts[column][0]!r}; expected numbers"
+                    f"--covariate {column} is {texts[column]!r}; expected numbers"
                 )
-        unused = sorted(c for c in common - {*columns, self.order} if not texts[c])
-        if unused:
+        if unused := sorted(common - texts.keys() - {*columns, self.order}):
             console.note(
                 f"the report does not use {', '.join(unused)}; --covariate {unused[0]} states how "
                 "parameters depend on it"
@@ -316,22 +310,13 @@ def campaign(
         )
     if reporting.report is not None and not running.dry_run:
         path = result.report(
-            reporting.report,
-            covariates=reporting.covariate or [],
-            order=reporting.order,
-            title=definition.stem,
-            overwrite=writing.overwrite,
-        )
+            reporting.report, covariates=reporting.covariate or [], order=reporting.order,
+            title=definition.stem, overwrite=writing.overwrite,
+        )  # fmt: skip
         console.note(f"report: {path}")
     if general.json:
-        console.write_json(
-            {
-                "finished": list(result.finished),
-                "to_do": list(result.to_do),
-                "statuses": dict(result.statuses),
-                "folder": str(result.folder),
-            }
-        )
+        fields = ("finished", "to_do", "statuses", "folder")
+        console.write_json({name: getattr(result, name) for name in fields})
     elif running.dry_run:
         console.write("\n".join([*(f"to do: {name}" for name in result.to_do), str(result)]))
     else:

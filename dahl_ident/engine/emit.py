@@ -7,6 +7,7 @@ types of thousands of lines, all of which are numbers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -123,8 +124,9 @@ def prepared(steps: Sequence[Step], first: int, last: int) -> tuple[tuple[Step, 
     return tuple(result), len(stored)
 
 
-def compiled(steps: Sequence[Step]) -> Any:
-    """Return the C function ``f(numbers)`` of some steps."""
+@cache
+def compiled(steps: tuple[Step, ...]) -> Any:
+    """Return the C function ``f(numbers)`` of some steps; the same steps are compiled once."""
     from llvmlite import ir
     from numba import cfunc, types
     from numba.extending import intrinsic

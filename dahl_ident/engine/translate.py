@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.engine.emit import Step, compiled, prepared, steps_of
+from dahl_ident.engine.emit import compiled, prepared, steps_of
 from dahl_ident.engine.switches import on_one_branch
 
 
@@ -125,12 +125,10 @@ def translate(equations: Equations) -> System:
     steps, stored = prepared(steps_of(graph, indices), last - len(parameters), last)
     order = len(states)
     followers = _followers(by_state, rows, states, drive)
-    if steps not in _COMPILED:
-        _COMPILED[steps] = compiled(steps)
     solved = [i for i in range(1 + equations.held, order) if i not in followers]
     rated = equations.held and not _is_rate_independent(equations)
     return System(
-        _COMPILED[steps],
+        compiled(steps),
         np.array(
             [order, len(switches), len(parameters), equations.held, rated, stored], dtype=np.int64
         ),
@@ -138,10 +136,6 @@ def translate(equations: Equations) -> System:
         np.array(followers, dtype=np.int64),
         is_odd(equations),
     )
-
-
-_COMPILED: dict[tuple[Step, ...], Any] = {}
-"""Compiled functions by their steps."""
 
 
 def _followers(by_state: ca.SX, rows: ca.SX, states: Sequence[ca.SX], drive: ca.SX) -> list[int]:
