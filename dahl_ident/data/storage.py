@@ -157,6 +157,7 @@ def locked(file: Path, error: type[DahlIdentError]) -> Iterator[None]:
     path = file.with_name(file.name + ".lock")
     lock = FileLock(path, timeout=0)
     try:
+        path.touch()  # where no file can be made, filelock would wait as for a lock that is held
         lock.acquire()
     except Timeout:
         raise error(
