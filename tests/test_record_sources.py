@@ -166,6 +166,15 @@ def test_scatter_between_runs_is_in_the_budget():
     assert "a single run" in di.fit(runs[0], di.Dahl()).verdict
 
 
+def test_copies_of_a_record_are_left_out():
+    record, other = (recorded(DAHL, "random", 600, 1e-3, seed) for seed in (0, 1))
+    once, often = di.fit(record, di.Dahl()), di.fit([record] * 3, di.Dahl())
+    assert often.summary().equals(once.summary())
+    assert "2 of 3 records are copies of others, identical to the digit" in often.verdict
+    assert "a single run" in often.verdict
+    assert len(di.fit([record, other, record], di.Dahl()).data) == 2
+
+
 def test_a_negative_damper_is_said_in_the_verdict_with_what_to_do():
     record = recorded(DAHL + di.Damper(-0.3), "multisine", 1500, 1e-3)
     fit = di.fit(record, di.Dahl() + di.Damper())

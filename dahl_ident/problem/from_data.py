@@ -72,7 +72,7 @@ def problem_of(
             steady=steady,
         )
     return RecordProblem(
-        [data] if isinstance(data, Record) else list(data),
+        [data] if isinstance(data, Record) else without_copied_records(list(data)),
         as_model(model).with_free(free).with_fixed(fixed or {}),
         output=output,
         excitation=excitation,
@@ -95,15 +95,41 @@ def without_copies(data: FrequencyResponse) -> FrequencyResponse:
     numbers = (data.frequency_hz, data.response.real, data.response.imag, data.harmonic, run)
     levels = (column for column in (data.amplitude, data.drive) if column is not None)
     first = np.unique(np.column_stack([*numbers, *levels]), axis=0, return_index=True)[1]
-    copies = data.n - len(first)
-    if not copies:
+    if len(first) == data.n:
         return data
-    provenance = dict(data.provenance or {})
-    verb = "is a copy of another" if copies == 1 else "are copies of others"
-    text = f"{copies} of {data.n} rows {verb}, identical to the digit: copies are left out"
-    provenance["warnings"] = [*provenance.get("warnings", ()), text]
     is_first = np.isin(np.arange(data.n), first)
+    provenance = _with_copies(data.provenance, data.n - len(first), f"{data.n} rows")
     return replace(data.select(rows=is_first), provenance=provenance)
+
+
+def without_copied_records(records: list[Record]) -> list[Record]:
+    """Return records without exact copies of other records, see :func:`without_copies`.
+
+    Examples
+    --------
+    >>> record = Record([0.0, 0.1], displacement=[0.0, 1.0], force=[0.0, 2.0])
+    >>> [once] = without_copied_records([record, record])
+    >>> once.provenance["warnings"]
+    ['1 of 2 records is a copy of another, identical to the digit: copies are left out']
+    """
+    kept: dict[Any, Record] = {}
+    for record in records:
+        if not isinstance(record, Record):
+            return records  # the problem refuses them
+        waves = record.time, record.motion_samples, record.force_samples
+        kept.setdefault((record.motion_channel, *(w.tobytes() for w in waves)), record)
+    first = list(kept.values())
+    if copies := len(records) - len(first):
+        provenance = _with_copies(first[0].provenance, copies, f"{len(records)} records")
+        first[0] = replace(first[0], provenance=provenance)
+    return first
+
+
+def _with_copies(provenance: Mapping[str, Any] | None, copies: int, of_all: str) -> dict[str, Any]:
+    """Return a provenance that states the number of copies."""
+    verb = "is a copy of another" if copies == 1 else "are copies of others"
+    text = f"{copies} of {of_all} {verb}, identical to the digit: copies are left out"
+    return {**(provenance or {}), "warnings": [*(provenance or {}).get("warnings", ()), text]}
 
 
 class ProblemBatch(TableProblem):
