@@ -445,6 +445,21 @@ def test_noise_of_the_drive_is_judged_as_it_was_fitted():
     assert "drive_std [N]" in again.data.to_frame().columns
 
 
+@pytest.mark.parametrize("kind", ["table", "record"])
+def test_a_robust_loss_does_not_hide_a_contradicted_constraint(kind):
+    rng = np.random.default_rng(3)
+    t = np.arange(600) / 100.0
+    x = 4e-3 * np.sin(2.0 * np.pi * 0.9 * t) * t / 6.0
+    force = Dahl(0.1, 30.0).force(x) + 5e-4 * rng.standard_normal(t.size)
+    data = friction_data() if kind == "table" else di.Record(t, displacement=x, force=force)
+    for least, status in ((29.0, "trusted"), (33.0, "not described")):
+        found = fit(
+            data, Dahl(alpha=1.0), method="ipopt", loss="huber", throw=False,
+            constraints=lambda p, least=least: [p["sigma"] >= least],
+        )  # fmt: skip
+        assert str(found.status) == status, found.verdict
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_constraint_that_the_data_contradict_is_said_so(known):
     data = friction_data(covariance=covariance_of() if known else None)

@@ -241,7 +241,8 @@ class RecordAssessment(Assessment):
         """Return what the number of records assumes."""
         exponents = self.problem.exponents
         unseen = [p.name for p in exponents if p.assumed and p.name not in self.assumed]
-        return {"single_run": self.errors.runs < 2, "unfound": tuple(unseen * counted)}
+        unfound = tuple(unseen) if counted and not self.first_order else ()
+        return {"single_run": self.errors.runs < 2, "unfound": unfound}
 
     @property
     def facts(self) -> dict[str, Any]:

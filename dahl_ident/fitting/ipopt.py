@@ -50,6 +50,7 @@ from dahl_ident.fitting.optimum import (
 )
 from dahl_ident.fitting.record_search import Tell
 from dahl_ident.fitting.search import solve, starts_of
+from dahl_ident.noise import squares_of
 from dahl_ident.problem import Problem, Quadratic, TableProblem
 
 if TYPE_CHECKING:
@@ -417,15 +418,28 @@ class _Descent:
         )
 
     def _constraint_cost(self, end: _End, begin: Optimum) -> ConstraintCost | None:
-        """Return the rise of the cost due to the constraints; None if it cannot be judged."""
+        """Return the rise of the cost due to the constraints; NaN if it cannot be judged.
+
+        For a robust loss it is divided by E[psi^2]/E[psi'], as it then has the same distribution
+        (P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed., 2009, chapter 7).
+        """
+        problem, loss = self.problem, self.loss
         relations = zip(self.relations.texts, self.relations.equal, end.active, strict=True)
         texts = tuple(text for text, equal, active in relations if equal or active)
-        has_one_scale = self.problem.scale_known or not self.problem.priors
-        noise_known = has_one_scale and not begin.is_exact and begin.dof > 0
-        if self.loss is not None or not noise_known or not texts:
+        if not texts:
             return None
-        rise = 2.0 * max(end.cost - begin.cost, 0.0) / begin.scale**2
-        return ConstraintCost(texts, rise, np.inf if begin.scale_known else float(begin.dof))
+        rise, dof = float("nan"), np.inf if begin.scale_known else float(begin.dof)
+        if begin.dof > 0 and not begin.is_exact:
+            constrained, free = (
+                float(problem.quadratic(theta, begin.scale, loss).cost)
+                for theta in (end.theta, begin.theta)
+            )
+            rise = 2.0 * max(constrained - free, 0.0)
+            if loss is not None:
+                r = problem.residuals(begin.theta, begin.scale)[: problem.n_residuals]
+                z = squares_of(r, problem.residuals_per_row)
+                rise /= loss.inflation(z, begin.dof) * loss.mean_slope(z)
+        return ConstraintCost(texts, rise, dof)
 
 
 @cache

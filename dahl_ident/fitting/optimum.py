@@ -105,7 +105,7 @@ class ConstraintCost:
     """The rise of the sum of squares due to the active constraints.
 
     `rise` is divided by the variance of the noise, which has `dof` degrees of freedom, infinite if
-    it is known.
+    it is known; NaN if the noise is not known.
     """
 
     texts: tuple[str, ...]
