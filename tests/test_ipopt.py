@@ -12,7 +12,7 @@ from scipy import optimize, stats
 from dahl_ident import BoucWen, Dahl, Damper, FitResult, LinearSystem, Mass, Spring
 from dahl_ident import fit as any_fit
 from dahl_ident import response as any_response
-from dahl_ident.data import FrequencyResponse
+from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.errors import FitError, ModelError, ValidationError
 from dahl_ident.fitting import Status, ipopt, solve
 from dahl_ident.fitting.ipopt import solve_ipopt
@@ -451,12 +451,15 @@ def test_a_robust_loss_does_not_hide_a_contradicted_constraint(kind):
     t = np.arange(600) / 100.0
     x = 4e-3 * np.sin(2.0 * np.pi * 0.9 * t) * t / 6.0
     force = Dahl(0.1, 30.0).force(x) + 5e-4 * rng.standard_normal(t.size)
-    data = friction_data() if kind == "table" else di.Record(t, displacement=x, force=force)
-    for least, status in ((29.0, "trusted"), (33.0, "not described")):
-        found = fit(
-            data, Dahl(alpha=1.0), method="ipopt", loss="huber", throw=False,
-            constraints=lambda p, least=least: [p["sigma"] >= least],
-        )  # fmt: skip
+    data = friction_data() if kind == "table" else Record(t, displacement=x, force=force)
+    for ratio, status in ((1.0, "trusted"), (1.1, "not described")):
+
+        def tied(p: Any, ratio: float = ratio) -> list[Any]:
+            return [p["sigma"] == 300.0 * ratio * p["f_max"]]
+
+        found = any_fit(
+            data, Dahl(alpha=1.0), method="ipopt", loss="huber", throw=False, constraints=tied
+        )
         assert str(found.status) == status, found.verdict
 
 
