@@ -157,6 +157,7 @@ def test_constraints():
         (record(TRUE), {"noise": "relative"}),
         (record(TRUE), {"steady": "describing function"}),
         (record(TRUE), {"drive_std": 0.1}),
+        (record(TRUE), {"excitation": "base"}),
         (di.load_dataset("noisy"), {"output": "force"}),
         (di.load_dataset("noisy"), {"excitation": "base"}),
     ],
@@ -164,6 +165,11 @@ def test_constraints():
 def test_options_of_the_other_kind_are_refused(data, option):
     with pytest.raises(ValidationError, match=r"is given with (records|a table): .*leave it out"):
         di.fit(data, MODEL, **option)
+
+
+def test_an_unknown_excitation_is_refused_at_once():
+    with pytest.raises(ValidationError, match="excitation is 'foo'; expected one of force, base"):
+        di.fit(record(TRUE), MODEL + di.Mass(), excitation="foo")
 
 
 def test_a_table_and_a_record_answer_the_same_questions(fit):

@@ -11,6 +11,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.data import Record
+from dahl_ident.data.columns import one_of
 from dahl_ident.data.record import at_even_times, unbroken
 from dahl_ident.data.rows import one_run
 from dahl_ident.elements import Element, Friction, Model, Parameter
@@ -18,7 +19,7 @@ from dahl_ident.elements.coefficients import Coefficients
 from dahl_ident.elements.equations import FirstState, plant_equations
 from dahl_ident.elements.model import as_model
 from dahl_ident.elements.parameter import Dimension
-from dahl_ident.errors import DataError, ModelError, ValidationError
+from dahl_ident.errors import DataError, ModelError, ValidationError, argument
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_noise import LEADS, in_band, noise_of, travelled
 from dahl_ident.problem.space import Space
@@ -56,10 +57,16 @@ class RecordWaves(Problem):
                     "FrequencyResponse.concatenate joins tables)"
                 )
         self.model = as_model(model)
+        one_of(excitation, "excitation", ("force", "base"))
         self.excitation = excitation
         self.output: Output = output or ("motion" if self.model.has_inertia else "force")
-        if self.output not in ("force", "motion"):
-            raise ValidationError(f"output is {output!r}; expected force or motion")
+        one_of(self.output, "output", ("force", "motion"))
+        if excitation == "base" and self.output == "force":
+            raise ValidationError(
+                f"{argument('excitation', 'base')} is given with records whose force is predicted, "
+                "from the displacement: their force channel is a force; leave it out, or predict "
+                "the motion of a model with a mass"
+            )
         if self.output == "force" and not self.coefficients.are_values:
             raise ModelError(
                 "a linear system with free parameters moves with a plant, but has no force over "
