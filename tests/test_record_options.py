@@ -169,7 +169,7 @@ def test_options_of_the_other_kind_are_refused(data, option):
 
 def test_an_unknown_excitation_is_refused_at_once():
     with pytest.raises(ValidationError, match="excitation is 'foo'; expected one of force, base"):
-        di.fit(record(TRUE), MODEL + di.Mass(), excitation="foo")
+        di.fit(record(TRUE), MODEL + di.Mass(), excitation="foo")  # type: ignore[arg-type]
 
 
 def test_a_table_and_a_record_answer_the_same_questions(fit):

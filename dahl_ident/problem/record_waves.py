@@ -63,9 +63,8 @@ class RecordWaves(Problem):
         one_of(self.output, "output", ("force", "motion"))
         if excitation == "base" and self.output == "force":
             raise ValidationError(
-                f"{argument('excitation', 'base')} is given with records whose force is predicted, "
-                "from the displacement: their force channel is a force; leave it out, or predict "
-                "the motion of a model with a mass"
+                f"{argument('excitation', 'base')} is given with records: their force is predicted "
+                "from the displacement; leave it out, or predict the motion of a model with a mass"
             )
         if self.output == "force" and not self.coefficients.are_values:
             raise ModelError(
