@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm, t
 
 import dahl_ident as di
+from dahl_ident.errors import ModelError
 from tests.test_record_fit import DAHL, driven, recorded
 
 
@@ -39,6 +40,16 @@ def _counted_as_independent(fit, name):
     J = fit.problem.predict(fit.optimum.values, 0).by
     covariance = np.linalg.inv(J.T @ J) * float(np.var(fit.residuals[0]))
     return float(covariance[number, number] ** 0.5)
+
+
+def test_a_prior_of_a_fixed_exponent_needs_it_free():
+    record, prior = recorded(DAHL, "random", 300, 1e-3), {"alpha": (0.5, 1.5)}
+    with pytest.raises(ModelError, match=r"to estimate alpha, give free=\['alpha'\]"):
+        di.posterior(record, di.Dahl(), method="grid", priors=prior)
+    freed = di.posterior(
+        record, di.Dahl(), method="grid", priors=prior, free=["alpha"], tolerance=0.03
+    )
+    assert freed.priors["alpha"] == "log-uniform from 0.5 to 1.5"
 
 
 def test_a_posterior_counts_noise_alone_or_the_stated_calibration():

@@ -29,7 +29,7 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray, finite_array
 from dahl_ident.elements import Parameter
-from dahl_ident.errors import HIGH, LOW, ModelError, ValidationError, argument, choices
+from dahl_ident.errors import HIGH, LOW, ModelError, ValidationError, argument, choices, spelled
 from dahl_ident.problem import Problem
 
 # Factors of the default bounds:
@@ -183,9 +183,11 @@ def joint_prior(
     }  # fmt: skip
     unknown = [name for name in sources["given"] if name not in names]
     if unknown:
+        fixed = [name for name in unknown if name in problem.device_parameters]
+        advice = f"; to estimate {', '.join(fixed)}, give {spelled(f'free={fixed}', 'it as free')}"
         raise ModelError(
             f"there is a prior for {', '.join(unknown)}; the free parameters are "
-            f"{choices(names, *unknown)}"
+            f"{choices(names, *unknown)}" + advice * bool(fixed)
         )
     parts = []
     for i, parameter in enumerate(parameters):
