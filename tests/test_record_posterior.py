@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm, t
 
 import dahl_ident as di
-from dahl_ident.errors import ModelError
+from dahl_ident.errors import ModelError, ValidationError
 from tests.test_record_fit import DAHL, driven, recorded
 
 
@@ -50,6 +50,18 @@ def test_a_prior_of_a_fixed_exponent_needs_it_free():
         record, di.Dahl(), method="grid", priors=prior, free=["alpha"], tolerance=0.03
     )
     assert freed.priors["alpha"] == "log-uniform from 0.5 to 1.5"
+
+
+def test_outliers_are_left_to_the_intervals_of_a_robust_fit():
+    record = recorded(DAHL, "random", 300, 1e-3)
+    with pytest.raises(
+        ValidationError, match="use the confidence intervals of a fit with a robust"
+    ):
+        di.posterior(record, di.Dahl(), likelihood="student_t")
+    robust = di.fit(record, di.Dahl(), loss="student_t")
+    with pytest.raises(ValidationError, match="use the fit's confidence intervals, or pass"):
+        di.posterior(robust)
+    assert robust.conf_interval()
 
 
 def test_a_posterior_counts_noise_alone_or_the_stated_calibration():

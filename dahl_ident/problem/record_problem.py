@@ -63,7 +63,8 @@ class RecordProblem(RecordWaves):
         "steady": "any motion is predicted, sample by sample",
         "drive_std": "noise of the drive is estimated from the record, and counted",
         "drive_covariance": "noise of the drive is estimated from the record, and counted",
-        "likelihood": "their posterior is that around the fit; fit with a robust loss",
+        "likelihood": "their posterior has Gaussian noise; against outliers, use the confidence "
+        "intervals of a fit with a robust loss",
         "pool": "their posterior needs no predictions",
     }
     around_optimum = True
