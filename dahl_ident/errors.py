@@ -250,7 +250,7 @@ class NoSteadyMotionWarning(UserWarning):
     """
 
 
-def choices(known: Iterable[str], *words: str) -> str:
+def choices(known: Iterable[str], *words: object) -> str:
     """Return the known names for a message, and those similar to unknown words.
 
     Examples
@@ -259,7 +259,7 @@ def choices(known: Iterable[str], *words: str) -> str:
     "f_max, sigma; did you mean 'f_max'?"
     """
     names = list(known)
-    near = [repr(name) for word in words for name in get_close_matches(word, names, 1)]
+    near = [repr(name) for word in words for name in get_close_matches(str(word), names, 1)]
     return ", ".join(names) + (f"; did you mean {', '.join(near)}?" if near else "")
 
 

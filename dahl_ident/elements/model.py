@@ -46,6 +46,10 @@ class Model(Element):
     def __init__(self, *elements: Element) -> None:
         flat: list[Element] = []
         for element in elements:
+            if not isinstance(element, Element):
+                raise ModelError(
+                    "expected a model such as Dahl() + Mass(0.3), got " + type(element).__name__
+                )
             flat.extend(element.elements if isinstance(element, Model) else [element])
         if not flat:
             raise ModelError("a model needs at least one element, got none")
@@ -190,7 +194,7 @@ class Model(Element):
     def _known(self, names: Iterable[str]) -> dict[str, Parameter]:
         """Return the parameters by name; refuse unknown names."""
         known = {p.name: p for p in self.parameters}
-        unknown = [name for name in names if name not in known]
+        unknown = [str(name) for name in names if name not in known]
         if unknown:
             raise ModelError(
                 f"the model has no parameter {', '.join(unknown)}; it has {', '.join(known)}"
@@ -203,11 +207,7 @@ class Model(Element):
 
 def as_model(model: Element) -> Model:
     """Return `model` as a sum, so that one element alone needs no special case."""
-    if isinstance(model, Model):
-        return model
-    if not isinstance(model, Element):
-        raise ModelError(f"expected a model such as Dahl() + Mass(0.3), got {type(model).__name__}")
-    return Model(model)
+    return model if isinstance(model, Model) else Model(model)
 
 
 def describe_model(model: Element) -> list[dict[str, Any]]:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dahl_ident.arrays import BoolArray, FloatArray, IntArray
+from dahl_ident.arrays import BoolArray, FloatArray, IntArray, finite_number
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
 from dahl_ident.fitting.asymptotes import (
     Chart,
@@ -102,7 +102,8 @@ def solve(
     """
     if method not in ("lm", "scipy"):
         raise ValidationError(f"method is {method!r}; expected lm or scipy")
-    _check(problem, start or {})
+    loss_named(loss)  # an unknown loss is refused before the search
+    _check(problem, {} if start is None else start)
     any_problem: Any = problem
     if problem.kind == "records":
         return solve_records(any_problem, method, loss, start or {}, tell)
@@ -210,11 +211,13 @@ def _check(problem: Problem, start: Mapping[str, float]) -> None:
     names, m = problem.names, problem.n_residuals + len(problem.priors)
     if not isinstance(start, Mapping):
         raise ValidationError(f"start is {start!r}; expected a mapping of names to numbers")
-    unknown = [name for name in start if name not in names]
+    unknown = [str(name) for name in start if name not in names]
     if unknown:
         raise ModelError(
             f"start names {', '.join(unknown)}; the free parameters are {choices(names, *unknown)}"
         )
+    for name, value in start.items():
+        finite_number(value, f"start of {name}")
     if m < len(names):
         raise FitError(
             f"{problem.extent} give {m} numbers, fewer than the {len(names)} free parameters "

@@ -12,7 +12,13 @@ known, after division by scale^2 where it is not.
 """
 
 from dahl_ident.problem.base import EXPLICIT, Problem, Quadratic
-from dahl_ident.problem.from_data import ProblemBatch, problem_class, problem_of, refuse_options
+from dahl_ident.problem.from_data import (
+    ProblemBatch,
+    changed_options,
+    problem_class,
+    problem_of,
+    refuse_options,
+)
 from dahl_ident.problem.prediction import Prediction
 from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.problem.table_problem import TableProblem
@@ -25,6 +31,7 @@ __all__ = [
     "Quadratic",
     "RecordProblem",
     "TableProblem",
+    "changed_options",
     "problem_class",
     "problem_of",
     "refuse_options",

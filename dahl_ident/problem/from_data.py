@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from typing import TYPE_CHECKING, Any
@@ -18,9 +18,10 @@ from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_problem import RecordProblem
+from dahl_ident.problem.space import with_changes
 from dahl_ident.problem.stiffness import checked_table
 from dahl_ident.problem.table_problem import TableProblem
-from dahl_ident.sensors import Sensors
+from dahl_ident.sensors import EXACT, Sensors
 
 if TYPE_CHECKING:
     from dahl_ident.elements.equations import Excitation
@@ -38,13 +39,19 @@ def refuse_options(
     problem: type[Problem], options: Mapping[str, Any], function: Callable[..., Any]
 ) -> None:
     """Refuse options that such data do not take, unless they are at the function's defaults."""
-    parameters = signature(function).parameters
-    for name, reason in problem.refused_options.items():
-        if name in options and options[name] != parameters[name].default:
-            option = argument(name).rstrip("=")
-            raise ValidationError(
-                f"{option} is given with {problem.kind_in_words}: {reason}; leave it out"
-            )
+    for name in changed_options(problem.refused_options, options, function):
+        raise ValidationError(
+            f"{argument(name).rstrip('=')} is given with {problem.kind_in_words}: "
+            f"{problem.refused_options[name]}; leave it out"
+        )
+
+
+def changed_options(
+    names: Iterable[str], options: Mapping[str, Any], function: Callable[..., Any]
+) -> list[str]:
+    """Return the names of options, as far as there are any, that differ from their defaults."""
+    default = {name: p.default for name, p in signature(function).parameters.items()}
+    return [n for n in names if n in options and not np.array_equal(options[n], default[n])]
 
 
 def problem_of(
@@ -71,12 +78,14 @@ def problem_of(
             fixed=fixed,
             steady=steady,
         )
+    changed, sensors = with_changes(as_model(model), sensors or EXACT, free, fixed or {})
+    is_one = isinstance(data, Record) or not isinstance(data, Iterable)
     return RecordProblem(
-        [data] if isinstance(data, Record) else without_copied_records(list(data)),
-        as_model(model).with_free(free).with_fixed(fixed or {}),
+        [data] if is_one else without_copied_records(list(data)),
+        changed,
         output=output,
         excitation=excitation,
-        calibration=(sensors or Sensors()).stated_uncertainties(),
+        calibration=sensors.stated_uncertainties(),
     )
 
 
@@ -154,8 +163,10 @@ class ProblemBatch(TableProblem):
     """
 
     def _checked(self, data: Any) -> list[FrequencyResponse]:
-        if isinstance(data, FrequencyResponse) or not len(data):
-            fault = "one table" if isinstance(data, FrequencyResponse) else "empty"
+        if isinstance(data, FrequencyResponse):
+            raise DataError("data is one table; expected a sequence of at least one table")
+        if not isinstance(data, Sequence) or not data:
+            fault = "empty" if isinstance(data, Sequence) else repr(data)
             raise DataError(f"data is {fault}; expected a sequence of at least one table")
         return [checked_table(table) for table in data]
 

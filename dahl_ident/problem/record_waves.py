@@ -52,8 +52,8 @@ class RecordWaves(Problem):
         for record in self.records:
             if not isinstance(record, Record):
                 raise ValidationError(
-                    f"data holds a {type(record).__name__}; expected a FrequencyResponse, a Record "
-                    "or several records (read_frequency_response and read_record read files, "
+                    f"data holds a {type(record).__name__}; expected one FrequencyResponse, or a "
+                    "Record or several (read_frequency_response and read_record read files, "
                     "FrequencyResponse.concatenate joins tables)"
                 )
         self.model = as_model(model)

@@ -195,8 +195,8 @@ def with_changes(
     """Free and fix parameters by name, in the model and the sensors."""
     if not isinstance(sensors, Sensors):
         raise ValidationError(f"sensors is {sensors!r}; expected Sensors(...)")
-    if isinstance(free, str):
-        raise ValidationError(f"free is {free!r}; expected a collection of names: [{free!r}]")
+    if isinstance(free, str) or not isinstance(free, Iterable):
+        raise ValidationError(f"free is {free!r}; expected a collection of names: ['{free}']")
     if not isinstance(fixed, Mapping):
         raise ValidationError(
             f"fixed is {fixed!r}; expected a mapping of names to numbers, such as {{'f_max': 0.1}}"

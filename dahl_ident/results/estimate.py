@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +30,13 @@ from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import Steady
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
-from dahl_ident.problem import ProblemBatch, problem_class, problem_of, refuse_options
+from dahl_ident.problem import (
+    ProblemBatch,
+    changed_options,
+    problem_class,
+    problem_of,
+    refuse_options,
+)
 from dahl_ident.results.fit_batch import FitBatch
 from dahl_ident.results.fit_result import FitResult
 from dahl_ident.results.posterior_result import Posterior
@@ -355,9 +360,7 @@ def posterior(
     refuse_options(
         problem_class(data) if source is None else type(source.problem), options, posterior
     )
-    defaults = signature(posterior).parameters
-    refused = [n for n in _NOT_OF_METHODS[method] if options[n] != defaults[n].default]
-    if refused:
+    if refused := changed_options(_NOT_OF_METHODS[method], options, posterior):
         names = ", ".join(argument(name).rstrip("=") for name in refused)
         raise ValidationError(
             f"{names} given with {argument('method', method)}, which has no such option; leave it "
