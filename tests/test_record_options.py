@@ -1,11 +1,13 @@
 """Options of a fit that tables and records share, on records."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 import dahl_ident as di
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import DahlIdentError, ModelError, ValidationError
 
 RNG = np.random.default_rng(0)
 X = 1e-3 * np.cumsum(RNG.standard_normal(2000))
@@ -230,3 +232,60 @@ def test_a_fit_of_a_driven_record_has_a_backbone():
     assert (u < [[0.01], [0.1]]).all()
     top, bottom = fit.predict([1.0, 3.0], drive=0.5).gain()
     assert (top < bottom).all()
+
+
+TABLE: Any = di.load_dataset("noisy")
+RECORD: Any = record(TRUE + NOISE)
+NONE: Any = None
+THREE: Any = 3
+
+
+@pytest.mark.parametrize("data", [TABLE, RECORD], ids=["table", "record"])
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sensors": {"force_gain": 1.0}}, "sensors is {'force_gain': 1.0}; expected Sensors"),
+        ({"free": 3}, "free is 3; expected a collection of names"),
+        ({"free": [3]}, "no parameter 3; it has f_max, sigma"),
+        ({"fixed": 3}, "fixed is 3; expected a mapping"),
+        ({"start": {"f_max": "a"}}, "start of f_max: expected real numbers"),
+        ({"start": {3: 1.0}}, "start names 3; the free parameters are f_max, sigma"),
+        ({"loss": None}, "loss is None; expected linear, huber"),
+        ({"loss": ["huber"]}, r"loss is \['huber'\]; expected linear, huber"),
+        ({"drive_std": np.full(30, 0.1)}, "drive_std"),
+    ],
+)
+def test_options_of_a_wrong_kind_are_refused_in_words(data, options, words):
+    with pytest.raises((ModelError, ValidationError), match=words):
+        di.fit(data, MODEL, **options)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: di.fit(NONE, MODEL), "data holds a NoneType; expected one FrequencyResponse"),
+        (lambda: di.fit([RECORD, TABLE], MODEL), "expected one FrequencyResponse, or a Record or"),
+        (lambda: di.fit_many(NONE, MODEL), "None; expected a sequence of at least one table"),
+        (lambda: di.posterior(THREE, MODEL), "data holds a int"),
+        (lambda: di.Model(THREE), "expected a model such as .*, got int"),
+        (lambda: di.compare_models(TABLE), "fit is a FrequencyResponse; expected the result of"),
+        (lambda: di.extract(TABLE), "records holds a FrequencyResponse; expected records"),
+        (lambda: di.extract(NONE), "records holds a NoneType; expected records"),
+        (lambda: di.read_frequency_response(NONE), "the file is None; expected its path"),
+        (lambda: di.read_record(THREE), "the file is 3; expected its path"),
+        (lambda: di.load_dataset(NONE), "no data set None; there are"),
+        (lambda: di.population(NONE), "table is a NoneType; expected a pandas.DataFrame"),
+    ],
+)
+def test_data_of_a_wrong_kind_are_refused_in_words(call, words):
+    with pytest.raises(DahlIdentError, match=words):
+        call()
+
+
+def test_models_and_metadata_of_a_wrong_kind_are_refused_in_words(fit, tmp_path):
+    with pytest.raises(ModelError, match=r"expected a model such as .*, got int"):
+        di.compare_models(fit, {"stiff": THREE})
+    with pytest.raises(ValidationError, match="metadata is 3; expected its path"):
+        di.report(fit, tmp_path / "report.json", metadata=THREE)
+    with pytest.raises(ValidationError, match="a report is None; expected its path"):
+        di.report(fit, NONE)

@@ -305,6 +305,11 @@ def population(
     >>> round(statistics.mean[0], 2), round(statistics.between_devices[0], 2)
     (0.1, 0.05)
     """
+    if not hasattr(table, "iloc"):
+        raise ValidationError(
+            f"table is a {type(table).__name__}; expected a pandas.DataFrame with one row per fit, "
+            "such as that of a campaign"
+        )
     names = _parameters(table, parameters)
     _require(table, ["device", "status", *covariates, *([order] if order else [])])
     table = with_final_status(table, names)

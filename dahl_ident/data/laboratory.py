@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dahl_ident.data.storage import read_toml
+from dahl_ident.data.storage import path_of, read_toml
 from dahl_ident.errors import DahlIdentError, ValidationError, choices
 from dahl_ident.units import parse_quantity
 
@@ -109,7 +109,7 @@ def metadata_of(source: Mapping[str, Any] | str | Path | None) -> Metadata:
     """Return metadata from a mapping or a TOML file."""
     entries, where = source or {}, ""
     if not isinstance(entries, Mapping):
-        entries, where = read_toml(entries), f"{source}: "
+        entries, where = read_toml(path_of(entries, "metadata")), f"{source}: "
     texts = _texts(entries, _TEXTS, _LISTS, f"{where}metadata", where)
     ambient, instruments = entries.get("ambient", ()), entries.get("instruments", ())
     name = f"{where}ambient"

@@ -37,7 +37,7 @@ _IRREGULAR = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "sock
 
 def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a table in the format of the path's extension."""
-    path = Path(path)
+    path = path_of(path)
     packed = path.suffix.lower() == ".gz" and Path(path.stem).suffix.lower() in (".csv", ".tsv")
     table = Path(path.stem) if packed else place_of(path, "a table", (*_WRITERS, ".csv.gz"))
     content = _WRITERS[table.suffix.lower()](frame)
@@ -45,9 +45,16 @@ def save_frame(frame: pd.DataFrame, path: str | Path, *, overwrite: bool = False
     return path
 
 
+def path_of(path: object, what: str = "the file") -> Path:
+    """Return the path of a file; raise for what is not a path."""
+    if isinstance(path, str | os.PathLike):
+        return Path(path)
+    raise ValidationError(f"{what} is {path!r}; expected its path, as text or pathlib.Path")
+
+
 def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
     """Return the path; raise if it has none of the endings."""
-    path = Path(path)
+    path = path_of(path, what)
     if path.suffix.lower() not in endings:
         raise ValidationError(
             f"{path}: {what} is written as {', '.join(endings)}; got {path.suffix or 'no ending'!r}"
@@ -57,7 +64,7 @@ def place_of(path: str | Path, what: str, endings: Sequence[str]) -> Path:
 
 def regular(path: str | Path, what: str = "the file") -> Path:
     """Return the path of a regular file; raise for others, because reading them may never end."""
-    place = Path(path)
+    place = path_of(path, what)
     try:
         kind = stat.S_IFMT(place.stat().st_mode)
     except (OSError, ValueError) as exc:

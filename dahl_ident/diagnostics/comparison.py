@@ -43,6 +43,7 @@ from dahl_ident.elements import (
     Spring,
 )
 from dahl_ident.elements.facts import Alternative
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
@@ -447,6 +448,11 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
             "compare_models got several fits; it takes one, and a mapping of names to other models "
             "of its data. What changed between fits of different data is in di.report([fit, ...])"
         )
+    if not hasattr(fit, "assessment"):
+        raise ValidationError(
+            f"fit is a {type(fit).__name__}; expected the result of a fit, such as "
+            "compare_models(di.fit(data, model))"
+        )
     if not isinstance(models, Mapping | None):
         raise ValidationError(
             f"models is a {type(models).__name__}; expected a mapping of names to models, such as "
@@ -458,7 +464,7 @@ def compare_models(fit: Any, models: Mapping[str, Element] | None = None) -> Mod
     if models is None:
         offered = list(_candidates(optimum, problem, fitted[0].density))
     else:
-        offered = [(name, "", (model,)) for name, model in models.items()]
+        offered = [(name, "", as_model(model).elements) for name, model in models.items()]
     for name, reason, elements in offered:
         try:
             # limits at infinity are other, simpler candidates

@@ -244,7 +244,10 @@ def _named(records: Records) -> list[tuple[str | None, Record | PathLike]]:
                 )
             named.append((str(name), files[0]))
     else:
-        sources = [records] if isinstance(records, str | Path) else records
+        if isinstance(records, str | Path) or not isinstance(records, Iterable):
+            sources: Iterable[Record | PathLike] = [records]
+        else:
+            sources = records
         files = [file for source in sources for file in _files(source)]
         if files == [str(records)]:  # a path that is not a pattern
             return [(None, files[0])]

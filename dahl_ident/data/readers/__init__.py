@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -136,7 +136,10 @@ def read_frequency_response(
     entries = {name: value for name, value in locals().items() if name in SETTINGS}
     if level is not None and level_from_name is not None:
         raise ValidationError("level and level_from_name are both given; leave out one of them")
-    paths = [path] if isinstance(path, (str, Path)) or _is_frame(path) else [*path]
+    if isinstance(path, (str, Path)) or _is_frame(path) or not isinstance(path, Iterable):
+        paths = [path]
+    else:
+        paths = [*path]
     if not paths:
         raise DataError("no file to read; expected at least one path")
     refuse_repeated(paths)
@@ -311,7 +314,7 @@ def open_source(
     options: Mapping[str, Any] | None = None,
 ) -> RawFile:
     """Return the channels of a file of any format, with the user's options."""
-    if not isinstance(path, (str, Path)):
+    if _is_frame(path) or (isinstance(path, Iterable) and not isinstance(path, str)):
         from dahl_ident.data.readers.tables import dictionary_source, frame_source
 
         source = frame_source(path) if _is_frame(path) else dictionary_source(path)
