@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 import dahl_ident as di
-from dahl_ident.errors import DahlIdentError, ModelError, ValidationError
+from dahl_ident.errors import DahlIdentError, FitError, ModelError, ValidationError
 
 RNG = np.random.default_rng(0)
 X = 1e-3 * np.cumsum(RNG.standard_normal(2000))
@@ -289,3 +289,14 @@ def test_models_and_metadata_of_a_wrong_kind_are_refused_in_words(fit, tmp_path)
         di.report(fit, tmp_path / "report.json", metadata=THREE)
     with pytest.raises(ValidationError, match="a report is None; expected its path"):
         di.report(fit, NONE)
+
+
+@pytest.mark.parametrize("data", [TABLE, RECORD], ids=["table", "record"])
+def test_constraints_without_a_solution_are_named(data):
+    with pytest.raises(FitError, match="no parameters satisfy the constraints sigma<=1; 2<=sigma"):
+        di.fit(
+            data,
+            di.Dahl(),
+            method="ipopt",
+            constraints=lambda p: [p["sigma"] <= 1, p["sigma"] >= 2],
+        )

@@ -284,7 +284,8 @@ class _Descent:
         ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
         if not ends:
             raise FitError("no start has a steady response in every row; give another start")
-        best = min(ends, key=lambda end: (bool(end.failure), end.cost))
+        # costs of failures say little: a contradiction in the constraints explains them
+        best = min(ends, key=lambda e: (bool(e.failure), e.failure != _INFEASIBLE, e.cost))
         again = best if best.failure else self.descend(best.theta)  # in the units of the optimum
         return best if again.failure else again
 
