@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.errors import ValidationError
+from dahl_ident.errors import ValidationError, argument, spelled
 
 if TYPE_CHECKING:
     from dahl_ident.data.laboratory import Metadata
@@ -122,11 +122,15 @@ class Sensors:
             if isinstance(stated, float) and stated == neutral:
                 continue
             if stated is None or isinstance(stated, float) or float(stated.mean()) != neutral:
+                value = "free" if stated is None else f"{stated}"
+                if name in self.priors:
+                    value = f"a prior about {self.priors[name].mean():g}"
+                prior = "norm(0, 1e-4)" if name == "delay" else "norm(1, 0.005)"
                 raise ValidationError(
-                    f"sensors state {name}={stated!r}; a fit of records expects a prior about "
-                    f"{neutral:g}, such as scipy.stats.norm({neutral:g}, 0.005), which counts in "
-                    "the uncertainty: correct the record for what is known, or fit an extracted "
-                    "table"
+                    f"{argument(name).rstrip('=')} is {value}; a fit of records expects a prior "
+                    f"about {neutral:g}, such as {spelled(f'scipy.stats.{prior}', repr(prior))}, "
+                    "which counts in the uncertainty: correct the record for what is known, or fit "
+                    "an extracted table"
                 )
             uncertainties[name] = float(stated.std())
         return uncertainties

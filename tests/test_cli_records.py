@@ -97,6 +97,15 @@ def test_options_of_tables_are_refused(command, words, odd_columns, told):
     assert re.search(rf"{words[0]} (is )?given (together )?with .*record", why)
 
 
+def test_a_gain_without_a_prior_about_one_is_refused(odd_columns, told):
+    place = odd_columns.with_name("columns.toml")
+    command = ("fit", odd_columns, "--record", "--columns", place, "--force-gain", "norm(1.1,0.1)")
+    code, _, why = told(*command)
+    assert code == 1
+    assert "--force-gain is a prior about 1.1;" in why
+    assert "such as 'norm(1, 0.005)', which" in why
+
+
 def test_the_force_is_predicted_although_the_model_has_a_mass(odd_columns, told):
     place = odd_columns.with_name("columns.toml")
     words = ("fit", odd_columns, "--record", "--columns", place, "--mass", "free")

@@ -300,3 +300,16 @@ def test_constraints_without_a_solution_are_named(data):
             method="ipopt",
             constraints=lambda p: [p["sigma"] <= 1, p["sigma"] >= 2],
         )
+
+
+@pytest.mark.parametrize(
+    ("sensors", "words"),
+    [
+        (di.Sensors(force_gain=1.02), "force_gain is 1.02; a fit of records expects a prior"),
+        (di.Sensors(force_gain=norm(1.1, 0.01)), r"is a prior about 1.1; .* scipy.stats.norm\(1"),
+        (di.Sensors(delay=None), r"delay is free; .* about 0, such as scipy.stats.norm\(0, 1e-4"),
+    ],
+)
+def test_sensors_without_a_prior_about_exact_ones_are_refused(sensors, words):
+    with pytest.raises(ValidationError, match=words):
+        di.fit(RECORD, MODEL, sensors=sensors)
