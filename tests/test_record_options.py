@@ -188,6 +188,17 @@ def test_a_table_and_a_record_answer_the_same_questions(fit):
             one.plot("spiral")
 
 
+def test_fits_with_constraints_have_no_budget_and_hold_nothing_out():
+    for data in (record(TRUE + NOISE), di.load_dataset("noisy")):
+        tied = di.fit(
+            data, MODEL, method="ipopt", constraints=lambda p: [p["sigma"] == 300.0 * p["f_max"]]
+        )
+        for refused in (tied.budget, tied.hold_out):
+            with pytest.raises(FitError, match="the fit had constraints"):
+                refused()
+        assert tied.fit_report()
+
+
 def test_what_one_kind_alone_has_is_refused_in_one_way(fit):
     table = di.fit(di.load_dataset("noisy"), MODEL)
     with pytest.raises(ValidationError, match="a fit of a table has no prediction of a record"):

@@ -132,6 +132,33 @@ class Assessment(ABC):
     def combined_intervals(self, levels: Sequence[float]) -> ConfidenceIntervals:
         """Return intervals that count every source of error."""
 
+    @property
+    @abstractmethod
+    def _budget(self) -> Budget:
+        """The uncertainty budget of a fit without constraints."""
+
+    def budget(self) -> Budget:
+        """Return the uncertainty budget."""
+        if self.first_order:
+            raise FitError(
+                "no uncertainty budget: the fit had constraints, which its sources do not keep; "
+                "its standard errors are from noise alone"
+            )
+        return self._budget
+
+    @abstractmethod
+    def _hold_out(self, parts: int | None) -> Any:
+        """Return the held-out tests of a fit without constraints."""
+
+    def hold_out(self, parts: int | None) -> Any:
+        """Return how well parts of the data are predicted by fits to the others."""
+        if self.first_order:
+            raise FitError(
+                "nothing is held out: the fit had constraints, which fits to the other data would "
+                "not keep; fit without constraints, or fit a part and predict the rest"
+            )
+        return self._hold_out(parts)
+
     def intervals(
         self,
         method: Method,
@@ -304,8 +331,7 @@ class TableAssessment(Assessment):
         errors = self.errors_of_combinations
         return None if errors is None else cross_validation(errors.left_out)
 
-    def hold_out(self, parts: int | None) -> CrossValidation:
-        """Return held-out tests against their bands."""
+    def _hold_out(self, parts: int | None) -> CrossValidation:
         if parts is not None:
             raise ValidationError("tests of a table are left out one at a time; leave parts out")
         check = self.cross_validation
@@ -382,16 +408,7 @@ class TableAssessment(Assessment):
 
     @cached_property
     def _budget(self) -> Budget:
-        if self.first_order:
-            raise FitError(
-                "no uncertainty budget: the fit had constraints, which its sources do not keep; "
-                "its standard errors are from noise alone"
-            )
         return budget(self.optimum, self.errors_of_combinations)
-
-    def budget(self) -> Budget:
-        """Return the uncertainty budget."""
-        return self._budget
 
     def derived(
         self, amplitudes: Sequence[float], frequency_hz: float | None

@@ -268,8 +268,8 @@ class RecordAssessment(Assessment):
             f"independent samples of {self.problem.n_samples}"
         ]
 
-    def budget(self) -> Budget:
-        """Return the uncertainty budget."""
+    @property
+    def _budget(self) -> Budget:
         problem, errors, count = self.problem, self.errors, self.problem.n_reported
         parameters = tuple(
             parameter_budget(errors, p.name, shown_unit(p.unit, problem.motion), value, direction)
@@ -354,8 +354,7 @@ class RecordAssessment(Assessment):
             problem.measured[0],
         )  # fmt: skip
 
-    def hold_out(self, parts: int | None) -> HoldOut:
-        """Return how well parts of the records are predicted by fits to the others."""
+    def _hold_out(self, parts: int | None) -> HoldOut:
         problem = self.problem
         several = len(self.problem.records) > 1
         if parts is None:

@@ -425,10 +425,10 @@ def _refuse_with_a_fit(fit: FitResult, options: Mapping[str, Any]) -> None:
             "data instead"
         )
     if fit.first_order or fit.optimum.loss != "linear":
-        had = "a constraint" if fit.first_order else "a robust loss"
+        had = "constraints" if fit.first_order else "a robust loss"
         raise ValidationError(
             f"the fit had {had}, which a posterior does not take; use the fit's confidence "
-            "intervals, or pass the data for a posterior without it"
+            f"intervals, or pass the data for a posterior without {had}"
         )
 
 

@@ -269,6 +269,11 @@ class FittedModel(Result):
         Budget
             Printed, a table: source, type A or B, standard uncertainty, degrees of freedom and
             share; then the combined and the expanded uncertainty.
+
+        Raises
+        ------
+        FitError
+            If a parameter is undetermined, or the fit had constraints.
         """
         limits = self.conf_interval().at(LEVELS[1])
         return self.assessment.budget().within({n: (i.lower, i.upper) for n, i in limits.items()})
@@ -380,7 +385,7 @@ class FittedModel(Result):
         DataError
             If a part is too short to be fitted.
         FitError
-            If nothing is left to fit.
+            If nothing is left to fit, or the fit had constraints.
         """
         return self.assessment.hold_out(parts)
 
