@@ -1,6 +1,7 @@
 """Least squares against lmfit, curve_fit and general optimisers; coverage by simulation."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import lmfit
@@ -358,6 +359,28 @@ def test_three_rows_of_two_runs_end_in_words(noise, loss):
     found = fit(data, Dahl(alpha=1.0) + Spring() + Damper(), loss=loss, throw=False)
     assert not found.trusted
     assert f"    {found.status.capitalize()}. " in str(found)
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_a_few_odd_rows_end_in_words(seed):
+    """Fewer rows than the model needs, of any noise, some of them with runs or a covariance."""
+    rng = np.random.default_rng(seed)
+    size = int(rng.integers(2, 5))
+    few = np.exp(rng.uniform(np.log(1e-4), np.log(1e-1), size))
+    noise = rng.choice([1e-3, 0.03, 0.5])
+    data = FrequencyResponse(
+        np.ones(size), Dahl(0.1, 30.0).describing_function(few) * relative_noise(size, noise, seed),
+        few, run=rng.choice(["a", "b"], size) if rng.random() < 0.5 else None,
+        covariance=np.tile(1e-2 * np.eye(2), (size, 1, 1)) if rng.random() < 0.5 else None,
+    )  # fmt: skip
+    linear = [[], [Damper()], [Mass()], [Spring()], [Spring(), Damper()]][rng.integers(5)]
+    model = Model(Dahl(alpha=1.0), *linear)
+    if 2 * size < len(model.parameters) - 1:
+        return
+    found = fit(data, model, loss=rng.choice(["linear", "huber"]), throw=False)
+    assert f"    {found.status.capitalize()}. " in str(found)
+    with suppress(FitError):  # nothing is determined
+        assert str(found.budget())
 
 
 def test_columns_alike_to_rounding_end_no_search():

@@ -346,8 +346,12 @@ class _Cells(NamedTuple):
 
 def _scan(plant: Plant, points: IntArray, per_decade: int) -> tuple[IntArray, FloatArray]:
     """Return all amplitudes of the chosen points, as pairs (point, amplitude) in rising order."""
+    low, high = plant.at(points).bounds()
+    bounded = ~np.isnan(low + high)  # outside the range of a law there is no solution
+    points, low, high = points[bounded], low[bounded], high[bounded]
+    if not points.size:
+        return points, low
     chosen = plant.at(points)
-    low, high = chosen.bounds()
     order = np.argsort(high)  # groups the few points near a resonance, which need a long grid
     decades = np.log10(high[order[order.size // 2]] / low.min())
     block = max(1, int(_BLOCK / (per_decade * max(decades, 1.0))))

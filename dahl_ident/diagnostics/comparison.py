@@ -373,7 +373,8 @@ def _undetermined(optimum: Optimum, quantities: Mapping[str, float]) -> list[str
             at_moved = _meaning(optimum.problem, values_at(optimum.problem, moved))
             with np.errstate(all="ignore"):
                 changes[:, i] += np.array([at_moved[n] for n in names]) / at_optimum / (2.0 * step)
-    stds = Information(optimum).std(np.nan_to_num(changes))
+    with np.errstate(over="ignore", invalid="ignore"):  # far from determined
+        stds = Information(optimum).std(np.nan_to_num(changes))
     return [n for n, u in zip(names, stds.tolist(), strict=True) if not u <= NOT_IDENTIFIED_ABOVE]
 
 

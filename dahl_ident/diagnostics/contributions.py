@@ -70,17 +70,18 @@ def variances(directions: FloatArray, covariance: FloatArray) -> FloatArray:
 def satterthwaite(variance: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the degrees of freedom of variances whose own variances are `spread`.
 
-    They are 2 variance^2/spread, at least 1; infinite if the spread is zero.
+    They are 2 variance^2/spread, at least 1, as if both are unbounded; infinite if the spread is
+    zero.
 
     Examples
     --------
     >>> satterthwaite(np.array([1.0, 1.0]), np.array([0.1, 0.0])).tolist()
     [20.0, inf]
     """
-    dof = np.divide(
-        2.0 * variance**2, spread, out=np.full(np.shape(spread), np.inf), where=spread > 0.0
-    )
-    return np.asarray(np.maximum(dof, 1.0))
+    dof = np.full(np.shape(spread), np.inf)
+    with np.errstate(invalid="ignore"):
+        np.divide(2.0 * variance**2, spread, out=dof, where=spread > 0.0)
+    return np.asarray(np.fmax(dof, 1.0))
 
 
 def positive_part(C: FloatArray) -> FloatArray:

@@ -159,6 +159,7 @@ class ErrorModel(ErrorContributions):
             return False  # at the limit at which the optimum lies
         return bool(self.estimate.basis.holds(np.eye(len(self.names))[self.names.index(name)]))
 
+    @np.errstate(over="ignore")  # a variance that nothing bounds has one degree of freedom
     def dof(self, direction: FloatArray, source: str | None = None) -> float:
         """Return the effective degrees of freedom of the uncertainty of direction . theta.
 

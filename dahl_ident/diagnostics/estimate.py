@@ -27,6 +27,7 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 from scipy.linalg import block_diag
 
 from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArray
@@ -297,7 +298,7 @@ def weighted_estimate(
     if not different:
         return best
     second = different[0]
-    chance = 1.0 / (1.0 + np.exp(0.5 * (second.deviance - best.deviance)))
+    chance = special.expit(0.5 * (best.deviance - second.deviance))
     return replace(best, second=np.sqrt(chance) * (second.theta - best.theta))
 
 

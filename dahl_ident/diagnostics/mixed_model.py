@@ -232,6 +232,8 @@ class MixedState:
         rank = len(model.y) - model.parameters - (0.0 if known else left_of_sure)
         values, vectors = np.linalg.eigh(self._Q[columns, columns])
         kept = np.flatnonzero(values > _ALIKE * values[-1])[-max(int(rank), 1) :]
+        if not kept.size:  # the parameters explain all of it
+            return 1.0
         values = values[kept]
         seen = (vectors[:, kept].T @ self._Q[-1, columns]) ** 2 / values
         unexplained = max(float(self._Q[-1, -1] - seen.sum()), 0.0)
