@@ -373,8 +373,10 @@ def test_a_few_odd_rows_end_in_words(seed):
         few, run=rng.choice(["a", "b"], size) if rng.random() < 0.5 else None,
         covariance=np.tile(1e-2 * np.eye(2), (size, 1, 1)) if rng.random() < 0.5 else None,
     )  # fmt: skip
-    linear = [[], [Damper()], [Mass()], [Spring()], [Spring(), Damper()]][rng.integers(5)]
-    model = Model(Dahl(alpha=1.0), *linear)
+    law = Dahl(alpha=1.0)
+    model = (law + Damper(), law + Mass(), law + Spring(), law + Spring() + Damper())[
+        rng.integers(4)
+    ]
     if 2 * size < len(model.parameters) - 1:
         return
     found = fit(data, model, loss=rng.choice(["linear", "huber"]), throw=False)

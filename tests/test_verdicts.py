@@ -75,6 +75,19 @@ class TestStiffening:
         assert rise(few, Dahl(alpha=1.0) + Spring() + Mass()) is None
 
 
+class TestSuspiciousRows:
+    def test_rows_that_alone_contradict_ask_for_no_element(self):
+        codes = {f.code for f in fit(load_dataset("outliers"), Dahl(), throw=False).findings}
+        assert "rows_apart" in codes
+        assert "beyond_slip" not in codes
+
+    def test_most_rows_are_not_outliers(self):
+        found = fit(load_dataset("alpha_2"), Dahl(alpha=1.0), loss="student_t", throw=False)
+        codes = {f.code for f in found.findings}
+        assert "misfit" in codes
+        assert not codes & {"rows_apart", "suspicious"}
+
+
 class TestTrust:
     def test_two_points_leave_noise_and_model_alike(self):
         result = fit(table(n=2, noise=0.03), Dahl())

@@ -227,11 +227,12 @@ def _misfit_within_runs(errors: ErrorModel) -> float:
 
 @_of_tables
 def _beyond_limit(fit: TableAssessment) -> Iterator[Finding]:
-    """Yield where a force exceeds what friction can carry, except outliers of a robust fit."""
+    """Yield where a force exceeds what friction can carry, except in rows that stand apart."""
     errors, differ = fit.errors, fit.goodness.runs_differ
     scatter = 0.0 if differ is None else sum(differ.scatter.values())
     optimum = fit.optimum if errors is None else errors.at_estimate
-    outliers = [p.row for p in fit.goodness.suspicious] if optimum.loss != "linear" else []
+    named = optimum.loss != "linear" or fit.goodness.apart  # as what contradicts the model
+    outliers = [p.row for p in fit.goodness.suspicious] if named else []
     yield from beyond_friction_limit(optimum, scatter, outliers)
 
 

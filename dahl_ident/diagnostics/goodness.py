@@ -408,7 +408,8 @@ def _misfit_if_described(optimum: Optimum) -> float:
 def _without_suspicious(optimum: Optimum, tested: Goodness) -> Goodness:
     """Return `tested` with the objections that remain without the suspicious rows."""
     rows = [point.row for point in tested.suspicious]
-    if not (rows and tested.objections and not is_at_end(optimum, rows)):
+    down_weighted = optimum.loss != "linear"
+    if down_weighted or not (rows and tested.objections and not is_at_end(optimum, rows)):
         return tested
     optimum_without = refitted_without(optimum, rows)
     without = None if optimum_without is None else _tested_estimate(optimum_without)
