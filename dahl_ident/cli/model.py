@@ -136,5 +136,7 @@ def _description(text: str) -> dict[str, Any]:
         if not label and i >= len(labels):
             raise ModelError(f"--element is {text!r}; {kind} takes {', '.join(labels) or 'labels'}")
         label = label or labels[i]
-        entry[label] = value if label == "name" or value == FREE else number(label, value)
+        entry[label] = (
+            value if label == "name" or value == FREE else number(label, value, or_free=True)
+        )
     return entry

@@ -106,7 +106,7 @@ def option(
             try:
                 return number("it", str(text), unit)
             except (ModelError, UnitError) as exc:
-                raise typer.BadParameter(str(exc).removesuffix(", or 'free'")) from exc
+                raise typer.BadParameter(str(exc)) from exc
 
         how |= {"parser": parse, "metavar": f"<{unit}>"}
     return typer.Option(*names, help=help_text, rich_help_panel=panel, **how)

@@ -17,16 +17,20 @@ _CALL = re.compile(r"(?:scipy\.)?(?:stats\.)?(\w+)\((.*)\)")
 _QUANTITY = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\s\d.,]?.*?)\s*")
 
 
-def number(name: str, text: str, unit: str | None = None) -> float:
-    """Return a number in SI, or one with its unit, ``50um``; by default the parameter has it."""
+def number(name: str, text: str, unit: str | None = None, *, or_free: bool = False) -> float:
+    """Return a number in SI, or one with its unit, ``50um``; by default the parameter has it.
+
+    With `or_free`, the error says that the parameter may be free as well.
+    """
     share = unit == "1" and text.rstrip().endswith("%")
     try:
         value = 0.01 * float(text.rstrip()[:-1]) if share else float(text)
     except ValueError:
         value = math.nan if share else _quantity(name, text, unit)
     if not math.isfinite(value):
+        free = f", or '{FREE}'" if or_free else ""
         raise ModelError(
-            f"{name} is {text!r}; expected a number in SI units or with its unit, or '{FREE}'"
+            f"{name} is {text!r}; expected a number in SI units or with its unit{free}"
         )
     return value
 
@@ -66,7 +70,7 @@ def ends(name: str, text: str, unit: str | None = None) -> float | tuple[float, 
 
 def number_or_free(name: str, text: str) -> float | None:
     """Return a parameter's value, None if it is free."""
-    return None if text == FREE else number(name, text)
+    return None if text == FREE else number(name, text, or_free=True)
 
 
 def sensor_value(name: str, text: str) -> Any:

@@ -20,7 +20,7 @@ from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
-from dahl_ident.fitting.optimum import Status
+from dahl_ident.fitting.optimum import Status, values_at_bounds
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.units import engineering, percent, shown_unit
 
@@ -134,7 +134,8 @@ def physical_warnings(optimum: Optimum) -> Iterator[str]:
     """Yield a sentence for each property of an estimate that is impossible or unsafe."""
     yield from negative_parameters(optimum)
     if optimum.status is Status.AT_BOUND:
-        yield optimum.message.removeprefix(Status.AT_BOUND.value).strip()
+        at_bounds = values_at_bounds(optimum.problem, optimum.theta, optimum.values)
+        yield at_bounds or optimum.message  # that of constraints states them
     yield from _not_a_sine(optimum)
     yield from _sizes(optimum)
     yield from _levels(optimum)

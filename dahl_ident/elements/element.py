@@ -295,10 +295,12 @@ class Element(ABC):
         return Model(self, other)
 
     def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self._arguments())})"
+
+    def _arguments(self) -> list[str]:
+        """Return the arguments as they are shown in `repr`."""
         arguments = [self._argument(p) for p in self.parameters]
-        if self.name:
-            arguments.append(f"name={self.name!r}")
-        return f"{type(self).__name__}({', '.join(arguments)})"
+        return [*arguments, f"name={self.name!r}"] if self.name else arguments
 
     def _argument(self, parameter: Parameter) -> str:
         """Return a parameter as it is shown in `repr`."""

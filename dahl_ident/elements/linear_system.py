@@ -364,11 +364,9 @@ class LinearSystem(Element):
         slopes = differences(lambda moved: self._curve(moved, omega), vector, self.labels)
         return np.stack([self._curve(vector, omega), *slopes])
 
-    def __repr__(self) -> str:
+    def _arguments(self) -> list[str]:
         system = getattr(self.system, "__name__", type(self.system).__name__)
-        _, _, arguments = super().__repr__().partition("(")
-        separator = "" if arguments == ")" else ", "
-        return f"LinearSystem({self.quantity} of {system}{separator}{arguments}"
+        return [f"{self.quantity} of {system}", *super()._arguments()]
 
 
 class Equation(NamedTuple):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,55 +30,72 @@ _BARELY = 1.001  # scale over that of rounding, below which residuals are roundi
 class Status(Enum):
     """The outcome of a search; the value is what a report says about it."""
 
-    CONVERGED = "Converged: the sum of squares has a minimum here, inside all bounds."
+    outcome: str
+    """The outcome without its meaning."""
+    _value_: str
+
+    def __new__(cls, outcome: str, meaning: str) -> Self:
+        """Return a status; its value states both."""
+        status = object.__new__(cls)
+        status._value_, status.outcome = f"{outcome}: {meaning}", outcome
+        return status
+
+    CONVERGED = (
+        "Converged",
+        "the sum of squares has a minimum here, inside all bounds.",
+    )
     AT_BOUND = (
-        "Converged with a parameter at its bound: the sum of squares falls beyond it, so the "
-        "interval is one-sided. Widen the bound, or fix the parameter."
+        "Converged with a parameter at its bound",
+        "the sum of squares falls beyond it, so the interval is one-sided. Widen the bound, "
+        "or fix the parameter.",
     )
     SINGULAR = (
-        "Converged, but the data leave a combination of the parameters undetermined: it can "
-        "change without any change of the prediction. Fix one of the parameters involved, or "
-        "give it a prior."
+        "Converged, but the data leave a combination of the parameters undetermined",
+        "it can change without any change of the prediction. Fix one of the parameters "
+        "involved, or give it a prior.",
     )
     MICROSLIP = (
-        "No finite optimum: the fit improves as f_max grows without bound at constant "
-        "sigma^2/f_max, while the spring takes sigma's place. No amplitude reaches slip: drive "
-        "harder, or measure the spring and fix it."
+        "No finite optimum",
+        "the fit improves as f_max grows without bound at constant sigma^2/f_max, while the "
+        "spring takes sigma's place. No amplitude reaches slip: drive harder, or measure "
+        "the spring and fix it.",
     )
     NO_LOSS = (
-        "No finite optimum: the fit improves as f_max grows without bound at constant sigma. The "
-        "data show the stiffness of friction but no loss: drive harder, or reduce the noise."
+        "No finite optimum",
+        "the fit improves as f_max grows without bound at constant sigma. The data show the "
+        "stiffness of friction but no loss: drive harder, or reduce the noise.",
     )
     GROSS_SLIP = (
-        "No finite optimum: the fit improves as sigma grows without bound at constant f_max. The "
-        "data show slip only: use smaller amplitudes, or reduce the noise."
+        "No finite optimum",
+        "the fit improves as sigma grows without bound at constant f_max. The data show "
+        "slip only: use smaller amplitudes, or reduce the noise.",
     )
     SHARP_KNEE = (
-        "No finite optimum: the fit improves as alpha tends to zero. Friction turns from stiffness "
-        "to slip more sharply than the data resolve: measure more amplitudes near the knee, or fix "
-        "alpha."
+        "No finite optimum",
+        "the fit improves as alpha tends to zero. Friction turns from stiffness to slip "
+        "more sharply than the data resolve: measure more amplitudes near the knee, or fix "
+        "alpha.",
     )
     NO_FULL_SLIP = (
-        "No finite optimum: the fit improves as alpha and f_max grow without bound at constant "
-        "f_max/alpha. The data show no limit of the friction force: drive harder, or fix alpha."
+        "No finite optimum",
+        "the fit improves as alpha and f_max grow without bound at constant f_max/alpha. "
+        "The data show no limit of the friction force: drive harder, or fix alpha.",
     )
     NO_FRICTION = (
-        "No finite optimum: the fit improves as friction vanishes. The other elements explain "
-        "the data: use smaller amplitudes, or leave the element out."
+        "No finite optimum",
+        "the fit improves as friction vanishes. The other elements explain the data: use "
+        "smaller amplitudes, or leave the element out.",
     )
     RUNS_AWAY = (
-        "No finite optimum: the fit improves as a parameter goes to a limit. The amplitudes do not "
-        "reach what it describes: measure where its effect is larger, or fix it."
+        "No finite optimum",
+        "the fit improves as a parameter goes to a limit. The amplitudes do not reach what "
+        "it describes: measure where its effect is larger, or fix it.",
     )
     NOT_CONVERGED = (
-        "Not converged: the search stopped before it found a minimum. The numbers are not an "
-        "optimum: give a start, or fix a parameter."
+        "Not converged",
+        "the search stopped before it found a minimum. The numbers are not an optimum: give "
+        "a start, or fix a parameter.",
     )
-
-    @property
-    def outcome(self) -> str:
-        """The outcome without its meaning: the status up to its colon."""
-        return self.value.partition(":")[0]
 
     @property
     def found_optimum(self) -> bool:
@@ -357,9 +374,7 @@ class OptimumBatch:
             names = np.array(problem.names)[self.undetermined[index]]
             parts.append(f"Involved: {', '.join(names)}.")
         elif status is Status.AT_BOUND:
-            is_hit = at_bound(problem, self.theta[index])
-            hits = zip(problem.names, values, is_hit, strict=True)
-            parts.append(f"At its bound: {', '.join(f'{n} = {v:g}' for n, v, at in hits if at)}.")
+            parts.append(values_at_bounds(problem, self.theta[index], values))
         return " ".join(parts)
 
 
@@ -369,6 +384,13 @@ def at_bound(problem: Problem, theta: FloatArray) -> BoolArray:
     with np.errstate(invalid="ignore"):
         near = _AT_BOUND * np.maximum(1.0, np.abs(theta))
         return np.asarray((theta - low <= near) | (high - theta <= near))
+
+
+def values_at_bounds(problem: Problem, theta: FloatArray, values: FloatArray) -> str:
+    """Return a sentence that states the values that lie at a bound; empty if there are none."""
+    hits = zip(problem.names, values.tolist(), at_bound(problem, theta), strict=True)
+    stated = ", ".join(f"{name} = {value:g}" for name, value, is_hit in hits if is_hit)
+    return f"At its bound: {stated}." if stated else ""
 
 
 def estimated_scale(problem: Problem, cost: ArrayLike, dof: int | IntArray) -> FloatArray:

@@ -268,8 +268,8 @@ class Posterior(PosteriorDraws):
         return "\n".join([self.message, *others, "", table, "", "Priors:", *priors])
 
     def __repr__(self) -> str:
-        first = self.message.partition(":")[0]
-        return f"<{type(self).__name__}: {', '.join(self.names)}; {first}>"
+        end = "converged" if self.converged else "NOT CONVERGED"
+        return f"<{type(self).__name__}: {', '.join(self.names)}; {end}>"
 
 
 def _objections(posterior: Posterior) -> Iterator[Finding]:
