@@ -60,6 +60,13 @@ class ValidationError(DahlIdentError, ValueError):
 class ModelError(DahlIdentError, ValueError):
     """A model cannot be built or evaluated: clashing names, or a parameter without a value.
 
+    Parameters
+    ----------
+    fault : str
+        What is wrong.
+    advice : str, optional
+        What to do; it follows the fault in the message.
+
     Examples
     --------
     >>> import dahl_ident as di
@@ -68,6 +75,10 @@ class ModelError(DahlIdentError, ValueError):
     ...
     dahl_ident.errors.ModelError: ... has no value for sigma; ...
     """
+
+    def __init__(self, fault: str, advice: str = "") -> None:
+        super().__init__(f"{fault}; {advice}" if advice else fault)
+        self.fault = fault
 
 
 class UnitError(DahlIdentError, ValueError):

@@ -151,7 +151,7 @@ class TestExactCycles:
 
     def test_loops_without_an_equation_of_motion_say_so(self):
         sampled = limit_cycles(control.c2d(control.ss(HUNTING), 1e-3, "tustin"), FRICTION)
-        assert "no equation of motion in continuous time" in sampled.approximate
+        assert sampled.approximate.endswith("no equation of motion in continuous time")
         assert limit_cycles(HUNTING, FRICTION).approximate == ""
 
 

@@ -58,7 +58,7 @@ def obstacle(model: Element) -> str:
             return "the model has no mass"
         plant_equations(model)
     except ModelError as error:
-        return str(error).partition(";")[0].partition(", so")[0]
+        return error.fault
     return ""
 
 

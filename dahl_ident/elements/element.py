@@ -411,8 +411,9 @@ class Element(ABC):
         `states`: in most laws with memory one, the present force.
         """
         raise ModelError(
-            f"{self!r} has no equation of motion, so it cannot be driven by a force over time; "
-            "give records with measured displacement and force"
+            f"{self!r} has no equation of motion",
+            "it cannot be driven by a force over time: give records with measured displacement "
+            "and force",
         )
 
     @property

@@ -181,8 +181,8 @@ class LinearSystem(Element):
         power = Z.degrees[0] - Z.degrees[1]
         if power > 2:
             raise ModelError(
-                f"the dynamic stiffness of {self!r} grows as s^{power}; an equation "
-                "of motion allows s^2, a mass: give the system at its point of drive"
+                f"the dynamic stiffness of {self!r} grows as s^{power}",
+                "an equation of motion allows s^2, a mass: give the system at its point of drive",
             )
         return Z
 
@@ -332,7 +332,8 @@ class LinearSystem(Element):
         if isinstance(system, control.FRD) or not system.isctime():
             raise ModelError(
                 f"{self!r} is not a rational function of s, and so has no equation of motion in "
-                "continuous time; give a continuous TransferFunction or StateSpace"
+                "continuous time",
+                "give a continuous TransferFunction or StateSpace",
             )
         transfer = control.tf(system)
         numerator, denominator = (

@@ -70,9 +70,9 @@ class Masing(Friction):
         In plain arithmetic; as many as :attr:`n_states`.
         """
         raise ModelError(
-            f"{self!r} does not list its Jenkins elements, so it cannot be driven by a force over "
-            "time; add sliders() and n_states to it, or give records with measured displacement "
-            "and force"
+            f"{self!r} does not list its Jenkins elements",
+            "it cannot be driven by a force over time: add sliders() and n_states to it, or give "
+            "records with measured displacement and force",
         )
 
     def mechanics(
