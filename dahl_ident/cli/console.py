@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import re
 import shlex
 import shutil
 import sys
@@ -36,8 +35,7 @@ WRONG_USE = 2  # that of click for unknown options
 NOT_TRUSTED = 3  # the first that is free
 INTERRUPTED = 130  # that of shells: 128 + the number of SIGINT
 _MIN_WIDTH = 40  # columns; in a narrower window indented lines would hold a word or two
-_STATUS = re.compile(r"\A\s*(Trusted|Approximate|Not determined|Not described)(?=\.)")
-_STYLES = {"Trusted": "1;32", "Approximate": "1;33"}
+_STYLES = {"trusted": "1;32", "approximate": "1;33"}
 _RED = "1;31"
 
 
@@ -117,22 +115,24 @@ def _styled(text: str, style: str) -> str:
 
 
 def write(text: str) -> None:
-    """Print a text; if it begins with the status of a result, that is coloured on a terminal."""
+    """Print a text."""
     if not session.quiet:
-        text = _STATUS.sub(lambda match: _styled(match[0], _STYLES.get(match[1], _RED)), text)
         sys.stdout.write(f"{text}\n")
 
 
-def write_wrapped(text: str) -> None:
-    """Print a text; long lines are wrapped and indented."""
+def write_wrapped(text: str, status: str = "") -> None:
+    """Print a text; long lines are wrapped and indented, and the status coloured on a terminal."""
+    word = status.capitalize()
+    coloured = _styled(word, _STYLES.get(status, _RED))
     has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
     width = max(_MIN_WIDTH, shutil.get_terminal_size().columns) if has_width else None
     for line in text.splitlines():
         indent = " " * (len(line) - len(line.lstrip()) + 4)
-        if width is None or len(line) <= width:
-            write(line)
-        else:
-            write(textwrap.fill(line, width, subsequent_indent=indent, break_on_hyphens=False))
+        if width is not None and len(line) > width:
+            line = textwrap.fill(line, width, subsequent_indent=indent, break_on_hyphens=False)
+        if status and line.lstrip().startswith(f"{word}."):
+            line = line.replace(word, coloured, 1)
+        write(line)
 
 
 @contextmanager

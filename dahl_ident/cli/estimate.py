@@ -253,7 +253,7 @@ def fit(
 def _print(result: Any, *, verbose: bool, compare: bool, of_records: bool) -> None:
     from dahl_ident.diagnostics.comparison import compare_models
 
-    console.write_wrapped(result.fit_report(details=verbose))
+    console.write_wrapped(result.fit_report(details=verbose), result.status)
     if compare and (result.goodness.acceptable or not verbose):  # otherwise already printed
         console.write(str(compare_models(result)))
     if not verbose:

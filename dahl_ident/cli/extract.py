@@ -254,7 +254,7 @@ def _run_steps(
     data.save(table, overwrite=overwrite)
     console.heading("3. fit: friction, mass, damper and spring, nothing known beforehand")
     result = fit(data, Dahl() + Mass() + Damper() + Spring(), throw=False)
-    console.write_wrapped(result.fit_report())
+    console.write_wrapped(result.fit_report(), result.status)
     rows = []
     for name, p in result.params.items():
         truth = origin["truth"][name]
