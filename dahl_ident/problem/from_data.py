@@ -126,7 +126,8 @@ def without_copied_records(records: list[Record]) -> list[Record]:
         if not isinstance(record, Record):
             return records  # the problem refuses them
         waves = record.time, record.motion_samples, record.force_samples
-        kept.setdefault((record.motion_channel, *(w.tobytes() for w in waves)), record)
+        kind = record.motion, record.motion_channel
+        kept.setdefault((*kind, *(w.tobytes() for w in waves)), record)
     first = list(kept.values())
     if copies := len(records) - len(first):
         provenance = _with_copies(first[0].provenance, copies, f"{len(records)} records")
