@@ -154,3 +154,8 @@ def test_a_root_of_a_speed_may_be_divided_within_it(divided, whole):
     ]
     assert float(found[0]) == pytest.approx(float(found[1]), rel=1e-9)
     assert float(found[1]) == pytest.approx(0.0584, abs=1e-4)
+
+
+def test_a_value_beyond_its_bound_by_rounding_is_at_the_bound():
+    values = [0.1, 30.0, np.nextafter(100.0, 101.0), 0.1, 0.0, 0.0]
+    assert LuGre().resembles(values, np.array([1e-3, 1e-2]), np.array([6.0, 6.0])) is not None

@@ -212,7 +212,7 @@ class Budget(Mapping[str, ParameterBudget]):
         return dict(zip(self, numbers, strict=True))
 
 
-@np.errstate(over="ignore")  # where nothing bounds a variance
+@np.errstate(over="ignore", invalid="ignore")  # where nothing bounds a variance
 def budget(optimum: Optimum, errors: ErrorModel | None = None) -> Budget:
     """Return the uncertainty budget of what a fit determines.
 

@@ -333,7 +333,7 @@ def robust_values(
             break
     theta, std = errors.theta.copy(), np.zeros(len(errors.theta))
     theta[free] += move
-    std[free] = np.sqrt(np.diagonal(covariance))
+    std[free] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     std *= np.abs(problem.value_slopes(errors.theta))
     robust = dict(zip(problem.names, problem.to_values(theta).tolist(), strict=True))
     by_noise = dict(zip(problem.names, std.tolist(), strict=True))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import special
 
-from dahl_ident.arrays import FloatArray
+from dahl_ident.arrays import TINY, FloatArray
 from dahl_ident.diagnostics.error_model import error_model
 from dahl_ident.diagnostics.formatting import listed, table, with_unit
 from dahl_ident.diagnostics.information import Information, parameter_values, values_at
@@ -582,7 +582,7 @@ def _falling_force(optimum: Optimum) -> str:
         return ""
     detrended = y - smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
     solution = np.linalg.lstsq(X, y, rcond=None)[0]
-    remaining = float(np.sum((y - X @ solution) ** 2))
+    remaining = max(float(np.sum((y - X @ solution) ** 2)), TINY)
     explained = float(detrended @ detrended) - remaining
     p = float(special.fdtrc(Q, dof, explained / Q / (remaining / dof)))
     change = (slopes @ solution[-Q:]) * float(np.ptp(rate))

@@ -142,9 +142,8 @@ class ErrorModel(ErrorContributions):
     def values(self) -> Mapping[str, float]:
         """The estimates by name."""
         values = self.problem.to_values(self.theta)
-        for i, p in enumerate(self.problem.parameters):  # beyond a bound by rounding
-            values[i] = np.clip(p.nearest(values[i]), p.lower, p.upper)
-        return dict(zip(self.names, values.tolist(), strict=True))
+        known = zip(self.problem.parameters, values.tolist(), strict=True)
+        return {p.name: p.nearest(value) for p, value in known}
 
     @cached_property
     def stderr(self) -> Mapping[str, float]:
@@ -423,6 +422,7 @@ def _mixed(estimate: WeightedEstimate, sources: Sequence[Source]) -> MixedModel:
     return MixedModel(estimate.y, estimate.columns, Z, group, np.array(known), 1 + both, most)
 
 
+@np.errstate(over="ignore")
 def _unit_covariances(lever: FloatArray, state: MixedState) -> FloatArray:
     """Return the estimate's covariances by noises, sources, priors of unit size: (k, Q, Q)."""
     model, G = state.model, state.model.noises

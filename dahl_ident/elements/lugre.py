@@ -126,7 +126,8 @@ class LuGre(Friction):
         """Return linear Dahl with a damper, and the distance from it."""
         if not np.all(np.isfinite(values)):
             return None
-        law = LuGre(*values, name=self.name)
+        pairs = zip(self.parameters, values, strict=True)
+        law = LuGre(*(p.nearest(value) for p, value in pairs), name=self.name)
         return "linear Dahl with a damper", law.distance_from_dahl(amplitude, omega)
 
     def distance_from_dahl(self, amplitude: FloatArray, omega: FloatArray) -> float:

@@ -106,8 +106,9 @@ class Parameter:
         return self.transform == "log"
 
     def nearest(self, value: float) -> float:
-        """Return the nearest value that a parameter can have, for one that stands for infinity."""
-        return float(np.clip(value, SMALLEST if self.positive else -LARGEST, LARGEST))
+        """Return the nearest possible value: of infinity, or of one beyond a bound by rounding."""
+        low = max(self.lower, SMALLEST if self.positive else -LARGEST)
+        return float(np.clip(value, low, min(self.upper, LARGEST)))
 
     @property
     def is_mechanical(self) -> bool:
