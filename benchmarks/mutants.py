@@ -42,7 +42,7 @@ RESPONSIBLE = {
         "driven_*", "limit_cycles",
     ),
     "fitting": (
-        "fitting*", "cold_records", "ipopt", "record_fit", "record_laws", "driven_plants",
+        "fitting*", "cold_records", "ipopt", "record_*", "driven_plants", "sweeps", "every_law*",
         "measured_dampers",
     ),
     "extraction": ("extraction_*",),
