@@ -334,7 +334,7 @@ class Goodness:
             yield described("flagged", worst, points=self.flagged, every=every)
         if self.sign or self.apart:
             return
-        if self.suspicious:
+        if self.suspicious and 2 * len(self.suspicious) < self.rows:  # most rows are not outliers
             names = tuple(point.name for point in self.suspicious)
             worst = _APPROXIMATE if self.neighbours else _TRUSTED
             yield described("suspicious", worst, names=names, neighbours=self.neighbours)

@@ -84,15 +84,14 @@ def _suspicious(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float
 
 
 def _outliers(optimum: Optimum) -> list[tuple[int, float, float]]:
-    """Return the same for a robust fit, on which outliers have no effect: less than half."""
+    """Return the same for a robust fit, on which outliers have no effect."""
     m, dof = optimum.problem.n_residuals, max(optimum.dof, 1)
     y, _ = optimum.problem.residuals_and_jacobian(optimum.theta, optimum.scale, tails=False)
     squares = y[:m:2] ** 2 + y[1:m:2] ** 2
     tail = special.chdtrc(2, squares) if optimum.scale_known else special.fdtrc(2, dof, squares / 2)
     p = np.minimum(1.0, squares.size * tail)
     order = np.argsort(-squares)
-    deviant = [(int(i), float(np.sqrt(squares[i])), float(p[i])) for i in order if p[i] < _LEVEL]
-    return deviant if 2 * len(deviant) < squares.size else []
+    return [(int(i), float(np.sqrt(squares[i])), float(p[i])) for i in order if p[i] < _LEVEL]
 
 
 def _most_deviant(
