@@ -69,7 +69,10 @@ def test_a_stribeck_speed_in_much_noise(seed):
     assert_lowest(cold.lugre(seed, speed=0.06, noise=1e-2))
 
 
-@pytest.mark.parametrize(("made", "seed"), [(cold.lugre, 0), (cold.slips, 1), (cold.iwan, 1)])
+@pytest.mark.parametrize(
+    ("made", "seed"),
+    [(cold.lugre, 0), (cold.slips, 1), pytest.param(cold.iwan, 1, marks=pytest.mark.long)],
+)
 def test_driven_plants(made, seed):
     assert_found(made(seed))
 

@@ -14,7 +14,9 @@ from dahl_ident.errors import FitError
 from tests.friction_tables import FRICTION, table
 
 
-@pytest.mark.parametrize("law", ["linear Dahl", "two limits", "gap"])
+@pytest.mark.parametrize(
+    "law", ["linear Dahl", "two limits", pytest.param("gap", marks=pytest.mark.long)]
+)
 def test_the_law_that_made_the_data_is_chosen(law):
     assert [right for _, right in choices(law, 1, seed=5, amplitudes=6)] == [True]
 
@@ -60,6 +62,7 @@ def test_the_command_prints_the_comparison(run):
     assert "force limit" in result.out
 
 
+@pytest.mark.long
 def test_lugre_is_tried_where_the_force_falls_with_the_frequency():
     A = np.tile(np.geomspace(1e-3, 1.0, 14), 2)
     f = np.repeat([0.1, 1.0], 14)

@@ -135,9 +135,12 @@ class TestBeam:
         [
             pytest.param(
                 "Force",
-                marks=pytest.mark.xfail(
-                    strict=True, reason="no lower limit of f_max is stated for the exact motion"
-                ),
+                marks=[
+                    pytest.mark.long,
+                    pytest.mark.xfail(
+                        strict=True, reason="no lower limit of f_max is stated for the exact motion"
+                    ),
+                ],
             ),
             "Response",
         ],

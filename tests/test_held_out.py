@@ -174,6 +174,7 @@ class TestTestsThatScatter:
 class TestAtInfinity:
     MODEL = Dahl() + Mass() + Damper() + Spring()
 
+    @pytest.mark.long
     def test_what_is_determined_has_budget_and_bands(self):
         truth = 30.0**2 / 0.1
         covered: list[bool] = []

@@ -163,7 +163,9 @@ def exact_data(plant):
 
 
 @pytest.mark.parametrize(
-    ("plant", "unknown"), [(PLANT, UNKNOWN_PLANT), (SOFT, UNKNOWN_SOFT)], ids=["Dahl", "BoucWen"]
+    ("plant", "unknown"),
+    [(PLANT, UNKNOWN_PLANT), pytest.param(SOFT, UNKNOWN_SOFT, marks=pytest.mark.long)],
+    ids=["Dahl", "BoucWen"],
 )
 def test_exact_steady_motion(plant, unknown):
     """The same optimum as least squares, and on a constraint that of one parameter fewer."""
@@ -418,6 +420,7 @@ def test_what_is_no_list_of_constraints_is_refused(constraints, message):
         solve_ipopt(TableProblem(friction_data(), Dahl()), constraints=constraints)
 
 
+@pytest.mark.long
 def test_noise_of_the_drive_is_judged_as_it_was_fitted():
     """Residuals, intervals and errors of an exact model count what its drive is off by."""
     exact = plant_data(3, 4, size=0.0)

@@ -143,6 +143,7 @@ def test_harmonics_have_the_error_that_is_stated():
             assert np.abs(other.imag / exact_one.imag - 1.0).max() < 0.02
 
 
+@pytest.mark.long
 def test_slopes_are_derivatives():
     plant = Driven(di.Iwan() + di.Mass() + di.Damper() + di.Spring(), multisine(64)[0], RATE)
     starts, values = np.array([1e-4, 0.01, 0.4]), np.array([*VALUES, M, C, K])
@@ -152,6 +153,7 @@ def test_slopes_are_derivatives():
         assert error < 2e-6, i
 
 
+@pytest.mark.long
 def test_a_short_record_from_rest_is_fitted():
     """Its three shape parameters lie in a long curved valley."""
     rng, t = np.random.default_rng(0), np.arange(384) / 100.0

@@ -129,6 +129,7 @@ class TestPlan:
         assert not less.reached
         assert "the limit of time prevents it" in str(less)
 
+    @pytest.mark.long
     def test_simulated_experiments_achieve_what_is_predicted(self):
         plan = _plan("trapezoid", {"time": 10.0})
         achieved = planning.achieved_by_records(plan, LINEAR, TRUTH, RATE, NOISE, 30, seed=1)

@@ -260,7 +260,9 @@ def _awkward(count):
     return [name for name, *_ in chosen], draws, [log for *_, log in chosen]
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize(
+    "count", [1, 5, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 3))]
+)
 @pytest.mark.versions
 def test_labels_of_corner_and_trace_do_not_collide(count):
     names, draws, log = _awkward(count)

@@ -71,6 +71,7 @@ def test_intervals_are_those_of_the_budget_where_all_is_linear():
     assert share == pytest.approx(0.9545, abs=0.03)
 
 
+@pytest.mark.long
 def test_coverage_with_scatter_between_days():
     inside = {"noise": 0, "combined": 0}
     for seed in range(8):

@@ -36,6 +36,7 @@ def test_an_assumed_exponent_counts_as_if_it_were_estimated():
     assert assumed.params["alpha"].stderr == pytest.approx(free.params["alpha"].stderr, rel=0.1)
 
 
+@pytest.mark.long
 def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says():
     """It moves the plant most near resonance, where damping and friction are determined."""
     plant = di.Dahl(0.1, 30.0, 1.0) + di.Mass(0.3) + di.Damper(0.24) + di.Spring(0.3)

@@ -354,7 +354,7 @@ class TestNamed:
     @pytest.mark.parametrize("law", [
         MaxwellSlip([0.3 * X_C, 3.0 * X_C], [25.0, 8.0]),
         BoucWen(30.0, 300.0, 300.0, exponent=2.0),
-        Backlash(FRICTION, 0.5 * X_C),
+        pytest.param(Backlash(FRICTION, 0.5 * X_C), marks=pytest.mark.long),
     ])  # fmt: skip
     def test_another_law_is_not_described_however_many_its_harmonics(self, law):
         """Or the limit of its force is within the interval: Bouc-Wen's loop is near to Dahl's."""
