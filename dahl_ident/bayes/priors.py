@@ -184,10 +184,10 @@ def joint_prior(
     unknown = [name for name in sources["given"] if name not in names]
     if unknown:
         fixed = [name for name in unknown if name in problem.device_parameters]
-        advice = f"; to estimate {', '.join(fixed)}, give {spelled(f'free={fixed}', 'it as free')}"
+        free = f"; to estimate {', '.join(fixed)}, give {spelled(f'free={fixed}', 'it as free')}"
         raise ModelError(
             f"there is a prior for {', '.join(unknown)}; the free parameters are "
-            f"{choices(names, *unknown)}" + advice * bool(fixed)
+            f"{choices(names, *unknown)}{free if fixed else ''}"
         )
     parts = []
     for i, parameter in enumerate(parameters):

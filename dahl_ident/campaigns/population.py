@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray
+from dahl_ident.data.readers import is_frame
 from dahl_ident.diagnostics.formatting import interval, with_unit
 from dahl_ident.errors import DataError, ValidationError
 
@@ -305,7 +306,7 @@ def population(
     >>> round(statistics.mean[0], 2), round(statistics.between_devices[0], 2)
     (0.1, 0.05)
     """
-    if not hasattr(table, "iloc"):
+    if not is_frame(table):
         raise ValidationError(
             f"table is a {type(table).__name__}; expected a pandas.DataFrame with one row per fit, "
             "such as that of a campaign"

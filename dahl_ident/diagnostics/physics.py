@@ -17,6 +17,7 @@ from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.diagnostics.information import parameter_values
 from dahl_ident.diagnostics.judgement import Finding, VerdictStatus, described
 from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements.facts import Values
 from dahl_ident.elements.parameter import FORCE, STIFFNESS
 from dahl_ident.errors import argument
 from dahl_ident.fitting import Optimum
@@ -180,12 +181,10 @@ def beyond_friction_limit(
     which the fundamental of friction may exceed its limit. `scatter` is the relative standard
     deviation of the force between runs.
     """
-    problem, values = optimum.problem, parameter_values(optimum)
-    bound, u = 0.0, 0.0
-    for element in problem.model.elements:
+    problem, bound, u = optimum.problem, 0.0, 0.0
+    for element, values in _with_values(optimum):
         if not element.is_linear:
-            law_values = [np.asarray(values[p.name]) for p in element.parameters]
-            bound += float(element.force_bounds(law_values)[1])
+            bound += float(element.force_bounds(values)[1])
             forces = (p for p in element.parameters if p.dimension == FORCE)
             u += sum(optimum.stderr.get(p.name, 0.0) for p in forces)
     if not 0.0 < bound < np.inf:
@@ -211,10 +210,8 @@ def beyond_friction_limit(
     driven = (problem.data.controlled == "force") & np.isfinite(force)
     fundamental = np.abs(view.stiffness * _sensor_factor(optimum) - friction) * size
     third = sum(
-        element.stiffness(
-            [np.asarray(values[p.name]) for p in element.parameters], size, 3.0 * view.omega
-        )
-        for element in problem.model.elements
+        element.stiffness(values, size, 3.0 * view.omega)
+        for element, values in _with_values(optimum)
         if element.is_linear
     )
     harmonics = np.minimum(np.abs(third) * size, bound - limit)
@@ -239,13 +236,16 @@ def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> Compl
     problem = optimum.problem
     view = problem.stiffness_data
     linear = np.zeros(len(view.amplitude), dtype=np.complex128)
-    values = parameter_values(optimum)
-    for element in problem.model.elements:
+    for element, values in _with_values(optimum):
         if element.is_linear and not (with_springs and is_spring(element)):
-            linear += view.stiffness_of(
-                element, [np.asarray(values[p.name]) for p in element.parameters]
-            )
+            linear += view.stiffness_of(element, values)
     return np.asarray(view.stiffness * _sensor_factor(optimum) - linear)
+
+
+def _with_values(optimum: Optimum) -> Iterator[tuple[Element, Values]]:
+    """Yield every element with the values of its parameters at the optimum."""
+    values, model = parameter_values(optimum), optimum.problem.model
+    yield from model.of([np.asarray(values[p.name]) for p in model.parameters])
 
 
 def _sensor_factor(optimum: Optimum) -> ComplexArray:

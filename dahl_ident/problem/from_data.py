@@ -11,6 +11,7 @@ import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
 from dahl_ident.data import FrequencyResponse, Record, read_frequency_response
+from dahl_ident.data.readers import is_frame
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import Steady
@@ -30,8 +31,7 @@ if TYPE_CHECKING:
 
 def problem_class(data: object) -> type[TableProblem] | type[RecordProblem]:
     """Return the class of the problem for some data."""
-    # pandas has iloc; it is not imported, because that is slow
-    is_table = isinstance(data, FrequencyResponse) or hasattr(data, "iloc")
+    is_table = isinstance(data, FrequencyResponse) or is_frame(data)
     return TableProblem if is_table else RecordProblem
 
 

@@ -136,7 +136,7 @@ def read_frequency_response(
     entries = {name: value for name, value in locals().items() if name in SETTINGS}
     if level is not None and level_from_name is not None:
         raise ValidationError("level and level_from_name are both given; leave out one of them")
-    if isinstance(path, (str, Path)) or _is_frame(path) or not isinstance(path, Iterable):
+    if isinstance(path, (str, Path)) or is_frame(path) or not isinstance(path, Iterable):
         paths = [path]
     else:
         paths = [*path]
@@ -166,7 +166,7 @@ def read_frequency_response(
                 )
         parts.append(part)
     if len(parts) == 1:
-        saved = (parts[0].provenance or {}).get("origin") if _is_frame(paths[0]) else None
+        saved = (parts[0].provenance or {}).get("origin") if is_frame(paths[0]) else None
         return parts[0] if saved is None else replace(parts[0], provenance=saved)
     try:
         return FrequencyResponse.concatenate(labelled(parts, run_names(paths)))
@@ -268,7 +268,7 @@ def record_pieces(
         yield record
 
 
-def _is_frame(path: Any) -> TypeIs[pd.DataFrame]:
+def is_frame(path: Any) -> TypeIs[pd.DataFrame]:
     """Return whether this is a table in memory, without importing pandas."""
     return hasattr(path, "iloc")
 
@@ -314,10 +314,10 @@ def open_source(
     options: Mapping[str, Any] | None = None,
 ) -> RawFile:
     """Return the channels of a file of any format, with the user's options."""
-    if _is_frame(path) or (isinstance(path, Iterable) and not isinstance(path, str)):
+    if is_frame(path) or (isinstance(path, Iterable) and not isinstance(path, str)):
         from dahl_ident.data.readers.tables import dictionary_source, frame_source
 
-        source = frame_source(path) if _is_frame(path) else dictionary_source(path)
+        source = frame_source(path) if is_frame(path) else dictionary_source(path)
         return replace(source, options=options or {})
     file = open_file(path)
     if sheet is not None and file.format not in ("excel", "ods"):
@@ -362,7 +362,7 @@ def _options_given(**options: Any) -> dict[str, Any]:
 
 def run_names(paths: Sequence[PathLike | pd.DataFrame]) -> list[str]:
     """Return a label for each of several files: its name, or its path where names are equal."""
-    if any(_is_frame(path) for path in paths):
+    if any(is_frame(path) for path in paths):
         return [str(i + 1) for i in range(len(paths))]
     names = [Path(str(path)).name for path in paths]
     stems = [Path(name).stem for name in names]
@@ -386,7 +386,7 @@ def groups_in_name(path: PathLike | pd.DataFrame, expression: str | None) -> dic
     """Return the groups that a regular expression finds in a file's name, including the level."""
     if expression is None:
         return {}
-    name = Path(str(path)).name if not _is_frame(path) else "the table"
+    name = Path(str(path)).name if not is_frame(path) else "the table"
     try:
         match = re.search(expression, name)
     except re.error as exc:
