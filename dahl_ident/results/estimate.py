@@ -28,6 +28,7 @@ from dahl_ident.diagnostics.estimate import with_assumed
 from dahl_ident.diagnostics.shared_errors import row_errors
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import Steady
+from dahl_ident.elements.model import as_model
 from dahl_ident.errors import FitError, FitInterrupted, ModelError, ValidationError, argument
 from dahl_ident.fitting import Optimum, solve, solve_many
 from dahl_ident.problem import (
@@ -106,7 +107,8 @@ def fit(
         Additional start of the search: values of some or all free parameters.
     constraints : callable, optional
         With "ipopt": function of a mapping of every parameter's name to its casadi symbol, which
-        returns comparisons, such as ``lambda p: [p["sigma"] >= 100 * p["f_max"]]``.
+        returns comparisons, such as ``lambda p: [p["sigma"] >= 100 * p["f_max"]]``. An exponent
+        that was not given is then a free parameter.
     drive_std, drive_covariance : array_like, shapes (n,) and (n, 2), optional
         With "ipopt", for force-controlled rows: standard deviation of the measured drive, and its
         covariance with real and imaginary part of the response.
@@ -166,6 +168,10 @@ def fit(
             f"{' and '.join(given)} given; only {argument('method', 'ipopt')} takes that"
         )
 
+    if constraints is not None:  # what nobody gave is estimated with them, as it is without
+        model = as_model(model)
+        unstated = (p for p in model.parameters if p.assumed and p.name not in (fixed or {}))
+        model = model.with_parameters({p.name: p.freed() for p in unstated})
     problem = problem_of(
         data, model, free=free, fixed=fixed, sensors=sensors, noise=noise, steady=steady,
         output=output, excitation=excitation,
