@@ -36,6 +36,20 @@ def test_an_assumed_exponent_counts_as_if_it_were_estimated():
     assert assumed.params["alpha"].stderr == pytest.approx(free.params["alpha"].stderr, rel=0.1)
 
 
+def test_an_assumed_exponent_is_as_uncertain_as_a_free_one_with_a_noisy_displacement():
+    t = np.arange(6000) / 250.0
+    level = np.geomspace(4e-4, 3e-2, 6)
+    x = np.interp(t, np.linspace(0.0, 24.0, 6), level) * np.sin(2.0 * np.pi * t)
+    noise = np.random.default_rng(2).standard_normal((2, t.size))
+    force = di.Dahl(0.1, 30.0).force(x) + 3e-4 * noise[0]
+    record = di.Record(t, displacement=x + 1e-6 * noise[1], force=force)
+    assumed, free = di.fit(record, di.Dahl()), di.fit(record, di.Dahl(alpha=None))
+    assert "noise in the displacement" in sources(free, "alpha")
+    for name in ("f_max", "sigma", "alpha"):
+        one, other = assumed.params[name], free.params[name]
+        assert one.stderr == pytest.approx(other.stderr, rel=0.15)
+
+
 @pytest.mark.long
 def test_noise_of_the_drive_moves_a_sweep_as_the_budget_says():
     """It moves the plant most near resonance, where damping and friction are determined."""

@@ -88,3 +88,16 @@ def positive_part(C: FloatArray) -> FloatArray:
     """Return the positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh(C)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def excess(total: FloatArray, known: FloatArray) -> FloatArray:
+    """Return the positive semidefinite part of `total` beyond `known`, scaled to unit diagonal.
+
+    Where either is infinite there is none.
+    """
+    finite = np.isfinite(total) & np.isfinite(known)
+    total, known = (np.where(finite, C, 0.0) for C in (total, known))
+    size = np.sqrt(np.maximum(total, known).diagonal())
+    units = np.outer(size, size)
+    units[units == 0.0] = 1.0
+    return np.asarray(positive_part((total - known) / units) * units)

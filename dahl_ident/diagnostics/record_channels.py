@@ -16,9 +16,9 @@ import numpy as np
 from scipy import fft, special
 
 from dahl_ident.arrays import FloatArray, IntArray
-from dahl_ident.diagnostics.contributions import CHANNELS, positive_part
+from dahl_ident.diagnostics.contributions import CHANNELS, excess
 from dahl_ident.diagnostics.correlated_residuals import correlated, sandwich
-from dahl_ident.diagnostics.record_sources import LinearFit, by_delay
+from dahl_ident.diagnostics.record_sources import LinearFit, Waves, by_delay
 from dahl_ident.elements.recursion import stretches
 from dahl_ident.errors import FitError
 from dahl_ident.problem.record_noise import LEADS, drive_noise
@@ -46,13 +46,14 @@ WINDOW = "window of differentiation"
 
 
 def motion_sources(
-    fit: LinearFit, other_motions: Mapping[str, Sequence[FloatArray]]
+    fit: LinearFit, noisier: Sequence[Waves], other_motions: Mapping[str, Waves]
 ) -> Iterator[tuple[str, FloatArray]]:
     """Yield what errors of the motion contribute, where they widen an interval of the model's.
 
-    Noise in a measured displacement counts as far as it shifts the estimate; where the residuals
-    show larger errors of the displacement at turning points, what these shift beyond that; and so
-    do the changes of the outputs by `other_motions`.
+    Noise in a measured displacement counts as far as it shifts the estimate, which the changes of
+    the outputs by `noisier` displacements show; where the residuals show larger errors of the
+    displacement at turning points, what these shift beyond that; and so do the changes of the
+    outputs by `other_motions`.
     """
     problem = fit.problem
     if "delay" not in problem.calibration:
@@ -61,24 +62,21 @@ def motion_sources(
     if problem.output != "force":
         return
     moved = np.zeros(fit.inverse.shape)
-    for name, moved in _if_it_matters(fit, DISPLACEMENT, _by_displacement(fit)):
+    by_noise = np.asarray(sum((_squared(fit.projected(waves)) for waves in noisier), moved))
+    for name, moved in _if_it_matters(fit, DISPLACEMENT, by_noise):
         yield name, moved
     for name, changes in other_motions.items():
         yield from _if_it_matters(fit, name, _squared(fit.projected(changes)))
     if problem.with_memory and not problem.displacement_noise:
-        u2 = fit.by_noise[0].diagonal()
-        unit = np.sqrt(np.where(np.isfinite(u2) & (u2 > 0.0), u2, 1.0))
-        units = np.outer(unit, unit)
-        beyond = positive_part((_at_turns(fit) - moved) / units) * units
-        yield from _if_it_matters(fit, TURNS, beyond)
+        yield from _if_it_matters(fit, TURNS, excess(_at_turns(fit), moved))
 
 
-def by_other_motions(fit: LinearFit) -> dict[str, Sequence[FloatArray]]:
+def by_other_motions(fit: LinearFit) -> dict[str, Waves]:
     """Return how the outputs change with motions that may as well be right, by source.
 
     The sources are turning points between samples, and the window of differentiation.
     """
-    problem, changes = fit.problem, dict[str, Sequence[FloatArray]]()
+    problem, changes = fit.problem, dict[str, Waves]()
     if problem.output == "force" and not problem.model.rate_independent:
         other = problem.differentiated_in(_OTHER_WINDOW * problem.window)
         changes[WINDOW] = fit.difference_to(other)
@@ -86,6 +84,44 @@ def by_other_motions(fit: LinearFit) -> dict[str, Sequence[FloatArray]]:
         other = problem.altered("latest", motions=_beyond_samples(problem))
         changes[SAMPLING] = fit.difference_to(other)
     return changes
+
+
+def with_noisier_displacement(fit: LinearFit) -> list[Waves]:
+    """Return how the outputs change with noisier displacements; their squares add up.
+
+    As much noise again is added, in several draws; or, with a dead band, the changes are those from
+    one end of where in it the true displacement may be to the other.
+    """
+    problem = fit.problem
+    if problem.output != "force":
+        return []
+    if problem.displacement_noise:
+        low, high = (
+            problem.without_noise(problem.displacement_noise, lead).outputs(fit.values)
+            for lead in LEADS[::2]
+        )
+        return [[problem.filtered(0.5 * (b - a)) for a, b in zip(low, high, strict=True)]]
+
+    def drawn(noise: float) -> list[Waves]:
+        outputs = [problem.with_more_noise(noise, n).outputs(fit.values) for n in range(_DRAWS)]
+        return [
+            [
+                problem.filtered((b - a) / _DRAWS**0.5)
+                for a, b in zip(fit.outputs, noisy, strict=True)
+            ]
+            for noisy in outputs
+        ]
+
+    noise = problem.estimated_noise
+    draws = drawn(noise)
+    unexplained = 0.0
+    for waves in draws:
+        change = fit.projected(waves)
+        left = (y - J @ change for y, J in zip(waves, fit.jacobians, strict=True))
+        unexplained += sum(float(e @ e) for e in left)
+    squares = sum(float(e @ e) for e in fit.residuals)
+    # rough motion looks like noise, but so much noise would leave larger residuals
+    return draws if unexplained <= squares else drawn(noise * (squares / unexplained) ** 0.5)
 
 
 def _if_it_matters(
@@ -183,38 +219,6 @@ def _by_wander(fit: LinearFit, stds: Sequence[float]) -> FloatArray:
     more = np.where(certain, np.maximum((moved - seen).diagonal(), 0.0), 0.0)
     size = np.sqrt(more / np.where(certain, known.diagonal(), 1.0))
     return np.asarray(np.where(np.isfinite(known), known, 0.0) * np.outer(size, size))
-
-
-def _by_displacement(fit: LinearFit) -> FloatArray:
-    """Return the mean square change of the estimate by the displacement's noise.
-
-    As large as that of as much noise again, in addition to the plain prediction; or, with a dead
-    band, from where in it the true displacement may be.
-    """
-    problem, noise = fit.problem, fit.problem.displacement_noise
-    if noise:
-        low, high = (problem.without_noise(noise, lead).outputs(fit.values) for lead in LEADS[::2])
-        return _squared(0.5 * fit.changed([b - a for a, b in zip(low, high, strict=True)]))
-
-    def noisier(noise: float) -> tuple[FloatArray, float]:
-        """Return the mean square change, and the mean sum of squares that the noise leaves."""
-        covariance, squares = np.zeros(fit.inverse.shape), 0.0
-        for draw in range(_DRAWS):
-            noisy = problem.with_more_noise(noise, draw).outputs(fit.values)
-            waves = [problem.filtered(b - a) for a, b in zip(fit.outputs, noisy, strict=True)]
-            change = fit.projected(waves)
-            covariance += np.outer(change, change) / _DRAWS
-            left = (y - J @ change for y, J in zip(waves, fit.jacobians, strict=True))
-            squares += sum(float(e @ e) for e in left) / _DRAWS
-        return covariance, squares
-
-    noise = problem.estimated_noise
-    covariance, left = noisier(noise)
-    squares = sum(float(e @ e) for e in fit.residuals)
-    if left <= squares:
-        return covariance
-    # rough motion looks like noise, but so much noise would leave larger residuals
-    return noisier(noise * (squares / left) ** 0.5)[0]
 
 
 def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from dahl_ident.diagnostics.record_channels import (
     by_drive,
     by_other_motions,
     motion_sources,
+    with_noisier_displacement,
 )
 from dahl_ident.diagnostics.record_misfit import MotionMisfit, motion_misfit
 from dahl_ident.diagnostics.record_sources import (
@@ -99,8 +101,9 @@ def record_errors(
     A misfit differs between the parts of a record: if estimates from blocks of a record scatter
     more than noise explains, the excess is the model error; a misfit that depends on the motion is
     a separate source. If estimates from several records scatter more than that, the excess is the
-    scatter between runs. An assumed exponent contributes by its range and its estimate from the
-    records. Errors of the channels are those of :mod:`dahl_ident.diagnostics.record_channels`.
+    scatter between runs. An assumed exponent contributes what it adds to all of these if it is
+    estimated within its range. Errors of the channels are those of
+    :mod:`dahl_ident.diagnostics.record_channels`.
 
     `jacobians` and `residuals` are the derivatives of each record's prediction, and measured minus
     predicted; for a robust fit, the scores.
@@ -110,14 +113,17 @@ def record_errors(
     sources = {NOISE: covariance}
     if (by_model := between_blocks(fit)) is not None:
         sources[MODEL_ERROR] = by_model
+    noisier, other_motions = with_noisier_displacement(fit), by_other_motions(fit)
+    by_motion = partial(motion_sources, noisier=noisier, other_motions=other_motions)
+    of_motion = dict(by_motion(fit))
+    exact = np.asarray(sum([*sources.values(), *of_motion.values()]))
+    exponents = fixed_exponents(fit, by_motion, exact)
     if (scatter := between_records(fit, np.asarray(sum(sources.values())))) is not None:
         sources[RUNS] = scatter
-    exponents = fixed_exponents(fit)
+    sources |= of_motion
+    known = np.asarray(sum(sources.values()))
     if assumed := [exponent.contribution for exponent in exponents if exponent.assumed]:
         sources[EXPONENT] = np.asarray(sum(assumed))
-    other_motions = by_other_motions(fit)
-    sources |= dict(motion_sources(fit, other_motions))
-    known = np.asarray(sum(sources.values()))
     misfit = motion_misfit(fit, other_motions.values())
     if misfit is not None:
         larger = misfit.covariance.diagonal() > _SHORTENS**2 * known.diagonal()
@@ -127,15 +133,15 @@ def record_errors(
             misfit = None
     for name, contribution in by_calibration(fit):
         sources[name] = sources.get(name, 0.0) + contribution
-    exact = [name for name in (FORCE, DISPLACEMENT_GAIN) if name not in sources]
+    unstated = [name for name in (FORCE, DISPLACEMENT_GAIN) if name not in sources]
     if problem.output == "motion":
         of_drive = by_drive(fit)
         if of_drive is None:
-            exact.insert(FORCE in exact, "the drive (its noise cannot be estimated)")
+            unstated.insert(FORCE in unstated, "the drive (its noise cannot be estimated)")
         elif of_drive.any():
             sources[DRIVE] = of_drive
     runs = len(set(problem.runs))
-    return RecordErrors(sources, effective, tuple(exact), runs, exponents, misfit)
+    return RecordErrors(sources, effective, tuple(unstated), runs, exponents, misfit)
 
 
 def errors_on_constraints(

@@ -7,16 +7,16 @@ source of error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import special
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray
-from dahl_ident.diagnostics.contributions import positive_part
+from dahl_ident.diagnostics.contributions import excess, positive_part
 from dahl_ident.diagnostics.correlated_residuals import inverse_normal, noise_in, sandwich
 from dahl_ident.diagnostics.formatting import with_unit
 from dahl_ident.errors import FitError
@@ -29,6 +29,12 @@ _LEVEL = 0.9995  # confidence at which scatter between blocks exceeds the noise
 _RUNS_LEVEL = 0.95  # the same between records: rather counted too often than too seldom
 _LONG = 0.05  # step of an exponent's logarithm, above which the model is not linear
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
+
+
+Waves: TypeAlias = Sequence[FloatArray]
+"""A filtered change of the output of each record."""
+Sources: TypeAlias = Callable[["LinearFit"], Iterable[tuple[str, FloatArray]]]
+"""Returns covariances of a fit's values, (P, P), by source."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class LinearFit:
         return self.problem.outputs(self.values)
 
     @cached_property
-    def exponent_slopes(self) -> Mapping[str, Sequence[FloatArray]]:
+    def exponent_slopes(self) -> Mapping[str, Waves]:
         """Derivatives of the outputs with respect to ln of each fixed exponent, by name.
 
         Empty if there is no motion close to the estimate.
@@ -93,13 +99,13 @@ class LinearFit:
             for name, i in columns.items()
         }
 
-    def with_freed(self, *slopes: Sequence[FloatArray]) -> LinearFit:
+    def with_freed(self, *slopes: Waves) -> LinearFit:
         """Return the fit with more parameters at the end, which have these derivatives."""
         jacobians = [np.column_stack(waves) for waves in zip(self.jacobians, *slopes, strict=True)]
         of_model = np.append(self.of_model, np.ones(len(slopes), dtype=bool))
         return replace(self, jacobians=jacobians, of_model=of_model)
 
-    def projected(self, waves: Sequence[FloatArray]) -> FloatArray:
+    def projected(self, waves: Waves) -> FloatArray:
         """Return the change of the estimate due to filtered changes of the measured outputs."""
         parts = zip(self.jacobians, waves, strict=True)
         return np.asarray(self.inverse @ sum(J.T @ y for J, y in parts))
@@ -108,22 +114,21 @@ class LinearFit:
         """Return the change of the estimate due to changes of the measured outputs."""
         return self.projected([self.problem.filtered(y) for y in outputs])
 
-    def difference_to(self, other: RecordProblem) -> Sequence[FloatArray]:
+    def difference_to(self, other: RecordProblem) -> Waves:
         """Return the filtered outputs of another problem minus those of this one."""
         ends = zip(self.outputs, other.outputs(self.values), strict=True)
         return [self.problem.filtered(b - a) for a, b in ends]
 
     @cached_property
-    def delay_slopes(self) -> Sequence[FloatArray]:
+    def delay_slopes(self) -> Waves:
         """Derivatives of the filtered outputs with respect to the delay, per second."""
         return [self.problem.filtered(slope) for slope in self.problem.delay_slopes(self.values)]
 
-    @cached_property
-    def variances(self) -> FloatArray:
-        """Variances of the values due to noise and scatter between blocks, (P,)."""
-        covariance, _ = self.by_noise
-        beyond = between_blocks(self)
-        return np.diagonal(covariance if beyond is None else covariance + beyond)
+    def covariance(self, sources: Sources | None = None) -> FloatArray:
+        """Return the covariance by noise, scatter between blocks and other `sources`, (P, P)."""
+        parts = [self.by_noise[0], between_blocks(self)]
+        parts += [part for _, part in sources(self)] if sources else []
+        return np.asarray(sum(part for part in parts if part is not None))
 
 
 @dataclass(frozen=True)
@@ -155,8 +160,13 @@ class FixedExponent:
         return f"{self.name} between {low:g} and {high:g} (here {value})"
 
 
-def fixed_exponents(fit: LinearFit) -> tuple[FixedExponent, ...]:
+def fixed_exponents(
+    fit: LinearFit, sources: Sources, exact: FloatArray
+) -> tuple[FixedExponent, ...]:
     """Return what the records show of each fixed exponent, stated or assumed.
+
+    Its uncertainty is that of noise, of scatter between blocks, and of `sources`; `exact` is the
+    covariance of the estimate by all of these with the exponents fixed.
 
     A stated exponent is estimated by a search in which it is free; an assumed one, which is close
     to its optimum, by a Gauss-Newton step, and by a search if that step is long. As for tables, the
@@ -165,14 +175,15 @@ def fixed_exponents(fit: LinearFit) -> tuple[FixedExponent, ...]:
     """
     exponents = []
     for p in (p for p in fit.problem.exponents if p.name in fit.exponent_slopes):
-        freed = _FreedValue.of(fit, fit.exponent_slopes[p.name])
+        freed = _FreedValue.of(fit, fit.exponent_slopes[p.name], sources)
         value, limits = float(p.value or 1.0), p.prior or (1.0, 1.0)
         low, high = (float(np.log(end / value)) for end in limits)
         low, high = min(low, 0.0), max(high, 0.0)
-        ratio, ratio_std = freed.change, freed.variance**0.5
-        std, covariance = freed.with_prior(float(np.clip(ratio, low, high)), (high - low) / 12**0.5)
+        ratio, ratio_std = freed.change, float(freed.covariance[-1, -1]) ** 0.5
+        mean, s = float(np.clip(ratio, low, high)), (high - low) / 12**0.5
+        std, covariance = freed.with_prior(mean, s, exact)
         if not p.assumed or abs(ratio) > max(_LONG, _CONTRADICTED * ratio_std):
-            ratio, ratio_std = _searched_ratio(fit, p.name) or (ratio, ratio_std)
+            ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
         exponents.append(
             FixedExponent(
                 p.name, p.unit, value, limits, std, ratio, ratio_std, covariance, p.assumed
@@ -181,7 +192,7 @@ def fixed_exponents(fit: LinearFit) -> tuple[FixedExponent, ...]:
     return tuple(exponents)
 
 
-def _searched_ratio(fit: LinearFit, name: str) -> tuple[float, float] | None:
+def _searched_ratio(fit: LinearFit, name: str, sources: Sources) -> tuple[float, float] | None:
     """Return ln of an exponent's estimate over its value, and its standard deviation, by a search.
 
     The displacement's noise is estimated again, as its estimate with the exponent fixed may contain
@@ -201,7 +212,8 @@ def _searched_ratio(fit: LinearFit, name: str) -> tuple[float, float] | None:
     values = free.to_values(end.theta[0])
     predicted = [free.predict(values, number) for number in range(len(problem.records))]
     e = [y - p.output for y, p in zip(free.measured, predicted, strict=True)]
-    u = float(LinearFit.of(free, values, [p.by for p in predicted], e).variances[i]) ** 0.5
+    at_end = LinearFit.of(free, values, [p.by for p in predicted], e)
+    u = float(at_end.covariance(sources)[i, i]) ** 0.5
     return float(np.log(values[i] / value)), u / float(values[i])
 
 
@@ -213,40 +225,45 @@ def by_delay(fit: LinearFit) -> FloatArray:
     """
     sample = 1.0 / fit.problem.records[0].sample_rate
     freed = _FreedValue.of(fit, [sample * slope for slope in fit.delay_slopes])
-    return freed.with_prior(freed.change, 1.0)[1]
+    return freed.with_prior(freed.change, 1.0, fit.covariance())[1]
 
 
 class _FreedValue(NamedTuple):
     """A value that a fit holds fixed, estimated by a Gauss-Newton step."""
 
     change: float  # of the value, by the records
-    variance: float  # of the change
-    others: FloatArray  # changes of the other values per change of this one
+    covariance: FloatArray  # (P + 1, P + 1): of the values and, last, of this one
+    others: FloatArray  # (P,): changes of the other values per change of this one
 
     @classmethod
-    def of(cls, fit: LinearFit, slopes: Sequence[FloatArray]) -> _FreedValue:
+    def of(cls, fit: LinearFit, slopes: Waves, sources: Sources | None = None) -> _FreedValue:
         """Return the value with these derivatives of the outputs."""
         joint = fit.with_freed(slopes)
-        others = np.zeros(fit.values.size)
+        others = np.zeros(len(joint.inverse) - 1)
         if any(slope.any() for slope in slopes):  # without a drive, a delay has no effect
             others = joint.inverse[:-1, -1] / joint.inverse[-1, -1]
         change = float(joint.projected(joint.residuals)[-1])
-        return cls(change, float(joint.variances[-1]), others)
+        return cls(change, joint.covariance(sources), others)
 
-    def with_prior(self, mean: float, s: float) -> tuple[float, FloatArray]:
-        """Return the standard deviation of the value, and the covariance of the others due to it.
+    def with_prior(self, mean: float, s: float, exact: FloatArray) -> tuple[float, FloatArray]:
+        """Return the standard deviation of the value, and what it adds to the others' covariance.
 
-        `mean` is the estimate by the records, `s` the standard deviation of the prior.
+        `mean` is the estimate by the records, `s` the standard deviation of the prior, `exact` the
+        covariance of the others where this value is exact.
         """
-        std, u2 = s, self.variance
-        if np.isfinite(u2):
-            s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
-            weight = s**2 / (s**2 + u2)
-            mean, std = mean * weight, (u2 * weight) ** 0.5
-        else:
-            mean = 0.0
-        changes = self.others * max(std, abs(mean))
-        return std, np.outer(changes, changes)
+        u2, C = float(self.covariance[-1, -1]), self.covariance
+        line = np.outer(self.others, self.others)
+        if not np.isfinite(u2):
+            return s, s**2 * line
+        s = max(s, s**2 / max(u2, 1e-300) ** 0.5)
+        weight = s**2 / (s**2 + u2)
+        shrink = np.column_stack([np.eye(self.others.size), (weight - 1.0) * self.others])
+        total = shrink @ np.where(np.isfinite(C), C, 0.0) @ shrink.T
+        total += ((1.0 - weight) * s) ** 2 * line
+        lost = np.isinf(C.diagonal()[:-1])
+        total[lost, lost] = np.inf
+        beyond = max((weight * mean) ** 2 - weight * u2, 0.0)
+        return (weight * u2) ** 0.5, excess(total, exact) + beyond * line
 
 
 def between_blocks(fit: LinearFit) -> FloatArray | None:
