@@ -51,7 +51,7 @@ def test_demo_recovers_the_plant_and_tells_machines_its_steps_on_standard_error(
     assert told["posterior"]["converged"] is not bool(steps)
     for name, row in told["posterior"]["summary"].items():
         if name in told["truth"] and not steps:  # twice the band: 99.99 %
-            low, high = row["2.5%"], row["97.5%"]
+            low, high = row["2.3%"], row["97.7%"]
             assert 1.5 * low - 0.5 * high < told["truth"][name] < 1.5 * high - 0.5 * low
     page = Path(said.rsplit("report: ", 1)[1].splitlines()[0])
     assert page == Path(told["report"]) == tmp_path / "here" / "report.html"

@@ -17,7 +17,7 @@ from dahl_ident.problem import TableProblem
 from dahl_ident.results import Posterior
 from tests.bayes_cases import friction_table, harmonic_table, spring_table, with_covariance
 
-LEVELS = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
+LEVELS = np.array([0.02275, 0.16, 0.5, 0.84, 0.97725])
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_the_summary_is_that_of_the_draws(posterior):
     assert list(table.index) == ["f_max", "sigma", "noise_scale"]
     assert table["unit"].tolist() == ["N", "N/m", ""]
     assert table["mean"].to_numpy() == pytest.approx(values.mean(axis=0))
-    assert table["97.5%"].to_numpy() == pytest.approx(np.quantile(values, 0.975, axis=0))
+    assert table["97.7%"].to_numpy() == pytest.approx(np.quantile(values, 0.97725, axis=0))
     std, ess = table["std"].to_numpy(), table["ess"].to_numpy()
     assert table["mcse"].to_numpy() == pytest.approx(std / np.sqrt(ess))
     assert values.shape == (len(posterior.to_frame()), 3)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _END = 1e-6  # probability beyond which there are too few draws for a quantile
-_QUANTILES = {"2.5%": 0.025, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.5%": 0.975}
+_QUANTILES = {"2.3%": 0.02275, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.7%": 0.97725}
 _LEVELS = np.array(list(_QUANTILES.values()))
 
 
@@ -198,7 +198,7 @@ class PosteriorDraws(Result):
         Returns
         -------
         dict of str to float
-            ``mean, std, 2.5%, 16%, median, 84%, 97.5%``.
+            ``mean, std, 2.3%, 16%, median, 84%, 97.7%``.
         """
         weights = self.weights
         values = dict(zip(self.names, self.values.T, strict=True))
@@ -220,7 +220,7 @@ class PosteriorDraws(Result):
         Returns
         -------
         pandas.DataFrame
-            Columns ``mean, std, 2.5%, 16%, median, 84%, 97.5%``; of a chain ``mcse``, the Monte
+            Columns ``mean, std, 2.3%, 16%, median, 84%, 97.7%``; of a chain ``mcse``, the Monte
             Carlo standard error of the mean, ``ess``, the effective number of draws, and
             ``r_hat``; ``unit``. ``ess`` and ``mcse`` are NaN where the chain has not converged.
         """

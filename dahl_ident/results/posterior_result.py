@@ -55,7 +55,7 @@ class Posterior(PosteriorDraws):
     >>> grid = di.posterior(data, di.Dahl(alpha=1.0), method="grid")
     >>> print(grid.message)
     Converged: error 0.0007 of the probability, 192 points.
-    >>> low, high = grid.quantile("f_max", [0.025, 0.975])
+    >>> low, high = grid.quantile("f_max", [0.02275, 0.97725])
     >>> print(f"f_max from {low:.4f} to {high:.4f} N")
     f_max from 0.0993 to 0.1004 N
     """
