@@ -44,7 +44,7 @@ class TestRows:
         assert (
             f"the residuals are consistent with noise ({100.0 * alone:.2g} % rms misfit)" in first
         )
-        assert 'a robust loss that down-weights them (loss="huber")' in first
+        assert "fit with loss='huber', which down-weights them" in first
         assert "not linear Dahl" not in found.verdict
         assert found.ndata == 60  # none is dropped
         assert fit(data, Dahl(), loss="huber").trusted

@@ -123,8 +123,8 @@ def _rows_apart(names: Sequence[str], rows: int, rms: float, remaining: str) -> 
     left = remaining[0].lower() + remaining[1:].rstrip(".")
     return (
         f"{named} the model ({percent(rms)} rms misfit): without {them} {left}. The fit includes "
-        f"every row: check {them}, or fit with a robust loss that down-weights {them} "
-        '(loss="huber").'
+        f"every row: check {them}, or fit with {argument('loss', 'huber')}, which down-weights "
+        f"{them}."
     )
 
 
@@ -369,7 +369,7 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "prior_influence": _prior_influence,
     "predictive_check": "{text}",
     "counted": "Counted: {sources:parts}.",
-    "noise_alone": "Noise alone is counted; with every source of the budget, u is {compared:list}.",
+    "noise_alone": "Noise alone is counted; with every source of its budget, u of the fit is {compared:list}.",
     "evidence": "ln evidence: {ln:.4f}",
     "warning": "Warning on reading: {text}.",
     "more_warnings": "{count} more warnings on reading.",

@@ -315,7 +315,7 @@ def _notes(posterior: Posterior) -> Iterator[Finding]:
         elif fit.errors is not None:
             std = zip(names, posterior.std().tolist(), strict=True)
             known = ((n, s) for n, s in std if n in fit.var_names)
-            u = [f"{fit.params[n].stderr:.2g} instead of {s:.2g} for {n}" for n, s in known]
+            u = [f"{fit.params[n].stderr:.2g} for {n} (here {s:.2g})" for n, s in known]
             yield Finding(assumed, VerdictStatus.TRUSTED, "noise_alone", {"compared": tuple(u)})
         yield from assumptions(fit.assessment, counted=counted)
     if not posterior.is_chain and posterior.normalised:
