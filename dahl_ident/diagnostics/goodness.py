@@ -16,7 +16,7 @@ A fit may agree with the data and still be physically impossible; this gives a w
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from dahl_ident.arrays import ComplexArray, FloatArray, quotient
+from dahl_ident.arrays import ComplexArray, quotient
 from dahl_ident.diagnostics.contributions import MODEL_ERROR, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel, error_model
 from dahl_ident.diagnostics.formatting import p_text, with_unit
@@ -56,8 +56,6 @@ from dahl_ident.diagnostics.trends import (
     trends,
 )
 from dahl_ident.fitting import Optimum
-from dahl_ident.problem.record_noise import share_in_band
-from dahl_ident.problem.record_problem import RecordProblem
 from dahl_ident.units import percent
 
 _TRUSTED, _APPROXIMATE, _NOT_DETERMINED, _NOT_DESCRIBED = VerdictStatus
@@ -68,7 +66,6 @@ _NO_SENSOR = 0.15  # noise over the response, more than any sensor has
 _MEDIAN_SQUARE = 2.0 * np.log(2.0)  # of two normal numbers' sum of squares
 _CLOSE = 0.8  # bound over the misfit, above which no law of this kind helps
 _OF_ONE_DEVICE = 0.25  # u of a logarithm: 95 % within a factor of 1.6, see verdicts.py
-_SEGMENTS = 50  # of a record: the worst one is 2 % of it
 _WORTH_NAMING = 0.1  # share of the largest scatter, below which a scatter is not listed
 
 
@@ -584,70 +581,3 @@ def _third_harmonic(optimum: Optimum, space: ResidualSpace) -> ThirdHarmonic | N
     third = rows.astype(np.complex128)
     ratio, error = space.coefficient(third)
     return ThirdHarmonic(1.0 + ratio, error, space.p_value(np.array([third, 1j * third])))
-
-
-@dataclass(frozen=True)
-class RecordGoodness(Goodness):
-    """Residuals of all records: their size, where they are largest, and their correlation."""
-
-    unexplained_share: float = 0.0  # variance of the residuals over that of the measured output
-    # root mean square over that of the output, at the drive's frequencies where residuals are
-    # weighted by their spectrum
-    rms_in_band: float = 0.0
-    rms: float = 0.0  # of the residuals, in the output's unit
-    worst_record: int = 1  # record, from 1, of the fiftieth of a record with the largest residuals
-    worst: str = ""  # that segment in words, with its times in s
-    correlation: float = 0.0  # of residuals of neighbouring samples
-
-    @property
-    def details(self) -> list[str]:
-        """The numbers as text."""
-        return [
-            f"unexplained share of variance {self.unexplained_share:.3g} "
-            f"({percent(self.rms_misfit)} rms)",
-            f"residuals {self.rms:.3g} rms; {self.worst}",
-            f"correlation of neighbouring residuals {self.correlation:.2f}",
-        ]
-
-
-def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> RecordGoodness:
-    """Return the statistics of the residuals of records, measured minus predicted output of each.
-
-    Examples
-    --------
-    >>> from dahl_ident import Dahl, Record
-    >>> t = np.arange(100.0)
-    >>> record = Record(t, displacement=t, force=np.sin(t))
-    >>> problem = RecordProblem([record], Dahl())
-    >>> print(record_goodness(problem, [0.1 * np.sin(t)]).details[0])
-    unexplained share of variance 0.01 (10 % rms)
-    """
-    records, measured = problem.records, problem.measured
-    joined = np.concatenate(list(residuals))
-    total = float(joined @ joined)
-    rms = float(np.sqrt(total / joined.size))
-    share = total / sum(float(np.sum((y - y.mean()) ** 2)) for y in measured)
-    in_band = share
-    if problem.whitening.size > 1:
-        in_band = share_in_band([r.force_samples for r in records], measured, residuals)
-    segments = []
-    for number, (record, e) in enumerate(zip(records, residuals, strict=True), 1):
-        width = max(1, e.size // _SEGMENTS)
-        sums = np.concatenate([[0.0], np.cumsum(e**2)])
-        mean = (sums[width:] - sums[:-width]) / width
-        first = int(np.argmax(mean))
-        last = min(first + width, e.size) - 1
-        segments.append((float(mean[first]), number, record.time[first], record.time[last]))
-    square, number, start, stop = max(segments, key=lambda segment: segment[0])
-    which = f" of record {number}" if len(records) > 1 else ""
-    ends = dict.fromkeys((f"{start:.4g}", f"{stop:.4g}"))
-    when = f"between {' and '.join(ends)}" if len(ends) > 1 else f"at {start:.4g}"
-    worst = (
-        f"most {when} s{which}, where the residuals are "
-        f"{square**0.5 / rms if rms else 0.0:.2g} times larger"
-    )
-    products = sum(float(e[1:] @ e[:-1]) for e in residuals)
-    return RecordGoodness(
-        share**0.5, unexplained_share=share, rms_in_band=in_band**0.5, rms=rms, worst_record=number,
-        worst=worst, correlation=products / total if total else 0.0,
-    )  # fmt: skip
