@@ -369,7 +369,8 @@ _TEXT: Mapping[str, str | Callable[..., str]] = {
     "prior_influence": _prior_influence,
     "predictive_check": "{text}",
     "counted": "Counted: {sources:parts}.",
-    "noise_alone": "Noise alone is counted; with every source of its budget, u of the fit is {compared:list}.",
+    "noise_alone": "Noise alone is counted; with every source of its budget, u of the fit is "
+    "{compared:list}.",
     "evidence": "ln evidence: {ln:.4f}",
     "warning": "Warning on reading: {text}.",
     "more_warnings": "{count} more warnings on reading.",
