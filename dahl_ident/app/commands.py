@@ -32,12 +32,15 @@ from dahl_ident.units import SI_UNITS, parse_quantity
 _LAWS: tuple[tuple[str, str, Any], ...] = (
     ("Dahl", "pivots, bearings, gears: stiffness, then slip", Dahl(0.7, 3.0, 1.0)),
     ("Bouc-Wen", "hysteresis with a stiffness after slip", BoucWen(3.0, 4.0, 1.0)),
-    ("Maxwell slip", "several springs that slip one after the other",
-     MaxwellSlip([0.1, 0.3, 0.6], [1.0, 0.8, 0.5])),
+    (
+        "Maxwell slip",
+        "several springs that slip one after the other",
+        MaxwellSlip([0.1, 0.3, 0.6], [1.0, 0.8, 0.5]),
+    ),
     ("Iwan", "bolted joints: microslip, then slip", Iwan(0.7, 3.0, -0.5, 0.7)),
     ("LuGre", "friction that depends on the speed", LuGre(0.7, 3.0, 1.4, 0.2, 0.05, 0.05)),
     ("power damper", "damping force as a power of the speed", PowerDamper(0.7, 0.3)),
-)  # fmt: skip
+)
 """Name and use of each law, and an element whose loop is drawn for an amplitude of 1."""
 LINEAR = {"mass": Mass, "damping": Damper, "stiffness": Spring}
 """The options of elements without friction, and their classes."""
@@ -45,10 +48,26 @@ TABLE_OPTIONS = ("quantity", "amplitude", "frequency", "sweep", "level_from_name
 RECORD_OPTIONS = ("sample_rate",)
 COMMON_OPTIONS = ("drive", "drive_factor")
 ROLES = (
-    "", "time", "displacement", "velocity", "acceleration", "force", "drive", "frequency",
-    "amplitude", "response", "real", "imag", "gain", "gain_db", "phase", "level", "run",
-    "controlled", "harmonic",
-)  # fmt: skip
+    "",
+    "time",
+    "displacement",
+    "velocity",
+    "acceleration",
+    "force",
+    "drive",
+    "frequency",
+    "amplitude",
+    "response",
+    "real",
+    "imag",
+    "gain",
+    "gain_db",
+    "phase",
+    "level",
+    "run",
+    "controlled",
+    "harmonic",
+)
 """Possible roles of a channel; "" is that of its name, or none."""
 _COLUMNS, _REPORT = "columns.toml", "report.toml"
 REPORTS = ("report.html", "report.pdf")
@@ -242,8 +261,10 @@ def report_toml(form: Mapping[str, str]) -> str:
         }
         if set(instrument) - {"k"}:
             instrument = {
-                "channel": channel, "name": f"{channel} channel".capitalize(), **instrument
-            }  # fmt: skip
+                "channel": channel,
+                "name": f"{channel} channel".capitalize(),
+                **instrument,
+            }
             with suppress(ValueError):
                 if math.isfinite(k := float(instrument.get("k", ""))):
                     instrument["k"] = k

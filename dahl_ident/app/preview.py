@@ -28,9 +28,15 @@ from dahl_ident.reporting.document import Picture
 from dahl_ident.units import parse_quantity
 
 EMPTY: Mapping[str, Any] = {
-    "channels": [], "notes": [], "pictures": [],
-    "error": "", "kind": "", "summary": "", "format": "", "sampling": "",
-}  # fmt: skip
+    "channels": [],
+    "notes": [],
+    "pictures": [],
+    "error": "",
+    "kind": "",
+    "summary": "",
+    "format": "",
+    "sampling": "",
+}
 _CURVE_POINTS = 300  # in a channel's picture
 _MOST_PICTURES = 6  # records that are drawn
 
@@ -63,9 +69,14 @@ def _add_channels(file: str, result: dict[str, Any]) -> None:
         role, entry = by_column.get(channel.name, ("", {}))
         curve = _thumbnail(channel.values) if channel.kind in "fiu" else []
         result["channels"].append(
-            {**asdict(line), "role": role, "curve": curve, "sign": entry.get("sign", 1),
-             "unit": entry.get("unit") or channel.unit or ""}
-        )  # fmt: skip
+            {
+                **asdict(line),
+                "role": role,
+                "curve": curve,
+                "sign": entry.get("sign", 1),
+                "unit": entry.get("unit") or channel.unit or "",
+            }
+        )
 
 
 def _add_data(files: Sequence[str], reading: dict[str, str], result: dict[str, Any]) -> None:

@@ -50,13 +50,21 @@ LIMIT = 2_000_000_000
 """Largest size of one upload, bytes."""
 _READ_SECONDS = 600  # time limit of reading files for the preview
 _DOWNLOADS = {
-    "report.html": "Report", "report.pdf": "Report, PDF", "fit.json": "Fit, JSON",
-    "points.csv": "Points, CSV", "plan.csv": "Plan, CSV", "waveform.csv": "Waveform, CSV",
-}  # fmt: skip
+    "report.html": "Report",
+    "report.pdf": "Report, PDF",
+    "fit.json": "Fit, JSON",
+    "points.csv": "Points, CSV",
+    "plan.csv": "Plan, CSV",
+    "waveform.csv": "Waveform, CSV",
+}
 _EXPORTS = {
-    "latex": "LaTeX", "c": "C", "matlab": "MATLAB", "modelica": "Modelica", "urdf": "URDF",
+    "latex": "LaTeX",
+    "c": "C",
+    "matlab": "MATLAB",
+    "modelica": "Modelica",
+    "urdf": "URDF",
     "mujoco": "MuJoCo",
-}  # fmt: skip
+}
 _REPORT_POLICY = (
     "sandbox allow-scripts allow-modals allow-downloads; default-src 'none'; img-src data:; "
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -139,8 +147,10 @@ class App:
         self._templates = Environment(
             loader=FileSystemLoader(_HERE / "templates"),
             autoescape=select_autoescape(default=True, default_for_string=True),
-            undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        )  # fmt: skip
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
 
     def routes(self) -> list[Route | Mount]:
         """Return the handler of every address."""
@@ -206,9 +216,13 @@ class App:
 
     def _preview(self, work: Work) -> dict[str, Any]:
         child = subprocess.run(
-            [sys.executable, "-m", "dahl_ident.app.preview"], cwd=work.folder, check=False,
-            input=json.dumps(work.state).encode(), capture_output=True, timeout=_READ_SECONDS,
-        )  # fmt: skip
+            [sys.executable, "-m", "dahl_ident.app.preview"],
+            cwd=work.folder,
+            check=False,
+            input=json.dumps(work.state).encode(),
+            capture_output=True,
+            timeout=_READ_SECONDS,
+        )
         if child.returncode:
             last = child.stderr.decode(errors="replace").strip().splitlines()[-1:]
             error = " ".join(["The files could not be read.", *last])
@@ -277,19 +291,28 @@ class App:
             text = work.with_uploaded_names(output(part, len(state["steps"]) - 1))
             parts.append((part.name, state, text, self._files(part)))
         return self._page(
-            "run", work=work, state=work.state, folder=folder, job=job, parts=parts,
+            "run",
+            work=work,
+            state=work.state,
+            folder=folder,
+            job=job,
+            parts=parts,
             report=report.partition("<main>")[2].partition("</main>")[0],
             typed=_typed([JobStep(step["title"], tuple(step["words"])) for step in job["steps"]]),
-            program=(folder / "program.py").read_text("utf-8"), files=self._files(folder),
-            failed=work.with_uploaded_names(job["error"]), exports=_EXPORTS,
-            is_table=_is_table(folder), busy=self.jobs.is_running(folder),
-        )  # fmt: skip
+            program=(folder / "program.py").read_text("utf-8"),
+            files=self._files(folder),
+            failed=work.with_uploaded_names(job["error"]),
+            exports=_EXPORTS,
+            is_table=_is_table(folder),
+            busy=self.jobs.is_running(folder),
+        )
 
     def _files(self, folder: Path) -> list[tuple[str, str]]:
         return [
-            (name, text) for name, text in _DOWNLOADS.items()
+            (name, text)
+            for name, text in _DOWNLOADS.items()
             if (folder / name).exists() or (name == "points.csv" and _is_table(folder))
-        ]  # fmt: skip
+        ]
 
     async def state(self, request: Request) -> Response:
         """Return the progress of a run, for the page's script."""
@@ -330,9 +353,11 @@ class App:
             save_frame(fit.data.to_frame(), points)
         files = {str(path.relative_to(folder)): path for path in folder.rglob("*")}
         path = files.get(wanted)  # never a path outside the folder
-        if path is None or not path.is_file() or path.suffix not in (
-            ".html", ".pdf", ".json", ".csv", ".png"
-        ):  # fmt: skip
+        if (
+            path is None
+            or not path.is_file()
+            or path.suffix not in (".html", ".pdf", ".json", ".csv", ".png")
+        ):
             raise HTTPException(404, "There is no such file in this run.")
         if path.suffix == ".html":  # its styles and scripts are inline
             return FileResponse(path, headers={"Content-Security-Policy": _REPORT_POLICY})

@@ -162,9 +162,12 @@ class Jobs:
     def start(self, folder: Path, steps: Sequence[JobStep], directory: Path) -> None:
         """Start the commands of a job in a directory; their output is written to a folder."""
         job = {
-            "status": _RUNNING, "step": 0, "began": time.time(), "error": "",
+            "status": _RUNNING,
+            "step": 0,
+            "began": time.time(),
+            "error": "",
             "steps": [{"title": step.title, "words": step.words} for step in steps],
-        }  # fmt: skip
+        }
         with self._lock:
             self._running[folder] = job
         _save(folder, job)
@@ -180,9 +183,12 @@ class Jobs:
                         break
                     child = self._children[folder] = subprocess.Popen(
                         [sys.executable, "-m", "dahl_ident.cli", *step["words"]],
-                        cwd=directory, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                        cwd=directory,
+                        stdin=subprocess.DEVNULL,
+                        stdout=out,
+                        stderr=err,
                         env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "100"},
-                    )  # fmt: skip
+                    )
                 status = child.wait()
             if job["status"] != _RUNNING:
                 break

@@ -54,10 +54,20 @@ TAIL_DOF = 4.0  # degrees of freedom of Student's t: heavy tails, but a finite v
 _FARTHEST = 300.0  # largest ln s, against overflow of s^2
 Sums = Callable[[FloatArray], FloatArray]
 _COLUMNS = (  # of a table, on which its likelihood depends
-    "quantity", "frequency_hz", "amplitude", "drive", "response", "covariance", "dof",
-    "amplitude_std", "amplitude_covariance", "drive_std", "drive_covariance", "harmonic",
+    "quantity",
+    "frequency_hz",
+    "amplitude",
+    "drive",
+    "response",
+    "covariance",
+    "dof",
+    "amplitude_std",
+    "amplitude_covariance",
+    "drive_std",
+    "drive_covariance",
+    "harmonic",
     "controlled",
-)  # fmt: skip
+)
 
 
 class LogDensity(ABC):

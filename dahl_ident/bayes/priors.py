@@ -179,8 +179,10 @@ def joint_prior(
     parameters = problem.parameters[: problem.n_reported]
     names = [p.name for p in parameters]
     sources: dict[str, Mapping[str, Any]] = {
-        "given": priors or {}, "assumed": assumed or {}, "sensors": problem.priors
-    }  # fmt: skip
+        "given": priors or {},
+        "assumed": assumed or {},
+        "sensors": problem.priors,
+    }
     unknown = [name for name in sources["given"] if name not in names]
     if unknown:
         fixed = [name for name in unknown if name in problem.device_parameters]

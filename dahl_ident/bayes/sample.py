@@ -231,9 +231,13 @@ def sample_points(
     if near is not None:
         log_density, sums, error = partial(density.marginal, sums=near), near, near.error
     integral = integrate(
-        log_density, density.prior, centre, covariance, density.decorrelation,
+        log_density,
+        density.prior,
+        centre,
+        covariance,
+        density.decorrelation,
         tolerance=tolerance - error,
-    )  # fmt: skip
+    )
     integral = replace(integral, error=integral.error + error, evaluations=evaluations)
     return PointSample(density, integral, tolerance, sums)
 

@@ -120,11 +120,14 @@ def _all_fits(table: pd.DataFrame, folder: str) -> Iterator[Block]:
         for name in names:
             cells += [_cell(row[name], 5), _cell(row[f"u_{name}"], 2)]
         rows.append(tuple(cells))
-    units = {c: f" [{table[f'unit_{c}'].dropna().iloc[0]}]" if f"unit_{c}" in table else ""
-             for c in names}  # fmt: skip
+    units = {
+        c: f" [{table[f'unit_{c}'].dropna().iloc[0]}]" if f"unit_{c}" in table else ""
+        for c in names
+    }
     header = [h for c in names for h in (f"{c}{units[c]}", "u")]
-    yield TextTable("Estimates and combined standard uncertainties", (*labels, "status", *header),
-                tuple(rows))  # fmt: skip
+    yield TextTable(
+        "Estimates and combined standard uncertainties", (*labels, "status", *header), tuple(rows)
+    )
     if len(table) > _LISTED:
         yield Paragraph(f"{len(table) - _LISTED} more fits are in the table of results.")
 

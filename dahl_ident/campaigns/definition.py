@@ -50,9 +50,21 @@ _UNITS = ("device", "run")
 _SET_BY_CAMPAIGN = {"data", "model", "path", "record", "run", "throw", "seed", "progress"}
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)\}")
 _COLUMNS = {
-    "device", "run", "status", "error", "statements", "points", "runs", "digests", "seconds",
-    "version", "report", "retry", "refused", "key",
-}  # fmt: skip
+    "device",
+    "run",
+    "status",
+    "error",
+    "statements",
+    "points",
+    "runs",
+    "digests",
+    "seconds",
+    "version",
+    "report",
+    "retry",
+    "refused",
+    "key",
+}
 _PREFIXES = ("u_", "U_", "dof_", "unit_", "posterior_")
 """Columns of the table of results, whose names covariates cannot have."""
 _BLANK = ("", "na", "n/a", "nan")

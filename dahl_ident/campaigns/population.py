@@ -170,8 +170,9 @@ class PopulationParameter:
         ]
         unit = "" if self.logarithmic else self.unit
         for groups, (median, low, high) in (
-            ("devices", self.between_devices), ("runs", self.between_runs)
-        ):  # fmt: skip
+            ("devices", self.between_devices),
+            ("runs", self.between_runs),
+        ):
             if high > 0.0:
                 limits = interval(low, high, unit)
                 lines.append(f"scatter of {quantity} between {groups}: {median:.2g} ({limits})")

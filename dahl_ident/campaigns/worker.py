@@ -210,10 +210,11 @@ class _Process:
         self.path = list(sys.path)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(self.path)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             start_new_session=True,  # an interrupt from the keyboard is for the parent process
             env={**os.environ, **dict.fromkeys(THREADS, "1")},
-        )  # fmt: skip
+        )
 
     def do(self, job: Job, seconds: float, memory: float | None) -> Row | None:
         """Return the row of a job, None if the process died; it is killed after so many seconds."""
@@ -242,8 +243,9 @@ class _Process:
             return failed(
                 f"stopped after {seconds:.3g} s, the limit of time for a device; give it more with "
                 "timeout= (on the command line --timeout)",
-                retry=True, seconds=seconds,
-            )  # fmt: skip
+                retry=True,
+                seconds=seconds,
+            )
         finally:
             timer.cancel()
         return row

@@ -31,9 +31,20 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 commands = (
-    demo, app_page, inspect, extract, fit, sample, plan, campaign, report, export, simulate,
-    datasets, template,
-)  # fmt: skip
+    demo,
+    app_page,
+    inspect,
+    extract,
+    fit,
+    sample,
+    plan,
+    campaign,
+    report,
+    export,
+    simulate,
+    datasets,
+    template,
+)
 for command in commands:
     app.command()(command)
 

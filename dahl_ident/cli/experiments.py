@@ -39,8 +39,12 @@ if TYPE_CHECKING:
     from dahl_ident.synthetic import Experiment
 
 _UNITS = {
-    "frequency": "Hz", "displacement": "m", "force": "N", "speed": "m/s", "acceleration": "m/s^2",
-}  # fmt: skip
+    "frequency": "Hz",
+    "displacement": "m",
+    "force": "N",
+    "speed": "m/s",
+    "acceleration": "m/s^2",
+}
 _RANGE = "the highest value, or lowest:highest"
 # levels if none are stated
 _LEVEL_RANGE = (0.1, 10.0)  # over the displacement, or the force, at the knee of the friction
@@ -167,11 +171,18 @@ def plan(
     if sample_rate is not None and waveform is None and bench.motion is None:
         raise ValidationError("--sample-rate is that of --waveform or --motion; give one of them")
     result = make_plan(
-        _fit_or_model(fit, model), limits=bench.limits(), noise=_noise(bench.noise),
-        scatter=bench.scatter, runs=bench.num_runs, controlled=bench.controlled,
-        change_over=bench.change_over, between_runs=bench.between_runs, seed=seed,
-        **bench.motion_keywords(sample_rate), **aim.keywords(),
-    )  # fmt: skip
+        _fit_or_model(fit, model),
+        limits=bench.limits(),
+        noise=_noise(bench.noise),
+        scatter=bench.scatter,
+        runs=bench.num_runs,
+        controlled=bench.controlled,
+        change_over=bench.change_over,
+        between_runs=bench.between_runs,
+        seed=seed,
+        **bench.motion_keywords(sample_rate),
+        **aim.keywords(),
+    )
     if table is not None:
         text = result.to_frame().to_csv(index=False)
         write_whole(table, text.encode(), overwrite=writing.overwrite)

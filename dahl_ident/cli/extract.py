@@ -272,8 +272,12 @@ def _run_steps(
     command = console.typed_command()
     with console.busy("drawing") as progress:
         report(
-            [result, chain], page, record=record, command=command, overwrite=overwrite,
+            [result, chain],
+            page,
+            record=record,
+            command=command,
+            overwrite=overwrite,
             progress=progress,
-        )  # fmt: skip
+        )
     console.write(f"table: {table}\nreport: {page.resolve()}")
     return result, chain

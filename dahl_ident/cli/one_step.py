@@ -310,9 +310,12 @@ def campaign(
         )
     if reporting.report is not None and not running.dry_run:
         path = result.report(
-            reporting.report, covariates=reporting.covariate or [], order=reporting.order,
-            title=definition.stem, overwrite=writing.overwrite,
-        )  # fmt: skip
+            reporting.report,
+            covariates=reporting.covariate or [],
+            order=reporting.order,
+            title=definition.stem,
+            overwrite=writing.overwrite,
+        )
         console.note(f"report: {path}")
     if general.json:
         fields = ("finished", "to_do", "statuses", "folder")

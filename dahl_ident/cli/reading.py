@@ -27,9 +27,13 @@ _COLUMN = 'Its column, with unit if needed: "x \\[mm]".'
 # what conditions can name, in addition to phase_deg and the measures of quality
 _COLUMNS = ("frequency_hz", "amplitude", "drive", "gain", "harmonic", "level", "run")
 _COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
-    ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le,
-    ast.Gt: operator.gt, ast.GtE: operator.ge,
-}  # fmt: skip
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
 
 
 def _existing_files(patterns: list[str]) -> list[str]:

@@ -76,9 +76,13 @@ def exact_motions(
 
     def solve(rows: IntArray, starts: FloatArray | None, **options: Any) -> SteadyMotion:
         return shooting(
-            np.tile(values, (rows.size, 1)), omega[rows], drive[rows], harmonics=HARMONICS,
-            starts=starts, **({"stable": False} | options),
-        )  # fmt: skip
+            np.tile(values, (rows.size, 1)),
+            omega[rows],
+            drive[rows],
+            harmonics=HARMONICS,
+            starts=starts,
+            **({"stable": False} | options),
+        )
 
     def add_new(rows: IntArray, solution: SteadyMotion) -> IntArray:
         """Add the motions that are new; return their indices."""

@@ -188,10 +188,13 @@ def flatten(
         all(element.unique_response for element in elements),
     )
     return Plant(
-        _flat(linear / stiffness, shape), _flat(_ROUNDING * size / stiffness, shape),
-        _flat(drive / force, shape), _flat(vectors, shape), _flat(force / stiffness, shape),
+        _flat(linear / stiffness, shape),
+        _flat(_ROUNDING * size / stiffness, shape),
+        _flat(drive / force, shape),
+        _flat(vectors, shape),
+        _flat(force / stiffness, shape),
         nonlinear,
-    ), shape  # fmt: skip
+    ), shape
 
 
 def _units(

@@ -104,9 +104,14 @@ class _Loop:
 
         start = np.append((y / size)[~at_rest], 1.0)
         solution = least_squares(
-            mismatch, start, jacobian, method="lm",
-            xtol=1e-14, ftol=1e-14, max_nfev=_EVALUATIONS,
-        )  # fmt: skip
+            mismatch,
+            start,
+            jacobian,
+            method="lm",
+            xtol=1e-14,
+            ftol=1e-14,
+            max_nfev=_EVALUATIONS,
+        )
         if not np.abs(solution.fun).max() < _CLOSED or solution.x[-1] <= 0.0:
             return None
         mismatch(solution.x)
@@ -115,9 +120,14 @@ class _Loop:
     def _after(self, y: FloatArray, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return state, map derivative and rates after a period; after half of one, negated."""
         motion = march(
-            self.system, np.array([0.0, period]), np.zeros((1, 1)), np.array([0.0, period]), y,
-            self._values, derivatives=True,
-        )  # fmt: skip
+            self.system,
+            np.array([0.0, period]),
+            np.zeros((1, 1)),
+            np.array([0.0, period]),
+            y,
+            self._values,
+            derivatives=True,
+        )
         end = motion.states[-1]
         rates = self._rates(end, 0.0, np.sign(end[1]) or -self._sign, self._values).full()[:, 0]
         return self._sign * end, self._sign * motion.map, self._sign * rates

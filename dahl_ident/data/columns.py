@@ -303,33 +303,51 @@ _PEAK: dict[str, Any] = {"check": positive_array, "expected": "a value > 0", "le
 _OF_RESPONSE: dict[str, Any] = {"kinds": QUANTITIES}
 _RESPONSE = (
     Column(
-        ("frequency", "freq", "frequency_hz", "freq_hz"), "Hz", "frequency_hz", positive_array,
-        header="frequency_hz", kinds=("frequency", "angular_frequency"), least=SMALLEST,
+        ("frequency", "freq", "frequency_hz", "freq_hz"),
+        "Hz",
+        "frequency_hz",
+        positive_array,
+        header="frequency_hz",
+        kinds=("frequency", "angular_frequency"),
+        least=SMALLEST,
         expected="a frequency > 0",
     ),
     Column(("level",), "", "level", labels, repeats=True),
     Column(("run", "test", "file", "day"), "", "run", run_labels, repeats=True),
+    Column(("amplitude", "displacement_amplitude"), _A, "amplitude", kinds=MOTION_KINDS, **_PEAK),
     Column(
-        ("amplitude", "displacement_amplitude"), _A, "amplitude", kinds=MOTION_KINDS, **_PEAK
-    ),
-    Column(
-        ("drive", "force", "force_amplitude", "drive_amplitude", "torque"), _F, "drive",
-        kinds=DRIVE_KINDS, **_PEAK,
+        ("drive", "force", "force_amplitude", "drive_amplitude", "torque"),
+        _F,
+        "drive",
+        kinds=DRIVE_KINDS,
+        **_PEAK,
     ),
     Column(("response", "frf"), _R, "response", complex_values, form="complex", **_OF_RESPONSE),
     Column(
         (
-            "real", "re", "real_part",
+            "real",
+            "re",
+            "real_part",
             *(f"{q}_{part}" for q in QUANTITIES for part in ("re", "real")),
         ),
-        _R, lambda d: d.response.real, form="rectangular", **_OF_RESPONSE,
+        _R,
+        lambda d: d.response.real,
+        form="rectangular",
+        **_OF_RESPONSE,
     ),
     Column(
         (
-            "imag", "im", "imaginary", "imag_part",
+            "imag",
+            "im",
+            "imaginary",
+            "imag_part",
             *(f"{q}_{part}" for q in QUANTITIES for part in ("im", "imag")),
         ),
-        _R, lambda d: d.response.imag, form="rectangular", like=("real",), **_OF_RESPONSE,
+        _R,
+        lambda d: d.response.imag,
+        form="rectangular",
+        like=("real",),
+        **_OF_RESPONSE,
     ),
     Column(source="covariance", check=finite_array, shape=(2, 2)),
     *(
@@ -337,49 +355,79 @@ _RESPONSE = (
         for name, part in (("real_real", (0, 0)), ("real_imag", (0, 1)), ("imag_imag", (1, 1)))
     ),
     Column(
-        ("damping_ratio", "zeta"), "1", lambda d: d.response.imag, form="backbone",
-        header="damping_ratio", expected="a damping ratio >= 0",
+        ("damping_ratio", "zeta"),
+        "1",
+        lambda d: d.response.imag,
+        form="backbone",
+        header="damping_ratio",
+        expected="a damping ratio >= 0",
     ),
     Column(
-        ("frequency_std",), "Hz", lambda d: backbone_std(d, 0), form="backbone",
-        like=("frequency",), **_STD,
+        ("frequency_std",),
+        "Hz",
+        lambda d: backbone_std(d, 0),
+        form="backbone",
+        like=("frequency",),
+        **_STD,
     ),
     Column(
-        ("damping_ratio_std", "zeta_std"), "1", lambda d: backbone_std(d, 1), form="backbone",
-        header="damping_ratio_std", **_STD,
+        ("damping_ratio_std", "zeta_std"),
+        "1",
+        lambda d: backbone_std(d, 1),
+        form="backbone",
+        header="damping_ratio_std",
+        **_STD,
     ),
     Column(("gain", "magnitude", "mag"), _R, "gain", form="polar", **_OF_RESPONSE),
     Column(("gain_db", "magnitude_db", "mag_db"), _R, **_OF_RESPONSE),
     Column(
-        ("phase", "phase_deg", "phase_rad"), "deg", lambda d: np.degrees(d.phase), form="polar",
-        header="phase_deg", kinds=("angle",),
+        ("phase", "phase_deg", "phase_rad"),
+        "deg",
+        lambda d: np.degrees(d.phase),
+        form="polar",
+        header="phase_deg",
+        kinds=("angle",),
     ),
     Column(("std",), _R, like=("gain", "real", "response"), **_STD),
     Column(("real_std",), _R, like=("real", "response"), **_STD),
     Column(("imag_std",), _R, like=("real", "response"), **_STD),
     Column(("gain_std",), _R, _polar(0), form="polar", like=("gain",), **_STD),
     Column(
-        ("phase_std", "phase_std_deg", "phase_std_rad"), "rad", _polar(1), form="polar",
-        header="phase_std_deg", **_STD,
+        ("phase_std", "phase_std_deg", "phase_std_rad"),
+        "rad",
+        _polar(1),
+        form="polar",
+        header="phase_std_deg",
+        **_STD,
     ),
     Column(("dof",), "", "dof", degrees_of_freedom, repeats=True, needs=("covariance",)),
     *(
         Column(
-            (f"{level}_std",), unit, f"{level}_std", non_negative_array, needs=(level,),
-            like=(level,), **_STD,
+            (f"{level}_std",),
+            unit,
+            f"{level}_std",
+            non_negative_array,
+            needs=(level,),
+            like=(level,),
+            **_STD,
         )
         for level, unit in (("amplitude", _A), ("drive", _F))
     ),
     *(
         Column(
-            source=f"{level}_covariance", check=finite_array, shape=(2,),
+            source=f"{level}_covariance",
+            check=finite_array,
+            shape=(2,),
             needs=(f"{level}_std", "covariance"),
         )
         for level in ("amplitude", "drive")
     ),
     *(
         Column(
-            (f"covariance_{level}_{part}",), f"({unit})*({_R})", f"{level}_covariance", part=(i,),
+            (f"covariance_{level}_{part}",),
+            f"({unit})*({_R})",
+            f"{level}_covariance",
+            part=(i,),
             form="rectangular",
         )
         for level, unit in (("amplitude", _A), ("drive", _F))
@@ -387,7 +435,7 @@ _RESPONSE = (
     ),
     Column(("controlled",), "", "controlled", controlled_words, repeats=True),
     Column(("harmonic",), "", "harmonic", harmonic_numbers, repeats=True),
-)  # fmt: skip
+)
 _RECORD = tuple(
     Column(names, unit, names[0], finite_array, kinds=kinds)
     for names, unit, kinds in (

@@ -245,16 +245,21 @@ class FrequencyResponse(Tabular):
         stds = [
             np.broadcast_to(positive_array(values, name), frequency.shape)
             for name, values in (
-                ("frequency_std", frequency_std), ("damping_ratio_std", damping_ratio_std)
+                ("frequency_std", frequency_std),
+                ("damping_ratio_std", damping_ratio_std),
             )
-        ]  # fmt: skip
+        ]
         covariance = np.zeros((*frequency.shape, 2, 2))
         covariance[..., 0, 0] = (stds[0] / frequency) ** 2
         covariance[..., 1, 1] = stds[1] ** 2
         return cls(
-            frequency, 1j * non_negative_array(damping_ratio, "damping_ratio"), amplitude,
-            covariance=covariance, quantity="backbone", **columns,
-        )  # fmt: skip
+            frequency,
+            1j * non_negative_array(damping_ratio, "damping_ratio"),
+            amplitude,
+            covariance=covariance,
+            quantity="backbone",
+            **columns,
+        )
 
     def with_mass(self, mass: float) -> FrequencyResponse:
         """Return a backbone as dynamic stiffness of mode, friction and this mass, kg or kg m^2."""

@@ -34,8 +34,12 @@ _FIELDS = {
 """The printed fields in order."""
 _LISTS = ("ambient", "instruments")
 _TEXTS = (
-    "title", "number", *(key for key in _FIELDS if key not in _LISTS), "authorised_by", "role"
-)  # fmt: skip
+    "title",
+    "number",
+    *(key for key in _FIELDS if key not in _LISTS),
+    "authorised_by",
+    "role",
+)
 _ALWAYS_PRINTED = ("specimen", "instruments", "ambient", "measured", "operator")
 _PREFIXES = {
     "serial": "serial ",

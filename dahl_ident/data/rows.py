@@ -37,10 +37,26 @@ _LINE = re.compile(
     re.IGNORECASE,
 )
 _SUBJECTS = {
-    "drive", "driving", "excitation", "source", "force", "control", "target", "reference", "test",
-    "shaker", "input", "sine", "load", "torque", "displacement", "velocity", "acceleration",
-    "response", "nominal",
-}  # fmt: skip
+    "drive",
+    "driving",
+    "excitation",
+    "source",
+    "force",
+    "control",
+    "target",
+    "reference",
+    "test",
+    "shaker",
+    "input",
+    "sine",
+    "load",
+    "torque",
+    "displacement",
+    "velocity",
+    "acceleration",
+    "response",
+    "nominal",
+}
 _SIZES = {"level", "amplitude"}
 
 

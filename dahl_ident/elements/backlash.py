@@ -91,10 +91,14 @@ class Backlash(Friction):
         self.parameters = (
             *element.parameters,
             Parameter(
-                prefixed(self.name, "gap"), "m", "play of the link", gap, lower=0.0,
+                prefixed(self.name, "gap"),
+                "m",
+                "play of the link",
+                gap,
+                lower=0.0,
                 transform="log",
             ),
-        )  # fmt: skip
+        )
 
     @property
     def element(self) -> Friction:

@@ -90,11 +90,17 @@ class BoucWen(Friction):
     )
     optional = (
         Parameter(
-            "exponent", "", "exponent of the force", lower=0.05, upper=100.0, transform="log",
-            scan=(0.7, 1.5, 3.0), prior=(0.5, 5.0),
+            "exponent",
+            "",
+            "exponent of the force",
+            lower=0.05,
+            upper=100.0,
+            transform="log",
+            scan=(0.7, 1.5, 3.0),
+            prior=(0.5, 5.0),
         ),
         1.0,
-    )  # fmt: skip
+    )
     scale_parameters = ("sigma",)
 
     def __init__(

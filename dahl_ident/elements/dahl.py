@@ -324,28 +324,47 @@ class Dahl(Friction):
         f_max, sigma = ("f_max", {"f_max": 1.0}), ("sigma", {"sigma": 1.0})
         limits = [
             Asymptote(
-                "no_loss", "a spring", alike, ("f_max", "sigma", _NO_LOSS * high),
-                {"f_max": np.inf}, (sigma,),
+                "no_loss",
+                "a spring",
+                alike,
+                ("f_max", "sigma", _NO_LOSS * high),
+                {"f_max": np.inf},
+                (sigma,),
             ),
             Asymptote(
-                "microslip", "a spring with a loss that grows with the amplitude", alike,
-                ("f_max", "sigma", _MICROSLIP * high), {"f_max": np.inf, "sigma": np.inf},
-                ((loss.expression, loss.powers),), adds_to_spring="sigma",
+                "microslip",
+                "a spring with a loss that grows with the amplitude",
+                alike,
+                ("f_max", "sigma", _MICROSLIP * high),
+                {"f_max": np.inf, "sigma": np.inf},
+                ((loss.expression, loss.powers),),
+                adds_to_spring="sigma",
             ),
             Asymptote(
-                "gross_slip", "Coulomb friction", linear,
-                ("sigma", "f_max", 1.0 / (_GROSS_SLIP * low)), {"sigma": np.inf}, (f_max,),
+                "gross_slip",
+                "Coulomb friction",
+                linear,
+                ("sigma", "f_max", 1.0 / (_GROSS_SLIP * low)),
+                {"sigma": np.inf},
+                (f_max,),
             ),
             Asymptote(
-                "sharp_knee", "elastic up to f_max, then full slip", {"alpha": _SHARP}, None,
-                {"alpha": 0.0}, (f_max, sigma),
+                "sharp_knee",
+                "elastic up to f_max, then full slip",
+                {"alpha": _SHARP},
+                None,
+                {"alpha": 0.0},
+                (f_max, sigma),
             ),
             Asymptote(
-                "no_full_slip", "dF/dx = sigma exp(-s F/phi), which never slips fully",
-                {"alpha": _SOFT}, None, {"f_max": np.inf, "alpha": np.inf},
+                "no_full_slip",
+                "dF/dx = sigma exp(-s F/phi), which never slips fully",
+                {"alpha": _SOFT},
+                None,
+                {"f_max": np.inf, "alpha": np.inf},
                 (("f_max/alpha", {"f_max": 1.0, "alpha": -1.0}), sigma),
             ),
-        ]  # fmt: skip
+        ]
         return tuple(limits if linear else limits[:3])
 
     def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:

@@ -80,12 +80,14 @@ class Path(NamedTuple):
         da = 0.5 * intervals**2 * a[1:] - c2
         return np.stack(
             [
-                x[:-1], c1, c2,
+                x[:-1],
+                c1,
+                c2,
                 10.0 * dx - 4.0 * dv + da,
                 -15.0 * dx + 7.0 * dv - 2.0 * da,
                 6.0 * dx - 3.0 * dv + da,
             ]
-        )  # fmt: skip
+        )
 
 
 class StiffnessGradient(NamedTuple):

@@ -124,10 +124,16 @@ def force_along(
     else:
         samples, rows = np.unique(times, return_inverse=True)
         motion = march(
-            system_of(law, values, chosen or ()), knots, coefficients, samples,
-            np.append([coefficients[0, 0], 0.0], first[2:]), numbers, chosen=chosen or (),
-            derivatives=chosen is not None, finer=_FINER if law.n_states == 1 else 1.0,
-        )  # fmt: skip
+            system_of(law, values, chosen or ()),
+            knots,
+            coefficients,
+            samples,
+            np.append([coefficients[0, 0], 0.0], first[2:]),
+            numbers,
+            chosen=chosen or (),
+            derivatives=chosen is not None,
+            finer=_FINER if law.n_states == 1 else 1.0,
+        )
         force = motion.output[rows]
         if chosen is not None:
             by_first, by[list(chosen)] = motion.by_first[rows], motion.by_parameter[rows].T

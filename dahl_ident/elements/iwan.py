@@ -88,14 +88,24 @@ class Iwan(Masing):
         Parameter("f_max", "N", "force of macroslip", lower=0.0, transform="log"),
         Parameter("sigma", "N/m", "tangent stiffness at zero force", lower=0.0, transform="log"),
         Parameter(
-            "chi", "", "exponent of the slip density", lower=-1.0, upper=3.0,
-            scan=(-0.75, -0.5, -0.25, 0.0, 0.5), prior=(-0.95, 0.5),
+            "chi",
+            "",
+            "exponent of the slip density",
+            lower=-1.0,
+            upper=3.0,
+            scan=(-0.75, -0.5, -0.25, 0.0, 0.5),
+            prior=(-0.95, 0.5),
         ),
         Parameter(
-            "ratio", "", "stiffness that slips at once over that before", lower=0.0,
-            transform="log", scan=(0.1, 1.0, 10.0), prior=(0.02, 50.0),
+            "ratio",
+            "",
+            "stiffness that slips at once over that before",
+            lower=0.0,
+            transform="log",
+            scan=(0.1, 1.0, 10.0),
+            prior=(0.02, 50.0),
         ),
-    )  # fmt: skip
+    )
 
     n_states = _SLIDERS
 

@@ -146,9 +146,11 @@ def run_file(file: LawFile) -> tuple[type[Element], ...]:
     laws: tuple[Any, ...] = tuple(
         value
         for value in vars(sys.modules[name]).values()
-        if isinstance(value, type) and issubclass(value, Element) and value.__module__ == name
+        if isinstance(value, type)
+        and issubclass(value, Element)
+        and value.__module__ == name
         and not inspect.isabstract(value)
-    )  # fmt: skip
+    )
     if not laws:
         raise ModelError(
             f"{file.path} defines no law; expected a subclass of di.Friction with parameters and "

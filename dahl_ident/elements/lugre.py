@@ -72,13 +72,19 @@ class LuGre(Friction):
         Parameter("f_max", "N", "Coulomb force", lower=0.0, transform="log"),
         Parameter("sigma", "N/m", "stiffness of the bristles", lower=0.0, transform="log"),
         Parameter(
-            "static_ratio", "", "static over Coulomb force", lower=1.0, upper=100.0,
-            transform="log", scan=(1.1, 1.5, 2.5), prior=(1.0, 4.0),
+            "static_ratio",
+            "",
+            "static over Coulomb force",
+            lower=1.0,
+            upper=100.0,
+            transform="log",
+            scan=(1.1, 1.5, 2.5),
+            prior=(1.0, 4.0),
         ),
         Parameter("stribeck_speed", "m/s", "Stribeck speed", lower=0.0, transform="log"),
         Parameter("micro_damping", "N s/m", "damping of the bristles", 0.0, lower=0.0),
         Parameter("viscous", "N s/m", "viscous damping", 0.0, lower=0.0),
-    )  # fmt: skip
+    )
 
     def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any:
         """Return df/dx of the bristles' force."""
@@ -114,11 +120,18 @@ class LuGre(Friction):
         slow = {"stribeck_speed": high * _FAR}
         static = (("f_max*static_ratio", {"f_max": 1.0, "static_ratio": 1.0}),)
         return (
-            Asymptote("sliding", "all speeds above Stribeck's", fast, None,
-                      {"stribeck_speed": 0.0}),
-            Asymptote("creeping", "all speeds below Stribeck's", slow, None,
-                      {"stribeck_speed": np.inf}, static),
-        )  # fmt: skip
+            Asymptote(
+                "sliding", "all speeds above Stribeck's", fast, None, {"stribeck_speed": 0.0}
+            ),
+            Asymptote(
+                "creeping",
+                "all speeds below Stribeck's",
+                slow,
+                None,
+                {"stribeck_speed": np.inf},
+                static,
+            ),
+        )
 
     def resembles(
         self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray

@@ -87,15 +87,19 @@ class MaxwellSlip(Masing):
         self.name = name
         self.parameters = tuple(
             Parameter(
-                prefixed(name, f"{label}_{i + 1}"), unit, f"{meaning} {i + 1}",
-                None if values is None else float(values[i]), lower=0.0, transform="log",
+                prefixed(name, f"{label}_{i + 1}"),
+                unit,
+                f"{meaning} {i + 1}",
+                None if values is None else float(values[i]),
+                lower=0.0,
+                transform="log",
             )
             for label, unit, meaning, values in (
                 ("stiffness", "N/m", "stiffness of Jenkins element", k),
                 ("slip", "m", "slip displacement of Jenkins element", d),
             )
             for i in range(n)
-        )  # fmt: skip
+        )
         self.linear_parameters = self.scale_parameters = self.labels[:n]
         self.like_parts = tuple(zip(self.labels[n:], self.labels[:n], strict=True))
 

@@ -54,10 +54,18 @@ _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 _WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are no coincidence
 _MISSING_CYCLES = 3.0  # largest number between two parts of one level
 _MEANS = (
-    "bias_real", "bias_imag", "displacement_share", "force_share", "displacement_distortion",
-    "force_distortion", "asymmetry", "displacement_steps", "force_steps", "displacement_clipped",
+    "bias_real",
+    "bias_imag",
+    "displacement_share",
+    "force_share",
+    "displacement_distortion",
+    "force_distortion",
+    "asymmetry",
+    "displacement_steps",
+    "force_steps",
+    "displacement_clipped",
     "force_clipped",
-)  # fmt: skip
+)
 _PERIOD_CHANGE = 0.03  # largest relative change from cycle to cycle of a sine (median by energy)
 _AMPLITUDE_CHANGE = 0.1  # largest change likewise; at a resonance, amplitudes change faster
 _SWEEP_RANGE = 0.2  # least change of log period over a sweep; less may be chance
@@ -365,8 +373,11 @@ def _neighbour_changes(runs: Sequence[Cycles]) -> tuple[float, float, float, int
     noise, period, amplitude, log_energy = (np.concatenate(c) for c in zip(*pairs, strict=True))
     energy = np.exp(log_energy - log_energy.max())
     return (
-        _median(noise, energy), _median(period, energy), _median(amplitude, energy), energy.size
-    )  # fmt: skip
+        _median(noise, energy),
+        _median(period, energy),
+        _median(amplitude, energy),
+        energy.size,
+    )
 
 
 def _median(values: FloatArray, weights: FloatArray) -> float:

@@ -290,9 +290,13 @@ def _cycle_sums(segment: Segment, cuts: IntArray, coefficients: FloatArray) -> F
 
 
 def _extended(
-    time: FloatArray, motion: FloatArray, segment: Segment, part: slice, room: slice,
+    time: FloatArray,
+    motion: FloatArray,
+    segment: Segment,
+    part: slice,
+    room: slice,
     inside: _Inside | None,
-) -> slice:  # fmt: skip
+) -> slice:
     """Return the slice extended by adjacent cycles that fit the segment's sine."""
     thinned = segment.thinned()
     basis = columns(thinned.theta, thinned.tau, 1)

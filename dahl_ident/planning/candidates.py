@@ -155,9 +155,14 @@ def evaluate(
     relative = changes[:, kept] / predicted[:, kept, None]
     amplitude, force = amplitude[:, kept], force[:, kept]
     candidates = Candidates(
-        question.controlled, level[kept], frequency_hz[kept], amplitude, force,
-        np.stack([relative.real, relative.imag], axis=2), question.noise.variance(force, amplitude),
-    )  # fmt: skip
+        question.controlled,
+        level[kept],
+        frequency_hz[kept],
+        amplitude,
+        force,
+        np.stack([relative.real, relative.imag], axis=2),
+        question.noise.variance(force, amplitude),
+    )
     return replace(candidates, rows=candidates.rows * candidates.weight)
 
 

@@ -84,9 +84,15 @@ class Forecast:
         if RESPONSE in question.target:
             directions[RESPONSE] = _response(candidates)
         return cls(
-            knowledge, candidates, known, searched, directions, question.scatter, model_error,
+            knowledge,
+            candidates,
+            known,
+            searched,
+            directions,
+            question.scatter,
+            model_error,
             departures=known.shape[-1] - units.size,
-        )  # fmt: skip
+        )
 
     def thinned(self) -> Forecast:
         """Return the forecast at the few draws that a search averages over."""
@@ -151,7 +157,8 @@ class Forecast:
         values, names = self.knowledge.stated, self.knowledge.names
         return {
             name: Expected(
-                value=np.nan if name == RESPONSE
+                value=np.nan
+                if name == RESPONSE
                 else float(np.prod(values ** powers_of(name, names))),
                 before=least_factor(name) * typical(before[name]),
                 after=typical(u),
@@ -160,7 +167,7 @@ class Forecast:
                 scatter_share=shares[name],
             )
             for name, u in after.items()
-        }  # fmt: skip
+        }
 
 
 def _departures(knowledge: Knowledge, candidates: Candidates) -> Departures | None:

@@ -103,9 +103,13 @@ class Knowledge:
         """Return the problem of levels whose responses are not measured yet."""
         level: dict[str, Any] = {"drive" if controlled == "force" else "amplitude": levels}
         data = FrequencyResponse(
-            frequency_hz, np.ones(len(levels)), controlled=controlled, motion=self.motion,
-            harmonic=harmonic, **level,
-        )  # fmt: skip
+            frequency_hz,
+            np.ones(len(levels)),
+            controlled=controlled,
+            motion=self.motion,
+            harmonic=harmonic,
+            **level,
+        )
         return TableProblem(
             data, model or self.model, noise=noise, sensors=self.sensors, steady=self.steady
         )
@@ -177,11 +181,20 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
     at = _among(wider.parameters, problem.names, at)
     noise, cycles = _row_noise(wider, float(np.median(scale)))
     return Knowledge(
-        model, wider.parameters, theta, _stated(source, wider.parameters),
+        model,
+        wider.parameters,
+        theta,
+        _stated(source, wider.parameters),
         _repeated(wider.information(at, scale) + _of_assumed(wider.parameters, assumed), draws),
-        _among(wider.parameters, problem.names, prior, 0.0), tuple(assumed), wider.sensors,
-        wider.data.motion, noise, cycles, wider, steady=wider.steady,
-    )  # fmt: skip
+        _among(wider.parameters, problem.names, prior, 0.0),
+        tuple(assumed),
+        wider.sensors,
+        wider.data.motion,
+        noise,
+        cycles,
+        wider,
+        steady=wider.steady,
+    )
 
 
 def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator) -> Knowledge:
@@ -203,11 +216,14 @@ def _of_model(model: Model, ranges: Ranges, draws: int, rng: np.random.Generator
     names = [p.name for p in free]
     theta = _within(centre + std * rng.standard_normal((draws, len(free))), free)
     return Knowledge(
-        model, parameters, _among(parameters, names, theta),
+        model,
+        parameters,
+        _among(parameters, names, theta),
         Space(parameters).to_values(_among(parameters, names, centre)),
         _repeated(_of_assumed(parameters, assumed), draws),
-        _among(parameters, names, _of_ranges(free, centre, std), 0.0), tuple(assumed),
-    )  # fmt: skip
+        _among(parameters, names, _of_ranges(free, centre, std), 0.0),
+        tuple(assumed),
+    )
 
 
 def _of_errors(fit: Any, prior: FloatArray, draws: int, rng: np.random.Generator) -> Knowledge:
@@ -219,14 +235,22 @@ def _of_errors(fit: Any, prior: FloatArray, draws: int, rng: np.random.Generator
     parameters, part = tuple(errors.problem.parameters[i] for i in kept), np.ix_(kept, kept)
     stated, cycles = _row_noise(errors.problem, 0.0)
     return Knowledge(
-        model, parameters,
+        model,
+        parameters,
         _drawn(rng, errors.theta[kept], errors.covariance[part], draws, parameters),
-        _stated(fit, parameters), _repeated(np.linalg.inv(errors.covariance)[part], draws),
-        _among(parameters, fitted.names, prior, 0.0), tuple(assumed),
-        fitted.sensors, fitted.data.motion,
-        float(np.hypot(stated, errors.rms(NOISE))), cycles, errors.problem, errors.rms(RUNS),
-        errors, steady=fitted.steady,
-    )  # fmt: skip
+        _stated(fit, parameters),
+        _repeated(np.linalg.inv(errors.covariance)[part], draws),
+        _among(parameters, fitted.names, prior, 0.0),
+        tuple(assumed),
+        fitted.sensors,
+        fitted.data.motion,
+        float(np.hypot(stated, errors.rms(NOISE))),
+        cycles,
+        errors.problem,
+        errors.rms(RUNS),
+        errors,
+        steady=fitted.steady,
+    )
 
 
 def _of_records(
@@ -260,17 +284,24 @@ def _of_records(
         covariance = np.atleast_2d(np.cov(posterior, rowvar=False))
         theta = _within(posterior[rng.integers(len(posterior), size=draws)], parameters)
     return Knowledge(
-        problem.model, parameters, theta, _stated(source, parameters),
-        _repeated(np.linalg.inv(covariance), draws), np.zeros(P),
+        problem.model,
+        parameters,
+        theta,
+        _stated(source, parameters),
+        _repeated(np.linalg.inv(covariance), draws),
+        np.zeros(P),
         motion=problem.records[0].motion,
         sample_noise=float(np.std(np.concatenate(fit.residuals))),
-    )  # fmt: skip
+    )
 
 
 def _drawn(
-    rng: np.random.Generator, centre: FloatArray, covariance: FloatArray, draws: int,
+    rng: np.random.Generator,
+    centre: FloatArray,
+    covariance: FloatArray,
+    draws: int,
     parameters: Sequence[Parameter],
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Return normal draws within the parameters' bounds."""
     return _within(rng.multivariate_normal(centre, covariance, draws, method="eigh"), parameters)
 

@@ -344,24 +344,36 @@ class Plan:
     def _levels(self) -> list[str]:
         heading = ("", f"level [{self._unit}]", "[Hz]", "settling", "measured", "time [s]")
         rows = [
-            (str(i), f"{s.level:.4g}", f"{s.frequency_hz:.4g}", str(s.settling_cycles),
-             str(s.measured_cycles), f"{s.seconds:.1f}")
+            (
+                str(i),
+                f"{s.level:.4g}",
+                f"{s.frequency_hz:.4g}",
+                str(s.settling_cycles),
+                str(s.measured_cycles),
+                f"{s.seconds:.1f}",
+            )
             for i, s in enumerate(self.steps, start=1)
-        ]  # fmt: skip
+        ]
         return _aligned([heading, *rows], 4, [13, 10, 10, 10, 10])
 
     def _motions(self) -> list[str]:
         moving = [(s, s.motion) for s in self.steps if s.motion is not None]
         names = {
             n: f"{n} [{shown_unit(trajectories.UNITS[n], self.motion)}]"
-            for _, motion in moving for n in motion.parameters
-        }  # fmt: skip
+            for _, motion in moving
+            for n in motion.parameters
+        }
         rows = [
-            (str(i), motion.kind,
-             *(f"{motion.parameters[n]:.4g}" if n in motion.parameters else "-" for n in names),
-             f"{1.0 / s.frequency_hz:.4g}", str(s.measured_cycles), f"{s.seconds:.1f}")
+            (
+                str(i),
+                motion.kind,
+                *(f"{motion.parameters[n]:.4g}" if n in motion.parameters else "-" for n in names),
+                f"{1.0 / s.frequency_hz:.4g}",
+                str(s.measured_cycles),
+                f"{s.seconds:.1f}",
+            )
             for i, (s, motion) in enumerate(moving, start=1)
-        ]  # fmt: skip
+        ]
         table = [("", "motion", *names.values(), "one [s]", "repeats", "time [s]"), *rows]
         first, *widths = (max(map(len, column)) for column in list(zip(*table, strict=True))[1:])
         return _aligned(table, 4, [first, *(w + 2 for w in widths)])
@@ -382,9 +394,12 @@ def _row(step: PlanStep) -> dict[str, Any]:
     if motion is None:
         return fields
     return {
-        "motion": motion.kind, **motion.parameters, "period": motion.period,
-        "repeats": step.measured_cycles, "seconds": step.seconds,
-    }  # fmt: skip
+        "motion": motion.kind,
+        **motion.parameters,
+        "period": motion.period,
+        "repeats": step.measured_cycles,
+        "seconds": step.seconds,
+    }
 
 
 def options_of(
@@ -494,9 +509,12 @@ def assumptions_of(search: Search, design: Design) -> tuple[str, ...]:
         ] * bool(known.assumed)
     is_longest = design.seconds > _NEARLY * LONGEST and not np.isfinite(q.limits.time)
     return (
-        *noise, *ranges, _MODEL_ERROR[search.forecast.model_error], "calibrations are exact",
+        *noise,
+        *ranges,
+        _MODEL_ERROR[search.forecast.model_error],
+        "calibrations are exact",
         *["no plan takes more than 30 days unless a time is given"] * is_longest,
-    )  # fmt: skip
+    )
 
 
 def _shown(u: float) -> str:

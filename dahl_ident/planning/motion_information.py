@@ -152,7 +152,12 @@ def evaluate_motions(
     ]
     S, level = len(knowledge.theta), peaks[within, 0]
     return Candidates(
-        "displacement", level, 1.0 / period, np.broadcast_to(level, (S, within.size)),
-        sizes["force"][:, within], np.stack(rows, axis=1), np.ones((S, within.size)),
+        "displacement",
+        level,
+        1.0 / period,
+        np.broadcast_to(level, (S, within.size)),
+        sizes["force"][:, within],
+        np.stack(rows, axis=1),
+        np.ones((S, within.size)),
         tuple(resolved[k] for k in within.tolist()),
-    )  # fmt: skip
+    )

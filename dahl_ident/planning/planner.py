@@ -202,11 +202,18 @@ def plan(
     if controlled == "force" and knowledge.steady == "exact":
         knowledge = knowledge.thinned(SEARCHED)
     question = PlanRequest(
-        knowledge, bench, targets, has_numbers, costs, controlled, noise_of_cycle(noise, knowledge),
+        knowledge,
+        bench,
+        targets,
+        has_numbers,
+        costs,
+        controlled,
+        noise_of_cycle(noise, knowledge),
         knowledge.scatter if scatter is None else float(non_negative_array(scatter, "scatter")),
         None if runs is None else whole_number(runs, "runs", 1),
-        larger_model(knowledge, larger, suspects), dict(suspects or {}),
-    )  # fmt: skip
+        larger_model(knowledge, larger, suspects),
+        dict(suspects or {}),
+    )
     if isinstance(candidates, int):
         options = options_of(question, bench, whole_number(candidates, "candidates", 2))
     else:
@@ -242,10 +249,14 @@ def _plan(search: Search, design: Design) -> Plan:
     steps = tuple(
         PlanStep(level, f, int(wait), int(n), change_over + (wait + n) / f, motion)
         for level, f, wait, n, motion in zip(
-            options.level.tolist(), options.frequency_hz.tolist(), settling.tolist(),
-            design.cycles.tolist(), options.motions or (None,) * len(settling), strict=True,
+            options.level.tolist(),
+            options.frequency_hz.tolist(),
+            settling.tolist(),
+            design.cycles.tolist(),
+            options.motions or (None,) * len(settling),
+            strict=True,
         )
-    )  # fmt: skip
+    )
     expected = search.forecast.expected(design)
     return Plan(
         controlled=q.controlled,

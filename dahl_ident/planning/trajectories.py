@@ -15,9 +15,15 @@ from dahl_ident.errors import ValidationError
 KINDS = ("trapezoid", "multisine")
 SAMPLES_PER_CYCLE = 10  # fewest samples in the fastest part of a waveform
 UNITS = {
-    "stroke": "m", "speed": "m/s", "acceleration": "m/s^2", "dwell": "s", "lowest_hz": "Hz",
-    "highest_hz": "Hz", "peak": "m", "rms": "m",
-}  # fmt: skip
+    "stroke": "m",
+    "speed": "m/s",
+    "acceleration": "m/s^2",
+    "dwell": "s",
+    "lowest_hz": "Hz",
+    "highest_hz": "Hz",
+    "peak": "m",
+    "rms": "m",
+}
 _FINE = 64  # points for each spectral line: a multisine's peak then errs by less than 0.1 %
 
 

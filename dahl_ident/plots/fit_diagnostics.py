@@ -128,9 +128,14 @@ def plot_profile(
     for name, height in limits.items():
         axis.axhline(height, color=style.GREY, lw=0.8, ls="--")
         axis.annotate(
-            name, (1.02, height), xycoords=("axes fraction", "data"), va="center", fontsize=7,
-            color=style.GREY, annotation_clip=False,
-        )  # fmt: skip
+            name,
+            (1.02, height),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=7,
+            color=style.GREY,
+            annotation_clip=False,
+        )
     top = 1.2 * max(limits.values())
     axis.set(xlabel=label, ylabel="rise of deviance", ylim=(-0.02 * top, top))
     axis.set_xscale("log" if log else "linear")
@@ -162,9 +167,14 @@ def plot_correlation(
     axis.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
     for (i, j), value in np.ndenumerate(matrix):
         axis.text(
-            j, i, f"{value:.2f}", ha="center", va="center", fontsize=8,
+            j,
+            i,
+            f"{value:.2f}",
+            ha="center",
+            va="center",
+            fontsize=8,
             color="white" if abs(value) > 0.6 else "black",
-        )  # fmt: skip
+        )
     axis.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axis.set_yticks(range(len(names)), names)
     axis.grid(visible=False)
@@ -203,15 +213,25 @@ def plot_information(
     area = _LARGEST_DISC / (max(float(part.max()) for part in parts) or 1.0)
     for line, (part, colour) in enumerate(zip(parts, itertools.cycle(style.SERIES), strict=False)):
         axis.scatter(
-            x, np.full(x.size, line), s=area * part, color=colour, alpha=0.6,
-            edgecolor=style.BLACK, lw=0.5, zorder=3,
-        )  # fmt: skip
+            x,
+            np.full(x.size, line),
+            s=area * part,
+            color=colour,
+            alpha=0.6,
+            edgecolor=style.BLACK,
+            lw=0.5,
+            zorder=3,
+        )
         largest = int(np.argmax(part))
         if part[largest] > 0.0:
             axis.annotate(
-                f"{100.0 * part[largest]:.0f} %", (x[largest], line), (0, 10),
-                textcoords="offset points", ha="center", fontsize=7,
-            )  # fmt: skip
+                f"{100.0 * part[largest]:.0f} %",
+                (x[largest], line),
+                (0, 10),
+                textcoords="offset points",
+                ha="center",
+                fontsize=7,
+            )
     axis.set(xlabel=x_label, xscale="log", ylim=(len(shares) - 0.4, -0.8))
     axis.set_title("share of the information, by area", fontsize=8, loc="left")
     axis.set_yticks(range(len(shares)), list(shares))
@@ -256,15 +276,27 @@ def plot_budget(
                 widths[parameters.index(parameter)] += 100.0 * share
         colour = style.SERIES[i % len(style.SERIES)]
         axis.barh(
-            range(len(parameters)), widths, left=ends, height=0.6, label=source, lw=1.0,
-            color="white" if i else colour, edgecolor=colour, hatch=_HATCHES[i % len(_HATCHES)],
-        )  # fmt: skip
+            range(len(parameters)),
+            widths,
+            left=ends,
+            height=0.6,
+            label=source,
+            lw=1.0,
+            color="white" if i else colour,
+            edgecolor=colour,
+            hatch=_HATCHES[i % len(_HATCHES)],
+        )
         for line, (start, width) in enumerate(zip(ends, widths, strict=True)):
             if width >= 10.0:
                 axis.text(
-                    start + 0.5 * width, line, f"{width:.0f} %", ha="center", va="center",
-                    fontsize=7, bbox={"fc": "white", "ec": "none", "pad": 1.0},
-                )  # fmt: skip
+                    start + 0.5 * width,
+                    line,
+                    f"{width:.0f} %",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                    bbox={"fc": "white", "ec": "none", "pad": 1.0},
+                )
         ends += widths
     axis.set(xlabel=x_label, xlim=(0.0, 100.0), ylim=(len(parameters) - 0.4, -0.6))
     axis.set_yticks(range(len(parameters)), parameters)
@@ -302,15 +334,21 @@ def plot_bench_time(
         axis.plot(time, 100.0 * np.asarray(planned), "o-", color=colour, label=f"{name}, plan")
         if np.isfinite(grid).any():
             axis.plot(
-                time, 100.0 * np.asarray(grid), "s--", color=colour, mfc="white",
+                time,
+                100.0 * np.asarray(grid),
+                "s--",
+                color=colour,
+                mfc="white",
                 label=f"{name}, logarithmic grid",
-            )  # fmt: skip
+            )
         if target and name in target:
             axis.axhline(100.0 * target[name], color=colour, ls=":", lw=1.0)
     axis.set(
-        xscale="log", yscale="log", xlabel="bench time [s]",
+        xscale="log",
+        yscale="log",
+        xlabel="bench time [s]",
         ylabel="relative uncertainty [%]",
-    )  # fmt: skip
+    )
     style.readable_log_ticks(axis)
     axis.legend()
     return axis
@@ -328,16 +366,27 @@ def plot_devices(devices: pd.DataFrame, mean: float, *, label: str, ax: Axes | N
     x = np.arange(len(table))
     axis.axhline(mean, color=style.GREY, lw=1.0, label="population mean")
     axis.errorbar(
-        x, table["shrunken"], 2.0 * table["u"], fmt="o", color=style.BLUE, capsize=0,
-        lw=1.0, label="shrunk towards the population, with 2 u",
-    )  # fmt: skip
+        x,
+        table["shrunken"],
+        2.0 * table["u"],
+        fmt="o",
+        color=style.BLUE,
+        capsize=0,
+        lw=1.0,
+        label="shrunk towards the population, with 2 u",
+    )
     axis.plot(x, table["own"], "x", color=style.VERMILION, label="own estimate")
     marked = np.flatnonzero(table["outlying"])
     if marked.size:
         axis.plot(
-            marked, table["own"].iloc[marked], "s", mfc="none", ms=9, color=style.BLACK,
+            marked,
+            table["own"].iloc[marked],
+            "s",
+            mfc="none",
+            ms=9,
+            color=style.BLACK,
             label="outside the population",
-        )  # fmt: skip
+        )
     if len(table) <= 40:
         axis.set_xticks(x, table.index, rotation=90)
     else:

@@ -324,9 +324,14 @@ def plot_margins(
         infinite = np.isposinf(values)
         if infinite.any():
             axis.plot(
-                A[infinite], np.full(infinite.sum(), 0.97), "^", color=style.FIT, label="infinite",
-                clip_on=False, transform=axis.get_xaxis_transform(),
-            )  # fmt: skip
+                A[infinite],
+                np.full(infinite.sum(), 0.97),
+                "^",
+                color=style.FIT,
+                label="infinite",
+                clip_on=False,
+                transform=axis.get_xaxis_transform(),
+            )
             if infinite.all():
                 axis.set_yticks([])
             style.legend_above(axis)

@@ -23,8 +23,14 @@ from numpy.typing import NDArray
 from dahl_ident.errors import ValidationError
 
 BLUE, VERMILION, GREEN, PURPLE, BROWN, INDIGO, BLACK = (
-    "#0072B2", "#D55E00", "#009E73", "#A0317E", "#6B4E00", "#222255", "#000000",
-)  # fmt: skip
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#A0317E",
+    "#6B4E00",
+    "#222255",
+    "#000000",
+)
 PALE_BLUE = "#B9DDF2"  # fills only, under an outline
 SERIES = (BLUE, VERMILION, GREEN, PURPLE, BROWN, INDIGO)
 MARKERS = ("o", "s", "^", "D", "v", "P")
@@ -128,9 +134,13 @@ def legend_above(axis: Axes) -> None:
     entries = len(axis.get_legend_handles_labels()[1])
     columns = entries if entries <= _MOST_IN_A_ROW else -(-entries // 2)
     axis.legend(
-        ncols=columns, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2,
-        columnspacing=1.0, handletextpad=0.5,
-    )  # fmt: skip
+        ncols=columns,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+        columnspacing=1.0,
+        handletextpad=0.5,
+    )
 
 
 def readable_log_ticks(axis: Axes) -> None:

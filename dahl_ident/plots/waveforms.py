@@ -241,9 +241,15 @@ def plot_universal_curve(
         inwards = 0.5 + 0.1j - value  # away from the data
         inwards *= 18.0 / abs(inwards)
         axis.annotate(
-            f"{beta:g}", (value.real, value.imag), (inwards.real, inwards.imag), fontsize=7,
-            textcoords="offset points", ha="center", va="center", color=style.GREY,
-        )  # fmt: skip
+            f"{beta:g}",
+            (value.real, value.imag),
+            (inwards.real, inwards.imag),
+            fontsize=7,
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            color=style.GREY,
+        )
     axis.set(xlabel="Re N / sigma", ylabel="Im N / sigma")
     axis.margins(y=0.12)
     style.legend_above(axis)

@@ -203,9 +203,15 @@ class Predictor:
         indices = np.arange(rows.n)
         fundamental = np.atleast_2d(np.where(rows.of_displacement, rows.fundamental, indices))[0]
         return SteadyRows(
-            self._model, self._shooting, drive[..., part], omega[..., part], measured[..., part],
-            rows.harmonic[part], np.searchsorted(indices[part], fundamental[part]), self._orbits,
-        )  # fmt: skip
+            self._model,
+            self._shooting,
+            drive[..., part],
+            omega[..., part],
+            measured[..., part],
+            rows.harmonic[part],
+            np.searchsorted(indices[part], fundamental[part]),
+            self._orbits,
+        )
 
     def as_stiffness(
         self, weights: FloatArray, predicted: ComplexArray | None = None

@@ -171,9 +171,15 @@ class SteadyRows:
     ) -> _SteadyMotions:
         """Return the motions of some points of one or more tables."""
         motions = self._shooting(
-            values, omega, drive, chosen=chosen, harmonics=self._harmonics, starts=starts,
-            again=again, stable=stable,
-        )  # fmt: skip
+            values,
+            omega,
+            drive,
+            chosen=chosen,
+            harmonics=self._harmonics,
+            starts=starts,
+            again=again,
+            stable=stable,
+        )
         X = [motions.harmonics[..., None], motions.by_drive[..., None], motions.by_parameter]
         return _SteadyMotions(
             np.concatenate(X, axis=-1), motions.starts, motions.harmonics[:, 0], motions.multiplier
@@ -227,9 +233,13 @@ class SteadyRows:
             if missing.size:
                 retried = now[missing]
                 X[missing], new_orbits[missing], _, multiplier = self._solve(
-                    values[retried], omega[retried], drive[retried], chosen,
-                    orbits[running][missing], stable=False,
-                )  # fmt: skip
+                    values[retried],
+                    omega[retried],
+                    drive[retried],
+                    chosen,
+                    orbits[running][missing],
+                    stable=False,
+                )
                 stable[retried] = ~(multiplier > 1.0 + NEUTRAL)
             result[now] = X
             if chosen and np.isnan(X).any():

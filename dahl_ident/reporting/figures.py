@@ -79,8 +79,9 @@ def _of_records(fit: FitResult) -> Iterator[Picture]:
     if fit.data[worst].displacement is not None:
         figures["loop"] = "Force over displacement", partial(fit.plot, "loop", record=worst)
         figures["residuals_displacement"] = (
-            "Residuals over displacement", partial(draw_residuals, against="displacement")
-        )  # fmt: skip
+            "Residuals over displacement",
+            partial(draw_residuals, against="displacement"),
+        )
     for kind, (caption, draw) in figures.items():
         yield Picture(
             f"record_{kind}",

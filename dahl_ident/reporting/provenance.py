@@ -27,9 +27,13 @@ Provenances = Iterable[Mapping[str, Any] | None]
 _PACKAGES = ("numpy", "scipy", "casadi", "emcee", "pandas", "matplotlib", "pint")
 _LISTED_ELSEWHERE = {"parts", "file", "sha256", "notes", "warnings"}
 _DEFAULTS = {
-    "f_max": None, "sigma": None, "alpha": 1.0,
-    "force_gain": 1.0, "displacement_gain": 1.0, "delay": 0.0,
-}  # fmt: skip
+    "f_max": None,
+    "sigma": None,
+    "alpha": 1.0,
+    "force_gain": 1.0,
+    "displacement_gain": 1.0,
+    "delay": 0.0,
+}
 """Values of parameters whose options are left out; None if they are then estimated."""
 _OPTIONS = {"f_max", "sigma", "alpha", "mass", "damping", "stiffness"}
 """Parameters with an option; elements with other parameters are written with --element."""
@@ -186,10 +190,13 @@ def _as_text(element: Element) -> str:
 
 def _fit(fit: FitResult) -> list[str]:
     return [
-        "fit", *_model(fit.problem), "--noise", fit.noise,
+        "fit",
+        *_model(fit.problem),
+        "--noise",
+        fit.noise,
         *_changed(method=(fit.method, "lm"), loss=(fit.optimum.loss, "linear")),
         *_changed(steady=(fit.problem.steady, "exact")),
-    ]  # fmt: skip
+    ]
 
 
 def _sample(posterior: Posterior) -> list[str]:
@@ -198,14 +205,18 @@ def _sample(posterior: Posterior) -> list[str]:
     if posterior.is_chain:
         how = ["--seed", str(posterior.seed), "--steps", str(posterior.steps)]
     return [
-        "sample", *_model(posterior.given_problem), "--noise", posterior.problem.noise, *how,
+        "sample",
+        *_model(posterior.given_problem),
+        "--noise",
+        posterior.problem.noise,
+        *how,
         *_changed(
             likelihood=(posterior.likelihood, "gaussian"),
             uncertainty=(posterior.uncertainty, "combined"),
             steady=(posterior.problem.steady, "exact"),
         ),
         *(word for prior in priors for word in ("--prior", prior)),
-    ]  # fmt: skip
+    ]
 
 
 def _model(problem: TableProblem) -> list[str]:

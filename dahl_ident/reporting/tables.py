@@ -267,8 +267,10 @@ def extraction(data: FrequencyResponse) -> TextTable:
     quality = points.quality
     assert points.amplitude is not None  # extraction measures it
     counts = {
-        "cycles": "num_periods", "left out": "settling_periods", "cycles missing": "more_periods"
-    }  # fmt: skip
+        "cycles": "num_periods",
+        "left out": "settling_periods",
+        "cycles missing": "more_periods",
+    }
     percents = {
         "bias [%]": np.hypot(quality["bias_real"], quality["bias_imag"]) / points.gain,
         "harmonics of displacement [%]": quality["displacement_distortion"],

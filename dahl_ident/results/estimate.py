@@ -160,8 +160,10 @@ def fit(
     if method not in ("lm", "scipy", "ipopt"):
         raise ValidationError(f"method is {method!r}; expected lm, scipy or ipopt")
     ipopt_options: dict[str, Any] = {
-        "constraints": constraints, "drive_std": drive_std, "drive_covariance": drive_covariance
-    }  # fmt: skip
+        "constraints": constraints,
+        "drive_std": drive_std,
+        "drive_covariance": drive_covariance,
+    }
     given = [name for name, value in ipopt_options.items() if value is not None]
     if given and method != "ipopt":
         raise ValidationError(
@@ -173,9 +175,16 @@ def fit(
         unstated = (p for p in model.parameters if p.assumed and p.name not in (fixed or {}))
         model = model.with_parameters({p.name: p.freed() for p in unstated})
     problem = problem_of(
-        data, model, free=free, fixed=fixed, sensors=sensors, noise=noise, steady=steady,
-        output=output, excitation=excitation,
-    )  # fmt: skip
+        data,
+        model,
+        free=free,
+        fixed=fixed,
+        sensors=sensors,
+        noise=noise,
+        steady=steady,
+        output=output,
+        excitation=excitation,
+    )
     try:
         with fit_progress() if progress else nullcontext() as tell:
             if method != "ipopt":
@@ -385,9 +394,14 @@ def posterior(
         raise ModelError("there is no model; give one, such as Dahl(), or pass a fit")
     else:
         problem = problem_of(
-            data, model, free=free, fixed=fixed, sensors=sensors, noise=noise,
+            data,
+            model,
+            free=free,
+            fixed=fixed,
+            sensors=sensors,
+            noise=noise,
             steady=steady or "exact",
-        )  # fmt: skip
+        )
         with fit_progress() if progress else nullcontext() as tell:
             optimum = optimum_of(problem, tell)
         fitted = None if optimum is None else FitResult(optimum)
@@ -400,15 +414,25 @@ def posterior(
             points = sample_points(density, begin, problem.names, tolerance, show)
         return Posterior(density, points, fitted, uncertainty)
     settings = ChainSettings(
-        len(density.names), seed=seed, steps=steps, max_steps=max_steps, ess=ess,
-        walkers=walkers, ensembles=ensembles,
-    )  # fmt: skip
+        len(density.names),
+        seed=seed,
+        steps=steps,
+        max_steps=max_steps,
+        ess=ess,
+        walkers=walkers,
+        ensembles=ensembles,
+    )
     start = partial(starting_points, density, optimum)
     with progress_bar(settings) if progress else nullcontext() as bar:
         sample = sample_chain(
-            density, start, settings, seed=seed, resume=resume, pool=pool,
+            density,
+            start,
+            settings,
+            seed=seed,
+            resume=resume,
+            pool=pool,
             listeners=[] if bar is None else [bar],
-        )  # fmt: skip
+        )
     result = Posterior(density, sample, fitted, uncertainty)
     sample.check(result.names, result)
     return result

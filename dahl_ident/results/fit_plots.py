@@ -157,9 +157,13 @@ def _draw_loop(fit: FittedModel, ax: Axes | None, record: int) -> Axes:
     x, labels = _displacement(data), _labels(data)
     fitted = fit.best_fit[record] if fit.problem.output == "force" else None
     return plot_recorded_loops(
-        x, data.force_samples, fitted=fitted, ax=ax, displacement_label=labels["displacement"],
+        x,
+        data.force_samples,
+        fitted=fitted,
+        ax=ax,
+        displacement_label=labels["displacement"],
         force_label=labels.get("force", "force"),
-    )  # fmt: skip
+    )
 
 
 def _residuals_of_record(

@@ -159,11 +159,13 @@ def _record_problem(content: Mapping[str, Any]) -> RecordProblem:
 
 
 _DESCRIBED: Mapping[str, Callable[[Any], dict[str, Any]]] = {
-    "table": _describe_table, "records": _describe_records
-}  # fmt: skip
+    "table": _describe_table,
+    "records": _describe_records,
+}
 _BUILT: Mapping[str, Callable[[Mapping[str, Any]], Problem]] = {
-    _SCHEMAS["table"]: _table_problem, _SCHEMAS["records"]: _record_problem
-}  # fmt: skip
+    _SCHEMAS["table"]: _table_problem,
+    _SCHEMAS["records"]: _record_problem,
+}
 
 
 def _describe_optimum(optimum: Optimum) -> dict[str, Any]:

@@ -43,8 +43,9 @@ if TYPE_CHECKING:
 
 
 _ASSESSMENTS: Mapping[str, type[TableAssessment | RecordAssessment]] = {
-    "table": TableAssessment, "records": RecordAssessment
-}  # fmt: skip
+    "table": TableAssessment,
+    "records": RecordAssessment,
+}
 
 
 class FittedModel(Result):

@@ -72,11 +72,16 @@ class Parameters(dict[str, Estimate]):
         for p in problem.all_parameters:
             value = values.get(p.name, p.value)
             estimates[p.name] = Estimate(
-                p.name, shown_unit(p.unit, problem.motion), p.description,
-                math.nan if value is None else value, stderr.get(p.name),
+                p.name,
+                shown_unit(p.unit, problem.motion),
+                p.description,
+                math.nan if value is None else value,
+                stderr.get(p.name),
                 init_value=p.value if p.name in values else None,
-                min=p.lower, max=p.upper, vary=bool(p.free),
-            )  # fmt: skip
+                min=p.lower,
+                max=p.upper,
+                vary=bool(p.free),
+            )
         return cls(estimates)
 
     def __repr__(self) -> str:

@@ -36,8 +36,14 @@ from dahl_ident.synthetic.mechanism import Signal
 
 _FILTER_OVERSAMPLING = 16  # points per sample; the signal is linear between them
 _WAVEFORM_FAULTS = (
-    "noise_std", "flicker_std", "hum_amplitude", "offset", "drift", "resolution", "limit",
-)  # fmt: skip
+    "noise_std",
+    "flicker_std",
+    "hum_amplitude",
+    "offset",
+    "drift",
+    "resolution",
+    "limit",
+)
 
 
 @dataclass(frozen=True)

@@ -161,9 +161,16 @@ def _table(
             "amplitude_covariance": np.column_stack([cross.real, cross.imag]),
         }
     data = FrequencyResponse(
-        frequency_hz[step], measured, amplitude, drive, level=level[step], harmonic=k,
-        controlled=in_name, quantity="receptance" if forced else "dynamic_stiffness", **stated,
-    )  # fmt: skip
+        frequency_hz[step],
+        measured,
+        amplitude,
+        drive,
+        level=level[step],
+        harmonic=k,
+        controlled=in_name,
+        quantity="receptance" if forced else "dynamic_stiffness",
+        **stated,
+    )
     return data, outliers
 
 

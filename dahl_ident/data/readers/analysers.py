@@ -52,19 +52,35 @@ _FILE, _MEASUREMENT, _DATA, _VECTOR, _CHANNEL, _X, _Y = 10, 11, 12, 13, 14, 16, 
 # Fields read from the records: type and position.
 _FIELDS: dict[int, dict[str, tuple[str, int]]] = {
     _FILE: {
-        "counts": ("(3,)>i2", 24), "places": ("(3,)>i4", 36), "x": (">i4", 56), "y": (">i4", 60),
+        "counts": ("(3,)>i2", 24),
+        "places": ("(3,)>i4", 36),
+        "x": (">i4", 56),
+        "y": (">i4", 60),
     },
     _MEASUREMENT: {"averages": (">i4", 30)},
     _DATA: {
-        "title": ("S16", 10), "domain": (">i2", 26), "kind": (">i2", 28), "points": (">i2", 30),
-        "start": (">f4", 34), "step": (">f4", 38), "spacing": (">i2", 42), "x_number": (">i2", 44),
-        "y_number": (">i2", 48), "values": (">i2", 50), "complex": (">i2", 52),
-        "valid": (">i2", 58), "vector": (">i4", 60), "rows": (">i2", 64), "columns": (">i2", 66),
-        "x_unit": ("S10", 68), "has_unit": (">i2", 90), "unit": ("S10", 92),
+        "title": ("S16", 10),
+        "domain": (">i2", 26),
+        "kind": (">i2", 28),
+        "points": (">i2", 30),
+        "start": (">f4", 34),
+        "step": (">f4", 38),
+        "spacing": (">i2", 42),
+        "x_number": (">i2", 44),
+        "y_number": (">i2", 48),
+        "values": (">i2", 50),
+        "complex": (">i2", 52),
+        "valid": (">i2", 58),
+        "vector": (">i4", 60),
+        "rows": (">i2", 64),
+        "columns": (">i2", 66),
+        "x_unit": ("S10", 68),
+        "has_unit": (">i2", 90),
+        "unit": ("S10", 92),
     },
     _VECTOR: {"channels": ("(2,)>i2", 10), "powers": ("(2,)>i2", 14)},
     _CHANNEL: {"overloaded": (">i2", 104), "unit": ("S10", 116), "sensitivity": (">f4", 138)},
-}  # fmt: skip
+}
 _FREQUENCY, _TIME = 0, 1  # domains
 _RESPONSE, _COHERENCE = 4, 8  # types of data
 _LOGARITHMIC, _STORED = 1, (2, 3, 4)  # axes; 0 is linear
@@ -92,9 +108,11 @@ def read_uff(file: File) -> RawFile:
     channels = [c for function in wanted for c in _uff_channels(file, function, units)]
     texts = [str(function.get(f"id{i}", "")) for function in wanted for i in range(1, 6)]
     return file.source(
-        "universal file", merged_axes(channels), row_name="sample {}".format,
+        "universal file",
+        merged_axes(channels),
+        row_name="sample {}".format,
         stated=stated_levels(texts),
-    )  # fmt: skip
+    )
 
 
 def _uff_sets(file: File, pyuff: Any) -> list[dict[str, Any]]:

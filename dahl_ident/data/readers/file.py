@@ -38,9 +38,15 @@ MOST_CHANNELS = 5000
 DEEPEST = 32
 """Deepest nesting of groups, structs or lists."""
 ZIP_ERRORS = (
-    zipfile.BadZipFile, OSError, EOFError, ValueError, KeyError, zlib.error, NotImplementedError,
+    zipfile.BadZipFile,
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    zlib.error,
+    NotImplementedError,
     RuntimeError,
-)  # fmt: skip
+)
 """What Python's zipfile raises on damaged archives."""
 _UNPACKED_BYTES = 1 << 27  # 134 MB: more than most tables; parsed, they take ten times as much
 _OBJECT_BYTES = 40  # least memory of each line or list into which a text is split

@@ -25,11 +25,18 @@ _RECORD = RECORD_COLUMNS | {"drive": replace(RECORD_COLUMNS["drive"], kinds=("vo
 _RESPONSE = {
     role: RESPONSE_COLUMNS[role] if by_unit else replace(RESPONSE_COLUMNS[role], kinds=())
     for role, by_unit in (
-        ("frequency", True), ("amplitude", True), ("drive", True), ("response", False),
-        ("real", False), ("imag", False), ("gain", True), ("gain_db", False), ("phase", True),
+        ("frequency", True),
+        ("amplitude", True),
+        ("drive", True),
+        ("response", False),
+        ("real", False),
+        ("imag", False),
+        ("gain", True),
+        ("gain_db", False),
+        ("phase", True),
         ("level", False),
     )
-}  # fmt: skip
+}
 _FREQUENCY = RESPONSE_COLUMNS["frequency"]
 _F_TOO = replace(_FREQUENCY, names=(*_FREQUENCY.names, "f"))
 

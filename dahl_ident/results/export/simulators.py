@@ -142,9 +142,11 @@ def _mjcf(
     parts: Device, notes: Sequence[str], damping: float, limit: float, actuators: Sequence[str]
 ) -> str:
     attributes = {
-        "armature": parts.mass, "damping": damping, "stiffness": parts.stiffness,
+        "armature": parts.mass,
+        "damping": damping,
+        "stiffness": parts.stiffness,
         "frictionloss": limit,
-    }  # fmt: skip
+    }
     fields = "".join(f' {name}="{value!r}"' for name, value in attributes.items() if value)
     kind = "hinge" if parts.rotation else "slide"
     body = "1e-9" if parts.mass else "1"
@@ -152,16 +154,21 @@ def _mjcf(
     if parts.mass:
         remark = "the mass, or inertia, of the fit is the armature; that of the body is negligible"
     lines = [
-        "<!--", *(f"  {note.replace('--', '-')}" for note in notes),
+        "<!--",
+        *(f"  {note.replace('--', '-')}" for note in notes),
         f"  {remark}",
-        "-->", '<mujoco model="identified">',
-        '  <option timestep="0.0001" integrator="implicitfast" gravity="0 0 0"/>', "  <worldbody>",
+        "-->",
+        '<mujoco model="identified">',
+        '  <option timestep="0.0001" integrator="implicitfast" gravity="0 0 0"/>',
+        "  <worldbody>",
         '    <body name="body">',
         f'      <joint name="joint" type="{kind}" axis="1 0 0"{fields}/>',
         f'      <inertial pos="0 0 0" mass="{body}" diaginertia="{body} {body} {body}"/>',
         "    </body>",
-        "  </worldbody>", *actuators, "</mujoco>",
-    ]  # fmt: skip
+        "  </worldbody>",
+        *actuators,
+        "</mujoco>",
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -205,10 +212,15 @@ def modelica(result: Any) -> str:
         total.append(_force(law, i, v))
     declared += [f"  constant Real {name}={getattr(parts, name)!r};" for name in LUMPED.values()]
     lines = [
-        *(f"// {note}" for note in parts.notes), 'model Friction "identified friction"',
+        *(f"// {note}" for note in parts.notes),
+        'model Friction "identified friction"',
         f"  extends Modelica.Mechanics.{base}.Interfaces.PartialCompliantWithRelativeStates;",
-        *declared, "equation", *equations, f"  {out} = {' + '.join(total)};", "end Friction;",
-    ]  # fmt: skip
+        *declared,
+        "equation",
+        *equations,
+        f"  {out} = {' + '.join(total)};",
+        "end Friction;",
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -310,9 +322,12 @@ def _power(law: Law, _: str) -> list[str]:
 
 
 _LINES: dict[str, Callable[[Law, str], list[str]]] = {
-    "dahl": _dahl, "bouc_wen": _bouc_wen, "lugre": _lugre, "maxwell_slip": _slips,
+    "dahl": _dahl,
+    "bouc_wen": _bouc_wen,
+    "lugre": _lugre,
+    "maxwell_slip": _slips,
     "power_damper": _power,
-}  # fmt: skip
+}
 
 
 def c_header(result: Any) -> str:
