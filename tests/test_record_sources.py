@@ -1,6 +1,7 @@
 """What the uncertainty of a fit to records counts, and what its verdict says of doubtful values."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -48,6 +49,41 @@ def test_an_assumed_exponent_is_as_uncertain_as_a_free_one_with_a_noisy_displace
     for name in ("f_max", "sigma", "alpha"):
         one, other = assumed.params[name], free.params[name]
         assert one.stderr == pytest.approx(other.stderr, rel=0.15)
+
+
+def encoded(x: FloatArray, line: float, noise: float, seed: int = 2) -> di.Record:
+    """Return a record of friction, a mass and a damper whose encoder has so many metres a line."""
+    t = np.arange(x.size) / RATE
+    spline = CubicSpline(t, x)
+    force = di.Dahl(6.0, 3e5).force(x) + 15.0 * spline(t, 1) + 4.0 * spline(t, 2)
+    force += noise * np.random.default_rng(seed).standard_normal(t.size)
+    return di.Record(t, displacement=line * np.round(x / line), force=force)
+
+
+def test_a_mass_is_found_behind_an_encoder_of_coarse_lines():
+    """In a window of few samples its acceleration would be noise, and the mass a twentieth."""
+    t = np.arange(5000) / RATE
+    x = 1e-6 * np.geomspace(10.0, 100.0, t.size) * np.sin(4.0 * np.pi * t)
+    model = di.Dahl() + di.Mass() + di.Damper()
+    found = di.fit(encoded(x, 5e-8, 0.01), model, output="force")
+    for name, truth in (("f_max", 6.0), ("sigma", 3e5), ("mass", 4.0), ("damping", 15.0)):
+        parameter = found.params[name]
+        assert parameter.value == pytest.approx(truth, abs=3.0 * parameter.stderr)
+    assert found.params["mass"].stderr < 1.0
+
+
+def test_an_encoder_at_rest_adds_no_noise():
+    """Noise at rest would let friction die away, and make f_max five times as uncertain."""
+    s = np.linspace(0.0, 1.0, 300)
+    smooth = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    ends = [0.0, 0.04, 0.01, 0.03, 0.0, 0.02, 0.0]
+    moves = [np.append(a + (b - a) * smooth, np.full(100, b)) for a, b in pairwise(ends)]
+    x = np.concatenate(moves)
+    model = di.Dahl() + di.Mass() + di.Damper()
+    found = di.fit(encoded(x, 5e-8, 0.2), model, output="force")
+    assert found.params["f_max"].value == pytest.approx(6.0, abs=0.03)
+    assert found.params["f_max"].stderr < 0.015
+    assert "noise in the displacement" not in sources(found, "f_max")
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ from dahl_ident.arrays import FloatArray
 
 _DEGREE = 4  # of the polynomials; that of the acceleration is 2
 _POWER = 0.9999  # share of the velocity's power in the band of the signal
+_ABOVE = 20.0  # times the noise's median power, which noise exceeds in one frequency of a million
 _MARGIN = 4.0  # pass band of the filter over that band: at 2 a mass has an error of 2 %
 
 
@@ -19,7 +20,8 @@ def differentiated(
     A polynomial of degree 4 is fitted to a moving window (Savitzky and Golay, Anal. Chem. 36
     (1964) 1627-1639). The window is the longest odd number of samples, at least 5, whose pass
     band, about (degree + 1)/(3.2 half-width - 4.6) of half the sampling rate, is four times as wide
-    as the band with 99.99 % of the velocity's power. `stretch` is a factor on its length.
+    as the band with 99.99 % of the velocity's power, or, if that is narrower, in which it exceeds
+    the displacement's white noise. `stretch` is a factor on its length.
 
     Examples
     --------
@@ -47,6 +49,11 @@ def filter_window(samples: FloatArray) -> int:
     total = power.sum()
     if total == 0.0:
         return 5
-    band = float(np.searchsorted(np.cumsum(power) / total, _POWER) + 1) / power.size
+    noise = 4.0 * np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, power.size)) ** 2
+    upper = power.size // 2
+    noise *= np.median(power[upper:] / noise[upper:])
+    above = np.flatnonzero(power > _ABOVE * noise)
+    highest = min(np.searchsorted(np.cumsum(power) / total, _POWER), above.max(initial=0))
+    band = float(highest + 1) / power.size
     half = int(((_DEGREE + 1.0) / min(1.0, _MARGIN * band) + 4.6) / 3.2)
     return 2 * max(2, min(half, samples.size // 4)) + 1

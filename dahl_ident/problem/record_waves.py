@@ -266,9 +266,15 @@ class RecordWaves(Problem):
         return float(np.median([noise_of(x) for x, _, _ in self.motions]))
 
     def with_more_noise(self, noise: float, draw: int = 0) -> Self:
-        """Return the same problem, white noise added to the displacements."""
+        """Return the same problem, white noise added to the displacements.
+
+        Samples that are equal to the one before stay equal to it: an encoder at rest has no noise.
+        """
         rng = np.random.default_rng(draw)
-        noisy = [x + noise * rng.standard_normal(x.size) for x, _, _ in self.motions]
+        noisy = []
+        for x, _, _ in self.motions:
+            reading = np.cumsum(np.diff(x, prepend=x[0]) != 0.0)
+            noisy.append(x + noise * rng.standard_normal(x.size)[reading])
         return self.altered("latest", motions=self._motions_of(noisy))
 
     def with_noisier_drive(self, stds: Sequence[float], draw: int) -> Self:
