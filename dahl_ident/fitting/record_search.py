@@ -26,7 +26,6 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _SHORT = {"force": 8192, "motion": 4096}  # samples of a first search of a long record
 _COMPARED = 8  # steps after which starts of a driven motion are compared
-_GOOD = 0.01  # unexplained share of variance above which a search that stagnates ends
 _LAGS = 20  # of the residuals' correlations
 _CORRELATED = 5.0  # standard deviations of the statistic of white noise that reject it
 _IDLE = 0.5  # standard error of a logarithm above which a parameter has hardly an effect
@@ -47,9 +46,8 @@ _ALIGNMENTS = 4  # most steps of the delay: each is a hundredth of the one befor
 SLOW = 0.5  # correlation of neighbouring residuals above which they are weighted by their spectrum
 EXACT = 1e-12  # unexplained share of variance that is rounding
 LOOSE = 1e4  # factor of the step at which a search of a long record has converged
-ROUGH = 15  # steps after which the noise is known well enough to judge a step by it
-_STAGNANT = 0.01  # relative fall of the cost in these steps, below which a search stagnates
-WORTHLESS = 1e-5  # fall of the cost, over the residuals' variance, that is negligible
+ROUGH = 15  # steps after which the limits of first states are taken anew
+_LOWER = 0.01  # relative fall of the cost from which an end of another search counts as lower
 SETTLED = 0.03  # step in standard errors that is negligible
 _HINDERED = 0.2  # the same where the cost does not fall along a step, as across the kinks of a law
 _CONFIRMED = 4.0  # fall of the sum of squares, in variances of the noise, that is significant
@@ -113,7 +111,7 @@ def solve_repetitions(
         end = search.descend(repetition, optimum.theta, STEPS)
         if end.converged[0]:
             theta[row] = end.theta[0]
-            scales[row] = (2.0 * end.cost[0] / repetition.n_residuals) ** 0.5
+            scales[row] = unexplained(repetition, end) ** 0.5
     usual = (2.0 * optimum.cost / problem.n_residuals) ** 0.5
     return theta, np.sqrt(np.diagonal(optimum.covariance)) * scales / usual
 
@@ -144,21 +142,17 @@ class RecordSearch:
 
     def descend(self, problem: RecordProblem, theta: FloatArray, steps: int) -> Minima:
         """Return the minimum near a start: first roughly, then to a small part of the noise."""
-        begin, before = theta[None], np.inf
+        begin = theta[None]
         for _ in range(0, steps, ROUGH):
-            end = self.minimise(problem, begin, ROUGH, bounded=before < np.inf)
+            end = self.minimise(problem, begin, ROUGH)
             if bool(end.converged[0]) or not np.isfinite(end.cost[0]) or steps == ROUGH:
                 return end
-            if problem.output == "motion" and end.cost[0] > (1.0 - _STAGNANT) * before:
-                end = self._judged(problem, end)
-                if end.converged[0] or 2.0 * end.cost[0] > _GOOD * problem.n_residuals:
-                    return end
-            begin, before = end.theta, float(end.cost[0])
+            begin = end.theta
         return self._judged(problem, end)
 
     def _judged(self, problem: RecordProblem, end: Minima) -> Minima:
         """Return the end, marked as converged if the next step would be negligible."""
-        noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+        noise = unexplained(problem, end)
         low, high = problem.step_bounds(problem.to_values(end.theta[0]), of_starts=True)
         # errors of the integration hide small falls of the cost where a motion comes to rest
         with np.errstate(all="ignore"):
@@ -173,17 +167,10 @@ class RecordSearch:
             fall = slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
         return replace(end, converged=np.array([bool(fall < _HINDERED**2 * noise)]))
 
-    def minimise(
-        self, problem: RecordProblem, begin: FloatArray, most: int, *, bounded: bool = False
-    ) -> Minima:
-        """Return the minimum near a start, shape (1, P), after at most `most` steps.
-
-        `bounded` limits the first states; a search from far away would end at these bounds.
-        """
-        bounds = problem.step_bounds(problem.to_values(begin[0]), of_starts=bounded)
+    def minimise(self, problem: RecordProblem, begin: FloatArray, most: int) -> Minima:
+        """Return the minimum near a start, shape (1, P), after at most `most` steps."""
+        bounds = problem.step_bounds(problem.to_values(begin[0]), of_starts=False)
         within = bounds if np.isfinite(bounds).any() else None
-        noise_known = bounded or problem.whitening.size > 1
-        enough = (lambda c: WORTHLESS * 2.0 * c / problem.n_residuals) if noise_known else None
         if self.method == "scipy":
             end = minimise_by_scipy(problem, begin[0], self.scale, self.rho)
             self.evaluations += int(end.evaluations[0])
@@ -194,7 +181,6 @@ class RecordSearch:
             problem.space.relative,
             problem.n_residuals,
             tolerance_factor=LOOSE,
-            enough=enough,
             steps=most,
             bounds=within,
             unseen=False,
@@ -203,7 +189,7 @@ class RecordSearch:
         theta, signs = problem.space.unfolded(end.theta)
         hessian = end.hessian * (signs[:, :, None] * signs[:, None, :])
         end = replace(end, theta=theta, hessian=hessian)
-        if end.cost[0] < EXACT * problem.n_residuals:  # as predicted for the last step
+        if unexplained(problem, end) < EXACT:  # as predicted for the last step
             end = replace(end, cost=self.evaluated(problem, end.theta).cost)
         return end
 
@@ -225,8 +211,8 @@ class RecordSearch:
         longer than that between channels sampled together, such as the effect of a missing damper.
         A delay that the user stated is not changed.
         """
-        share = 2.0 * float(plain.cost[0]) / problem.n_residuals
-        if not plain.converged[0] or "delay" in problem.calibration or share < EXACT:
+        is_exact = unexplained(problem, plain) < EXACT
+        if not plain.converged[0] or "delay" in problem.calibration or is_exact:
             return problem, plain
         sample, delayed, end = 1.0 / problem.records[0].sample_rate, problem, plain
         for _ in range(_ALIGNMENTS):
@@ -288,12 +274,8 @@ class RecordSearch:
         because slow residuals may also be due to a wrong model.
         """
         residuals = problem.split_residuals(problem.to_values(plain.theta[0]))
-        share = 2.0 * float(plain.cost[0]) / problem.n_residuals
-        if (
-            not plain.converged[0]
-            or correlation(residuals) < SLOW
-            or not EXACT < share < _DESCRIBED
-        ):
+        is_noise = EXACT < unexplained(problem, plain) < _DESCRIBED
+        if not plain.converged[0] or correlation(residuals) < SLOW or not is_noise:
             return problem, plain
         drives = [record.force_samples for record in problem.records]
         before = share_in_band(drives, problem.measured, residuals)
@@ -306,8 +288,7 @@ class RecordSearch:
                 return problem, plain
             change = end.theta[0] - theta[0]
             residuals = white.split_residuals(white.to_values(end.theta[0]))
-            noise = 2.0 * float(end.cost[0]) / problem.n_residuals
-            if change @ end.hessian[0] @ change < SETTLED**2 * noise:
+            if change @ end.hessian[0] @ change < SETTLED**2 * unexplained(white, end):
                 break
         if share_in_band(drives, problem.measured, residuals) > before:
             return problem, plain
@@ -367,8 +348,7 @@ class RecordSearch:
         estimate is not changed if the search does not converge.
         """
         assumed = [p.name for p in problem.exponents if p.assumed]
-        exact = 2.0 * fixed.cost[0] < EXACT * problem.n_residuals
-        if not assumed or exact or not fixed.converged[0]:
+        if not assumed or unexplained(problem, fixed) < EXACT or not fixed.converged[0]:
             return problem, fixed
         values = problem.to_values(fixed.theta[0]).tolist()
         known = {p.name: float(p.value or 0.0) for p in problem.exponents}
@@ -490,10 +470,15 @@ class RecordSearch:
             if not _has_idle(problem, best):
                 break
             end = self.descend(problem, begin.theta[0], steps)
-            if not end.cost[0] < best.cost[0] * (1.0 - _STAGNANT):
+            if not end.cost[0] < best.cost[0] * (1.0 - _LOWER):
                 break
             best = end
         return best
+
+
+def unexplained(problem: RecordProblem, end: Minima) -> float:
+    """Return the share of variance that the end of a search leaves: the residuals' mean square."""
+    return 2.0 * float(end.cost[0]) / problem.n_residuals
 
 
 def significant_fall(cost: float, samples: int, residuals: Sequence[FloatArray]) -> float:
@@ -532,7 +517,7 @@ def _changed(starts: FloatArray, problem: RecordProblem, start: Mapping[str, flo
 
 def _is_white(problem: RecordProblem, end: Minima) -> bool:
     """Return whether the residuals are white noise, by the Box-Pierce test."""
-    if 2.0 * end.cost[0] < EXACT * problem.n_residuals:
+    if unexplained(problem, end) < EXACT:
         return True
     products = np.zeros(_LAGS + 1)
     for e in problem.split_residuals(problem.to_values(end.theta[0])):
@@ -550,7 +535,7 @@ def _has_idle(problem: RecordProblem, end: Minima) -> bool:
     low, high = problem.step_bounds(problem.to_values(theta), of_starts=True)
     if ((theta <= low) | (theta >= high)).any():
         return True
-    noise = 2.0 * float(end.cost[0]) / problem.n_residuals
+    noise = unexplained(problem, end)
     scaled, size = unit_diagonal(hessian)
     inverse = np.linalg.pinv(scaled, rcond=EXACT, hermitian=True)
     idle = (noise * inverse.diagonal() / size**2 > _IDLE**2) & problem.space.relative
