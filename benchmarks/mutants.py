@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RESPONSIBLE = {
     "diagnostics": (
         "diagnostics_*", "verdicts", "intervals", "held_out", "comparison", "record_*",
-        "mean_force_rows", "measured_dampers",
+        "mean_force_rows", "measured_dampers", "maxwell_slip",
     ),
     "problem": (
         "problem", "sensors", "noise", "record_*", "driven_plants", "harmonics_of_motion",
@@ -183,7 +183,7 @@ def survivor(tree: Path, change: Change, run: Executed) -> str | None:
     line = int(node.lineno)  # type: ignore[attr-defined]  # statements and expressions have it
     _change(node)
     (tree / change.module).write_text(ast.unparse(parsed), "utf-8")
-    tests = tests_of(change.module, line, tree, run)
+    tests = [change.module, *tests_of(change.module, line, tree, run)]  # the examples first
     try:
         status = _run(tree, ["-m", "pytest", "-x", "-q", "-n", "0", *tests], _LIMIT)
     finally:

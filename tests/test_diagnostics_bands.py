@@ -231,3 +231,11 @@ class TestDerived:
         results = (fit(table(beta=(1e-4, 1e-3), seed=s), di.Dahl(), throw=False) for s in range(10))
         (first, *_) = (r for r in results if not r.success)
         assert first.derived() == ()
+
+    def test_what_is_determined_has_an_error_where_the_parameters_are_not(self):
+        """In microslip the stiffness, 24 times measured, is known whatever f_max is."""
+        found = fit(table(beta=(1e-6, 1e-4), n=24), di.Dahl(alpha=1.0), throw=False)
+        assert not found.success
+        stiffness = next(q for q in found.derived([1e-5 * X_C]) if q.unit == "N/m")
+        assert stiffness.value == pytest.approx(30.0, abs=3.0 * stiffness.stderr)
+        assert stiffness.stderr / 30.0 == pytest.approx(0.01 / np.sqrt(24.0), rel=0.4)

@@ -39,6 +39,13 @@ class TestClosedForm:
             assert lower == pytest.approx(mean - t * error, abs=1e-7 * error)
             assert upper == pytest.approx(mean + t * error, abs=1e-7 * error)
 
+    def test_limits_are_printed_from_the_lowest_to_the_highest(self):
+        found = fit(table(n=8), Dahl(alpha=1.0)).conf_interval("wald")
+        for line in str(found).splitlines()[2:]:
+            numbers = [float(text) for text in line.split("]")[1].split()]
+            assert numbers == sorted(numbers)
+            assert len(numbers) == 2 * len(found.levels) + 1
+
     def test_known_noise_gives_normal_thresholds(self):
         data = replace(spring_table(), covariance=np.tile(0.04 * np.eye(2), (8, 1, 1)))
         (interval,) = fit(data, Spring()).conf_interval("wald", levels=[0.95])["stiffness"]

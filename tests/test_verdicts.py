@@ -68,6 +68,13 @@ class TestStiffening:
             found = rise(table(model=Dahl(0.1, 30.0, alpha=alpha)), Dahl(alpha=1.0))
             assert found is None or found.p_value > 0.01
 
+    def test_a_free_mass_takes_a_degree_of_freedom_and_other_elements_none(self):
+        A = np.repeat([1e-3, 1e-1], 5) * np.tile(np.geomspace(1.0, 1.05, 5), 2) * X_C
+        Z = np.repeat([30.0, 36.0], 5) * (1.0 + 0.01j) * relative_noise(10, 1e-3, 1)
+        data = FrequencyResponse(np.ones(10), Z, A)
+        assert rise(data, Dahl(alpha=1.0) + Spring()).rise == pytest.approx(0.2, abs=0.01)
+        assert rise(data, Dahl(alpha=1.0) + Spring() + Mass()) is None
+
     def test_it_needs_friction_and_points(self):
         assert rise(stiffened(0.2), Spring()) is None
         assert rise(table(n=4), Dahl(alpha=1.0)) is None

@@ -325,7 +325,6 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
     view = estimate.view
     first = view.harmonic == 1
     points = log_points(view.amplitude, view.omega)
-    unit = float(np.abs(view.stiffness[first]).max(initial=0.0)) or 1.0
     all_points = points if further is None else np.vstack([points, further])
     size = _sizes(problem, estimate.predicted)
     responding = first & (size != 0.0)  # within a gap there is no response
@@ -334,7 +333,7 @@ def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iter
     stiffness = np.where(first, view.stiffness, np.inf)
     for shape in (
         Shapes.of(all_points, parallel=False),
-        Shapes.of(all_points, parallel=True, unit=unit),
+        Shapes.of(all_points, parallel=True, unit=float(view.typical_stiffness)),
     ):
         changes, absorbed = shape.changes(points, stiffness) * first, None
         square = 0.5 * float(np.sum(np.abs(changes) ** 2, axis=0).mean())

@@ -301,8 +301,7 @@ class RecordAssessment(Assessment):
         """Return the rms force of an element of one parameter, over that of the records."""
         size = np.concatenate([y - y.mean() for y in self.problem.measured]).std()
         force = [
-            element.force_history([value], x, v, 0.0, acceleration=a)
-            for x, v, a in self.problem.motions
+            element.force_history([value], x, v, acceleration=a) for x, v, a in self.problem.motions
         ]
         return float(np.concatenate([f - f.mean() for f in force]).std() / size)
 
