@@ -339,8 +339,7 @@ def _vanishing(problem: TableProblem, axes: Directions) -> list[Asymptote]:
         if p in axes.scale:
             continue
         if direction.is_number and p.positive:
-            plain = min(p.scan or (1.0,), key=lambda v: abs(np.log(v)) if v > 0.0 else np.inf)
-            pinned[label(p)] = plain
+            pinned[label(p)] = float(np.clip(1.0, p.lower, p.upper))
         else:
             pinned[label(p)] = np.exp(direction.sizes(view).mean(axis=-1)) if p.positive else 0.0
     gone = {label(p): 0.0 for p in scale}

@@ -107,7 +107,7 @@ def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
     table, node = _local_minima(cost.reshape(S, *grid.shape), mixed=grid.mixed)
     last = cost.shape[-1] - 1
     if grid.shape == (last + 1,) and last >= sum(_FINE_ENDS):
-        first = np.flatnonzero(np.diff(table, prepend=-1))
+        first = np.searchsorted(table, np.arange(S))
         for edge, nearer in ((0, _FINE_ENDS[0]), (last, last - _FINE_ENDS[1])):
             at_edge = table[first[node[first] == edge]]  # a bound may keep a search far out
             table, node = np.append(table, at_edge), np.append(node, np.full(at_edge.size, nearer))
@@ -120,7 +120,7 @@ def _starts(problem: TableProblem, view: StiffnessData) -> Starts:
     starts = Starts(table, theta)
     if all(p.value is None for p in problem.parameters):
         return starts
-    best = theta[np.diff(table, prepend=-1) > 0]
+    best = theta[np.searchsorted(table, np.arange(S))]
     values = problem.to_values(best)
     for index, parameter in enumerate(problem.parameters):
         if parameter.value is not None:

@@ -41,6 +41,7 @@ _FIRST_DAMPING = 1e-9  # lambda at first, almost zero for a Gauss-Newton step
 _GAUSS_NEWTON = 1e-3  # lambda above which a short step does not show convergence
 _MOST_DAMPING = 1e12  # lambda above which the search has failed
 _ROUNDING = 1e-12  # rounding errors of a scaled Hessian, some thousand times _EPS
+_EASING = 0.2  # factor on lambda, at least, after a step that lowers the cost as predicted
 _LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, up to which the cost may be quadratic
 # length of a step, over the residuals' standard deviation, at which a search has converged
 _NOISE_TOLERANCE = 1e-8
@@ -246,9 +247,7 @@ def minimise(
         tiny = predicted <= unseen_change * at.cost
         better = (new.cost < at.cost) | (tiny & (new.cost <= (1.0 + unseen_change) * at.cost))
         gain = np.where(tiny, 1.0, at.cost - new.cost) / np.where(tiny, 1.0, predicted)
-        # after a failed step the damping falls slowly
-        least = np.where(growth > 2.0, 1.0 / 3.0, 0.05)
-        lower = np.maximum(damping * np.maximum(least, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
+        lower = np.maximum(damping * np.maximum(_EASING, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-15)
         damping = np.where(better, lower, np.maximum(damping * growth, 1e-6))
         growth = np.where(better, 2.0, 4.0 * growth)
         last = np.where(better, moves, 1e-300)
@@ -292,11 +291,10 @@ def _step(
     if longest.max() > _LONGEST_STEP:
         delta *= np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-300))[:, None]
     if bounds is not None:
-        unbounded = delta
-        delta = (np.clip(at.theta + unbounded / size, low, high) - at.theta) * size
-        cut = delta != unbounded
+        end = at.theta + delta / size
+        cut = (end < low) | (end > high)
         if cut.any():  # solve for the other coordinates, given those at bounds
-            at_bounds = np.where(cut, delta, 0.0)
+            at_bounds = np.where(cut, (np.clip(end, low, high) - at.theta) * size, 0.0)
             g_inner = np.where(cut, 0.0, g + (damped @ at_bounds[:, :, None])[:, :, 0])
             H_inner = np.where(cut[:, :, None] | cut[:, None, :], np.eye(P), damped)
             inner = -np.linalg.solve(H_inner + _ROUNDING * np.eye(P), g_inner[:, :, None])[:, :, 0]
@@ -306,7 +304,7 @@ def _step(
             longest = np.maximum(longest, longest_inner)
     moves = (delta[:, None, :] @ H @ delta[:, :, None])[:, 0, 0]
     predicted = -(delta * g).sum(axis=1) - 0.5 * moves
-    return delta / size, moves, np.maximum(predicted, 1e-300), longest
+    return delta / size, moves, predicted, longest
 
 
 def _extrapolation(hessian: FloatArray, step: FloatArray, before: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ _IDLE = 0.5  # standard error of a logarithm above which a parameter has hardly 
 _ROUNDS = 8  # most rounds of searches elsewhere: a limit on time
 _WORTH = 3  # searches in each round
 _ALIKE = 1e-8  # eigenvalue over the largest, below which effects of parameters are equal
-_FARTHEST = 10.0  # largest factor by which a value is adapted
+_ADAPTED = 0.1, 10.0  # least and largest factor by which a value is adapted
 _PRIORS = 4  # most descents until the noise, and with it the weight of priors, is known
 _SAME_NOISE = 1.3  # factor within which the noise is known
 _SETTLING = 2000  # samples after which simulated noise is stationary
@@ -439,7 +439,7 @@ class RecordSearch:
         step /= size
         # forces are linear in most values, not in their logarithms
         relative = problem.space.relative
-        step[relative] = np.log(np.clip(1.0 + step[relative], 1.0 / _FARTHEST, _FARTHEST))
+        step[relative] = np.log(np.clip(1.0 + step[relative], *_ADAPTED))
         return predicted, theta + step
 
     def best(self, problem: RecordProblem, starts: FloatArray, steps: int = STEPS) -> Minima:

@@ -27,13 +27,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray, finite_number
 from dahl_ident.errors import FitError, ModelError, ValidationError, choices
-from dahl_ident.fitting.asymptotes import (
-    Chart,
-    Limit,
-    Reach,
-    limits,
-    microslip_charts,
-)
+from dahl_ident.fitting.asymptotes import Chart, Reach, limits, microslip_charts
 from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.global_start import Starts, edge_starts, global_starts, grid_size
 from dahl_ident.fitting.levenberg_marquardt import (
@@ -56,8 +50,6 @@ _STEPS = 80  # most steps of a search, of which ten are usual
 _BRIEF = 30  # the same where no limit is searched: a repetition is near its optimum
 # fall of the cost, over that of one residual, for which such a search takes no further step
 _SLIGHT = 1e-5
-_FIRST_LOOK = 15  # steps after which a search at a limit continues only where it may still win
-_HOPELESS = 3.0  # cost there, over the lowest so far, from which it cannot win
 _PATIENCE = 1000  # most steps where friction is so faint that each step gains little
 _AT_LIMIT = 1e4  # factor on the tolerance at a limit, where large terms cancel
 _MANY = 30.0  # factor on the tolerance for many tables: 3e-7 standard deviations are near enough
@@ -260,7 +252,7 @@ class TableSearch:
             begin = Starts(begin.table, np.clip(begin.theta, self.low, self.high))
         if self.rescales:
             squares = self.problem.squares(begin.theta)
-            size = float(np.sqrt(np.median(squares, axis=-1).min() / np.log(4.0)))
+            size = float(np.sqrt(np.median(squares, axis=1).min() / np.log(4.0)))
             scale = max(size, float(np.max(self.problem.rounding)))
         end = self._search(begin, scale)
         if self.rescales:
@@ -424,15 +416,8 @@ class TableSearch:
 
     def _put_limits(self, end: Minima, edges: Starts, scale: float) -> None:
         """End each table at the best limit whose cost is no higher than that of its optimum."""
-        candidates: list[tuple[Limit, Minima]] = []
-        for limit in sorted(limits(self.problem), key=lambda lim: lim.chart.matrix.shape[1]):
-            minima = self._descend(edges, scale, limit.chart, limit=True, steps=_FIRST_LOOK)
-            further = np.flatnonzero(~minima.converged & (minima.cost < _HOPELESS * end.cost))
-            if further.size:
-                charts = limit.chart.of(further)
-                begin = Starts(np.arange(further.size), charts.theta(minima.theta[further]))
-                minima.put(further, self._of(further)._descend(begin, scale, charts, limit=True))
-            candidates.append((limit, minima))
+        ordered = sorted(limits(self.problem), key=lambda limit: limit.chart.matrix.shape[1])
+        candidates = [(at, self._descend(edges, scale, at.chart, limit=True)) for at in ordered]
         if not candidates:
             return
         costs = np.array([np.where(m.converged, m.cost, np.inf) for _, m in candidates])
