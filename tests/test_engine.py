@@ -23,7 +23,7 @@ from benchmarks.motion_oracles import (
 from dahl_ident import Parameter
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import law_equations, plant_equations
-from dahl_ident.engine import band_limited, march, settled, translate
+from dahl_ident.engine import band_limited, differentiated, march, settled, translate
 from dahl_ident.errors import FitError
 
 F_MAX = Parameter("f_max", "N", "limit", lower=0.0, transform="log")
@@ -92,6 +92,17 @@ class Bilinear(di.Friction):
         k, f_max = values
         y = direction * force / f_max
         return k * ((y < 0.5) + 0.2 * (y >= 0.5)) * (y < 1.0)
+
+
+class Returning(di.Friction):
+    """Slope k up to the limit, and back from beyond: the force stays at the limit."""
+
+    kind = "returning_of_tests"
+    parameters = (STIFFNESS, F_MAX)
+
+    def slope(self, force, direction, velocity, values):
+        k, f_max = values
+        return k * np.sign(1.0 - direction * force / f_max)
 
 
 class Pinched(di.Friction):
@@ -165,6 +176,14 @@ def test_bilinear_slopes_by_comparisons():
         c = by_oracle(hand, A, result, True, 1.0)
         for found in (result.coefficients[0], harmonics_of(Bilinear(100.0, 1.0), A)):
             assert np.max(np.abs(found - c)) < 1e-8 * np.max(np.abs(c))
+
+
+def test_a_force_stays_where_both_branches_lead():
+    law, jenkins = Returning(100.0, 1.0), di.MaxwellSlip([0.01], [100.0])
+    for A in (0.005, 0.012, 0.03, 3.0):
+        assert harmonics_of(law, A) == pytest.approx(harmonics_of(jenkins, A), rel=1e-9, abs=1e-9)
+    x = 0.03 * np.cos(np.linspace(0.0, 12.0, 400))
+    assert law.force(x) == pytest.approx(jenkins.force(x), abs=1e-12)
 
 
 @pytest.mark.parametrize("law", [Pinched, PinchedBySquares])
@@ -419,3 +438,13 @@ def test_importing_the_package_does_not_import_numba():
     code = "import dahl_ident, sys; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_derivatives_are_smoothed_as_far_as_the_motion_allows():
+    """By five samples, the fewest, the velocity would have an error of 0.1 m/s."""
+    t = np.arange(2000) / 1000.0
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(t.size)
+    v, _ = differentiated(np.sin(2.0 * np.pi * t) + noise, 1e-3)
+    assert np.std(v - 2.0 * np.pi * np.cos(2.0 * np.pi * t)) < 5e-3
+    v, _ = differentiated(np.full(100, 0.3), 1e-3)
+    assert np.abs(v).max() < 1e-9

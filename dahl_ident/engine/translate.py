@@ -194,8 +194,6 @@ def _factors(equations: Equations, states: Sequence[float], others: float) -> li
                 factor = a / b
             elif code == ca.OP_INV and a:
                 factor = 1.0 / a
-            elif code == ca.OP_IF_ELSE_ZERO and a == 1.0:
-                factor = b
             elif code in (ca.OP_NEG, ca.OP_TWICE):
                 factor = a
             elif code == ca.OP_SQ:
