@@ -25,6 +25,7 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import law_equations, plant_equations
 from dahl_ident.engine import band_limited, differentiated, march, settled, translate
 from dahl_ident.errors import FitError
+from tests.motions import Driven
 
 F_MAX = Parameter("f_max", "N", "limit", lower=0.0, transform="log")
 STIFFNESS = Parameter("k", "N/m", "stiffness", lower=0.0, transform="log")
@@ -312,6 +313,28 @@ def test_derivatives_of_driven_motions_are_differences_of_oracles():
     step = np.array([0.0, 1e-6, 0.0, 0.0])
     difference = (oracle(values, first + step) - oracle(values, first - step)) / 2e-6
     assert np.max(np.abs(motion.by_first[:, 1] - difference)) < 1e-6
+
+
+@pytest.mark.parametrize("alpha", [0.9, 0.97, 1.03])
+def test_derivatives_of_a_motion_that_slips_far(alpha):
+    """A hundred x_c of slip bring the force to its limit within rounding, and beyond it.
+
+    Exponents near 1 come so close; outputs are compared with oracles elsewhere.
+    """
+    rate, rng = 500.0, seeded(62)
+    t = np.arange(2000) / rate
+    lines = np.arange(2, 60) / 4.0
+    drive = np.sin(2.0 * np.pi * (lines[:, None] * t + rng.random((lines.size, 1)))).sum(axis=0)
+    plant = di.Dahl(alpha=None) + di.Mass() + di.Damper() + di.Spring()
+    driven = Driven(plant, 2.0 * drive / drive.std(), rate)
+    values = np.array([0.5, 2e3, alpha, 0.3, 0.5, 400.0])
+    by = driven.motion(np.zeros(3), values, derivatives=True).by_parameter
+    for i in range(values.size):
+        step = np.zeros(values.size)
+        step[i] = 1e-5 * values[i]
+        ends = [driven.motion(np.zeros(3), values + s * step).output for s in (1.0, -1.0)]
+        difference = (ends[0] - ends[1]) / (2.0 * step[i])
+        assert np.linalg.norm(by[:, i] - difference) < 0.02 * np.linalg.norm(difference)
 
 
 def test_friction_faster_than_the_sampling():

@@ -166,6 +166,22 @@ def first_event(f, signal, t, h, y, w, at):
 
 
 @compiled
+def reached_zero(y, w, at):
+    """Return a switching function that has come to zero at the step's end to stay, or -1.
+
+    Rounding takes it beyond zero, where the present branch would lead further away.
+    """
+    end = STAGES - 1
+    if abs(y[1] + w[at.stages + end * at.n + 1]) <= NEAR * w[at.scale + 1]:
+        return -1
+    values = at.values + end * (at.n + 1 + at.k) + at.n
+    for e in range(1, at.k + 1):
+        if w[values + e] * w[at.sides + e] <= 0.0 < w[at.before + e] * w[at.sides + e]:
+            return e
+    return -1
+
+
+@compiled
 def state_jumps(position, y, w, at):
     """Return whether a state has changed by a position in a step that takes no time."""
     put_interpolated(y, position, w, at)

@@ -13,6 +13,7 @@ from dahl_ident.engine.events import (
     first_event,
     pass_event,
     passed_another,
+    reached_zero,
     slope_fades,
     state_jumps,
     step_to_event,
@@ -280,6 +281,7 @@ def advance(
             sample = write_samples(
                 f, signal, t, h, y, S, first, chosen, samples, sample, output, by, path, w, at
             )
+        arrived = reached_zero(y, w, at) if which < 0 else -1
         finish_step(h, y, S, w, at)
         if not w[at.scale + 1] < _BEYOND_BOUNDS:
             return 0.0
@@ -289,6 +291,9 @@ def advance(
         if turned:
             after_turn, turned = h * factor, False
         step = max(step, h * factor) if h < step else h * factor
+        if arrived >= 0:
+            pass_event(f, signal, t, arrived, y, S, first, chosen, w, at)
+            new_branch = True
         if which >= 0:
             pass_event(f, signal, t, which, y, S, first, chosen, w, at)
             new_branch = True
