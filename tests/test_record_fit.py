@@ -67,6 +67,22 @@ def driven(seed, noise, samples=2048, channel="displacement"):
     return di.Record(t, force=drive, **{channel: y})
 
 
+def test_a_swept_acceleration_is_found_without_a_start():
+    """Integrated twice, its noise below the sweep would be four times the displacement."""
+    t = np.arange(4000) / RATE
+    drive = 3.0 * np.sin(2.0 * np.pi * (t + 0.9 * t**2))
+    plant = Model(di.Dahl(0.5, 2e3, 1.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(400.0))
+    x, v, friction = Driven(plant, drive, RATE).motion(np.zeros(3)).states.T
+    a = (drive - 0.5 * v - 400.0 * x - friction) / 0.3
+    a += 0.02 * a.std() * np.random.default_rng(4).standard_normal(t.size)
+    model = di.Dahl() + di.Mass() + di.Damper() + di.Spring()
+    fit = di.fit(di.Record(t, force=drive, acceleration=a), model)
+    assert fit.trusted
+    truth = {"f_max": 0.5, "sigma": 2e3, "mass": 0.3, "damping": 0.5, "stiffness": 400.0}
+    for name, value in truth.items():
+        assert fit.params[name].value == pytest.approx(value, abs=3.5 * fit.params[name].stderr)
+
+
 @pytest.mark.parametrize("kind", ["random", "trapezoid"])
 @pytest.mark.versions
 def test_force_from_displacement(kind):

@@ -21,6 +21,7 @@ HIGHEST_ORDER = (
 )
 SAMPLES_PER_ORDER = 20  # samples for each coefficient: with fewer, it follows the noise
 _BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
+_ABOVE = 20.0  # times the noise's median power, which noise exceeds in one frequency of a million
 _OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
 
 
@@ -111,7 +112,8 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     """Return displacement, velocity and acceleration of a record's motion `y`, in the drive's band.
 
     Differentiated by Fourier transform of the record, its linear trend removed and mirrored at its
-    ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive.
+    ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive, or
+    than the motion that exceeds the record's noise.
     """
     n = len(record)
     drive = record.force_samples
@@ -123,7 +125,10 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     power = _power(drive if _power(drive).any() else y)  # in a free decay the motion gives the band
     bins = np.flatnonzero(power >= _BAND * power.max())
     highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
-    lowest = 0.5 * bins[0] / power.size
+    response = _power(y)
+    noise = np.median(response[bins[-1] :])
+    shown = bins[response[bins] > _ABOVE * noise]
+    lowest = 0.5 * (shown if shown.size else bins)[0] / power.size
     fraction = np.arange(spectrum.size) / spectrum.size
     spectrum[fraction > highest] = 0.0
     order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
