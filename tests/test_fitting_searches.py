@@ -3,19 +3,20 @@
 import numpy as np
 import pytest
 from scipy import optimize
+from scipy.signal import lfilter
 
 import dahl_ident as di
 from dahl_ident.fitting import Status, solve
 from dahl_ident.fitting.global_start import global_starts
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise
-from dahl_ident.fitting.record_search import RecordSearch
+from dahl_ident.fitting.record_search import RecordSearch, noise_power
 from dahl_ident.problem import Quadratic, RecordProblem, TableProblem
 from tests import cold_records as cold
 from tests.random_problems import friction_and_spring
 from tests.test_cold_records import with_gap
 
 TIME = np.linspace(0.0, 5.0, 30)
-DECAY = 3.0 * np.exp(-2.0 * TIME) + 0.02 * np.random.default_rng(0).standard_normal(30)
+DECAY = 300.0 * np.exp(-2.0 * TIME) + 2.0 * np.random.default_rng(0).standard_normal(30)
 
 
 def rosenbrock(theta):
@@ -33,14 +34,14 @@ def decay(theta):
     return wave - DECAY, np.stack([wave, -rate * TIME * wave], axis=-1)
 
 
-def searched(function, starts, logarithmic=False, bounds=None):
+def searched(function, starts, logarithmic=False, **settings):
     def evaluate(theta, _which):
         r, J = function(theta)
         gradient, hessian = np.einsum("si,sip->sp", r, J), np.einsum("sip,siq->spq", J, J)
         return Quadratic(0.5 * (r**2).sum(axis=1), gradient, hessian)
 
     rows = function(starts)[0].shape[1]
-    return minimise(evaluate, starts, np.full(2, logarithmic), rows, bounds=bounds)
+    return minimise(evaluate, starts, np.full(2, logarithmic), rows, **settings)
 
 
 def test_a_curved_valley_is_followed_in_few_evaluations():
@@ -62,12 +63,21 @@ def test_a_search_ends_where_a_bound_cuts_the_valley():
 
 
 def test_logarithms_far_off_are_found_in_few_evaluations():
-    best = optimize.curve_fit(lambda t, a, b: a * np.exp(-b * t), TIME, DECAY, [3.0, 2.0])[0]
+    best = optimize.curve_fit(lambda t, a, b: a * np.exp(-b * t), TIME, DECAY, [300.0, 2.0])[0]
     starts = np.log(best) + np.random.default_rng(2).uniform([-7.0, -2.0], [7.0, 1.0], (40, 2))
     ends = searched(decay, starts, logarithmic=True)
     assert ends.converged.all()
     np.testing.assert_allclose(ends.theta, np.tile(np.log(best), (40, 1)), atol=1e-7)
     assert ends.evaluations.mean() < 11.5
+
+
+def test_a_search_takes_no_steps_below_the_accuracy_of_predictions():
+    starts = np.log([[300.0, 2.0]]) + np.random.default_rng(2).uniform(-1.0, 1.0, (40, 2))
+    exact, rough = (searched(decay, starts, True, accuracy=e) for e in (1e-15, 1e-4))
+    assert rough.converged.all()
+    assert rough.evaluations.mean() < 6.5
+    assert exact.evaluations.mean() > 7.0
+    np.testing.assert_allclose(rough.theta, exact.theta, atol=1e-4)
 
 
 @pytest.mark.parametrize(("steps", "error"), [(600, 2e-6), (1200, 2e-3)])
@@ -85,6 +95,18 @@ def test_a_start_has_the_accuracy_of_its_table(steps, error, alpha):
     near = start_for(30.0)
     f_max = 30.0 * near[0] / near[1]  # its x_c is that of a node
     np.testing.assert_allclose(start_for(f_max), [f_max, 30.0, alpha], rtol=error)
+
+
+@pytest.mark.parametrize("f_max", [1e-15, 1e15])
+def test_a_friction_limit_of_any_size_may_be_given(f_max):
+    amplitude = f_max / 30.0 * np.geomspace(0.1, 10.0, 20)
+    error = np.random.default_rng(8).normal(size=40).view(complex)
+    N = di.Dahl(f_max, 30.0).describing_function(amplitude) * np.exp(0.01 * error)
+    table = di.FrequencyResponse(np.ones(20), N, amplitude)
+    found = solve(TableProblem(table, di.Dahl(f_max), noise="relative"))
+    assert found.status is Status.CONVERGED
+    assert found.nfev < 8
+    assert found.values == pytest.approx([30.0], rel=0.03)
 
 
 def test_a_bound_does_not_keep_a_search_far_out():
@@ -160,3 +182,12 @@ def test_springs_start_with_the_loads_that_a_gap_leaves(seed, most):
     best = solve(RecordProblem([with_gap(record, 200, 260)], model))
     assert 2.0 * best.cost / len(record) < 1.5e-6
     assert best.nfev < most
+
+
+@pytest.mark.parametrize("pole", [-0.5, 0.0, 0.9])
+def test_correlated_residuals_count_by_their_power_at_low_frequencies(pole):
+    white = np.random.default_rng(0).standard_normal(200_000)
+    halves = np.array_split(lfilter([3.0], [1.0, -pole], white), 2)
+    cost = 0.5 * float(sum(half @ half for half in halves))
+    expected = (3.0 / (1.0 - pole)) ** 2
+    assert noise_power(cost, white.size, halves) == pytest.approx(expected, rel=0.02)
