@@ -22,6 +22,7 @@ HIGHEST_ORDER = (
 SAMPLES_PER_ORDER = 20  # samples for each coefficient: with fewer, it follows the noise
 _BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
 _ABOVE = 20.0  # times the noise's median power, which noise exceeds in one frequency of a million
+_FORGETS = 3.0  # samples times the cut, over half the rate, after which a high pass forgets
 _OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
 
 
@@ -147,9 +148,10 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 
         cut = min(max(lowest, 1.0 / n), 0.5)
         highpass = butter(4, cut, "highpass", output="sos")
+        padding = min(n - 1, int(_FORGETS / cut))
         for _ in range(order):
             wave = cumulative_trapezoid(waves[0], dx=1.0 / record.sample_rate, initial=0)
-            waves.insert(0, np.asarray(sosfiltfilt(highpass, detrend(wave))))
+            waves.insert(0, np.asarray(sosfiltfilt(highpass, detrend(wave), padlen=padding)))
     return waves[0], waves[1], waves[2]
 
 
