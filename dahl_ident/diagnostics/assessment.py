@@ -421,8 +421,10 @@ class TableAssessment(Assessment):
         """Plain data for JSON, see ``Assessment``."""
         suspicious = [str(point) for point in self.goodness.suspicious]
         return super().facts | {
-            "noise": self.problem.noise, "suspicious": suspicious, "redchi": self.redchi
-        }  # fmt: skip
+            "noise": self.problem.noise,
+            "suspicious": suspicious,
+            "redchi": self.redchi,
+        }
 
     @property
     def exact(self) -> tuple[str, ...]:

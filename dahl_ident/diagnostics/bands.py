@@ -155,11 +155,13 @@ def predicted_backbone(
     band = response_band(optimum, f, A, None, "dynamic_stiffness", errors, of_a_test=False)
     critical = 2.0 * mass * omega**2
     return FrequencyResponse.backbone(
-        A, f, model.dynamic_stiffness(A, omega).imag / critical,
+        A,
+        f,
+        model.dynamic_stiffness(A, omega).imag / critical,
         frequency_std=np.maximum(f * band.real_std / slope, SMALLEST),
         damping_ratio_std=np.maximum(band.imag_std / critical, SMALLEST),
         motion=optimum.problem.data.motion,
-    )  # fmt: skip
+    )
 
 
 def _estimate(optimum: Optimum, errors: ErrorModel | None) -> tuple[TableProblem, FloatArray]:
@@ -191,9 +193,13 @@ def problem_at(
     levels: dict[str, Any] = {name: at_points}
     default = "dynamic_stiffness" if problem.response is None else problem.response.quantity
     grid = FrequencyResponse(
-        f, np.ones(f.shape), **levels, controlled="displacement" if drive is None else "force",
-        quantity=quantity or default, motion=problem.motion,
-    )  # fmt: skip
+        f,
+        np.ones(f.shape),
+        **levels,
+        controlled="displacement" if drive is None else "force",
+        quantity=quantity or default,
+        motion=problem.motion,
+    )
     moved: TableProblem = problem.for_table(grid)
     return moved
 

@@ -123,9 +123,7 @@ class Budget(Mapping[str, ParameterBudget]):
         """Yield rows of name, value and `_COLUMNS`: for each parameter first the total."""
         for p in self.parameters:
             value, u = rounded(p.value, p.u)
-            yield (
-                p.name, value, "combined", "", u, _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded
-            )  # fmt: skip
+            yield (p.name, value, "combined", "", u, _dof(p.dof), "100 %", f"{p.k:.2f}", p.expanded)
             for r in p.rows:
                 share = f"{100.0 * r.share:.0f} %"
                 u = rounded(p.value, r.u)[1]
@@ -170,13 +168,18 @@ class Budget(Mapping[str, ParameterBudget]):
             "taken_as_exact": list(self.exact),
             "parameters": {
                 p.name: {
-                    "value": p.value, "unit": p.unit, "u": p.u, "dof": _finite(p.dof), "k": p.k,
-                    "U": p.U if p.limits is None else None, "interval": p.limits,
+                    "value": p.value,
+                    "unit": p.unit,
+                    "u": p.u,
+                    "dof": _finite(p.dof),
+                    "k": p.k,
+                    "U": p.U if p.limits is None else None,
+                    "interval": p.limits,
                     "sources": [{**vars(row), "dof": _finite(row.dof)} for row in p.rows],
                 }
                 for p in self.parameters
             },
-        }  # fmt: skip
+        }
 
     def numbers(self, library: Literal["uncertainties", "GTC"] = "uncertainties") -> dict[str, Any]:
         """Return the parameters as correlated numbers of a library for uncertain numbers.

@@ -119,9 +119,11 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
         yield undetermined("solver", message=message)
     if optimum.dof <= 0:
         yield undetermined(
-            "no_degrees_of_freedom", numbers=optimum.problem.n_residuals,
-            parameters=len(optimum.names), scale_known=optimum.scale_known,
-        )  # fmt: skip
+            "no_degrees_of_freedom",
+            numbers=optimum.problem.n_residuals,
+            parameters=len(optimum.names),
+            scale_known=optimum.scale_known,
+        )
     if noise_known:
         for why in dict.fromkeys(parameter.why for parameter in known.open):
             shown = {p.name: p.known_text for p in known.open if p.why == why}
@@ -257,9 +259,13 @@ def _constraints(fit: Assessed) -> Iterator[Finding]:
     cost = fit.constraint_cost
     if cost is not None and cost.p_value <= _CHANCE:
         yield described(
-            "constraint", _NOT_DESCRIBED, texts=tuple(cost.texts), rise=cost.rise,
-            noise_known=bool(np.isinf(cost.dof)), p_value=cost.p_value,
-        )  # fmt: skip
+            "constraint",
+            _NOT_DESCRIBED,
+            texts=tuple(cost.texts),
+            rise=cost.rise,
+            noise_known=bool(np.isinf(cost.dof)),
+            p_value=cost.p_value,
+        )
 
 
 def _priors(fit: Assessed) -> Iterator[Finding]:
@@ -276,15 +282,23 @@ def _exponents(fit: Assessed) -> Iterator[Finding]:
     for exponent in fit.contradicted_exponents:
         if exponent.range is None:
             yield described(
-                "stated_exponent", _NOT_DESCRIBED, name=exponent.name, held=exponent.fixed,
+                "stated_exponent",
+                _NOT_DESCRIBED,
+                name=exponent.name,
+                held=exponent.fixed,
                 wanted=with_unit(exponent.indicated, exponent.stderr, ""),
-            )  # fmt: skip
+            )
         else:
             low, high = exponent.range
             yield described(
-                "beyond_range", _APPROXIMATE, name=exponent.name, value=exponent.indicated,
-                stderr=exponent.stderr, low=low, high=high,
-            )  # fmt: skip
+                "beyond_range",
+                _APPROXIMATE,
+                name=exponent.name,
+                value=exponent.indicated,
+                stderr=exponent.stderr,
+                low=low,
+                high=high,
+            )
 
 
 @_of_tables
@@ -368,9 +382,11 @@ def _notes(fit: RecordAssessment) -> Iterator[Finding]:
         yield described("slow_residuals", rms=goodness.rms_in_band)
     if problem.displacement_noise:
         yield described(
-            "displacement_noise", noise=problem.displacement_noise,
-            unit=si_unit("displacement", problem.motion), travel=problem.noise_travel,
-        )  # fmt: skip
+            "displacement_noise",
+            noise=problem.displacement_noise,
+            unit=si_unit("displacement", problem.motion),
+            travel=problem.noise_travel,
+        )
     size = {"effective": fit.errors.effective, "samples": problem.n_samples}
     yield described("effective_samples", **size)
 
@@ -397,10 +413,16 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
         if p.prior is None or p.free:
             continue
         if counted and p.name in fit.assumed:
-            ranges.append({
-                "name": p.name, "low": p.prior[0], "high": p.prior[1], "unit": p.unit,
-                "value": values[p.name], "stderr": stderr[p.name],
-            })  # fmt: skip
+            ranges.append(
+                {
+                    "name": p.name,
+                    "low": p.prior[0],
+                    "high": p.prior[1],
+                    "unit": p.unit,
+                    "value": values[p.name],
+                    "stderr": stderr[p.name],
+                }
+            )
         elif p.value is not None:
             stated[p.name] = p.value
     sensors = {p.name for p in fit.problem.sensors.parameters if p.free}
@@ -420,10 +442,22 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
 
 
 RESERVATIONS: tuple[_Check, ...] = (
-    _beyond_limit, _unphysical, _priors, _exponents, _moved_by_outliers
-)  # fmt: skip
+    _beyond_limit,
+    _unphysical,
+    _priors,
+    _exponents,
+    _moved_by_outliers,
+)
 """Reasons not to trust a fit although its residuals may look like noise."""
 CHECKS: tuple[_Check, ...] = (
-    _constraints, _parameters, _parameters_of_records, _misfit, _weak_elements, _steady, _delay,
-    _notes, reading, assumptions,
-)  # fmt: skip
+    _constraints,
+    _parameters,
+    _parameters_of_records,
+    _misfit,
+    _weak_elements,
+    _steady,
+    _delay,
+    _notes,
+    reading,
+    assumptions,
+)

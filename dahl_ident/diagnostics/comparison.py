@@ -292,11 +292,17 @@ class ModelComparison:
             gain, error = m.density.gain_over(first.density)
             changes = [_change(m.meaning[key], first.meaning[key]) for key in _OF_FRICTION]
             mark = " (best)" if m is self.best else ""
-            lines.append([
-                m.name, m.reason, percent(m.density.misfit), percent(m.density.harmonic_misfit),
-                str(m.optimum.dof), *changes,
-                ("0" if m is first else f"{gain:+.1f} ± {error:.1f}") + mark,
-            ])  # fmt: skip
+            lines.append(
+                [
+                    m.name,
+                    m.reason,
+                    percent(m.density.misfit),
+                    percent(m.density.harmonic_misfit),
+                    str(m.optimum.dof),
+                    *changes,
+                    ("0" if m is first else f"{gain:+.1f} ± {error:.1f}") + mark,
+                ]
+            )
         return lines
 
     @property
@@ -520,10 +526,15 @@ def _candidates(
         estimated = name == "exponent free" and exponent_is_assumed
         named_twice = len(alternatives) > 1 and any(len(a.elements) > 1 for a in alternatives)
         if reason and not estimated and not named_twice:
-            yield name, reason, [
-                element for e, offered in offers
-                for element in (offered[name].elements if name in offered else (e,))
-            ]  # fmt: skip
+            yield (
+                name,
+                reason,
+                [
+                    element
+                    for e, offered in offers
+                    for element in (offered[name].elements if name in offered else (e,))
+                ],
+            )
     if not any(is_spring(e) for e in model.elements):
         yield "spring added", misfit, (model, Spring())
     added: list[Element] = []

@@ -390,9 +390,17 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         runs = grouped_rows(np.unique(np.asarray(problem.data.run), return_inverse=True)[1])
         by_runs = RunJackknife(estimate.jackknife(runs), len(runs))
     return ErrorModel(
-        optimum, problem, estimate, sources, state, every, len(tests), tuple(assumed),
-        units[:, : state.model.count], by_runs,
-    )  # fmt: skip
+        optimum,
+        problem,
+        estimate,
+        sources,
+        state,
+        every,
+        len(tests),
+        tuple(assumed),
+        units[:, : state.model.count],
+        by_runs,
+    )
 
 
 def _standing_apart(optimum: Optimum) -> list[int]:

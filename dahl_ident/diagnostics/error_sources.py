@@ -312,11 +312,13 @@ def error_sources(
     return tuple(
         source
         for sources in (
-            _model_error(estimate, further), _changes_with_speed(estimate),
-            _runs(estimate), _levels(estimate),
+            _model_error(estimate, further),
+            _changes_with_speed(estimate),
+            _runs(estimate),
+            _levels(estimate),
         )
         for source in sources
-    )  # fmt: skip
+    )
 
 
 def _model_error(estimate: WeightedEstimate, further: FloatArray | None) -> Iterator[Source]:

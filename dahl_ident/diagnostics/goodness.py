@@ -227,9 +227,16 @@ class Goodness:
     def _tests(self) -> list[_Test]:
         """Every test that applies."""
         tests = (
-            self.runs_differ, self.chi_square, self.stiffening, *self.groups, *self.trends,
-            *self.runs, self.exponent, self.third_harmonic, self.smooth,
-        )  # fmt: skip
+            self.runs_differ,
+            self.chi_square,
+            self.stiffening,
+            *self.groups,
+            *self.trends,
+            *self.runs,
+            self.exponent,
+            self.third_harmonic,
+            self.smooth,
+        )
         return [test for test in tests if test is not None]
 
     @property

@@ -204,7 +204,11 @@ def cross_validation(left_out: HeldOut | None) -> CrossValidation | None:
     width, deviation = width[known], left_out.deviation[known]
     gains, phases = (np.abs(deviation) <= width).sum(axis=0).tolist()
     return CrossValidation(
-        len(np.unique(left_out.test)), gains, phases, len(width),
-        float(np.sqrt(np.mean(width**2))), float(np.sqrt(np.mean(deviation**2))),
+        len(np.unique(left_out.test)),
+        gains,
+        phases,
+        len(width),
+        float(np.sqrt(np.mean(width**2))),
+        float(np.sqrt(np.mean(deviation**2))),
         left_out.available,
-    )  # fmt: skip
+    )

@@ -205,9 +205,15 @@ def combined_intervals(
         p.unit for p in (*optimum.problem.parameters, *(every.parameters[i] for i in also))
     )
     return ConfidenceIntervals(
-        "combined", array, (*optimum.names, *assumed), units,
-        np.append(values, estimates[also]), lower, upper, note,
-    )  # fmt: skip
+        "combined",
+        array,
+        (*optimum.names, *assumed),
+        units,
+        np.append(values, estimates[also]),
+        lower,
+        upper,
+        note,
+    )
 
 
 def natural_sizes(optimum: Optimum) -> FloatArray:

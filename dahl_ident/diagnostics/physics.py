@@ -42,8 +42,10 @@ _INSTEAD = {
 # Ranges in SI units within which mechanisms lie, from micromachines to bridge bearings.
 _TYPICAL = {"x_c": (1e-9, 0.1), "force limit": (1e-9, 1e8), "contact stiffness": (1e-2, 1e12)}
 _TYPICAL_ROTATION = {
-    "x_c": (1e-7, 1.0), "force limit": (1e-10, 1e8), "contact stiffness": (1e-4, 1e12)
-}  # fmt: skip
+    "x_c": (1e-7, 1.0),
+    "force limit": (1e-10, 1e8),
+    "contact stiffness": (1e-4, 1e12),
+}
 _DIMENSIONS = {FORCE: "force limit", STIFFNESS: "contact stiffness"}
 _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
 _ALIKE = 0.05  # largest relative difference from such a ratio

@@ -102,9 +102,14 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     unit = np.sqrt(stated + excess[group] + _EXACT**2)
     Z = [columns[kept] / unit[:, None] for columns in scatter]
     model = MixedModel(
-        y / unit, orthonormal(X[kept] / unit[:, None]), Z, group, np.full(groups, _ROUNDING),
-        groups, np.full(len(Z), np.inf),
-    )  # fmt: skip
+        y / unit,
+        orthonormal(X[kept] / unit[:, None]),
+        Z,
+        group,
+        np.full(groups, _ROUNDING),
+        groups,
+        np.full(len(Z), np.inf),
+    )
     state = model.reml(np.ones(len(Z)))
     tests = _densities(state, np.repeat(test, 2)[kept], unit, robust=optimum.loss != "linear")
     first = np.unique(test, return_index=True)[1]

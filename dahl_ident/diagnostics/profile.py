@@ -66,9 +66,13 @@ class Bracket:
     """
 
     def __init__(
-        self, target: FloatArray, step: FloatArray, furthest: FloatArray, logarithmic: BoolArray,
+        self,
+        target: FloatArray,
+        step: FloatArray,
+        furthest: FloatArray,
+        logarithmic: BoolArray,
         least_width: FloatArray,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._target, self._furthest, self._logarithmic = target, furthest, logarithmic
         self._least_width = least_width
         self.position, self._step = np.minimum(step, furthest), step
@@ -292,10 +296,16 @@ class Profiler:
             return Quadratic(cost, gradient, np.where(either, 0.0, hessian))
 
         ends = minimise(
-            evaluate, start, self._logarithmic, self._problem.n_residuals,
-            tolerance_factor=_TOLERANCE_FACTOR, enough=lambda _: _ENOUGH, steps=_SEARCH_STEPS,
-            accuracy=self._problem.accuracy, bounds=(self._low, self._high),
-        ).theta  # fmt: skip
+            evaluate,
+            start,
+            self._logarithmic,
+            self._problem.n_residuals,
+            tolerance_factor=_TOLERANCE_FACTOR,
+            enough=lambda _: _ENOUGH,
+            steps=_SEARCH_STEPS,
+            accuracy=self._problem.accuracy,
+            bounds=(self._low, self._high),
+        ).theta
         step = ends - theta
         moved = step.any(axis=1, keepdims=True)  # elsewhere derivatives may be infinite
         bend = np.where(moved, np.einsum("sij,sj->si", lowest.hessian, step), 0.0)

@@ -132,9 +132,14 @@ def record_goodness(problem: RecordProblem, residuals: Sequence[FloatArray]) -> 
     )
     products = sum(float(e[1:] @ e[:-1]) for e in residuals)
     return RecordGoodness(
-        share**0.5, unexplained_share=share, rms_in_band=in_band**0.5, rms=rms, worst_record=number,
-        worst=worst, correlation=products / total if total else 0.0,
-    )  # fmt: skip
+        share**0.5,
+        unexplained_share=share,
+        rms_in_band=in_band**0.5,
+        rms=rms,
+        worst_record=number,
+        worst=worst,
+        correlation=products / total if total else 0.0,
+    )
 
 
 class RecordAssessment(Assessment):
@@ -242,11 +247,15 @@ class RecordAssessment(Assessment):
         assumed_values = np.array([p.value for p in assumed])
         note = f"every source of the budget, {self.errors.effective:.3g} effective samples"
         return ConfidenceIntervals(
-            "combined", array, (*self.problem.names, *(p.name for p in assumed)),
+            "combined",
+            array,
+            (*self.problem.names, *(p.name for p in assumed)),
             (*(p.unit for p in self.problem.parameters), *(p.unit for p in assumed)),
-            np.append(values, assumed_values), np.hstack([lower, assumed_values * np.exp(-ln_U)]),
-            np.hstack([upper, assumed_values * np.exp(ln_U)]), note,
-        )  # fmt: skip
+            np.append(values, assumed_values),
+            np.hstack([lower, assumed_values * np.exp(-ln_U)]),
+            np.hstack([upper, assumed_values * np.exp(ln_U)]),
+            note,
+        )
 
     @cached_property
     def undetermined(self) -> Mapping[str, str]:
@@ -374,9 +383,14 @@ class RecordAssessment(Assessment):
         covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
         share = (0.5 * self.goodness.unexplained_share) ** 0.5 if self.exceeds_noise else _LEAST
         optimum = replace(
-            self.optimum, problem=problem, theta=theta, values=values, covariance=covariance,
-            scale=share, dof=int(self.errors.least_dof),
-        )  # fmt: skip
+            self.optimum,
+            problem=problem,
+            theta=theta,
+            values=values,
+            covariance=covariance,
+            scale=share,
+            dof=int(self.errors.least_dof),
+        )
         return optimum, None, None
 
     def predict_record(self, record: Record, initial: str) -> RecordBand:
@@ -418,9 +432,13 @@ class RecordAssessment(Assessment):
             scatter *= max(1.0, problem.level / self.problem.level) ** 2
         U = coverage_factor(self.errors.least_dof) * np.sqrt(variance + scatter)
         return RecordBand(
-            problem.records[0].time, output, np.sqrt(variance), output - U, output + U,
+            problem.records[0].time,
+            output,
+            np.sqrt(variance),
+            output - U,
+            output + U,
             problem.measured[0],
-        )  # fmt: skip
+        )
 
     def _hold_out(self, parts: int | None) -> HoldOut:
         problem = self.problem
@@ -477,9 +495,12 @@ class HoldOut:
         rows = [["record", "from (s)", "to (s)", "error (% rms)", inside]]
         rows += [
             [
-                str(part.record), f"{part.start:.4g}", f"{part.stop:.4g}",
-                percent(part.rms_share).removesuffix(" %"), f"{100.0 * part.inside:.1f} %",
+                str(part.record),
+                f"{part.start:.4g}",
+                f"{part.stop:.4g}",
+                percent(part.rms_share).removesuffix(" %"),
+                f"{100.0 * part.inside:.1f} %",
             ]
             for part in self.parts
-        ]  # fmt: skip
+        ]
         return f"{table(rows, ())}\nall samples: {100.0 * self.inside:.1f} % inside"

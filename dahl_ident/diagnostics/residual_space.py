@@ -83,9 +83,12 @@ class Linearization:
 
 
 def run_deviations(
-    estimate: WeightedEstimate, mean: FloatArray, effects: FloatArray, spread: FloatArray,
+    estimate: WeightedEstimate,
+    mean: FloatArray,
+    effects: FloatArray,
+    spread: FloatArray,
     noise: float,
-) -> RunDeviations | None:  # fmt: skip
+) -> RunDeviations | None:
     """Return the deviations of runs that minimise each run's residuals and deviations together.
 
     None if the model has no response at the `mean`, as may happen for a poorly known parameter.

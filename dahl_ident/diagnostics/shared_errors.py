@@ -48,10 +48,19 @@ def row_errors(errors: ErrorModel) -> RowErrors | None:
     volume += float(np.log(np.abs(np.linalg.det(factors))).sum())
     _, slopes = problem.residuals_and_jacobian(errors.theta, tails=False)
     return RowErrors(
-        counted, W, np.maximum(ratios, 0.0), volume, factors, *_dof_and_share(errors), jacobian,
-        size * root * estimate.y[:m], problem.scale_known, np.where(scatters, errors.theta, np.nan),
-        np.where(scatters, slopes[:m], 0.0), basis,
-    )  # fmt: skip
+        counted,
+        W,
+        np.maximum(ratios, 0.0),
+        volume,
+        factors,
+        *_dof_and_share(errors),
+        jacobian,
+        size * root * estimate.y[:m],
+        problem.scale_known,
+        np.where(scatters, errors.theta, np.nan),
+        np.where(scatters, slopes[:m], 0.0),
+        basis,
+    )
 
 
 def _dof_and_share(errors: ErrorModel) -> tuple[float, float]:

@@ -115,10 +115,13 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
     n = system.slip.size
     _, least = _solved(system, 0.0)
     coefficients, misfit = next(
-        (pair for s in _SMOOTHING if (pair := _solved(system, s))[1]
-         <= max(_ALLOWED * least, _EXACT)),
+        (
+            pair
+            for s in _SMOOTHING
+            if (pair := _solved(system, s))[1] <= max(_ALLOWED * least, _EXACT)
+        ),
         _solved(system, 0.0),
-    )  # fmt: skip
+    )
     parallel_values = dict.fromkeys(system.names, 0.0)
     for name, sign, value in zip(system.names, system.signs, coefficients[n + 1 :], strict=True):
         parallel_values[name] += sign * float(value)

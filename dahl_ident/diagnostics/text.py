@@ -36,8 +36,10 @@ class _Words(Formatter):
 
 _WORDS = _Words()
 _FIELDS: Mapping[str, Callable[[Any], str]] = {
-    "percent": percent, "list": listed, "parts": "; ".join
-}  # fmt: skip
+    "percent": percent,
+    "list": listed,
+    "parts": "; ".join,
+}
 
 
 def joined(parts: Sequence[str], most: int = 100) -> str:

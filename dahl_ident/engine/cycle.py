@@ -66,16 +66,38 @@ def keep_offsets(f, signal, y, chosen, w, at, matrix, columns):
 
 @njit(
     types.Tuple((NUMBERS, complex128[:, :, ::1], TABLE, float64[:, :, ::1]))(
-        FUNCTION, NUMBERS, NUMBERS, NUMBERS, boolean, VECTOR, VECTOR, TABLE, TABLE, NUMBERS,
-        VECTOR, int64, float64,
+        FUNCTION,
+        NUMBERS,
+        NUMBERS,
+        NUMBERS,
+        boolean,
+        VECTOR,
+        VECTOR,
+        TABLE,
+        TABLE,
+        NUMBERS,
+        VECTOR,
+        int64,
+        float64,
     ),
     cache=True,
     error_model="numpy",
-)  # fmt: skip
+)
 def cycles(
-    f, sizes, solved, followers, odd, amplitudes, omegas, parameters, starts, chosen, harmonics,
-    initial_cycles, tolerance,
-):  # fmt: skip
+    f,
+    sizes,
+    solved,
+    followers,
+    odd,
+    amplitudes,
+    omegas,
+    parameters,
+    starts,
+    chosen,
+    harmonics,
+    initial_cycles,
+    tolerance,
+):
     """Return settled motions, row by row.
 
     Whether each converged; harmonics c_k of ``output = sum of Re c_k exp(j k omega t)`` with their
@@ -121,10 +143,28 @@ def cycles(
                 for i in range(free):
                     S[begin + i, i] = 1.0
                 step = advance(
-                    f, solved, followers, signal, times, x, S, no_parameters, coarse * tolerance,
-                    longest, step, no_array, no_sums, no_array, no_array, no_table, no_table, w, at,
-                    block, sides,
-                )  # fmt: skip
+                    f,
+                    solved,
+                    followers,
+                    signal,
+                    times,
+                    x,
+                    S,
+                    no_parameters,
+                    coarse * tolerance,
+                    longest,
+                    step,
+                    no_array,
+                    no_sums,
+                    no_array,
+                    no_array,
+                    no_table,
+                    no_table,
+                    w,
+                    at,
+                    block,
+                    sides,
+                )
                 if step <= 0.0:
                     break
                 for i in range(free):
@@ -157,9 +197,28 @@ def cycles(
                 S[0, free] = 1.0
             sums[:] = 0.0
             step = advance(
-                f, solved, followers, signal, times, x, S, chosen, tolerance, longest, step,
-                harmonics, sums, no_array, no_array, no_table, no_table, w, at, block, sides,
-            )  # fmt: skip
+                f,
+                solved,
+                followers,
+                signal,
+                times,
+                x,
+                S,
+                chosen,
+                tolerance,
+                longest,
+                step,
+                harmonics,
+                sums,
+                no_array,
+                no_array,
+                no_table,
+                no_table,
+                w,
+                at,
+                block,
+                sides,
+            )
             if step <= 0.0:
                 converged[row] = 0
                 continue

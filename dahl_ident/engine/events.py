@@ -210,9 +210,7 @@ def slope_fades(solved, y, w, at):
 
 
 @compiled
-def step_to_event(
-    f, solved, followers, signal, t, h, position, e, y, span, w, at, matrix, columns
-):  # fmt: skip
+def step_to_event(f, solved, followers, signal, t, h, position, e, y, span, w, at, matrix, columns):
     """Solve for a step that ends at a zero of function e; return its length, and whether it does.
 
     The length is 0 if there is no such step. If the more accurate shorter step shows that the

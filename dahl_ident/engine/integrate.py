@@ -172,9 +172,28 @@ def finish_step(h, y, S, w, at):
 
 @compiled
 def advance(
-    f, solved, followers, signal, times, y, S, chosen, tolerance, longest, step, harmonics, sums,
-    samples, output, by, path, w, at, matrix, columns,
-):  # fmt: skip
+    f,
+    solved,
+    followers,
+    signal,
+    times,
+    y,
+    S,
+    chosen,
+    tolerance,
+    longest,
+    step,
+    harmonics,
+    sums,
+    samples,
+    output,
+    by,
+    path,
+    w,
+    at,
+    matrix,
+    columns,
+):
     """Integrate from times[0] to times[1], in place; return a length of step, 0 if it fails.
 
     `longest` is the longest step. `step` is a guess of the first step, and of the first after a
@@ -221,9 +240,10 @@ def advance(
             if step < _SMALLEST * span:
                 return 0.0
             continue
-        error = error_of(
-            f, solved, followers, dense, integrates_output, signal, t, h, y, w, at
-        ) / tolerance  # fmt: skip
+        error = (
+            error_of(f, solved, followers, dense, integrates_output, signal, t, h, y, w, at)
+            / tolerance
+        )
         if turned:
             error *= _TURNING
         factor = GROW
@@ -252,9 +272,10 @@ def advance(
             if h <= 0.0 or (h > _TOGETHER * span and passed_another(which, w, at)):
                 step, last = 0.5 * where * full, 0.0
                 continue
-            error = error_of(
-                f, solved, followers, dense, integrates_output, signal, t, h, y, w, at
-            ) / tolerance  # fmt: skip
+            error = (
+                error_of(f, solved, followers, dense, integrates_output, signal, t, h, y, w, at)
+                / tolerance
+            )
             if which == 0:
                 error *= _TURNING
             if error * tolerance > allowed and h > LOCATED * span:

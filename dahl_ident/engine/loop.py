@@ -511,9 +511,7 @@ def _half_cycle(f, F, gap, chosen, last_pass, harmonics, sums, tolerance, longes
 
 
 @compiled
-def _settle(
-    f, y, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, longest, steps, at
-):  # fmt: skip
+def _settle(f, y, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, longest, steps, at):
     """Return whether the loop settles, its initial force, the remaining correction, and 1 - map.
 
     Coarse passes, which are left out if the guess y is `sure`, are followed by fine ones with all
@@ -532,10 +530,18 @@ def _settle(
             for half in range(halves):
                 at.numbers[2] = -1.0 if half == 0 else 1.0
                 F, first = _half_cycle(
-                    f, F, gap, chosen, last_pass, harmonics, sums,
+                    f,
+                    F,
+                    gap,
+                    chosen,
+                    last_pass,
+                    harmonics,
+                    sums,
                     tolerance if last_pass else _COARSE * tolerance,
-                    longest if last_pass else np.pi, steps[half], at,
-                )  # fmt: skip
+                    longest if last_pass else np.pi,
+                    steps[half],
+                    at,
+                )
                 if first == 0.0:
                     return False, y, np.inf, 1.0
                 steps[half] = first
@@ -565,7 +571,7 @@ def _continues(row, other, omegas, parameters):
     ),
     cache=True,
     error_model="numpy",
-)  # fmt: skip
+)
 def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics, tolerance):
     """Return settled loops, row by row, each from a guess by the rows before it.
 
@@ -576,12 +582,30 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
     k, P, rows = sizes[1], sizes[2], amplitudes.size
     o, m, columns = 6 + k + P + sizes[5], 4 + k, 2 + chosen.size
     at = Work(
-        np.zeros(o + m * (5 + P)), k, P, o, m, sizes[4] == 1, np.zeros(STAGES), np.zeros(STAGES),
-        np.zeros(STAGES), np.zeros(STAGES), np.zeros(STAGES), np.zeros((STAGES, k)),
-        np.zeros((STAGES, k)), np.zeros(k), np.zeros(k), np.zeros(STAGES), np.zeros(STAGES),
-        np.zeros((STAGES, STAGES)), np.zeros((STAGES, columns)), np.zeros((STAGES, columns)),
-        np.zeros((STAGES, columns)), np.zeros(columns), np.zeros(4),
-    )  # fmt: skip
+        np.zeros(o + m * (5 + P)),
+        k,
+        P,
+        o,
+        m,
+        sizes[4] == 1,
+        np.zeros(STAGES),
+        np.zeros(STAGES),
+        np.zeros(STAGES),
+        np.zeros(STAGES),
+        np.zeros(STAGES),
+        np.zeros((STAGES, k)),
+        np.zeros((STAGES, k)),
+        np.zeros(k),
+        np.zeros(k),
+        np.zeros(STAGES),
+        np.zeros(STAGES),
+        np.zeros((STAGES, STAGES)),
+        np.zeros((STAGES, columns)),
+        np.zeros((STAGES, columns)),
+        np.zeros((STAGES, columns)),
+        np.zeros(columns),
+        np.zeros(4),
+    )
     converged = np.zeros(rows, dtype=np.int64)
     result = np.zeros((rows, harmonics.size, columns), dtype=np.complex128)
     tops, decays = np.zeros(rows), np.zeros(rows)
@@ -609,17 +633,39 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
             guess = tops[last] + increase * (rise + increase * bend)
             sure = older > 0.0 and abs(increase * increase * bend) <= _PREDICTED * abs(tops[last])
             settles, y, change, one_minus_map = _settle(
-                f, guess, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, longest,
-                steps, at,
-            )  # fmt: skip
+                f,
+                guess,
+                sure,
+                halves,
+                sign,
+                gap,
+                chosen,
+                harmonics,
+                sums,
+                tolerance,
+                longest,
+                steps,
+                at,
+            )
         else:
             last = -1
         if not settles:
             steps[:] = _FIRST
             settles, y, change, one_minus_map = _settle(
-                f, 0.0, False, halves, sign, gap, chosen, harmonics, sums, tolerance, longest,
-                steps, at,
-            )  # fmt: skip
+                f,
+                0.0,
+                False,
+                halves,
+                sign,
+                gap,
+                chosen,
+                harmonics,
+                sums,
+                tolerance,
+                longest,
+                steps,
+                at,
+            )
         if not settles:
             last = -1
             continue

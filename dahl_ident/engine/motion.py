@@ -118,11 +118,20 @@ def settled(
     first = np.zeros((amplitude.size, system.order)) if starts is None else starts
     found, result, first, maps = _run(
         kernels("cycle").cycles,
-        system.function, system.sizes, system.solved, system.followers, system.odd,
-        _numbers(amplitude), _numbers(omega), _numbers(parameters), _numbers(first),
-        np.asarray(chosen, dtype=np.int64), np.asarray(harmonics, dtype=np.float64), cycles,
+        system.function,
+        system.sizes,
+        system.solved,
+        system.followers,
+        system.odd,
+        _numbers(amplitude),
+        _numbers(omega),
+        _numbers(parameters),
+        _numbers(first),
+        np.asarray(chosen, dtype=np.int64),
+        np.asarray(harmonics, dtype=np.float64),
+        cycles,
         _SETTLED / finer,
-    )  # fmt: skip
+    )
     found = found.astype(bool)
     result[~found] = np.nan
     return Settled(found, result[..., 0], result[..., 1], result[..., 2:], first, maps)
@@ -145,11 +154,17 @@ def loops(
     that is the last parameter.
     """
     found, result, tops, decays = kernels("loop").loops(
-        system.function, system.sizes, system.odd, gap, _numbers(amplitude), _numbers(omega),
-        _numbers(parameters), np.asarray(chosen, dtype=np.int64),
+        system.function,
+        system.sizes,
+        system.odd,
+        gap,
+        _numbers(amplitude),
+        _numbers(omega),
+        _numbers(parameters),
+        np.asarray(chosen, dtype=np.int64),
         np.asarray(harmonics, dtype=np.int64),
         _LOOP / finer / (_RATED if system.sizes[4] else 1.0),
-    )  # fmt: skip
+    )
     found = found.astype(bool)
     result[~found] = np.nan
     return Loops(found, result[..., 0], result[..., 1], result[..., 2:], tops, decays)
@@ -175,11 +190,19 @@ def march(
     """
     found, output, by, states, last = _run(
         kernels("samples").march,
-        system.function, system.sizes, system.solved, system.followers, _numbers(knots),
-        _numbers(coefficients), _numbers(samples), _numbers(first), _numbers(parameters),
-        np.asarray(chosen, dtype=np.int64), int(derivatives),
+        system.function,
+        system.sizes,
+        system.solved,
+        system.followers,
+        _numbers(knots),
+        _numbers(coefficients),
+        _numbers(samples),
+        _numbers(first),
+        _numbers(parameters),
+        np.asarray(chosen, dtype=np.int64),
+        int(derivatives),
         _SAMPLED / finer / (_HELD if system.held else 1.0),
-    )  # fmt: skip
+    )
     if not found or not np.isfinite(output).all():
         raise FitError(
             f"the motion grows beyond all bounds at the parameters {parameters.tolist()}"

@@ -98,9 +98,16 @@ def steady_motions(
         for count in runs or (None,):
             with np.errstate(all="ignore"):
                 motions = settled(
-                    symmetric, drive[solved], omega[solved], parameters[solved], chosen=chosen,
-                    harmonics=harmonics, starts=states, cycles=count, finer=finer,
-                )  # fmt: skip
+                    symmetric,
+                    drive[solved],
+                    omega[solved],
+                    parameters[solved],
+                    chosen=chosen,
+                    harmonics=harmonics,
+                    starts=states,
+                    cycles=count,
+                    finer=finer,
+                )
             states = motions.starts
         multiplier = np.full(solved.size, np.nan)
         ok = motions.found & np.isfinite(motions.maps).all(axis=(1, 2))

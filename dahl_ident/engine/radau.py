@@ -132,11 +132,36 @@ def layout(sizes, columns, degree):
     interval = stiff + 1  # the signal's: number, begin, end, 1 where pinned, coefficients
     length = interval + 4 + degree + 1
     return Layout(
-        n, k, P, sizes[3], sizes[4], degree, outputs, values, rates, state_slopes, drive_slopes,
-        solved_slopes, coupling, follow, follow_slopes, stages, last, changes, scale, sides,
-        before, output, weights, jump, late, signal,
-        stiff, interval, length,
-    )  # fmt: skip
+        n,
+        k,
+        P,
+        sizes[3],
+        sizes[4],
+        degree,
+        outputs,
+        values,
+        rates,
+        state_slopes,
+        drive_slopes,
+        solved_slopes,
+        coupling,
+        follow,
+        follow_slopes,
+        stages,
+        last,
+        changes,
+        scale,
+        sides,
+        before,
+        output,
+        weights,
+        jump,
+        late,
+        signal,
+        stiff,
+        interval,
+        length,
+    )
 
 
 @compiled
@@ -518,9 +543,7 @@ def error_of(f, solved, followers, dense, integrates_output, signal, t, h, y, w,
 
 
 @compiled
-def sensitivities(
-    f, solved, followers, signal, t, h, y, S, first, chosen, w, at, matrix, columns
-):  # fmt: skip
+def sensitivities(f, solved, followers, signal, t, h, y, S, first, chosen, w, at, matrix, columns):
     """Set the changes of the sensitivities up to the stages of the solved step."""
     n, P, R, q, held = at.n, at.P, solved.size, S.shape[1], at.held
     m, d = n + 1 + at.k, at.changes

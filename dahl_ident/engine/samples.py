@@ -21,16 +21,36 @@ from dahl_ident.engine.radau import (
 
 @njit(
     types.Tuple((int64, VECTOR, TABLE, TABLE, TABLE))(
-        FUNCTION, NUMBERS, NUMBERS, NUMBERS, VECTOR, TABLE, VECTOR, VECTOR, VECTOR, NUMBERS,
-        int64, float64,
+        FUNCTION,
+        NUMBERS,
+        NUMBERS,
+        NUMBERS,
+        VECTOR,
+        TABLE,
+        VECTOR,
+        VECTOR,
+        VECTOR,
+        NUMBERS,
+        int64,
+        float64,
     ),
     cache=True,
     error_model="numpy",
-)  # fmt: skip
+)
 def march(
-    f, sizes, solved, followers, knots, coefficients, samples, first, parameters, chosen,
-    derivatives, tolerance,
-):  # fmt: skip
+    f,
+    sizes,
+    solved,
+    followers,
+    knots,
+    coefficients,
+    samples,
+    first,
+    parameters,
+    chosen,
+    derivatives,
+    tolerance,
+):
     """Return success; output at the samples, its derivatives, states; derivatives of the last one.
 
     The signal is polynomials between knots. If `derivatives` is 1, these are with respect to the
@@ -51,8 +71,26 @@ def march(
     times = np.array([samples[0], samples[N - 1]])
     step = knots[1] - knots[0]
     done = advance(
-        f, solved, followers, signal, times, y, S, chosen, tolerance, np.inf, step,
-        np.empty(0), np.empty((0, 1 + q), dtype=np.complex128), samples, output, by, path, w, at,
-        matrix, columns,
-    )  # fmt: skip
+        f,
+        solved,
+        followers,
+        signal,
+        times,
+        y,
+        S,
+        chosen,
+        tolerance,
+        np.inf,
+        step,
+        np.empty(0),
+        np.empty((0, 1 + q), dtype=np.complex128),
+        samples,
+        output,
+        by,
+        path,
+        w,
+        at,
+        matrix,
+        columns,
+    )
     return int(done > 0.0), output, by, path, S

@@ -150,9 +150,16 @@ def _followers(by_state: ca.SX, rows: ca.SX, states: Sequence[ca.SX], drive: ca.
 
 
 _ODD = (
-    ca.OP_SIN, ca.OP_TAN, ca.OP_SINH, ca.OP_TANH, ca.OP_ASIN, ca.OP_ATAN, ca.OP_ASINH, ca.OP_ATANH,
+    ca.OP_SIN,
+    ca.OP_TAN,
+    ca.OP_SINH,
+    ca.OP_TANH,
+    ca.OP_ASIN,
+    ca.OP_ATAN,
+    ca.OP_ASINH,
+    ca.OP_ATANH,
     ca.OP_ERF,
-)  # fmt: skip
+)
 _EVEN = (ca.OP_COS, ca.OP_COSH)
 
 

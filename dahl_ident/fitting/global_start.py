@@ -552,10 +552,12 @@ def _computed_table(
         with np.errstate(all="ignore"):
             parts.append(
                 element.stiffness(
-                    values, np.tile(np.exp(part), orders.size), np.ones(()),
+                    values,
+                    np.tile(np.exp(part), orders.size),
+                    np.ones(()),
                     np.repeat(orders, part.size),
                 ).reshape(orders.size, -1)
-            )  # fmt: skip
+            )
         if not (np.abs(parts[-1]) < _LARGEST).all():
             break
     Z = np.concatenate(parts, axis=1)

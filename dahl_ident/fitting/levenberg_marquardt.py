@@ -361,13 +361,23 @@ def minimise_by_scipy(
     if np.isfinite(rows(start.tobytes())[0]).all():
         with np.errstate(all="ignore"):
             end = optimize.least_squares(
-                residuals, start, jacobian, bounds=problem.bounds(),
-                x_scale="jac", ftol=_OF_COST, xtol=_OF_STEP, gtol=_OF_SLOPE, max_nfev=_EVALUATIONS,
-            )  # fmt: skip
+                residuals,
+                start,
+                jacobian,
+                bounds=problem.bounds(),
+                x_scale="jac",
+                ftol=_OF_COST,
+                xtol=_OF_STEP,
+                gtol=_OF_SLOPE,
+                max_nfev=_EVALUATIONS,
+            )
         theta, converged, nfev = np.asarray(end.x), end.status > 0, int(end.nfev)
     minimum = problem.quadratic(theta, scale, loss)
     cost = float(minimum.cost) if nfev > 1 or converged else np.inf
     return Minima(
-        theta[None], np.array([cost]), minimum.hessian[None], np.array([converged]),
+        theta[None],
+        np.array([cost]),
+        minimum.hessian[None],
+        np.array([converged]),
         np.array([nfev]),
-    )  # fmt: skip
+    )

@@ -347,9 +347,13 @@ class OptimumBatch:
         }
         status = tuple(one for part in parts for one in part.status)
         return replace(
-            parts[0], problem=problem, status=status, combinations=combinations,
-            meanings=meanings, **arrays,
-        )  # fmt: skip
+            parts[0],
+            problem=problem,
+            status=status,
+            combinations=combinations,
+            meanings=meanings,
+            **arrays,
+        )
 
     def _message(self, index: int) -> str:
         """Return the status with the names and numbers that belong to it."""
