@@ -192,3 +192,19 @@ def test_a_search_ends_at_a_kink_of_the_cost():
     fit = di.fit(di.Record(t, displacement=x, force=force), Bilinear())
     assert fit.trusted
     assert abs(fit.params["sigma"].value - 100.0) < 3.0 * fit.params["sigma"].stderr
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_elements_of_one_law_are_in_order_of_their_x_c(seed):
+    """As for tables; without an order every second fit had the names exchanged."""
+    x = trajectory("random", 1200, seed) / 10.0
+    force = di.Dahl(4.0, 3e5).force(x) + di.Dahl(3.0, 2e4).force(x)
+    force = force + 0.02 * np.random.default_rng(seed).standard_normal(x.size)
+    record = di.Record(np.arange(x.size) / RATE, displacement=x, force=force)
+    pair = di.fit(record, di.Dahl(name="a") + di.Dahl(name="b"))
+    springs = di.fit(record, di.MaxwellSlip(2), throw=False)
+    for name, truth in {"a_f_max": 4.0, "a_sigma": 3e5, "b_f_max": 3.0, "b_sigma": 2e4}.items():
+        assert pair.params[name].value == pytest.approx(truth, rel=0.1)
+    assert springs.params["slip_1"].value < springs.params["slip_2"].value
+    again = di.FitResult.from_json(pair.to_json())
+    assert again.params["b_f_max"].value == pair.params["b_f_max"].value

@@ -331,6 +331,10 @@ class RecordSearch:
 
     def optimum(self, problem: RecordProblem, end: Minima) -> Optimum:
         """Return the optimum at the end of a search, with assumed exponents fixed there."""
+        ordered = problem.in_order(end.theta)
+        if (ordered != end.theta).any():
+            cost, _, hessian = problem.quadratic(ordered, self.scale, self.rho)
+            end = replace(end, theta=ordered, cost=cost, hessian=hessian)
         if problem.ranges:
             values = dict(zip(problem.names, problem.to_values(end.theta[0]), strict=True))
             theta = end.theta[:, [name not in problem.ranges for name in problem.names]]

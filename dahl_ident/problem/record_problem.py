@@ -25,7 +25,7 @@ from dahl_ident.noise import Rho
 from dahl_ident.problem.base import Quadratic
 from dahl_ident.problem.record_prediction import Predicted, force_of, motion_of
 from dahl_ident.problem.record_waves import SHORTEST, RecordWaves, bends
-from dahl_ident.problem.space import Space
+from dahl_ident.problem.space import Interchangeable, Space
 from dahl_ident.problem.table_problem import TableProblem
 
 _SAMPLES_PER_CYCLE = 100.0  # of a record that is thinned
@@ -140,6 +140,13 @@ class RecordProblem(RecordWaves):
                 low, high = min(low, value), max(high, value)
                 ranges[name] = np.log(value), np.log(high / low) / 12.0**0.5 / noise
         return self._with_free(self.model.with_parameters(freed), ranges)
+
+    def in_order(self, theta: ArrayLike) -> FloatArray:
+        """Return theta with interchangeable elements in order of their knees, as for tables."""
+        several = len(self.records) > 1
+        records = [f"_{i + 1}" if several else "" for i in range(len(self.records))]
+        alike = Interchangeable(self.model, self.names, records)
+        return alike.in_order(self.space.checked(theta), self.space)
 
     def held(self, values: Mapping[str, float]) -> RecordProblem:
         """Return the same problem with free parameters assumed to have some values."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray, positive_array, real_array
 from dahl_ident.elements import Element, Model, Parameter
+from dahl_ident.elements.element import prefixed
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 
@@ -142,10 +143,11 @@ class Space:
 class Interchangeable:
     """Interchangeable elements of a model, and interchangeable parts of one element.
 
-    Elements are ordered by their knees, parts by the first parameter of each.
+    Elements are ordered by their knees, parts by the first parameter of each. Their states at the
+    first sample of a record, whose names end in one of `records`, go with them.
     """
 
-    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
+    def __init__(self, model: Model, names: tuple[str, ...], records: Sequence[str] = ()) -> None:
         alike: dict[tuple[object, ...], list[Element]] = {}
         for element in model.elements:
             if not element.is_linear and any(p.free for p in element.parameters):
@@ -155,16 +157,28 @@ class Interchangeable:
                 )
                 alike.setdefault((type(element), element.labels, settings), []).append(element)
         self._sets = [elements for elements in alike.values() if len(elements) > 1]
-        self._columns = [
-            np.array([[names.index(p.name) for p in e.parameters if p.free] for e in elements])
-            for elements in self._sets
-        ]
+
+        def first_states(element: Element) -> list[list[int]]:
+            starts = element.starts if element.has_memory else ()
+            states = [prefixed(element.name, start) for start, *_ in starts]
+            return [[names.index(state + record) for record in records] for state in states]
+
+        self._columns = []
+        for elements in self._sets:
+            columns = [[names.index(p.name) for p in e.parameters if p.free] for e in elements]
+            for row, element in zip(columns, elements, strict=True):
+                row += [i for state in first_states(element) for i in state]
+            self._columns.append(np.array(columns))
         self._parts = []
         for element in model.elements:
             by_label = dict(zip(element.labels, element.parameters, strict=True))
             parts = [[by_label[label] for label in part] for part in element.like_parts]
             if parts and all(p.free for part in parts for p in part):
-                self._parts.append(np.array([[names.index(p.name) for p in q] for q in parts]))
+                columns = [[names.index(p.name) for p in part] for part in parts]
+                states = first_states(element)
+                if len(states) == len(parts):
+                    columns = [c + at for c, at in zip(columns, states, strict=True)]
+                self._parts.append(np.array(columns))
 
     def in_order(self, theta: FloatArray, space: Space) -> FloatArray:
         """Return `theta` with the columns of like elements exchanged until the knees rise."""
