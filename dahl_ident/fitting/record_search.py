@@ -524,7 +524,11 @@ def _is_white(problem: RecordProblem, end: Minima) -> bool:
     if unexplained(problem, end) < EXACT:
         return True
     products = np.zeros(_LAGS + 1)
-    for e in problem.split_residuals(problem.to_values(end.theta[0])):
+    try:
+        residuals = problem.split_residuals(problem.to_values(end.theta[0]))
+    except FitError:  # values so far off that not every way to integrate them succeeds
+        return False
+    for e in residuals:
         products += [float(e[k:] @ e[: max(e.size - k, 0)]) for k in range(_LAGS + 1)]
     statistic = problem.n_residuals * float(((products[1:] / products[0]) ** 2).sum())
     return bool(statistic < _LAGS + _CORRELATED * (2.0 * _LAGS) ** 0.5)
