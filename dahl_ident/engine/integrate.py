@@ -302,7 +302,7 @@ def advance(
             sample = write_samples(
                 f, signal, t, h, y, S, first, chosen, samples, sample, output, by, path, w, at
             )
-        arrived = reached_zero(y, w, at) if which < 0 else -1
+        event = which if which >= 0 else reached_zero(y, w, at)
         finish_step(h, y, S, w, at)
         if not w[at.scale + 1] < _BEYOND_BOUNDS:
             return 0.0
@@ -312,15 +312,14 @@ def advance(
         if turned:
             after_turn, turned = h * factor, False
         step = max(step, h * factor) if h < step else h * factor
-        if arrived >= 0:
-            pass_event(f, signal, t, arrived, y, S, first, chosen, w, at)
+        if event >= 0:
+            pass_event(f, signal, t, event, y, S, first, chosen, w, at)
             new_branch = True
-        if which >= 0:
-            pass_event(f, signal, t, which, y, S, first, chosen, w, at)
-            new_branch = True
-            if which == 0:
-                step, turned = after_turn, True
-        elif at.held and at_stop and t < end:  # the held motion turns, or has another polynomial
+        if which == 0:
+            step, turned = after_turn, True
+        elif (
+            which < 0 and at.held and at_stop and t < end
+        ):  # the held motion turns, or has another polynomial
             direction = w[at.sides]
             next_stop(signal, t, end, span, w, at)
             choose_branch(f, signal, t, y, w, at)
