@@ -35,7 +35,6 @@ from dahl_ident.diagnostics.record_sources import (
     BLOCKS,
     FixedExponent,
     LinearFit,
-    between_blocks,
     between_records,
     fixed_exponents,
 )
@@ -111,8 +110,8 @@ def record_errors(
     fit = LinearFit.of(problem, values, jacobians, residuals)
     covariance, effective = fit.by_noise
     sources = {NOISE: covariance}
-    if (by_model := between_blocks(fit)) is not None:
-        sources[MODEL_ERROR] = by_model
+    if fit.between_blocks is not None:
+        sources[MODEL_ERROR] = fit.between_blocks
     noisier, other_motions = with_noisier_displacement(fit), by_other_motions(fit)
     by_motion = partial(motion_sources, noisier=noisier, other_motions=other_motions)
     of_motion = dict(by_motion(fit))

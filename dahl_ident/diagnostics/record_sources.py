@@ -67,6 +67,14 @@ class LinearFit:
         return sandwich(self.jacobians, self.residuals, self.noise)
 
     @cached_property
+    def between_blocks(self) -> FloatArray | None:
+        """Covariance between blocks in excess of noise; None if noise explains it."""
+        if sum(e.size for e in self.residuals) < BLOCKS * BLOCKS:
+            return None
+        blocks = [[block] for block in blocks_of(self.residuals)]
+        return _between(self, blocks, self.by_noise[0], _LEVEL)
+
+    @cached_property
     def inverse(self) -> FloatArray:
         """Inverse of the normal matrix, (P, P)."""
         return inverse_normal(self.jacobians)
@@ -126,7 +134,7 @@ class LinearFit:
 
     def covariance(self, sources: Sources | None = None) -> FloatArray:
         """Return the covariance by noise, scatter between blocks and other `sources`, (P, P)."""
-        parts = [self.by_noise[0], between_blocks(self)]
+        parts = [self.by_noise[0], self.between_blocks]
         parts += [part for _, part in sources(self)] if sources else []
         return np.asarray(sum(part for part in parts if part is not None))
 
@@ -264,14 +272,6 @@ class _FreedValue(NamedTuple):
         total[lost, lost] = np.inf
         beyond = max((weight * mean) ** 2 - weight * u2, 0.0)
         return (weight * u2) ** 0.5, excess(total, exact) + beyond * line
-
-
-def between_blocks(fit: LinearFit) -> FloatArray | None:
-    """Return the covariance between blocks in excess of noise; None if noise explains it."""
-    if sum(e.size for e in fit.residuals) < BLOCKS * BLOCKS:
-        return None
-    blocks = [[block] for block in blocks_of(fit.residuals)]
-    return _between(fit, blocks, fit.by_noise[0], _LEVEL)
 
 
 def blocks_of(waves: Sequence[FloatArray], blocks: int = BLOCKS) -> list[tuple[int, IntArray]]:
