@@ -24,7 +24,7 @@ from dahl_ident.errors import DataError, FitError
 from dahl_ident.noise import Rho
 from dahl_ident.problem.base import Quadratic
 from dahl_ident.problem.record_prediction import Predicted, force_of, motion_of
-from dahl_ident.problem.record_waves import SHORTEST, RecordWaves, bends
+from dahl_ident.problem.record_waves import SHORTEST, RecordWaves, bends, endings
 from dahl_ident.problem.space import Interchangeable, Space
 from dahl_ident.problem.table_problem import TableProblem
 
@@ -143,9 +143,7 @@ class RecordProblem(RecordWaves):
 
     def in_order(self, theta: ArrayLike) -> FloatArray:
         """Return theta with interchangeable elements in order of their knees, as for tables."""
-        several = len(self.records) > 1
-        records = [f"_{i + 1}" if several else "" for i in range(len(self.records))]
-        alike = Interchangeable(self.model, self.names, records)
+        alike = Interchangeable(self.model, self.names, endings(self.records))
         return alike.in_order(self.space.checked(theta), self.space)
 
     def held(self, values: Mapping[str, float]) -> RecordProblem:

@@ -344,13 +344,17 @@ class RecordWaves(Problem):
         return FirstState(self.coefficients.model)
 
 
+def endings(records: Sequence[Record]) -> list[str]:
+    """Return what the names of each record's unknowns end in: its number, if there are several."""
+    return [f"_{i + 1}" for i in range(len(records))] if len(records) > 1 else [""]
+
+
 def nuisance(model: Model, records: Sequence[Record], output: str) -> list[Parameter]:
     """Return the unknowns of each record: initial states, an offset and, of forces, a drift."""
     unknowns = []
     channel = records[0].motion_channel
     unit = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}[channel]
-    for number in range(len(records)):
-        tail = f"_{number + 1}" if len(records) > 1 else ""
+    for tail in endings(records):
         if output == "motion":
             unknowns.append(Parameter(f"initial_displacement{tail}", "m", "at the first sample"))
             unknowns.append(Parameter(f"initial_velocity{tail}", "m/s", "at the first sample"))

@@ -144,10 +144,10 @@ class Interchangeable:
     """Interchangeable elements of a model, and interchangeable parts of one element.
 
     Elements are ordered by their knees, parts by the first parameter of each. Their states at the
-    first sample of a record, whose names end in one of `records`, go with them.
+    first sample of each record, whose names end in one of `endings`, go with them.
     """
 
-    def __init__(self, model: Model, names: tuple[str, ...], records: Sequence[str] = ()) -> None:
+    def __init__(self, model: Model, names: tuple[str, ...], endings: Sequence[str] = ()) -> None:
         alike: dict[tuple[object, ...], list[Element]] = {}
         for element in model.elements:
             if not element.is_linear and any(p.free for p in element.parameters):
@@ -161,7 +161,7 @@ class Interchangeable:
         def first_states(element: Element) -> list[list[int]]:
             starts = element.starts if element.has_memory else ()
             states = [prefixed(element.name, start) for start, *_ in starts]
-            return [[names.index(state + record) for record in records] for state in states]
+            return [[names.index(state + ending) for ending in endings] for state in states]
 
         self._columns = []
         for elements in self._sets:
