@@ -8,8 +8,9 @@ from dahl_ident.arrays import FloatArray
 
 _DEGREE = 4  # of the polynomials; that of the acceleration is 2
 _POWER = 0.9999  # share of the velocity's power in the band of the signal
-_ABOVE = 20.0  # times the noise's median power, which noise exceeds in one frequency of a million
 _MARGIN = 4.0  # pass band of the filter over that band: at 2 a mass has an error of 2 %
+ABOVE_NOISE = 20.0
+"""Power over the median of noise, which noise exceeds in one frequency of a million."""
 
 
 def differentiated(
@@ -52,7 +53,7 @@ def filter_window(samples: FloatArray) -> int:
     noise = 4.0 * np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, power.size)) ** 2
     upper = power.size // 2
     noise *= np.median(power[upper:] / noise[upper:])
-    above = np.flatnonzero(power > _ABOVE * noise)
+    above = np.flatnonzero(power > ABOVE_NOISE * noise)
     highest = min(np.searchsorted(np.cumsum(power) / total, _POWER), above.max(initial=0))
     band = float(highest + 1) / power.size
     half = int(((_DEGREE + 1.0) / min(1.0, _MARGIN * band) + 4.6) / 3.2)

@@ -15,13 +15,13 @@ from scipy.special import comb
 
 from dahl_ident.arrays import BoolArray, FloatArray
 from dahl_ident.data import Record
+from dahl_ident.engine.differentiation import ABOVE_NOISE
 
 HIGHEST_ORDER = (
     60  # most coefficients of an autoregression, to limit time; Akaike's criterion chooses
 )
 SAMPLES_PER_ORDER = 20  # samples for each coefficient: with fewer, it follows the noise
 _BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
-_ABOVE = 20.0  # times the noise's median power, which noise exceeds in one frequency of a million
 _FORGETS = 3.0  # samples times the cut, over half the rate, after which a high pass forgets
 _OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
 
@@ -92,9 +92,10 @@ def drive_noise(drives: Sequence[FloatArray]) -> DriveNoise | None:
     stds, noise, signal = [], 0.0, 0.0
     for drive in drives:
         band, power = excited(drive), _power(drive)
-        if np.mean(~band) < _OUTSIDE:
+        median = _median(power, ~band)
+        if median is None:
             return None
-        mean = float(np.median(power[~band])) / np.log(2.0)
+        mean = median / np.log(2.0)
         stds.append((mean / float((np.hanning(drive.size) ** 2).sum())) ** 0.5)
         noise += mean * band.sum() / drive.size
         signal += float(power[band].sum()) / drive.size
@@ -123,13 +124,13 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     spectrum = np.fft.rfft(np.concatenate([detrended, -detrended[-2:0:-1]]))
     m = 2 * n - 2
     s = 2j * np.pi * np.fft.rfftfreq(m, 1.0 / record.sample_rate)
-    power = _power(drive if _power(drive).any() else y)  # in a free decay the motion gives the band
-    bins = np.flatnonzero(power >= _BAND * power.max())
-    highest = 1.25 * bins[-1] / power.size  # of half the sampling rate
+    # in a free decay the motion gives the band
+    bins = np.flatnonzero(excited(drive if _power(drive).any() else y))
     response = _power(y)
-    noise = np.median(response[bins[-1] :])
-    shown = bins[response[bins] > _ABOVE * noise]
-    lowest = 0.5 * (shown if shown.size else bins)[0] / power.size
+    highest = 1.25 * bins[-1] / response.size  # of half the sampling rate
+    noise = _median(response, np.arange(response.size) > bins[-1]) or 0.0
+    shown = bins[response[bins] > ABOVE_NOISE * noise]
+    lowest = 0.5 * (shown if shown.size else bins)[0] / response.size
     fraction = np.arange(spectrum.size) / spectrum.size
     spectrum[fraction > highest] = 0.0
     order = ("displacement", "velocity", "acceleration").index(record.motion_channel)
@@ -153,6 +154,11 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
             wave = cumulative_trapezoid(waves[0], dx=1.0 / record.sample_rate, initial=0)
             waves.insert(0, np.asarray(sosfiltfilt(highpass, detrend(wave), padlen=padding)))
     return waves[0], waves[1], waves[2]
+
+
+def _median(power: FloatArray, outside: BoolArray) -> float | None:
+    """Return the median power outside a band, that of noise; None if too little is outside."""
+    return float(np.median(power[outside])) if np.mean(outside) >= _OUTSIDE else None
 
 
 def _power(wave: FloatArray) -> FloatArray:
