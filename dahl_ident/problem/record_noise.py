@@ -15,7 +15,6 @@ from scipy.special import comb
 
 from dahl_ident.arrays import BoolArray, FloatArray
 from dahl_ident.data import Record
-from dahl_ident.engine.differentiation import ABOVE_NOISE
 
 HIGHEST_ORDER = (
     60  # most coefficients of an autoregression, to limit time; Akaike's criterion chooses
@@ -117,6 +116,8 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     ends; integrated by the trapezoidal rule, and then freed of what is slower than the drive, or
     than the motion that exceeds the record's noise.
     """
+    from dahl_ident.engine.differentiation import ABOVE_NOISE  # the engine is slow to import
+
     n = len(record)
     drive = record.force_samples
     line = np.linspace(y[0], y[-1], n)
