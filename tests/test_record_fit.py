@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
 
 import dahl_ident as di
@@ -67,10 +67,15 @@ def driven(seed, noise, samples=2048, channel="displacement"):
     return di.Record(t, force=drive, **{channel: y})
 
 
-def test_a_swept_acceleration_is_found_without_a_start():
-    """Integrated twice, its noise below the sweep would be four times the displacement."""
+@pytest.mark.parametrize("kind", ["sweep", "noise in a band", "noise"])
+def test_a_driven_acceleration_is_found_without_a_start(kind):
+    """Integrated twice, noise below the lowest motion would be four times the displacement."""
     t = np.arange(4000) / RATE
     drive = 3.0 * np.sin(2.0 * np.pi * (t + 0.9 * t**2))
+    if kind != "sweep":
+        drive = 3.0 * np.random.default_rng(5).standard_normal(t.size)
+    if kind == "noise in a band":
+        drive = 2.0 * sosfiltfilt(butter(4, 0.24, output="sos"), drive)
     plant = Model(di.Dahl(0.5, 2e3, 1.0) + di.Mass(0.3) + di.Damper(0.5) + di.Spring(400.0))
     x, v, friction = Driven(plant, drive, RATE).motion(np.zeros(3)).states.T
     a = (drive - 0.5 * v - 400.0 * x - friction) / 0.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -418,8 +419,10 @@ class RecordSearch:
             starts = [theta for cost, theta in candidates if cost < np.inf][:_WORTH]
             ends = [self.minimise(problem, theta[None], ROUGH) for theta in starts]
             lowest = min(ends, key=lambda minimum: float(minimum.cost[0]), default=end)
-            residuals = problem.split_residuals(values)
-            chance = significant_fall(float(end.cost[0]), problem.n_residuals, residuals)
+            chance = 0.0
+            with suppress(FitError):  # values so far off that their motion is not always found
+                residuals = problem.split_residuals(values)
+                chance = significant_fall(float(end.cost[0]), problem.n_residuals, residuals)
             better = 2.0 * (end.cost[0] - lowest.cost[0]) > chance
             if better or (lowest.cost[0] < end.cost[0] and not end.converged[0]):
                 end = self.descend(problem, lowest.theta[0], STEPS)

@@ -22,6 +22,8 @@ HIGHEST_ORDER = (
 SAMPLES_PER_ORDER = 20  # samples for each coefficient: with fewer, it follows the noise
 _BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
 _FORGETS = 3.0  # samples times the cut, over half the rate, after which a high pass forgets
+_NEIGHBOURS = 16  # fewest frequencies whose mean power is compared: chance halves the least mean
+_PARTS = 64  # of the frequencies, whose mean powers are compared
 _OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
 
 
@@ -129,7 +131,7 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     bins = np.flatnonzero(excited(drive if _power(drive).any() else y))
     response = _power(y)
     highest = 1.25 * bins[-1] / response.size  # of half the sampling rate
-    noise = _median(response, np.arange(response.size) > bins[-1]) or 0.0
+    noise = _median(response, np.arange(response.size) > bins[-1]) or _least(response)
     shown = bins[response[bins] > ABOVE_NOISE * noise]
     lowest = 0.5 * (shown if shown.size else bins)[0] / response.size
     fraction = np.arange(spectrum.size) / spectrum.size
@@ -162,8 +164,16 @@ def _median(power: FloatArray, outside: BoolArray) -> float | None:
     return float(np.median(power[outside])) if np.mean(outside) >= _OUTSIDE else None
 
 
+def _least(power: FloatArray) -> float:
+    """Return the least mean power of neighbouring frequencies: noise is not larger."""
+    width = max(_NEIGHBOURS, power.size // _PARTS)
+    return float(np.convolve(power, np.full(width, 1.0 / width), "valid").min())
+
+
 def _power(wave: FloatArray) -> FloatArray:
-    return np.asarray(np.abs(np.fft.rfft(np.hanning(wave.size) * (wave - wave.mean()))) ** 2)
+    window = np.hanning(wave.size)
+    mean = np.average(wave, weights=window)  # the plain mean contains parts of all frequencies
+    return np.asarray(np.abs(np.fft.rfft(window * (wave - mean))) ** 2)
 
 
 _ORDER = 4  # order of differences: they contain little of any motion
