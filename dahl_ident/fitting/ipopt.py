@@ -63,9 +63,18 @@ _LEAST_RESIDUAL = 1e-4
 _ACTIVE = 1e-6  # distance, in units of the step, at which an inequality holds with equality
 _STEP = 1e-4  # of ln p, for differences of gradients
 _MOST_STARTS = 6  # of the global grid and the user
+_FACTORS = (1.0, 0.01, 100.0)  # of the data's sizes, from which constraints alone are satisfied
+_SMALL = 1e-6  # weight of the distance from there
 _SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-_INFEASIBLE = "infeasible problem detected"
+_INFEASIBLE = "Infeasible_Problem_Detected"
+_SILENT: dict[str, Any] = {
+    "print_time": False,
+    "show_eval_warnings": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+}
 _WORDS = {
+    _INFEASIBLE: "it found no way to satisfy the constraints",
     "Maximum_Iterations_Exceeded": "it reached the maximum number of iterations",
     "Restoration_Failed": "it could not return to a point that satisfies the constraints",
     "Diverging_Iterates": "a parameter diverged",
@@ -137,6 +146,31 @@ class Relations:
                 values.append(ca.SX(float(parameter.value or 0.0)))
         differences: ca.SX = self.differences.call(values)[0]
         return differences
+
+    def check(self, problem: Problem) -> None:
+        """Raise if no parameters satisfy the constraints, whatever the data."""
+        import casadi as ca
+
+        if self.differences is None:
+            return
+        sizes = np.array([np.median(problem.unit_sizes(p.dimension)) for p in problem.parameters])
+        low, high = problem.bounds()
+        for factor in _FACTORS:
+            start = np.clip(problem.to_search(factor * sizes), low, high)
+            unit = np.where(problem.space.positive, 1.0, factor * sizes)
+            xi = ca.SX.sym("xi", start.size)
+            relations = self.at(problem, ca.DM(start) + ca.DM(unit) * xi)
+            nlp = {"x": xi, "f": _SMALL * ca.sumsqr(xi), "g": relations}
+            solver = ca.nlpsol("ipopt", "ipopt", nlp, _SILENT)
+            least = np.where(self.equal, 0.0, -np.inf)
+            bounds = {"lbx": (low - start) / unit, "ubx": (high - start) / unit}
+            solver(x0=0.0, lbg=least, ubg=0.0, **bounds)
+            if str(solver.stats()["return_status"]) != _INFEASIBLE:
+                return
+        raise FitError(
+            f"no parameters satisfy the constraints {'; '.join(self.texts)} within the bounds: "
+            "relax one of them"
+        )
 
 
 class _Symbols(dict[str, "ca.SX"]):
@@ -214,6 +248,7 @@ def solve_ipopt(
     if drive_std is not None or drive_covariance is not None:
         problem = _with_drive_error(problem, loss, drive_std, drive_covariance)
     relations = Relations.of(problem, constraints)
+    relations.check(problem)
     # without constraints, the start is that without errors of the drive, which is far quicker
     begin = solve(problem if relations.texts else plain, loss=loss, start=start, tell=tell)
     if begin.status.at_infinity and not relations.texts and problem is plain:
@@ -284,8 +319,7 @@ class _Descent:
         ends += [self.descend(theta) for theta in starts if np.isfinite(self.at(theta).cost)]
         if not ends:
             raise FitError("no start has a steady response in every row; give another start")
-        # costs of failures say little: a contradiction in the constraints explains them
-        best = min(ends, key=lambda e: (bool(e.failure), e.failure != _INFEASIBLE, e.cost))
+        best = min(ends, key=lambda e: (bool(e.failure), e.cost))
         again = best if best.failure else self.descend(best.theta)  # in the units of the optimum
         return best if again.failure else again
 
@@ -323,10 +357,7 @@ class _Descent:
             "ipopt",
             {"x": x, "f": cost(x), "g": constraints(x)},
             {
-                "print_time": False,
-                "show_eval_warnings": False,
-                "ipopt.print_level": 0,
-                "ipopt.sb": "yes",
+                **_SILENT,
                 "ipopt.tol": tolerance,
                 "ipopt.max_iter": _ITERATIONS,
                 "ipopt.nlp_scaling_method": "none",
@@ -365,11 +396,6 @@ class _Descent:
     def optimum(self, end: _End, begin: Optimum) -> Optimum:
         """Return the optimum with status, message and covariance."""
         problem, relations = self.problem, self.relations
-        if end.failure == _INFEASIBLE:
-            raise FitError(
-                f"no parameters satisfy the constraints {'; '.join(relations.texts)} within the "
-                "bounds; IPOPT found the least violation elsewhere: relax one of them"
-            )
         minima = Minima(
             end.theta[None],
             np.array([end.cost]),

@@ -273,8 +273,8 @@ class RecordProblem(RecordWaves):
         values = self.space.to_values(theta)
         waves = []
         no_rows = np.full((1 + derivatives * theta.size, self.n_residuals), np.nan)
-        if not np.isfinite(values).all():
-            return no_rows
+        if not np.isfinite(values).all() or (self.space.positive & (values == 0.0)).any():
+            return no_rows  # a positive value that has underflown
         for number, measured in enumerate(self.measured):
             try:
                 predicted = self.predict(values, number, derivatives=derivatives)
