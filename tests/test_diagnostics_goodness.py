@@ -105,13 +105,13 @@ class TestDepartures:
         ends = np.exp(trend.stiffness.value + trend.stiffness.stderr * np.array([-1.0, 1.0]))
         assert error == pytest.approx(50.0 * (ends[1] - ends[0]), rel=0.02)
 
-    def test_a_smooth_departure_is_no_larger_than_the_misfit(self):
+    def test_a_smooth_departure_has_the_size_of_the_misfit(self):
         """Of friction that rises with a power of the speed."""
         f, A = np.repeat([0.25, 0.5, 1.0, 2.0], 8), np.tile(np.geomspace(0.3, 10.0, 8) * X_C, 4)
         limits = 0.1 * (f * A / X_C) ** 0.2
         N = [Dahl(limit, 30.0).describing_function(a) for limit, a in zip(limits, A, strict=True)]
         found = judge(FrequencyResponse(f, np.array(N) * relative_noise(32, 0.01, 1), A))
-        assert 0.0 < found.smooth.size < found.rms_misfit
+        assert 0.8 * found.rms_misfit < found.smooth.size < found.rms_misfit
 
     def test_ten_scattered_points_show_a_fall_of_stiffness_by_30_percent(self):
         """As the points of a damper do: most such tables are not to be trusted."""

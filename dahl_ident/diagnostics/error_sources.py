@@ -364,8 +364,10 @@ def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
     change = np.pad(np.repeat(speed - centre, 2), (0, estimate.problem.n_priors))
     for i in _scattering_parameters(estimate.problem):
         column = -(estimate.jacobian[:, i] * change)[:, None]
+        relative = estimate.relative_units @ column[: 2 * first.size].reshape(-1, 2, 1)
+        square = 0.5 * float(np.mean(np.sum(relative[first] ** 2, axis=(1, 2))))
         rate_of = (estimate.problem.names[i], centre)
-        yield Source(MODEL_ERROR, column, 0.0, rate_of=rate_of, chance=_OFTEN)
+        yield Source(MODEL_ERROR, column, square, rate_of=rate_of, chance=_OFTEN)
 
 
 def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
