@@ -66,6 +66,22 @@ def test_a_jump_is_fitted_on_the_branch_that_was_measured(upwards):
     assert "The response jumps: at 0.06 N from " in fit.verdict
 
 
+def test_a_delay_of_the_displacement_does_not_look_like_a_source_of_energy():
+    """Above the resonance a lag of 0.2 ms turns the receptance beyond minus 180 degrees."""
+    truth = {"f_max": 2.0, "sigma": 2e4, "mass": 0.5, "damping": 2.0, "stiffness": 2000.0}
+    plant = di.Dahl(2.0, 2e4, 1.0) + di.Mass(0.5) + di.Damper(2.0) + di.Spring(2000.0)
+    f, u = np.tile(np.geomspace(4.0, 60.0, 12), 2), np.repeat([0.5, 4.0], 12)
+    noise = 0.003 * np.random.default_rng(1).standard_normal((f.size, 2)) @ [1.0, 1.0j]
+    lagging = di.response(plant, f, u).receptance * np.exp(noise - 2j * np.pi * f * 2e-4)
+    assert (lagging.imag > 0.0).any()
+    data = di.FrequencyResponse(f, lagging, drive=u, controlled="force", quantity="receptance")
+    unknown = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
+    fit = di.fit(data, unknown, sensors=di.Sensors(delay=None))
+    assert fit.trusted
+    for name, value in (truth | {"delay": 2e-4}).items():
+        assert fit.params[name].value == pytest.approx(value, abs=3.5 * fit.params[name].stderr)
+
+
 def test_a_plant_that_feeds_energy_in_is_fitted_by_the_describing_function():
     rng = np.random.default_rng(3)
     f, u = np.tile(np.geomspace(0.4, 2.6, 8), 2), np.repeat([0.05, 0.3], 8)

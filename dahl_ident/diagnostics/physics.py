@@ -210,7 +210,7 @@ def beyond_friction_limit(
     if problem.data.drive is None:
         return
     driven = (problem.data.controlled == "force") & np.isfinite(force)
-    fundamental = np.abs(view.stiffness * _sensor_factor(optimum) - friction) * size
+    fundamental = np.abs(view.stiffness * problem.sensor_factor(optimum.theta) - friction) * size
     third = sum(
         element.stiffness(values, size, 3.0 * view.omega)
         for element, values in _with_values(optimum)
@@ -241,26 +241,13 @@ def friction_stiffness(optimum: Optimum, *, with_springs: bool = False) -> Compl
     for element, values in _with_values(optimum):
         if element.is_linear and not (with_springs and is_spring(element)):
             linear += view.stiffness_of(element, values)
-    return np.asarray(view.stiffness * _sensor_factor(optimum) - linear)
+    return np.asarray(view.stiffness * problem.sensor_factor(optimum.theta) - linear)
 
 
 def _with_values(optimum: Optimum) -> Iterator[tuple[Element, Values]]:
     """Yield every element with the values of its parameters at the optimum."""
     values, model = parameter_values(optimum), optimum.problem.model
     yield from model.of([np.asarray(values[p.name]) for p in model.parameters])
-
-
-def _sensor_factor(optimum: Optimum) -> ComplexArray:
-    """Return the stiffness at the sensors' estimates over that at their starting values."""
-    problem = optimum.problem
-    if problem.sensors.are_exact:
-        return np.ones(1, dtype=np.complex128)
-    values, view = parameter_values(optimum), problem.stiffness_data
-    start = {p.name: p.value or 0.0 for p in problem.sensors.parameters}
-    gain = values["force_gain"] / values["displacement_gain"]
-    gain /= start["force_gain"] / start["displacement_gain"]
-    lag = values["delay"] - start["delay"]
-    return np.asarray(np.exp(-1j * view.harmonic * view.omega * lag) / gain)
 
 
 def is_single(element: Element) -> bool:

@@ -37,7 +37,7 @@ from dahl_ident.problem.base import EXPLICIT, Problem
 from dahl_ident.problem.prediction import NearbyPredictor, Prediction, Predictor
 from dahl_ident.problem.space import Interchangeable, Space, with_changes
 from dahl_ident.problem.stiffness import StiffnessData, as_response, checked_table
-from dahl_ident.sensors import EXACT, Prior, Sensors
+from dahl_ident.sensors import EXACT, Prior, Sensors, measured_stiffness_factor
 from dahl_ident.units import shown_unit
 
 _ORBITS: WeakKeyDictionary[FrequencyResponse, dict[int, FloatArray]] = WeakKeyDictionary()
@@ -271,7 +271,7 @@ class TableProblem(Problem):
         sine = self.with_steady("describing function")
         Z = sine.predicted_stiffness(theta)
         first = Z.harmonic == 1
-        return bool(np.all(Z.stiffness.imag[first] > 0.0))
+        return bool(np.all((Z.stiffness * self.sensor_factor(theta)).imag[first] > 0.0))
 
     def near(self, theta: FloatArray) -> TableProblem:
         """Return a problem that predicts nearly the same near theta, (P,), and much faster.
@@ -372,6 +372,22 @@ class TableProblem(Problem):
         """Return what the model predicts as dynamic stiffness, without the data's noise."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._predictor.as_stiffness(self._noise.weights, self.predict(theta))
+
+    def sensor_factor(self, theta: FloatArray) -> ComplexArray:
+        """Return the dynamic stiffness by the sensors at theta over that by their starts."""
+        if self.sensors.are_exact:
+            return np.ones(1, dtype=np.complex128)
+        view, values = (
+            self.stiffness_data,
+            dict(zip(self.names, self.to_values(theta), strict=True)),
+        )
+        start = [np.asarray(p.value) for p in self.sensors.parameters]
+        at_theta = [np.asarray(values.get(p.name, p.value)) for p in self.sensors.parameters]
+        before, after = (
+            measured_stiffness_factor(sensors, view.omega, view.harmonic)
+            for sensors in (start, at_theta)
+        )
+        return before / after
 
     @property
     def rounding(self) -> FloatArray:
