@@ -471,3 +471,16 @@ def test_derivatives_are_smoothed_as_far_as_the_motion_allows():
     assert np.std(v - 2.0 * np.pi * np.cos(2.0 * np.pi * t)) < 5e-3
     v, _ = differentiated(np.full(100, 0.3), 1e-3)
     assert np.abs(v).max() < 1e-9
+
+
+def test_derivatives_of_motions_up_to_half_the_rate_are_central_differences():
+    """Five samples and degree 4: the differences of order 4."""
+    n, h = 200, 0.1
+    t = np.arange(n)
+    phase = seeded(63).uniform(0.0, 2.0 * np.pi, (69, 1))
+    x = np.cos(2.0 * np.pi * np.arange(1, 70)[:, None] * t / n + phase).sum(axis=0)
+    v, a = differentiated(x, h)
+    first = (x[:-4] - 8.0 * x[1:-3] + 8.0 * x[3:-1] - x[4:]) / (12.0 * h)
+    second = (16.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:] - 30.0 * x[2:-2]) / (12.0 * h**2)
+    assert v[2:-2] == pytest.approx(first, abs=1e-10)
+    assert a[2:-2] == pytest.approx(second, abs=1e-9)
