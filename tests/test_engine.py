@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 
 import dahl_ident as di
 from benchmarks import engine_oracles as cases
+from benchmarks import loop_oracles
 from benchmarks.motion_oracles import (
     HARMONICS,
     DahlByHand,
@@ -138,6 +139,16 @@ class Preloaded(di.Friction):
         return k * (1.0 - direction * force / f_max) * (0.75 - 0.25 * np.tanh(2.0 * (force - 10.0)))
 
 
+class Stepped(Preloaded):
+    """The same by a comparison."""
+
+    kind = "stepped_of_tests"
+
+    def slope(self, force, direction, velocity, values):
+        k, f_max = values
+        return k * (1.0 - direction * force / f_max) * (1.0 - 0.5 * (force > 10.0))
+
+
 class Drifting(di.Friction):
     """Depends on rate and direction: even harmonics."""
 
@@ -224,6 +235,34 @@ def test_even_harmonics_where_directions_differ_at_large_forces_alone():
     assert abs(c[2]) > 1.0
     for found in (result.coefficients[0], harmonics_of(law, amplitude)):
         assert np.max(np.abs(found - c)) < 1e-9 * np.max(np.abs(c))
+
+
+def test_even_harmonics_of_a_comparison_of_the_force():
+    """From a force F a stiffness k leads to s f - (s f - F) exp(-k p/f) after a path p."""
+    k, f, A = 1e4, 30.0, 2.1e-3
+
+    def way(start, s):
+        first, then = (k, 0.5 * k) if s > 0.0 else (0.5 * k, k)
+        kink = f / first * np.log((s * f - start) / (s * f - 10.0))
+
+        def force(p):
+            early = s * f - (s * f - start) * np.exp(-first * p / f)
+            late = s * f - (s * f - 10.0) * np.exp(-then * (p - kink) / f)
+            return np.where(p < kink, early, late)
+
+        return loop_oracles.Way(force, [kink])
+
+    top = 15.0
+    for _ in range(100):
+        bottom = float(way(top, -1.0).force(2.0 * A))
+        top = float(way(bottom, 1.0).force(2.0 * A))
+    assert top > 10.0 > bottom
+    expected = loop_oracles.harmonics_of([way(top, -1.0), way(bottom, 1.0)], A, HARMONICS)
+    assert abs(expected[2]) > 0.1
+    found = (loop_of(Stepped(), A, [k, f], harmonics=HARMONICS).coefficients[0],
+             harmonics_of(Stepped(k, f), A))  # fmt: skip
+    for c in found:
+        assert np.max(np.abs(c - expected)) < 1e-9 * np.max(np.abs(expected))
 
 
 def test_derivatives_of_settled_motions_are_differences_of_oracles():
