@@ -24,7 +24,7 @@ from benchmarks.motion_oracles import (
 from dahl_ident import Parameter
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import law_equations, plant_equations
-from dahl_ident.engine import band_limited, differentiated, march, settled, translate
+from dahl_ident.engine import band_limited, differentiated, loops, march, settled, translate
 from dahl_ident.errors import FitError
 from tests.motions import Driven
 
@@ -149,6 +149,27 @@ class Stepped(Preloaded):
         return k * (1.0 - direction * force / f_max) * (1.0 - 0.5 * (force > 10.0))
 
 
+class Geared(di.Friction):
+    """Half as stiff at a speed above v_0."""
+
+    kind = "geared_of_tests"
+    rate_independent = False
+    loss = 0.5
+    parameters = (STIFFNESS, F_MAX, Parameter("v_0", "m/s", "speed", lower=0.0, transform="log"))
+
+    def slope(self, force, direction, velocity, values):
+        k, f_max, v_0 = values
+        share = 1.0 - self.loss * (np.fabs(velocity) > v_0)
+        return k * (1.0 - direction * force / f_max) * share
+
+
+class Reversing(Geared):
+    """Back along its curve at a speed above v_0: both slopes have a mean of zero."""
+
+    kind = "reversing_of_tests"
+    loss = 2.0
+
+
 class Drifting(di.Friction):
     """Depends on rate and direction: even harmonics."""
 
@@ -263,6 +284,43 @@ def test_even_harmonics_of_a_comparison_of_the_force():
              harmonics_of(Stepped(k, f), A))  # fmt: skip
     for c in found:
         assert np.max(np.abs(c - expected)) < 1e-9 * np.max(np.abs(expected))
+
+
+@pytest.mark.parametrize("law", [Geared, Reversing])
+def test_derivatives_of_loops_with_a_kink_at_a_speed(law):
+    values, A, omega, orders = np.array([1e4, 30.0, 0.36]), 0.01, 40.0, (1, 3)
+
+    def expected(p, A):
+        k, f, v_0 = p
+        half = np.sqrt(A**2 - (v_0 / omega) ** 2)  # |x| where the speed is v_0
+
+        def softened(path):
+            return path - law.loss * np.clip(path - A + half, 0.0, 2.0 * half)
+
+        share = np.exp(-k * softened(2.0 * A) / f)
+        start = -f * (1.0 - share) / (1.0 + share)
+
+        def along(path):
+            return f - (f - start) * np.exp(-k * softened(path) / f)
+
+        kinks = [A - half, A + half]
+        ways = [loop_oracles.Way(lambda path: -along(path), kinks), loop_oracles.Way(along, kinks)]
+        return loop_oracles.harmonics_of(ways, A, orders)
+
+    system = translate(law_equations(law()))
+    arguments = (system, np.array([A]), np.array([omega]), values[None])
+    size = np.max(np.abs(expected(values, A)))
+    for kernel in (loops, settled):
+        result = kernel(*arguments, chosen=range(3), harmonics=orders)
+        assert np.max(np.abs(result.coefficients[0] - expected(values, A))) < 1e-9 * size
+        for i in range(3):
+            step = np.zeros(3)
+            step[i] = 1e-5 * values[i]
+            difference = (expected(values + step, A) - expected(values - step, A)) / 2e-5
+            computed = result.by_parameter[0, :, i] * values[i]
+            assert np.max(np.abs(computed - difference)) < 1e-6 * size
+        difference = (expected(values, 1.00001 * A) - expected(values, 0.99999 * A)) / 2e-5
+        assert np.max(np.abs(result.by_amplitude[0] * A - difference)) < 1e-6 * size
 
 
 def test_derivatives_of_settled_motions_are_differences_of_oracles():
