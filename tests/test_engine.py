@@ -170,6 +170,24 @@ class Reversing(Geared):
     loss = 2.0
 
 
+class Sticky(di.Friction):
+    """A limit that falls by f_s with the speed, without a number that is of parameters alone."""
+
+    kind = "sticky_of_tests"
+    rate_independent = False
+    parameters = (
+        STIFFNESS,
+        F_MAX,
+        Parameter("f_s", "N", "limit at rest, in addition", lower=0.0, transform="log"),
+        Parameter("v_0", "m/s", "speed", lower=0.0, transform="log"),
+    )
+
+    def slope(self, force, direction, velocity, values):
+        k, f_max, f_s, v_0 = values
+        level = f_max + f_s * np.exp(-((velocity / v_0) ** 2))
+        return k * (1.0 - direction * force / level)
+
+
 class Drifting(di.Friction):
     """Depends on rate and direction: even harmonics."""
 
@@ -321,6 +339,27 @@ def test_derivatives_of_loops_with_a_kink_at_a_speed(law):
             assert np.max(np.abs(computed - difference)) < 1e-6 * size
         difference = (expected(values, 1.00001 * A) - expected(values, 0.99999 * A)) / 2e-5
         assert np.max(np.abs(result.by_amplitude[0] * A - difference)) < 1e-6 * size
+
+
+def test_a_short_time_near_rest_is_not_passed_over():
+    """Speeds are hundreds of times that at which the limit falls."""
+    speed = 1e-3
+    knots = np.linspace(0.0, 1.0, 8)
+    spline = CubicSpline(knots, 0.02 * seeded(1).standard_normal(8))
+    samples = np.linspace(0.0, 1.0, 60)
+    system = translate(law_equations(Sticky()))
+    coefficients = spline.c[::-1] * (knots[1] - knots[0]) ** np.arange(4)[:, None]
+    first = np.array([float(spline(0.0)), float(spline(0.0, 1)), 0.0])
+    motion = march(system, knots, coefficients, samples, first, np.array([1e4, 30.0, 20.0, speed]))
+    slow = [spline.derivative().solve(v, extrapolate=False)
+            for v in speed * np.array([-6, -3, -1, 0, 1, 3, 6])]  # fmt: skip
+    places = np.unique(np.concatenate([knots, *slow]))
+    places = places[(places > 0.0) & (places < 1.0)]
+    hand = DahlByHand(30.0, 1e4, static_ratio=5.0 / 3.0, speed=speed)
+    oracle = Oracle([hand], lambda t: (float(spline(t)), float(spline(t, 1))), True,
+                    sizes=np.array([30.0]))  # fmt: skip
+    _, force, _ = integrated(oracle, first[2:], 0.0, 1.0, samples, kinks=places.tolist())
+    assert np.max(np.abs(motion.output - force)) < 1e-8 * np.max(np.abs(force))
 
 
 def test_derivatives_of_settled_motions_are_differences_of_oracles():
