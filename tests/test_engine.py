@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.special import digamma, gamma
 
 import dahl_ident as di
 from benchmarks import engine_oracles as cases
@@ -36,10 +37,10 @@ def seeded(*numbers):
     return np.random.default_rng([7, *numbers])
 
 
-def loop_of(element, amplitude, values, **options):
+def loop_of(element, amplitude, values, omega=1.0, **options):
     system = translate(law_equations(element))
     return settled(
-        system, np.array([amplitude]), np.array([1.0]), np.array([values], dtype=float), **options
+        system, np.array([amplitude]), np.array([omega]), np.array([values], dtype=float), **options
     )
 
 
@@ -415,6 +416,40 @@ def test_derivatives_along_a_history_jump_at_kinks():
         difference = (force(values + step) - force(values - step)) / 2e-6
         computed = motion.by_parameter[:, i] * values[parameter]
         assert np.max(np.abs(computed - difference)) < 1e-6 * size
+
+
+def test_derivatives_of_a_force_that_parameters_change_at_once():
+    """A power of the speed, in closed form."""
+    knots = np.linspace(0.0, 1.0, 8)
+    spline = CubicSpline(knots, 0.1 * seeded(64).standard_normal(8))
+    samples = np.linspace(0.0, 1.0, 50)
+    c, p, v_0 = values = np.array([2.0, 0.7, 0.3])
+    system = translate(law_equations(di.PowerDamper(reference_speed=0.3)))
+    first = np.array([float(spline(0.0)), float(spline(0.0, 1))])
+    coefficients = spline.c[::-1] * (knots[1] - knots[0]) ** np.arange(4)[:, None]
+    motion = march(system, knots, coefficients, samples, first, values, chosen=range(3),
+                   derivatives=True)  # fmt: skip
+    ratio = spline(samples, 1) / v_0
+    square = ratio**2 + 1e-12
+    force = c * ratio * square ** (0.5 * (p - 1.0))
+    by_ratio = force / ratio + force * (p - 1.0) * ratio / square
+    expected = [force / c, 0.5 * force * np.log(square), -by_ratio * ratio / v_0]
+    assert motion.output == pytest.approx(force, abs=1e-9)
+    assert np.max(np.abs(motion.by_parameter - np.transpose(expected))) < 1e-8
+
+
+def test_derivatives_of_harmonics_that_parameters_change_at_once():
+    """The same law under a sine, by gamma functions."""
+    c, p, v_0 = values = np.array([2.0, 0.7, 0.3])
+    A, omega = 0.02, 40.0
+    result = loop_of(di.PowerDamper(reference_speed=0.3), A, values, chosen=range(3), omega=omega)
+    first = 2.0 / np.sqrt(np.pi) * gamma(0.5 * p + 1.0) / gamma(0.5 * p + 1.5)
+    c_1 = 1j * c * first * (A * omega / v_0) ** p
+    by_p = np.log(A * omega / v_0) + 0.5 * (digamma(0.5 * p + 1.0) - digamma(0.5 * p + 1.5))
+    assert abs(result.coefficients[0, 0] - c_1) < 1e-7 * abs(c_1)
+    assert abs(result.by_amplitude[0, 0] - p * c_1 / A) < 1e-6 * abs(c_1 / A)
+    expected = c_1 * np.array([1.0 / c, by_p, -p / v_0])
+    assert np.max(np.abs(result.by_parameter[0, 0] - expected) * values) < 1e-6 * abs(c_1)
 
 
 def test_derivatives_of_driven_motions_are_differences_of_oracles():
