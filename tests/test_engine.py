@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -548,6 +549,23 @@ def test_plants_near_stick_and_in_resonance(share):
         )  # fmt: skip
         _, c, _ = fixed_point(plant, result.starts[0], result.maps[0], omega, True)
         assert np.max(np.abs(result.coefficients[0] - c)) < 1e-8 * size
+
+
+@pytest.mark.parametrize("odd", [True, False])
+def test_derivatives_of_a_plant_that_sticks_are_those_of_springs(odd):
+    """Jenkins elements that never slip, in closed form; by whole cycles their offsets are free."""
+    values = np.array([30.0, 20.0, 0.02, 0.06, 0.5, 0.8, 40.0])
+    U, omega = 0.1, 9.0
+    system = translate(plant_equations(di.MaxwellSlip(2) + di.Mass() + di.Damper() + di.Spring()))
+    result = settled(replace(system, odd=odd), np.array([U]), np.array([omega]), values[None],
+                     chosen=range(7), harmonics=(0, 1))  # fmt: skip
+    R = 1.0 / (90.0 - 0.5 * omega**2 + 0.8j * omega)
+    assert U * abs(R) < 0.02
+    expected = -U * R**2 * np.array([1.0, 1.0, 0.0, 0.0, -(omega**2), 1j * omega, 1.0])
+    assert np.max(np.abs(result.coefficients[0] - [0.0, U * R])) < 1e-9 * abs(U * R)
+    assert np.max(np.abs(result.by_amplitude[0] - [0.0, R])) < 1e-8 * abs(R)
+    error = (result.by_parameter[0] - [np.zeros(7), expected]) * values
+    assert np.max(np.abs(error)) < 1e-8 * abs(U * R)
 
 
 def test_where_no_motion_settles_none_is_found():
