@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -26,7 +27,15 @@ from benchmarks.motion_oracles import (
 from dahl_ident import Parameter
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements import law_equations, plant_equations
-from dahl_ident.engine import band_limited, differentiated, loops, march, settled, translate
+from dahl_ident.engine import (
+    Equations,
+    band_limited,
+    differentiated,
+    loops,
+    march,
+    settled,
+    translate,
+)
 from dahl_ident.errors import FitError
 from tests.motions import Driven
 
@@ -579,6 +588,18 @@ def test_where_no_motion_settles_none_is_found():
     knots = np.linspace(0.0, 100.0, 11)
     with pytest.raises(FitError, match="beyond all bounds"):
         march(system, knots, np.ones((1, 10)), knots, np.zeros(2), np.array([1.0, -200.0, 1.0]))
+
+
+def test_derivatives_that_do_not_exist_are_not_made_up():
+    """At rest hypot(F, v) has none; the motion itself is known."""
+    x, v, F, u, s, k = (ca.SX.sym(name) for name in "xvFusk")
+    rates = ca.vertcat(v, u - F, k * v * (1.0 - ca.hypot(F, v)))
+    system = translate(Equations([x, v, F], u, s, [k], rates, x, False))
+    times: FloatArray = 0.1 * np.arange(10.0)
+    arguments = (system, times, np.zeros((1, 9)), times, np.zeros(3), np.ones(1))
+    assert np.array_equal(march(*arguments).output, np.zeros(10))
+    with pytest.raises(FitError):
+        march(*arguments, derivatives=True)
 
 
 def test_floquet_maps_are_those_of_an_independent_integrator():
