@@ -320,10 +320,7 @@ def advance(
         elif (
             which < 0 and at.held and at_stop and t < end
         ):  # the held motion turns, or has another polynomial
-            direction = w[at.sides]
             next_stop(signal, t, end, span, w, at)
             choose_branch(f, signal, t, y, w, at)
             new_branch = True
-            if w[at.sides] != direction:
-                step, turned = after_turn, True
     return 0.0
