@@ -186,7 +186,7 @@ def march(
 
     `coefficients`, (degree + 1, m), are those of powers of the position, 0 to 1, between two of the
     `knots`, (m + 1,). The motion starts from the states `first` at the first of the `samples`.
-    FitError is raised if it grows beyond all bounds.
+    FitError is raised if it grows beyond all bounds, or has no derivatives that are wanted.
     """
     found, output, by, states, last = _run(
         kernels("samples").march,
@@ -204,8 +204,9 @@ def march(
         _SAMPLED / finer / (_HELD if system.held else 1.0),
     )
     if not found or not np.isfinite(output).all():
+        smooth = ", or has no derivatives," if derivatives else ""
         raise FitError(
-            f"the motion grows beyond all bounds at the parameters {parameters.tolist()}"
+            f"the motion grows beyond all bounds{smooth} at the parameters {parameters.tolist()}"
         )
     n = system.order
     return Marched(
