@@ -13,6 +13,7 @@ from dahl_ident import Model
 from dahl_ident.arrays import FloatArray
 from dahl_ident.errors import ValidationError
 from dahl_ident.synthetic import Acquisition, Experiment, FrequencySweep, simulate
+from tests.motions import Driven
 from tests.test_record_fit import DAHL, RATE, driven, recorded, trajectory
 
 
@@ -49,6 +50,28 @@ def test_an_assumed_exponent_is_as_uncertain_as_a_free_one_with_a_noisy_displace
     for name in ("f_max", "sigma", "alpha"):
         one, other = assumed.params[name], free.params[name]
         assert one.stderr == pytest.approx(other.stderr, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_in_the_drive_shifts_the_estimate_by_what_it_states(seed):
+    """At one frequency, mass and spring differ by transients, which the noise covers."""
+    rate, seconds, levels = 1000.0, 1.0, np.array([0.4, 0.9, 1.8, 3.5, 6.0])
+    t = np.arange(int(levels.size * seconds * rate)) / rate
+    place = np.minimum((t / seconds).astype(int), levels.size - 1)
+    rise = np.clip((t / seconds - place) / 0.3, 0.0, 1.0)
+    before = np.concatenate([[0.0], levels])[place]
+    level = before + (levels[place] - before) * rise**2 * (3.0 - 2.0 * rise)
+    drive = level * np.sin(2.0 * np.pi * 24.0 * t)
+    truth = {"f_max": 1.2, "sigma": 2e4, "mass": 0.8, "damping": 6.0, "stiffness": 3000.0}
+    plant = Model(di.Dahl(1.2, 2e4, 1.0) + di.Mass(0.8) + di.Damper(6.0) + di.Spring(3000.0))
+    x = Driven(plant, drive, rate).motion(np.zeros(3)).states.T[0]
+    noise = np.random.default_rng(seed).standard_normal((2, t.size))
+    record = di.Record(t, displacement=x + 2e-6 * noise[0], force=drive + 1e-2 * noise[1])
+    model = di.Dahl(alpha=1.0) + di.Mass() + di.Damper() + di.Spring()
+    fit = di.fit(record, model, start=truth)
+    assert sources(fit, "mass")["noise in the drive"] > 2.0 * sources(fit, "mass")["noise"]
+    for name, value in truth.items():
+        assert fit.params[name].value == pytest.approx(value, abs=3.0 * fit.params[name].stderr)
 
 
 def encoded(x: FloatArray, line: float, noise: float, seed: int = 2) -> di.Record:

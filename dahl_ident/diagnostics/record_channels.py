@@ -24,7 +24,6 @@ from dahl_ident.errors import FitError
 from dahl_ident.problem.record_noise import LEADS, drive_noise
 from dahl_ident.problem.record_problem import RecordProblem
 
-_SLIGHT = 1e-6  # relative: noise of the drive below does not count
 _MATTERS = 0.2  # standard errors that a source may shift without being counted
 _DRIVE_DRAWS = 4, 16  # of the drive's noise, fewest and most; the most give it to a third
 _DRIVE_SAMPLES = 50_000  # of all these draws: half a second
@@ -184,41 +183,40 @@ def _with_force(fit: LinearFit) -> FloatArray:
 def by_drive(fit: LinearFit) -> FloatArray | None:
     """Return what noise in a measured drive contributes; None where it cannot be estimated.
 
-    It makes the response look smaller than it is, by the noise's share of the drive's power within
-    its band, and makes the plant wander.
-    """
-    noise = drive_noise([record.force_samples for record in fit.problem.records])
-    if noise is None:
-        return None
-    wander = _by_wander(fit, noise.stds)
-    return wander + _squared(noise.share * _with_force(fit)) * (noise.share > _SLIGHT)
-
-
-def _by_wander(fit: LinearFit, stds: Sequence[float]) -> FloatArray:
-    """Return the effect of white noise in the drive on the estimate, beyond that in the residuals.
-
     It moves the plant most where it resonates or where friction slips, and parameters are
     determined at these places. The covariance by noise takes the residuals as equally large
-    everywhere, so it includes only a part of such noise. Draws of the noise give both.
+    everywhere, so it includes only a part of such noise. In addition, prediction and derivatives
+    have errors in common, which shifts the estimate (errors in variables): by as much as the same
+    noise once more would shift it. Draws of the noise give all three.
     """
     problem, known = fit.problem, fit.by_noise[0]
+    stds = drive_noise([record.force_samples for record in problem.records])
+    if stds is None:
+        return None
     draws = int(np.clip(_DRIVE_SAMPLES // problem.n_residuals, *_DRIVE_DRAWS))
     moved, seen, zero = np.zeros_like(known), np.zeros_like(known), np.zeros_like(known)
+    shift = np.zeros(len(known))
     for draw in range(draws):
+        noisy = problem.with_noisier_drive(stds, draw)
         try:
-            noisy = problem.with_noisier_drive(stds, draw).outputs(fit.values)
+            predicted = [noisy.predict(fit.values, i) for i in range(len(problem.records))]
         except FitError:
             return zero
-        wander = [problem.filtered(b - a) for a, b in zip(fit.outputs, noisy, strict=True)]
-        change = fit.projected(wander)
-        if not draw and not (change**2 > _MATTERS**2 * known.diagonal()).any():
+        pairs = zip(fit.outputs, predicted, strict=True)
+        wander = [problem.filtered(p.output - y) for y, p in pairs]
+        change, shifted = fit.projected(wander), np.zeros(len(known))
+        for J, p, wave in zip(fit.jacobians, predicted, wander, strict=True):
+            shifted -= fit.inverse @ ((problem.filtered(p.by) - J).T @ wave)
+        if not draw and not (change**2 + shifted**2 > _MATTERS**2 * known.diagonal()).any():
             return zero
+        shift += shifted / draws
         moved += np.outer(change, change) / draws
         seen += sandwich(fit.jacobians, wander)[0] / draws
     certain = np.isfinite(known.diagonal()) & (known.diagonal() > 0.0)
     more = np.where(certain, np.maximum((moved - seen).diagonal(), 0.0), 0.0)
     size = np.sqrt(more / np.where(certain, known.diagonal(), 1.0))
-    return np.asarray(np.where(np.isfinite(known), known, 0.0) * np.outer(size, size))
+    wandering = np.where(np.isfinite(known), known, 0.0) * np.outer(size, size)
+    return np.asarray(wandering + _squared(shift))
 
 
 def _beyond_samples(problem: RecordProblem) -> tuple[tuple[FloatArray, ...], ...]:

@@ -8,7 +8,6 @@ some standard deviations are therefore not counted, where the residuals confirm 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import comb
@@ -25,17 +24,6 @@ _FORGETS = 3.0  # samples times the cut, over half the rate, after which a high 
 _NEIGHBOURS = 16  # fewest frequencies whose mean power is compared: chance halves the least mean
 _PARTS = 64  # of the frequencies, whose mean powers are compared
 _OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
-
-
-@dataclass(frozen=True)
-class DriveNoise:
-    """White noise of measured drives: its std in each record, in the drive's unit.
-
-    `share` is its power over that of the drives, both within their band.
-    """
-
-    stds: tuple[float, ...]
-    share: float
 
 
 def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
@@ -84,23 +72,18 @@ def share_in_band(
     return above / below if below > 0.0 else 0.0
 
 
-def drive_noise(drives: Sequence[FloatArray]) -> DriveNoise | None:
-    """Return the noise of measured drives, from their power outside the drive's band.
+def drive_noise(drives: Sequence[FloatArray]) -> list[float] | None:
+    """Return the standard deviation of the white noise of each measured drive.
 
-    The noise is taken as white, of the median power outside the band. None where less than a
-    tenth of the frequencies lie outside, so that it cannot be estimated.
+    Its power is the median outside the drive's band. None where less than a tenth of the
+    frequencies lie outside, so that it cannot be estimated.
     """
-    stds, noise, signal = [], 0.0, 0.0
-    for drive in drives:
-        band, power = excited(drive), _power(drive)
-        median = _median(power, ~band)
-        if median is None:
-            return None
-        mean = median / np.log(2.0)
-        stds.append((mean / float((np.hanning(drive.size) ** 2).sum())) ** 0.5)
-        noise += mean * band.sum() / drive.size
-        signal += float(power[band].sum()) / drive.size
-    return DriveNoise(tuple(stds), noise / signal) if signal > 0.0 else None
+    medians = [_median(_power(drive), ~excited(drive)) for drive in drives]
+    known = [median for median in medians if median is not None]
+    if len(known) < len(drives):
+        return None
+    windows = (float((np.hanning(drive.size) ** 2).sum()) for drive in drives)
+    return [(m / np.log(2.0) / w) ** 0.5 for m, w in zip(known, windows, strict=True)]
 
 
 def excited(drive: FloatArray) -> BoolArray:
