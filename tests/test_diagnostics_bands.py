@@ -100,6 +100,8 @@ class TestBands:
         law = di.Dahl(*(result.errors.values[name] for name in ("f_max", "sigma", "alpha")))
         band = result.describing_function(GRID)
         np.testing.assert_allclose(band.response, law.describing_function(GRID))
+        one = result.describing_function(GRID[3])
+        assert (one.response, one.real_std) == pytest.approx((band.response[3], band.real_std[3]))
         noise = np.sqrt(result.optimum.covariance[0, 0])
         assert 0.9 * noise < band.log_gain_std[-1] < 4.0 * noise  # a model error counts
 

@@ -215,7 +215,9 @@ def describing_function_band(
     omega = np.exp(np.log(errors.problem.stiffness_data.omega).mean())  # mean frequency
     columns = by.reshape(-1, by.shape[-1])
     band = _combined_band(errors, N.ravel(), columns, np.isfinite(N.ravel()), A.ravel(), omega)
-    parts = {k: v.reshape(*v.shape[:-1], *A.shape) for k, v in vars(band).items() if k != "scores"}
+    parts = {
+        k: v.reshape((*v.shape[:-1], *A.shape)) for k, v in vars(band).items() if k != "scores"
+    }
     return ResponseBand(**parts)
 
 
