@@ -138,10 +138,12 @@ def test_interchangeable_elements_keep_their_order():
     assert np.median(values[:, 0]) == pytest.approx(0.1, rel=0.1)
 
 
-def test_sensor_priors_of_any_kind_are_sampled():
+@pytest.mark.parametrize("uncertainty", ["noise", "combined"])
+def test_sensor_priors_of_any_kind_are_sampled(uncertainty):
+    """Least squares takes normal priors alone; the exponent is not given."""
     sensors = di.Sensors(force_gain=stats.uniform(0.95, 0.1))
     posterior = di.posterior(
-        friction_table(), di.Dahl(), sensors=sensors, seed=1, uncertainty="noise"
+        friction_table(), di.Dahl(), sensors=sensors, seed=1, uncertainty=uncertainty
     )
     gain = posterior.values[:, posterior.names.index("force_gain")]
     assert 0.95 <= gain.min() < 0.955

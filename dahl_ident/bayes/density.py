@@ -304,12 +304,12 @@ class Density(LogDensity):
 
     def curvature(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return half the sum of squares at theta, (P,), and its Hessian, at estimated sizes."""
-        errors, m = self.errors, self.problem.n_residuals
+        errors = self.errors
         assert errors is not None
         at = theta[None]
-        y, by = self.problem.residuals_and_jacobian(errors.at_centre(at), tails=False)
-        y = y[..., :m] + errors.change(at)
-        by = np.where(np.isnan(errors.centre), by[..., :m, :], errors.slopes)
+        rows = self.problem.data_rows(errors.at_centre(at), tails=False)  # priors of any kind apart
+        y = rows[..., 0, :] + errors.change(at)
+        by = np.where(np.isnan(errors.centre), rows[..., 1:, :].swapaxes(-1, -2), errors.slopes)
         with np.errstate(invalid="ignore", over="ignore"):
             y = errors.independent(y)
             by = errors.independent(by.swapaxes(-1, -2))[0]
