@@ -484,3 +484,18 @@ def test_results_of_records_are_copied_and_pickled():
                 assert (p.stderr or 0.0) == pytest.approx(expected[name].stderr or 0.0, rel=1e-9)
             assert copied.statements == result.statements
             assert str(copied.budget()) == str(result.budget())
+
+
+def test_a_long_record_is_fitted_by_a_law_that_depends_on_time():
+    """The scan for a start takes a part of it."""
+    t = np.arange(8400) / 200.0
+    x = 1e-3 * np.sin(2.0 * np.pi * t) * np.exp(-t / 40.0)
+    force = di.Dahl(2.5, 4e4).force(x) + 50.0 * np.gradient(x, t)
+    force += 5e-3 * np.random.default_rng(0).standard_normal(t.size)
+    model = di.LuGre(static_ratio=1.0, stribeck_speed=1.0, viscous=None)
+    fit = di.fit(di.Record(t, displacement=x, force=force), model)
+    for name, value in (("f_max", 2.5), ("sigma", 4e4), ("viscous", 50.0)):
+        assert fit.params[name].value == pytest.approx(value, abs=3.5 * fit.params[name].stderr)
+    assert 0.0 < fit.effective_samples < 2.0 * t.size
+    with pytest.raises(ValidationError, match="a fit of a table has no effective samples; extract"):
+        _ = di.fit(di.load_dataset("noisy"), di.Dahl()).effective_samples

@@ -206,6 +206,11 @@ class RecordAssessment(Assessment):
         return record_errors(self.problem, self.optimum.values, jacobians, residuals)
 
     @property
+    def effective_samples(self) -> float:
+        """Samples of white noise with the same information as the residuals."""
+        return self.errors.effective
+
+    @property
     def covar(self) -> FloatArray:
         """Covariance of the free values, from all sources together."""
         return self.errors.covariance

@@ -100,8 +100,8 @@ class _Scan:
         self.time = 1.0 / rate if rate > 0.0 else 1.0
         self.force = max(float(np.std(h[3])) for h in self.histories)
 
-    def _histories(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return displacement, velocity, acceleration and force of a record's fastest part."""
+    def _histories(self, number: int) -> tuple[FloatArray, ...]:
+        """Return displacement, velocity, acceleration, force, time of a record's fastest part."""
         problem, record = self.problem, self.problem.records[number]
         if problem.output == "force":
             x, v, a = problem.motions[number]
@@ -116,7 +116,7 @@ class _Scan:
         energy = np.concatenate([[0.0], np.cumsum((v - v.mean()) ** 2)])
         start = int(np.argmax(energy[n:] - energy[:-n])) if n < x.size else 0
         part = slice(start, start + n)
-        return x[part], v[part], a[part], force[part]
+        return x[part], v[part], a[part], force[part], record.time[part]
 
     def starts(self, count: int) -> FloatArray:
         """Return the best starts of the scan."""
@@ -198,11 +198,10 @@ class _Scan:
 
     def _columns(self, element: Element, values: tuple[float, ...]) -> list[FloatArray]:
         """Return the force along each record; none if one has no motion at these values."""
-        records = zip(self.problem.records, self.histories, strict=True)
         try:
             return [
-                element.force_history(values, x, v, 0.0, acceleration=a, time=record.time)
-                for record, (x, v, a, _) in records
+                element.force_history(values, x, v, 0.0, acceleration=a, time=time)
+                for x, v, a, _, time in self.histories
             ]
         except FitError:
             return []
@@ -216,7 +215,7 @@ class _Scan:
         """Return starts with the best linear parameters, and the best non-negative ones."""
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal: FloatArray | None = None
-        for i, (_, _, _, force) in enumerate(self.histories):
+        for i, (_, _, _, force, _) in enumerate(self.histories):
             rows = [self._weighted(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
             remaining = force - sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
             rows.append(self._weighted(i, remaining))
@@ -288,7 +287,7 @@ class _Scan:
 
     def _weight(self, number: int) -> FloatArray:
         """Return a smooth receptance, zero outside the band, from forces to displacements."""
-        x, _, _, force = self.histories[number]
+        x, _, _, force, _ = self.histories[number]
         window = np.hanning(x.size)
         X, F = (np.abs(np.fft.rfft(window * (w - w.mean()))) for w in (x, force))
         if not F.any():  # a free decay: the forces balance by themselves

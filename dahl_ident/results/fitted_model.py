@@ -146,7 +146,8 @@ class FittedModel(Result):
         "assessment.residuals", "Of records: measured minus predicted, record by record."
     )
     effective_samples: float = part(
-        "errors.effective", "Of records: white samples that would tell as much as the residuals."
+        "assessment.effective_samples",
+        "Of records: white samples that would tell as much as the residuals.",
     )
 
     @cached_property
