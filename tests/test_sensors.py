@@ -109,3 +109,22 @@ def test_a_calibration_counts_however_small_the_noise(noise):
     # F = g_F f_max h(g_x x): f_max has the force's error, sigma that of both
     assert found.params["f_max"].stderr == pytest.approx(0.1 * 0.0025, rel=1e-2)
     assert found.params["sigma"].stderr == pytest.approx(30.0 * np.hypot(0.0025, 0.001), rel=1e-2)
+
+
+def test_what_an_unknown_gain_leaves_is_one_number_everywhere():
+    """A ratio, with an exponent that was not given: params, model and x_c are of one estimate."""
+    levels = np.geomspace(3e-4, 3e-2, 24)
+    noise = 0.005 * np.random.default_rng(3).standard_normal((levels.size, 2)) @ [1.0, 1.0j]
+    N = Dahl(0.1, 30.0, 1.4).describing_function(levels) * np.exp(noise)
+    data = FrequencyResponse(np.ones(levels.size), N, levels)
+    found = fit(data, Dahl(), sensors=Sensors(force_gain=None), throw=False)
+    (ratio,) = found.budget().parameters
+    assert ratio.name == "f_max/sigma"
+    assert ratio.value == pytest.approx(0.1 / 30.0, abs=3.0 * ratio.u)
+    (x_c,) = found.derived([])
+    f_max, sigma, alpha = (found.params[name].value for name in ("f_max", "sigma", "alpha"))
+    assert (x_c.value, x_c.stderr) == pytest.approx((ratio.value, ratio.u), rel=1e-6)
+    assert f_max / sigma == pytest.approx(ratio.value, rel=1e-6)
+    assert [p.value for p in found.model.parameters] == pytest.approx([f_max, sigma, alpha])
+    assert "alpha = 1 exactly" not in str(found)
+    assert f"(here {alpha:.1f}" in str(found)

@@ -41,6 +41,7 @@ from dahl_ident.units import shown_unit
 
 _SPECIFIC = {
     "cross_validation": "held-out tests",
+    "effective_samples": "effective samples",
     "errors_of_combinations": "errors of combinations",
     "predict_record": "prediction of a record",
     "record_at_draws": "prediction of a record",
@@ -122,6 +123,11 @@ class Assessment(ABC):
     @abstractmethod
     def estimate(self) -> Optimum:
         """The estimate, as an optimum."""
+
+    @property
+    def counts_sources(self) -> bool:
+        """Whether the uncertainty counts every source of error, not noise alone."""
+        return True
 
     @property
     @abstractmethod
@@ -224,6 +230,11 @@ class TableAssessment(Assessment):
         return self.errors or error_model(self.optimum, of_combinations=True)
 
     @property
+    def counts_sources(self) -> bool:
+        """Whether the sources of error could be estimated."""
+        return self.errors_of_combinations is not None
+
+    @property
     def device(self) -> tuple[Optimum, ErrorModel | None, ErrorModel | None]:
         """The optimum and its errors, of parameters and of combinations, from which to predict."""
         return self.optimum, self.errors, self.errors_of_combinations
@@ -235,9 +246,9 @@ class TableAssessment(Assessment):
         values = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
         stderr = dict(optimum.stderr)
         if errors is not None:
-            determined = [name for name in (*values, *errors.assumed) if errors.holds(name)]
-            values |= {name: errors.values[name] for name in determined}
-            stderr |= {name: errors.stderr[name] for name in determined}
+            values |= {name: errors.estimates[name] for name in (*values, *errors.assumed)}
+            lost = [name for name in values if not errors.holds(name)]
+            stderr |= dict(errors.stderr) | {name: stderr.get(name, math.inf) for name in lost}
         return values, stderr
 
     @cached_property
@@ -285,8 +296,8 @@ class TableAssessment(Assessment):
         model, optimum = self.problem.model, self.optimum
         values = self.problem.to_values(optimum.theta).tolist()
         estimates = dict(zip(optimum.names, values, strict=True))
-        if self.errors is not None:
-            estimates = dict(self.errors.values)
+        if self.errors_of_combinations is not None:
+            estimates = dict(self.errors_of_combinations.values)
         known = (p for p in model.parameters if p.name in estimates)
         return model.with_values({p.name: p.nearest(estimates[p.name]) for p in known})
 
@@ -312,7 +323,8 @@ class TableAssessment(Assessment):
     @property
     def assumed(self) -> tuple[str, ...]:
         """Names of parameters that were not given; the uncertainty counts their ranges."""
-        return () if self.errors is None else tuple(self.errors.assumed)
+        errors = self.errors_of_combinations
+        return () if errors is None else errors.assumed
 
     @cached_property
     def goodness(self) -> Goodness:
@@ -401,7 +413,7 @@ class TableAssessment(Assessment):
     def design(self, *, counted: bool) -> dict[str, Any]:
         """Return the assumptions about runs and drift, with all sources of error or noise alone."""
         data = self.problem.data
-        errors = self.errors if counted else None
+        errors = self.errors_of_combinations if counted else None
         runs = len((data if errors is None else errors.problem.data).runs or ())
         passes = runs * (data.run is None)
         return {"single_run": runs < 2, "passes": passes, "no_drift": is_monotonic(data)}
@@ -414,7 +426,8 @@ class TableAssessment(Assessment):
         self, amplitudes: Sequence[float], frequency_hz: float | None
     ) -> Iterator[DerivedQuantity]:
         """Yield x_c, energy per cycle, equivalent stiffness and damping."""
-        return derived(self.optimum, amplitudes, frequency_hz, self.errors)
+        errors = None if self.optimum.status.at_infinity else self.errors_of_combinations
+        return derived(self.optimum, amplitudes, frequency_hz, errors)
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -407,7 +407,7 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
 
     Those of noise alone, unless all sources of error are `counted`.
     """
-    counted, (values, stderr) = counted and fit.errors is not None, fit.known
+    counted, (values, stderr) = counted and fit.counts_sources, fit.known
     ranges, stated = [], dict[str, float]()
     for p in fit.problem.model.parameters:
         if p.prior is None or p.free:

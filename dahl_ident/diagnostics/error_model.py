@@ -146,6 +146,12 @@ class ErrorModel(ErrorContributions):
         return {p.name: p.nearest(value) for p, value in known}
 
     @cached_property
+    def estimates(self) -> Mapping[str, float]:
+        """The same, with the limits at which the optimum lies, zero or infinite."""
+        at_optimum = zip(self.optimum.names, self.optimum.values.tolist(), strict=True)
+        return {**self.values, **{n: v for n, v in at_optimum if v == 0.0 or np.isinf(v)}}
+
+    @cached_property
     def stderr(self) -> Mapping[str, float]:
         """Combined standard uncertainty of each value, by name."""
         size = np.abs(self.problem.value_slopes(self.theta))
@@ -189,12 +195,7 @@ class ErrorModel(ErrorContributions):
     def at_estimate(self) -> Optimum:
         """The estimate as an optimum: its residuals have the stated weights."""
         problem, theta, optimum = self.problem, self.theta, self.optimum
-        at_optimum = dict(zip(optimum.names, optimum.values.tolist(), strict=True))
         holds = np.array([self.holds(name) for name in self.names])
-        values = [
-            v if h else at_optimum.get(n, v)
-            for h, (n, v) in zip(holds, self.values.items(), strict=True)
-        ]
         y, m = problem.residuals(theta), problem.n_residuals
         scale = 1.0
         if not problem.scale_known:
@@ -202,7 +203,7 @@ class ErrorModel(ErrorContributions):
             loss = self.estimate.loss
             scale = agreed_scale(problem, loss, lambda _: (theta, free), self.estimate.scale)
         at = replace(optimum, theta=theta, covariance=blanked(self.covariance, ~holds), scale=scale)
-        return self._of_problem(at, problem, np.array(values))
+        return self._of_problem(at, problem, np.array(list(self.estimates.values())))
 
     @cached_property
     def by_noise(self) -> Optimum:
