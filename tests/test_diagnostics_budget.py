@@ -137,6 +137,34 @@ class TestBudget:
             assert found.k > 3.0
         assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(0.05 / np.sqrt(3.0), rel=0.4)
 
+    @pytest.mark.parametrize("scatters", [("sigma",), ("f_max", "sigma")])
+    def test_each_parameter_of_friction_scatters_on_its_own(self, scatters):
+        """Five days of friction in parallel with a spring and a damper, which do not change."""
+        levels, f = (x.ravel() for x in np.meshgrid(np.geomspace(3e-4, 3e-2, 14), [1.0, 4.0]))
+        rng, days = np.random.default_rng(6), 5
+        of_days = {n: v * np.ones(days) for n, v in (("f_max", 0.1), ("sigma", 30.0))}
+        for name in scatters:
+            of_days[name] = of_days[name] * np.exp(0.04 * rng.standard_normal(days))
+        responses = [
+            (Dahl(f_max, sigma, 1.0) + Spring(3.0) + Damper(0.1)).dynamic_stiffness(
+                levels, 2.0 * np.pi * f
+            )
+            * np.exp(5e-4 * rng.standard_normal((f.size, 2)) @ [1.0, 1.0j])
+            for f_max, sigma in zip(*of_days.values(), strict=True)
+        ]
+        data = FrequencyResponse(
+            np.tile(f, days), np.concatenate(responses), np.tile(levels, days),
+            run=np.repeat([f"day {k}" for k in range(days)], f.size),
+        )  # fmt: skip
+        result = fit(data, Dahl(alpha=1.0) + Spring() + Damper())
+        for name in scatters:
+            of_mean = np.std(of_days[name], ddof=1) / days**0.5
+            parameter = result.params[name]
+            assert parameter.stderr == pytest.approx(of_mean, rel=0.15)
+            assert parameter.value == pytest.approx(of_days[name].mean(), abs=0.3 * of_mean)
+        for name, value in (("stiffness", 3.0), ("damping", 0.1)):
+            assert result.params[name].stderr < 0.01 * value
+
     def test_passes_over_the_levels_are_days_where_they_differ(self):
         """Whoever does not state days gets their uncertainty; most repeats stay repeats."""
         passes = "each of 3 passes over the levels a run of its own"

@@ -362,7 +362,7 @@ def _changes_with_speed(estimate: WeightedEstimate) -> Iterator[Source]:
         return
     centre = float(speed[first].mean())
     change = np.pad(np.repeat(speed - centre, 2), (0, estimate.problem.n_priors))
-    for i in _scattering_parameters(estimate.problem):
+    for i in _scale_parameters(estimate.problem, every=False):
         column = -(estimate.jacobian[:, i] * change)[:, None]
         relative = estimate.relative_units @ column[: 2 * first.size].reshape(-1, 2, 1)
         square = 0.5 * float(np.mean(np.sum(relative[first] ** 2, axis=(1, 2))))
@@ -388,7 +388,8 @@ def _runs(estimate: WeightedEstimate) -> Iterator[Source]:
     yield Source(RUNS, estimate.changed(gain), 0.5, per_test="gain", chance=chance)
     yield Source(RUNS, estimate.changed(phase), 0.5, per_test="phase", chance=chance)
     members = np.pad(np.repeat(runs, 2, axis=1).T, ((0, problem.n_priors), (0, 0)))
-    for i in _scattering_parameters(problem):
+    every = any(element.is_linear for element in problem.model.elements)
+    for i in _scale_parameters(problem, every=every):
         columns = -members * estimate.jacobian[:, i : i + 1]
         yield Source(RUNS, columns, 0.0, per_test=problem.names[i], chance=chance)
 
@@ -451,13 +452,16 @@ def _absorbed(problem: TableProblem, J: FloatArray, columns: FloatArray) -> Floa
     return changes
 
 
-def _scattering_parameters(problem: TableProblem) -> list[int]:
-    """Return the columns of parameters that may differ from run to run, in addition to the gain."""
+def _scale_parameters(problem: TableProblem, *, every: bool) -> list[int]:
+    """Return the columns of friction's scale parameters, all or without the last of each law.
+
+    All of them together are a gain, if friction is all there is.
+    """
     indices = []
     for element in problem.model.elements:
         if element.is_linear:
             continue
-        for label in element.scale_parameters[:-1]:  # all of them together are a gain
+        for label in element.scale_parameters[: None if every else -1]:
             name = element.parameter(label).name
             if name in problem.names:
                 indices.append(problem.names.index(name))
