@@ -8,6 +8,7 @@ source of error.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
@@ -191,7 +192,8 @@ def fixed_exponents(
         mean, s = float(np.clip(ratio, low, high)), (high - low) / 12**0.5
         std, covariance = freed.with_prior(mean, s, exact)
         if not p.assumed or abs(ratio) > max(_LONG, _CONTRADICTED * ratio_std):
-            ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
+            with suppress(FitError):  # no motion at values that the search tries
+                ratio, ratio_std = _searched_ratio(fit, p.name, sources) or (ratio, ratio_std)
         exponents.append(
             FixedExponent(
                 p.name, p.unit, value, limits, std, ratio, ratio_std, covariance, p.assumed

@@ -310,25 +310,34 @@ class RecordSearch:
         return float(step[-1] / size[-1]), float(step[-1] ** 2 / inverse[-1, -1])
 
     def solved(self, problem: RecordProblem, start: Mapping[str, float]) -> Optimum:
-        """Return the optimum of a problem."""
-        steps, begin = STEPS, None
+        """Return the optimum of a problem.
+
+        A long record is searched from the end of a search of its part with the largest motion. That
+        part may determine less than the whole; the search goes on if the end is near.
+        """
         if all(p.name in start for p in problem.free):
-            begin = [start[p.name] for p in problem.free]
+            end = self.near(problem, [start[p.name] for p in problem.free], start, STEPS)
         elif problem.n_residuals > 2 * _SHORT[problem.output]:
             part = problem.shortened(_SHORT[problem.output])
             first = self.searched(part, start)
             hopeless = problem.output == "motion" and not first.converged[0]
-            steps = ROUGH if hopeless else STEPS
             begin = part.to_values(first.theta[0])[: len(problem.free)].tolist()
-        if begin is None:
-            end = self.searched(problem, start)
+            end = self.near(problem, begin, start, ROUGH if hopeless else STEPS)
+            if not end.converged[0] and unexplained(problem, end) < _DESCRIBED:
+                end = self.descend(problem, end.theta[0], STEPS)
         else:
-            starts = _changed(started_at(problem, begin)[None], problem, start)
-            end = self.best(problem, starts, steps)
+            end = self.searched(problem, start)
         problem, end = self.refined(*self.freed(problem, end))
         if self.loss != "linear":
             end = self.robust(problem, end)
         return self.optimum(problem, end)
+
+    def near(
+        self, problem: RecordProblem, values: list[float], start: Mapping[str, float], steps: int
+    ) -> Minima:
+        """Return the end of a search from values of the model, changed to those in `start`."""
+        starts = _changed(started_at(problem, values)[None], problem, start)
+        return self.best(problem, starts, steps)
 
     def optimum(self, problem: RecordProblem, end: Minima) -> Optimum:
         """Return the optimum at the end of a search, with assumed exponents fixed there."""
