@@ -298,8 +298,10 @@ class TestRefusal:
             read(table, **{role: value})
 
     def test_no_response(self):
-        with pytest.raises(DataError, match="no response; expected real and imag, gain"):
+        with pytest.raises(DataError, match="no response; expected real and imag, gain") as error:
             read(BASE)
+        assert all(name in str(error.value) for name in BASE)
+        assert "(inspect proposes a column map)" in str(error.value)
         with pytest.raises(DataError, match="'response' holds no complex numbers"):
             read({**BASE, "response [N/m]": 1.0})
 

@@ -346,9 +346,11 @@ class _TableBinding(Binding):
                 quantity, gain = self._part(role)
                 return quantity, gain * np.exp(1j * self._phase())
         if amplitude is None or drive is None or not self.has("phase"):
+            headers = listed([channel.header for channel in self.source.channels], 20)
             raise ValidationError(
                 "no response; expected real and imag, gain (or gain_db) and phase, complex "
-                "numbers, or a phase together with amplitude and drive"
+                f"numbers, or a phase together with amplitude and drive; there are {headers} "
+                "(inspect proposes a column map)"
             )
         if self.map.quantity is None:
             raise ValidationError(
