@@ -7,7 +7,7 @@ of records both have, or is marked as one for tables or records only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial, wraps
 from typing import Any
 
@@ -133,18 +133,13 @@ def _parameters(fit: TableAssessment) -> Iterator[Finding]:
 # Described?
 
 
-def _misfit(fit: Assessed) -> Iterator[Finding]:
-    """Yield size and kind of the misfit, then the reservations about the fit."""
-    reservations = [finding for check in RESERVATIONS for finding in check(fit)]
-    if isinstance(fit, TableAssessment):
-        yield from _misfit_of_table(fit, reservations)
-    else:
-        yield from _misfit_of_records(fit)
-    yield from reservations
+def _reservations(fit: Assessed) -> list[Finding]:
+    return [finding for check in RESERVATIONS for finding in check(fit)]
 
 
+@_of_records
 def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
-    """Yield whether the model describes the records."""
+    """Yield whether the model describes the records, then the reservations about the fit."""
     problem, converged = fit.problem, fit.optimum.converged
     far = fit.goodness.rms_in_band > (_FAIRLY if fit.exceeds_noise else _TOO_LARGE)
     if far:
@@ -166,11 +161,13 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
     if fit.errors.dof_of(NOISE) < _FEW:
         few = {"effective": fit.errors.effective, "unknowns": len(problem.names)}
         yield described("few_effective_samples", _APPROXIMATE, **few)
+    yield from _reservations(fit)
 
 
-def _misfit_of_table(fit: TableAssessment, reservations: Sequence[Finding]) -> Iterator[Finding]:
-    """Yield size and kind of the misfit, and whether bands hold if there are objections."""
-    goodness = fit.goodness
+@_of_tables
+def _misfit_of_table(fit: TableAssessment) -> Iterator[Finding]:
+    """Yield the misfit, whether bands hold if there are objections, and the reservations."""
+    goodness, reservations = fit.goodness, _reservations(fit)
     bands = list[Finding]()
     if not goodness.sign and (goodness.objections or goodness.flagged or reservations):
         bands = list(_bands(fit))
@@ -190,6 +187,7 @@ def _misfit_of_table(fit: TableAssessment, reservations: Sequence[Finding]) -> I
     if large and not goodness.objections:
         yield described("large_misfit", severity, rms=goodness.rms_misfit)
     yield from bands
+    yield from reservations
 
 
 def _stated_exponent_is_wrong(fit: TableAssessment) -> bool:
@@ -453,7 +451,8 @@ CHECKS: tuple[_Check, ...] = (
     _constraints,
     _parameters,
     _parameters_of_records,
-    _misfit,
+    _misfit_of_table,
+    _misfit_of_records,
     _weak_elements,
     _steady,
     _delay,
