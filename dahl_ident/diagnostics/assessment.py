@@ -235,6 +235,11 @@ class TableAssessment(Assessment):
         return self.errors_of_combinations is not None
 
     @property
+    def _errors_of_model(self) -> ErrorModel | None:
+        """The errors of combinations; None if the optimum lies at infinity."""
+        return None if self.optimum.status.at_infinity else self.errors_of_combinations
+
+    @property
     def device(self) -> tuple[Optimum, ErrorModel | None, ErrorModel | None]:
         """The optimum and its errors, of parameters and of combinations, from which to predict."""
         return self.optimum, self.errors, self.errors_of_combinations
@@ -296,8 +301,8 @@ class TableAssessment(Assessment):
         model, optimum = self.problem.model, self.optimum
         values = self.problem.to_values(optimum.theta).tolist()
         estimates = dict(zip(optimum.names, values, strict=True))
-        if self.errors_of_combinations is not None:
-            estimates = dict(self.errors_of_combinations.values)
+        if self._errors_of_model is not None:
+            estimates = dict(self._errors_of_model.values)
         known = (p for p in model.parameters if p.name in estimates)
         return model.with_values({p.name: p.nearest(estimates[p.name]) for p in known})
 
@@ -426,8 +431,7 @@ class TableAssessment(Assessment):
         self, amplitudes: Sequence[float], frequency_hz: float | None
     ) -> Iterator[DerivedQuantity]:
         """Yield x_c, energy per cycle, equivalent stiffness and damping."""
-        errors = None if self.optimum.status.at_infinity else self.errors_of_combinations
-        return derived(self.optimum, amplitudes, frequency_hz, errors)
+        return derived(self.optimum, amplitudes, frequency_hz, self._errors_of_model)
 
     @property
     def facts(self) -> dict[str, Any]:
