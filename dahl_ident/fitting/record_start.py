@@ -74,6 +74,16 @@ class _Start(NamedTuple):
     """Whether no mass, damping, stiffness or scale is negative."""
 
 
+class _History(NamedTuple):
+    """The fastest part of a record."""
+
+    displacement: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    force: FloatArray
+    time: FloatArray
+
+
 def _non_negative(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the non-negative solution of normal equations."""
     from scipy.optimize import nnls
@@ -93,15 +103,17 @@ def _differ(first: list[float], second: list[float]) -> bool:
 class _Scan:
     def __init__(self, problem: RecordProblem) -> None:
         self.problem = problem
-        self.histories = [self._histories(i) for i in range(len(problem.records))]
-        x = np.concatenate([h[0] - h[0].mean() for h in self.histories])
+        self.histories = [self._history(i) for i in range(len(problem.records))]
+        positions = [h.displacement for h in self.histories]
+        x = np.concatenate([x - x.mean() for x in positions])
         self.length = float(np.abs(x).max()) or 1.0
-        rate = float(np.sqrt(np.mean([np.var(h[1]) / np.var(h[0]) for h in self.histories])))
+        rate = float(
+            np.sqrt(np.mean([np.var(h.velocity) / np.var(h.displacement) for h in self.histories]))
+        )
         self.time = 1.0 / rate if rate > 0.0 else 1.0
-        self.force = max(float(np.std(h[3])) for h in self.histories)
+        self.force = max(float(np.std(h.force)) for h in self.histories)
 
-    def _histories(self, number: int) -> tuple[FloatArray, ...]:
-        """Return displacement, velocity, acceleration, force, time of a record's fastest part."""
+    def _history(self, number: int) -> _History:
         problem, record = self.problem, self.problem.records[number]
         if problem.output == "force":
             x, v, a = problem.motions[number]
@@ -116,7 +128,7 @@ class _Scan:
         energy = np.concatenate([[0.0], np.cumsum((v - v.mean()) ** 2)])
         start = int(np.argmax(energy[n:] - energy[:-n])) if n < x.size else 0
         part = slice(start, start + n)
-        return x[part], v[part], a[part], force[part], record.time[part]
+        return _History(x[part], v[part], a[part], force[part], record.time[part])
 
     def starts(self, count: int) -> FloatArray:
         """Return the best starts of the scan."""
@@ -215,9 +227,10 @@ class _Scan:
         """Return starts with the best linear parameters, and the best non-negative ones."""
         scaled = [any(self._scales(e, p) for p in range(len(e.parameters))) for e in elements]
         normal: FloatArray | None = None
-        for i, (_, _, _, force, _) in enumerate(self.histories):
+        for i, history in enumerate(self.histories):
             rows = [self._weighted(i, c[i]) for c, s in zip(sets, scaled, strict=True) if s]
-            remaining = force - sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
+            known = sum(c[i] for c, s in zip(sets, scaled, strict=True) if not s)
+            remaining = history.force - known
             rows.append(self._weighted(i, remaining))
             block = np.array(rows)
             product_ = np.real(block.conj() @ block.T)
@@ -287,7 +300,7 @@ class _Scan:
 
     def _weight(self, number: int) -> FloatArray:
         """Return a smooth receptance, zero outside the band, from forces to displacements."""
-        x, _, _, force, _ = self.histories[number]
+        x, force = self.histories[number].displacement, self.histories[number].force
         window = np.hanning(x.size)
         X, F = (np.abs(np.fft.rfft(window * (w - w.mean()))) for w in (x, force))
         if not F.any():  # a free decay: the forces balance by themselves

@@ -377,10 +377,8 @@ class TableProblem(Problem):
         """Return the dynamic stiffness by the sensors at theta over that by their starts."""
         if self.sensors.are_exact:
             return np.ones(1, dtype=np.complex128)
-        view, values = (
-            self.stiffness_data,
-            dict(zip(self.names, self.to_values(theta), strict=True)),
-        )
+        view = self.stiffness_data
+        values = dict(zip(self.names, self.to_values(theta), strict=True))
         start = [np.asarray(p.value) for p in self.sensors.parameters]
         at_theta = [np.asarray(values.get(p.name, p.value)) for p in self.sensors.parameters]
         before, after = (
