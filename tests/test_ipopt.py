@@ -493,6 +493,10 @@ def test_a_constraint_that_the_data_contradict_is_said_so(known):
     assert "the constraint sigma==(300*f_max)" in right.verdict
     assert str(wrong.status) == "not described"
     assert "The data contradict the constraint sigma==(330*f_max)" in wrong.verdict
+    assert "consistent with noise" not in wrong.verdict
+    if known:
+        residuals = wrong.optimum.residuals
+        assert wrong.goodness.chi_square.value == pytest.approx(residuals @ residuals, rel=1e-6)
     cost = wrong.optimum.constraint_cost
     rise = 2.0 * (wrong.optimum.cost - free.optimum.cost) / free.optimum.scale**2
     assert cost.rise == pytest.approx(rise, rel=1e-6)

@@ -75,9 +75,12 @@ def judgement(fit: Assessed) -> Judgement:
     """Return the findings of every check, and the status that follows from them.
 
     Misfit findings of the reduced fit replace those of the fit where they are worse: harmonics or
-    a stated covariance may otherwise hide a misfit of the fundamentals.
+    a stated covariance may otherwise hide a misfit of the fundamentals. Residuals with constraints
+    that the data contradict are not noise, even where no other test shows it.
     """
     findings = [finding for check in CHECKS for finding in check(fit)]
+    if any(finding.code == "constraint" for finding in findings):
+        findings = [finding for finding in findings if finding.code != "noise"]
     if fit.reduced is not None:
         worst = max(
             (f.severity.rank for f in findings if f.question is Question.DESCRIBED), default=0
@@ -423,9 +426,6 @@ def assumptions(fit: Assessed, *, counted: bool = True) -> Iterator[Finding]:
             )
         elif p.value is not None:
             stated[p.name] = p.value
-    sensors = {p.name for p in fit.problem.sensors.parameters if p.free}
-    if "delay" in sensors and "force_gain" not in sensors:
-        stated["force_gain"] = 1.0
     cost = fit.constraint_cost
     assumed = {
         "ranges": tuple(ranges),

@@ -224,7 +224,9 @@ class ResidualSpace(_Complement):
         columns[:m] *= self._column_weight[:, None]
         self.basis = orthonormal(columns)[:m]
         r = residual_weight * y[:m] * (not optimum.is_exact)
-        self.residuals = r - self.basis @ (self.basis.T @ r)
+        self.residuals = r
+        if optimum.constraint_cost is None:  # with constraints, parameters would explain more
+            self.residuals = r - self.basis @ (self.basis.T @ r)
 
     def _weights(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the weights of each row in the columns, and in the residuals."""

@@ -160,11 +160,11 @@ def _held_out(tests: int, available: int, gains: int, phases: int, rows: int, wi
 
 
 def _constraint(texts: Sequence[str], rise: float, noise_known: bool, p_value: float) -> str:
-    against = "known noise" if noise_known else "the noise of the fit without them"
+    noise = "known" if noise_known else "estimated"
     return (
-        f"The data contradict the constraint {listed(texts)}: the sum of squares rises by "
-        f"{rise:.3g} times the variance of {against} ({p_text(p_value)}): check the constraint, "
-        "or the model."
+        f"The data contradict the constraint {listed(texts)} ({p_text(p_value)}): it raises the "
+        f"sum of squares by {rise:.3g} times the {noise} variance of the noise. Check the "
+        "constraint, or the model."
     )
 
 
