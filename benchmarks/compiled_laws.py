@@ -20,7 +20,7 @@ import dahl_ident as di
 from benchmarks.harness import Row, print_table, seconds
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.driven_motion import Shooting
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from tests.motions import Driven
 
 TITLE = "Laws that are compiled"

@@ -19,7 +19,7 @@ from scipy.stats import binom
 
 import dahl_ident as di
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 
 TABLES, PROBLEMS, SEED = 200, 1000, 1
 _BATCH = 100

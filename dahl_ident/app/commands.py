@@ -25,7 +25,8 @@ from dahl_ident.elements import (
     PowerDamper,
     Spring,
 )
-from dahl_ident.elements.law_files import KINDS, class_named, load_laws
+from dahl_ident.elements.element import KINDS, class_named
+from dahl_ident.elements.law_files import load_laws
 from dahl_ident.errors import DahlIdentError, DataError
 from dahl_ident.units import SI_UNITS, parse_quantity
 

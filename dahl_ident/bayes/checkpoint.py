@@ -26,7 +26,7 @@ import numpy as np
 from dahl_ident.bayes.chain import Chain, ChainSettings, Convergence
 from dahl_ident.bayes.density import LogDensity
 from dahl_ident.data.storage import library, locked, plain_data, put_in_place
-from dahl_ident.elements.model import describe_model
+from dahl_ident.elements.element import describe_model
 from dahl_ident.errors import ModelError, SamplingError
 
 _FORMAT = "dahl_ident chain", 1  # name and version of the layout; any other is refused

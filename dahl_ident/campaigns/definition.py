@@ -182,8 +182,9 @@ def _run_laws(folder: Path, laws: Any) -> None:
 
 def _model(entries: Any) -> tuple[list[dict[str, Any]], Collection[str], dict[str, str]]:
     """Return the model as plain data, the names of its parameters, and digests of its law files."""
-    from dahl_ident.elements.law_files import file_of, user_laws
-    from dahl_ident.elements.model import describe_model, model_from_description
+    from dahl_ident.elements.element import describe_model, model_from_description
+    from dahl_ident.elements.law_files import user_laws
+    from dahl_ident.elements.law_module import file_of
 
     if (
         not isinstance(entries, list)

@@ -51,7 +51,7 @@ from dahl_ident.version import __version__
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dahl_ident.elements.law_files import LawFile
+    from dahl_ident.elements.law_module import LawFile
 
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
@@ -300,8 +300,9 @@ def campaign(
 
 def _laws(definition: Definition) -> tuple[str | LawFile, ...]:
     """Return the modules and files that define the model's laws, other than this package's."""
-    from dahl_ident.elements.law_files import LawFile, file_of, source_path, user_laws
-    from dahl_ident.elements.model import model_from_description
+    from dahl_ident.elements.element import model_from_description
+    from dahl_ident.elements.law_files import user_laws
+    from dahl_ident.elements.law_module import LawFile, file_of, source_path
 
     sources: dict[str | LawFile, None] = {}
     for law in user_laws(model_from_description(definition.options["model"]).elements):

@@ -33,7 +33,7 @@ from dahl_ident.version import __version__
 
 if TYPE_CHECKING:
     from dahl_ident.data import FrequencyResponse
-    from dahl_ident.elements.law_files import LawFile
+    from dahl_ident.elements.law_module import LawFile
     from dahl_ident.results import FitResult
 
 Row = dict[str, Any]
@@ -101,13 +101,13 @@ def _load(law: str | LawFile) -> None:
     if isinstance(law, str):
         importlib.import_module(law)
         return
-    from dahl_ident.elements.law_files import run_file
+    from dahl_ident.elements.element import laws_of
 
-    run_file(law)
+    laws_of(law)
 
 
 def _fitted(job: Job, digests: list[str]) -> Row:
-    from dahl_ident.elements.model import model_from_description
+    from dahl_ident.elements.element import model_from_description
     from dahl_ident.results import fit, posterior
 
     options = job.options

@@ -200,7 +200,7 @@ def plan(
 
 def _fit_or_model(fit: str | None, options: ModelOptions) -> Any:
     """Return the saved fit, or else the model of the options."""
-    from dahl_ident.elements.model import as_model
+    from dahl_ident.elements.element import as_model
 
     if fit is not None:
         if options != ModelOptions():
@@ -364,7 +364,7 @@ def _default_levels(truth: Element, controlled: str) -> str:
     """Return levels of displacement or force around the knee of the friction."""
     import numpy as np
 
-    from dahl_ident.elements.model import as_model
+    from dahl_ident.elements.element import as_model
 
     laws = [e for e in as_model(truth).elements if not e.is_linear]
     knees = np.array([[float(knee) for knee in e.knee(e.known_values())] for e in laws])

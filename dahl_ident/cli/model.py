@@ -90,7 +90,7 @@ def model_of(
     element. A parameter that is None is free.
     """
     from dahl_ident.elements import Dahl, Damper, Mass, Spring
-    from dahl_ident.elements.model import model_from_description
+    from dahl_ident.elements.element import model_from_description
 
     friction: Element
     if elements:
@@ -109,7 +109,7 @@ def model_of(
 
 def _description(text: str) -> dict[str, Any]:
     """Return an element as plain data; the element behind a gap is in the gap's brackets."""
-    from dahl_ident.elements.law_files import KINDS, class_named
+    from dahl_ident.elements.element import KINDS, class_named
 
     call = _CALL.fullmatch(text.strip())
     if call is None:

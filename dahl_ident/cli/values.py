@@ -39,7 +39,7 @@ def _quantity(name: str, text: str, unit: str | None) -> float:
     """Return a number with its unit in SI; NaN for other text."""
     if _QUANTITY.fullmatch(text) is None:
         return math.nan
-    from dahl_ident.elements.law_files import KINDS
+    from dahl_ident.elements.element import KINDS
     from dahl_ident.units import SI_UNITS, parse_quantity
 
     if unit is None:

@@ -31,9 +31,8 @@ from dahl_ident.control_interop.linear_part import (
 )
 from dahl_ident.control_interop.nonlinearity import friction_alone, friction_and_slope
 from dahl_ident.elements.driven_motion import Steady, obstacle
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.linear_system import LinearSystem, check_system
-from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError, ValidationError
 
 _AMPLITUDES_PER_DECADE = 60  # 4 % apart; N is smooth, and crossings are interpolated

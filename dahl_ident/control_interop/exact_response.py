@@ -12,7 +12,7 @@ import numpy as np
 
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements.driven_motion import NEUTRAL, Shooting
-from dahl_ident.elements.model import Model
+from dahl_ident.elements.element import Model
 
 if TYPE_CHECKING:
     from dahl_ident.engine import SteadyMotion

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.facts import Sine
-from dahl_ident.elements.model import as_model
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _Values = list[Sequence[FloatArray]]

@@ -19,9 +19,8 @@ from scipy.optimize import least_squares
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.driven_motion import NEUTRAL
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, Model
 from dahl_ident.elements.equations import law_equations, plant_equations
-from dahl_ident.elements.model import Model
 from dahl_ident.engine import System, march, settled, translate
 from dahl_ident.errors import FitError
 

@@ -25,8 +25,7 @@ from dahl_ident.control_interop.nonlinearity import friction_and_slope
 from dahl_ident.control_interop.steady_response import SteadyResponse, response
 from dahl_ident.data.columns import CONTROLLED, one_of
 from dahl_ident.elements.driven_motion import NEUTRAL, Steady
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import Model
+from dahl_ident.elements.element import Element, Model
 from dahl_ident.errors import ValidationError
 from dahl_ident.units import QUANTITIES, Quantity, converted, si_unit
 

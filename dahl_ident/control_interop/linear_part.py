@@ -23,9 +23,8 @@ from dahl_ident.arrays import (
     positive_array,
 )
 from dahl_ident.data import FrequencyResponse
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.linear_system import LinearSystem, check_system
-from dahl_ident.elements.model import Model, as_model
 from dahl_ident.elements.rational import Rational
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.units import jacobian

@@ -27,8 +27,7 @@ from dahl_ident.arrays import (
     positive_number,
 )
 from dahl_ident.control_interop.linear_part import controller_response, rational_stiffness, split
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.rational import Rational
 from dahl_ident.errors import ValidationError
 

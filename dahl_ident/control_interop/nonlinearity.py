@@ -6,9 +6,8 @@ import control
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray, finite_number, non_negative_array
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.elements.facts import Sine
-from dahl_ident.elements.model import Model, as_model
 from dahl_ident.errors import ModelError
 
 _AT_REST = np.zeros(())

@@ -32,8 +32,7 @@ from dahl_ident.control_interop.exact_response import HARMONICS, exact_motions
 from dahl_ident.control_interop.force_balance import find_roots, flatten
 from dahl_ident.data.columns import one_of
 from dahl_ident.elements.driven_motion import LINEAR, NEUTRAL, STEADY, Shooting, Steady, obstacle
-from dahl_ident.elements.element import Element
-from dahl_ident.elements.model import Model, as_model
+from dahl_ident.elements.element import Element, Model, as_model
 from dahl_ident.errors import MultipleSolutionsWarning, NoSteadyMotionWarning, ValidationError
 from dahl_ident.units import percent
 

@@ -42,8 +42,7 @@ from dahl_ident.elements import (
     PowerDamper,
     Spring,
 )
-from dahl_ident.elements.facts import Alternative
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import Alternative, as_model
 from dahl_ident.errors import DahlIdentError, ValidationError
 from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem

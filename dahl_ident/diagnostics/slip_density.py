@@ -21,8 +21,8 @@ from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data import FrequencyResponse
 from dahl_ident.diagnostics.text import sentence
 from dahl_ident.elements import Element, MaxwellSlip, Model
+from dahl_ident.elements.element import as_model
 from dahl_ident.elements.masing import jenkins
-from dahl_ident.elements.model import as_model
 from dahl_ident.errors import DahlIdentError, DataError, ModelError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import TableProblem

@@ -8,12 +8,12 @@ element moves with the amplitude A - gap/2.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element, prefixed
+from dahl_ident.elements.element import KINDS, Element, class_named
 from dahl_ident.elements.facts import (
     Asymptote,
     Combination,
@@ -23,9 +23,9 @@ from dahl_ident.elements.facts import (
     Values,
     clipped,
 )
+from dahl_ident.elements.force_law import prefixed
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.held_motion import loops_of
-from dahl_ident.elements.law_files import KINDS, class_named
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.errors import ModelError
 
@@ -206,7 +206,7 @@ class Backlash(Friction):
         }
 
     @classmethod
-    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
+    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Self:
         """Return the element that :meth:`describe` described."""
         entry = description.get("element")
         inner = dict(entry) if isinstance(entry, Mapping) else {}

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.element import Model
 from dahl_ident.elements.facts import Mechanics
 from dahl_ident.elements.linear_system import Equation, LinearSystem, coefficients_of, differences
-from dahl_ident.elements.model import Model
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.rational import Rational, typical_rate
 

@@ -24,8 +24,8 @@ from dahl_ident.arrays import (
 from dahl_ident.elements import general_dahl, hysteresis, linear_dahl
 from dahl_ident.elements.backlash import Backlash
 from dahl_ident.elements.bouc_wen import BoucWen
+from dahl_ident.elements.element import Alternative
 from dahl_ident.elements.facts import (
-    Alternative,
     Asymptote,
     Combination,
     HistoryGradient,

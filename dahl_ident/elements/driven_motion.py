@@ -14,10 +14,9 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.coefficients import Coefficients
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.equations import plant_equations
 from dahl_ident.elements.friction import Friction
-from dahl_ident.elements.model import as_model
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:

@@ -1,12 +1,15 @@
-"""The base class of all elements: checked methods for users, and the unchecked mathematics."""
+"""Elements, and models: elements in parallel. Both also as plain data, for files of results."""
 
 from __future__ import annotations
 
-import re
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+import inspect
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from itertools import pairwise
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,86 +23,43 @@ from dahl_ident.arrays import (
     non_negative_array,
     whole_number,
 )
-from dahl_ident.elements.facts import (
-    Alternative,
-    Asymptote,
-    Combination,
-    HistoryGradient,
-    Mechanics,
-    Orders,
-    Path,
-    Sine,
-    StiffnessGradient,
-    UniversalCurve,
-    Values,
-)
-from dahl_ident.elements.law_files import empty_element, file_of, register
+from dahl_ident.elements.facts import HistoryGradient, Path, Sine, StiffnessGradient, Values
+from dahl_ident.elements.force_law import ForceLaw, required_history
+from dahl_ident.elements.law_checks import check_declarations
+from dahl_ident.elements.law_module import LawFile, file_of, module_of, source_path
 from dahl_ident.elements.parameter import Parameter
-from dahl_ident.errors import ModelError, ValidationError
+from dahl_ident.errors import ModelError, ValidationError, choices
 
-if TYPE_CHECKING:
-    from dahl_ident.elements.model import Model
+Value = TypeVar("Value")
+
+KINDS: dict[str, type[Element]] = {}
+"""Every element class by its name in files and on the command line."""
 
 
-class Element(ABC):
+class Alternative(NamedTuple):
+    """Elements in place of one.
+
+    Attributes
+    ----------
+    elements : tuple of Element
+        In parallel.
+    shows : {"shape", "asymmetry", "speed", "masing"}
+        The evidence for them: the dependence of force on amplitude, and the odd harmonics; the
+        mean force and the even harmonics; a force that falls with the speed; or parallel Jenkins
+        elements, which would leave a much smaller misfit.
+    """
+
+    elements: tuple[Element, ...]
+    shows: str = "shape"
+
+
+class Element(ForceLaw):
     """Part of a mechanism, with the dynamic stiffness Z(A, omega) = F/X.
 
     Elements act in parallel: ``+`` adds their forces at one displacement. A parameter that is given
     a number is fixed; one left out is free, and is estimated. A subclass with a `kind` can be
     written to files under this name.
-
-    Attributes
-    ----------
-    kind : str
-        Name in JSON, TOML and on the command line, such as "dahl".
-    equation : str
-        The law in plain text.
-    is_linear : bool
-        True: the stiffness does not depend on the amplitude.
-    rate_independent : bool
-        True: the stiffness does not depend on the frequency.
-    has_memory : bool
-        True: the force depends on the history of displacement.
-    unique_response : bool
-        True: in parallel with a passive linear part the response to a sine force is unique, because
-        A abs(L + N(A)) rises with A.
-    name : str or None
-        The element's name, which prefixes those of its parameters.
-    parameters : tuple of Parameter
-        In the order of the constructor: declarations on the class, with values on an element.
-    optional : (Parameter, float) or None
-        One more parameter, and the argument with which an element does not have it.
-    linear_parameters : tuple of str
-        Labels of parameters in which the force is linear.
-    scale_parameters : tuple of str
-        Labels of parameters that, all multiplied by one factor, multiply the force by it.
-    like_parts : tuple of tuple of str
-        Labels of each of several interchangeable parts; estimates are ordered by the first label.
-    softens : bool
-        True: Re N falls with the amplitude, whatever the values.
-    holds_at_rest : bool
-        True: holding a constant displacement may take a force.
-    starts : tuple of (str, str, str)
-        Name, unit and meaning of each unknown from which the states follow at the first sample.
     """
-
-    kind: ClassVar[str] = ""
-    equation: str = ""
-    is_linear: bool = False
-    rate_independent: bool = True
-    has_memory: bool = False
-    unique_response: bool = False
-    parameters: tuple[Parameter, ...] = ()
-    optional: ClassVar[tuple[Parameter, float] | None] = None
-    linear_parameters: tuple[str, ...] = ()
-    scale_parameters: tuple[str, ...] = ()
-    like_parts: tuple[tuple[str, ...], ...] = ()
-    softens: bool = False
-    holds_at_rest: bool = True
-    starts: tuple[tuple[str, str, str], ...] = (
-        ("initial_force", "N", "friction at the first sample"),
-    )
-    name: str | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -111,66 +71,6 @@ class Element(ABC):
         if file is None:
             return super().__reduce_ex__(protocol)
         return empty_element, (file, type(self).__qualname__), self.__dict__
-
-    def _bind(self, arguments: Mapping[str, float | None], name: str | None) -> None:
-        """Give the declared parameters their full names and values."""
-        self.name = name
-        declared = type(self).parameters
-        if self.optional and arguments[self.optional[0].name] != self.optional[1]:
-            declared = (*declared, self.optional[0])
-        self.parameters = tuple(
-            p.bound(prefixed(name, p.name), arguments.get(p.name, p.value)) for p in declared
-        )
-
-    @property
-    def has_optional(self) -> bool:
-        """Whether the element has its optional parameter."""
-        return self.optional is not None and self.optional[0].name in self.labels
-
-    def copy_with(self, parameters: tuple[Parameter, ...]) -> Self:
-        """Return a copy of this element with other values, bounds or free flags."""
-        copy = object.__new__(type(self))
-        copy.__dict__.update(self.__dict__)
-        copy.parameters = parameters
-        return copy
-
-    def started_at(self, values: Sequence[float]) -> Self:
-        """Return this element with start values for its free parameters."""
-        return self.copy_with(
-            tuple(
-                replace(p, value=p.nearest(v), assumed=False) if p.free else p
-                for p, v in zip(self.parameters, values, strict=True)
-            )
-        )
-
-    def describe(self) -> dict[str, Any]:
-        """Return kind, name and parameters as plain data."""
-        name = {"name": self.name} if self.name else {}
-        parameters = {self.label(p): p.describe() for p in self.parameters}
-        return {"kind": self.kind, **name, **parameters}
-
-    @classmethod
-    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
-        """Return the element that :meth:`describe` described, here without its kind and name."""
-        options: dict[str, Any] = {"name": name}
-        if cls.optional and cls.optional[0].name in description:
-            options[cls.optional[0].name] = None
-        return cls(**options)._described(description)
-
-    def _described(self, description: Mapping[str, Any]) -> Self:
-        """Return this element with the parameters that plain data describe, by label."""
-        unknown = [label for label in description if label not in self.labels]
-        if unknown:
-            raise ModelError(
-                f"the {self.kind} element has the keys {', '.join(unknown)}; expected "
-                f"{', '.join(self.labels)}"
-            )
-        return self.copy_with(
-            tuple(
-                p.described(description[label]) if label in description else p
-                for label, p in zip(self.labels, self.parameters, strict=True)
-            )
-        )
 
     def dynamic_stiffness(
         self, amplitude: ArrayLike, omega: ArrayLike = 0.0, *, harmonic: int = 1
@@ -288,189 +188,9 @@ class Element(ABC):
 
     def __add__(self, other: Element) -> Model:
         """Put two elements, or sums of elements, in parallel."""
-        from dahl_ident.elements.model import Model
-
         if not isinstance(other, Element):
             return NotImplemented
         return Model(self, other)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(self._arguments())})"
-
-    def _arguments(self) -> list[str]:
-        """Return the arguments as they are shown in `repr`."""
-        arguments = [self._argument(p) for p in self.parameters]
-        return [*arguments, f"name={self.name!r}"] if self.name else arguments
-
-    def _argument(self, parameter: Parameter) -> str:
-        """Return a parameter as it is shown in `repr`."""
-        value = "free" if parameter.value is None else f"{parameter.value:g}"
-        if parameter.free and parameter.value is not None:
-            value += " free"
-        return f"{self.label(parameter)}={value}"
-
-    # The mathematics, in plain numbers; arguments are not checked.
-
-    def label(self, parameter: Parameter) -> str:
-        """Return a parameter's name without the element's prefix."""
-        return parameter.name.removeprefix(f"{self.name}_") if self.name else parameter.name
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The parameters' names without the element's prefix."""
-        return tuple(self.label(p) for p in self.parameters)
-
-    def parameter(self, label: str) -> Parameter:
-        """Return the parameter called `label` within this element."""
-        if label not in self.labels:
-            raise ModelError(f"{self!r} has no parameter {label}; it has {', '.join(self.labels)}")
-        return self.parameters[self.labels.index(label)]
-
-    def named(self, expression: str) -> str:
-        """Return an expression of labels with the parameters' full names."""
-        for label, parameter in zip(self.labels, self.parameters, strict=True):
-            expression = re.sub(rf"\b{label}\b", parameter.name, expression)
-        return expression
-
-    def known_values(self) -> tuple[FloatArray, ...]:
-        """Return the value of every parameter, or name those that have none."""
-        missing = [p.name for p in self.parameters if p.value is None]
-        if missing:
-            raise ModelError(
-                f"{self!r} has no value for {', '.join(missing)}; "
-                "give a number to evaluate the model, or estimate it with fit"
-            )
-        return tuple(np.asarray(p.value) for p in self.parameters)
-
-    @abstractmethod
-    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
-        """Return F_k/X_1 at the parameter `values`, unchecked; all arguments broadcast.
-
-        `derivatives` is 0 for none, 1 for that with respect to the amplitude, 2 for those with
-        respect to the parameters too.
-        """
-
-    def stiffness(
-        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
-    ) -> ComplexArray:
-        """Return F_k/X_1, unchecked; `harmonic` 0 is the mean force over the amplitude."""
-        return self.settled(values, Sine(amplitude, omega, harmonic), 0).value
-
-    def stiffness_gradient(
-        self, values: Values, amplitude: FloatArray, omega: FloatArray, harmonic: Orders = 1
-    ) -> StiffnessGradient:
-        """Return F_k/X_1 with all its derivatives, unchecked."""
-        return self.settled(values, Sine(amplitude, omega, harmonic), 2)
-
-    def has_harmonic(self, harmonic: int) -> bool:
-        """Return whether the force may have this harmonic under a sinusoidal displacement.
-
-        The force of a linear element has only the fundamental, that of a law that is the same in
-        both directions only odd harmonics.
-        """
-        return harmonic == 1 if self.is_linear else harmonic % 2 == 1
-
-    def normalised(self, values: Values) -> tuple[FloatArray, FloatArray, Values]:
-        """Return a force, a stiffness, and the values in these units, of which fewer vary.
-
-        ``N(A; values) = stiffness * N(A stiffness/force; values in these units)``. By default 1,
-        1 and the values themselves.
-        """
-        return np.ones(()), np.ones(()), values
-
-    def history(
-        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
-    ) -> HistoryGradient:
-        """Return the force at every sample with its derivatives, unchecked.
-
-        `state` is the unknown at the first sample: in most laws, the force there. Without `slopes`
-        the derivatives need not be right.
-        """
-        raise ModelError(f"{self!r} has no force over time")
-
-    def force_history(
-        self,
-        values: Sequence[Any],
-        displacement: FloatArray,
-        velocity: FloatArray | None = None,
-        state: float = 0.0,
-        *,
-        acceleration: FloatArray | None = None,
-        time: FloatArray | None = None,
-    ) -> FloatArray:
-        """Return the force alone of :meth:`history`."""
-        path = Path(displacement, velocity, acceleration, time)
-        return self.history(values, path, state, slopes=False).value
-
-    def mechanics(
-        self, values: Sequence[Any], x: Any, velocity: Any, direction: Any, states: Sequence[Any]
-    ) -> Mechanics:
-        """Return the element's part in an equation of motion, in plain arithmetic.
-
-        `x` is the displacement, `direction` the sign of the velocity. There are :attr:`n_states`
-        `states`: in most laws with memory one, the present force.
-        """
-        raise ModelError(
-            f"{self!r} has no equation of motion",
-            "it cannot be driven by a force over time: give records with measured displacement "
-            "and force",
-        )
-
-    @property
-    def inner_elements(self) -> tuple[Any, ...]:
-        """Elements that this one contains, such as that behind a gap."""
-        return ()
-
-    @property
-    def n_states(self) -> int:
-        """Number of states in an equation of motion."""
-        return int(self.has_memory)
-
-    @property
-    def has_inertia(self) -> bool:
-        """Whether a force determines the motion of the element."""
-        return any(p.is_mass for p in self.parameters)
-
-    def initial_states(self, values: Sequence[Any], starts: Sequence[Any]) -> Sequence[Any]:
-        """Return the states at the first sample from the unknowns there, in plain arithmetic.
-
-        The states of a linear element are the unknowns themselves.
-        """
-        return starts
-
-    def start_with(self, values: Sequence[Any], force: float) -> float:
-        """Return the unknown at the first sample for which the force there is `force`."""
-        return force
-
-    def coarser(self) -> Self:
-        """Return this element, or an approximation whose motion under a force costs less."""
-        return self
-
-    def free_responses(self, time: FloatArray) -> FloatArray:
-        """Return a linear element's force from a unit of each initial state, (n, states)."""
-        return np.zeros((time.size, 0))
-
-    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return upper bounds of abs(N) and A abs(N) over all amplitudes; inf if unbounded."""
-        return np.full((), np.inf), np.full((), np.inf)
-
-    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return the amplitudes between which N changes, m; NaN for a linear element."""
-        return np.full((), np.nan), np.full((), np.nan)
-
-    def transient_decay(
-        self, values: Values, amplitude: FloatArray, omega: FloatArray
-    ) -> FloatArray:
-        """Return the factor by which a deviation from the steady loop shrinks in one cycle."""
-        return np.zeros(np.broadcast_shapes(np.shape(amplitude), np.shape(omega)))
-
-    def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
-        """Return the limits at infinity that this law declares, for amplitudes low to high, m."""
-        return ()
-
-    def combinations(self) -> tuple[Combination, ...]:
-        """Return products of powers that data may determine where their factors are not."""
-        return ()
 
     def alternatives(self, values: Sequence[float], smallest: float) -> dict[str, Alternative]:
         """Return alternatives to this element by a short description of each.
@@ -479,56 +199,294 @@ class Element(ABC):
         """
         return {}
 
-    def universal_curve(self) -> UniversalCurve | None:
-        """Return the curve that N follows for all values of the scale parameters, or None."""
-        return None
 
-    def resembles(
-        self, values: Sequence[float], amplitude: FloatArray, omega: FloatArray
-    ) -> tuple[str, float] | None:
-        """Return a simpler law, if there is one, and the rms deviation of its best fit to this N.
+class Model(Element):
+    """Elements in parallel: Z(A, omega) is the sum of theirs, at one displacement.
 
-        The deviation is relative, over levels of `amplitude` and `omega`.
-        """
-        return None
+    Usually written with ``+``. Sums of sums are flattened.
+
+    Parameters
+    ----------
+    *elements : Element
+        One or more elements or sums.
+
+    Raises
+    ------
+    ModelError
+        If there is no element, or two parameters share a name.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Damper, Mass, Spring
+    >>> plant = Dahl() + Mass(0.3) + Damper() + Spring()
+    >>> [p.name for p in plant.parameters if p.free]
+    ['f_max', 'sigma', 'damping', 'stiffness']
+    """
+
+    def __init__(self, *elements: Element) -> None:
+        flat: list[Element] = []
+        for element in elements:
+            if not isinstance(element, Element):
+                raise ModelError(
+                    "expected a model such as Dahl() + Mass(0.3), got " + type(element).__name__
+                )
+            flat.extend(element.elements if isinstance(element, Model) else [element])
+        if not flat:
+            raise ModelError("a model needs at least one element, got none")
+        self._elements = tuple(flat)
+        self.parameters = tuple(p for element in flat for p in element.parameters)
+        self.is_linear = all(element.is_linear for element in flat)
+        self.rate_independent = all(element.rate_independent for element in flat)
+        self.has_memory = any(element.has_memory for element in flat)
+        clashes = [n for n, count in Counter(p.name for p in self.parameters).items() if count > 1]
+        if clashes:
+            raise ModelError(
+                f"two elements share the parameter names {', '.join(clashes)}; "
+                "give each a name, such as Dahl(name='pivot')"
+            )
+        ends = np.cumsum([0, *(len(element.parameters) for element in flat)]).tolist()
+        self._slices = [slice(a, b) for a, b in pairwise(ends)]
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """The elements, in the order in which they were added."""
+        return self._elements
+
+    def of(self, values: Sequence[Value]) -> Iterator[tuple[Element, Sequence[Value]]]:
+        """Yield every element with its own part of the model's parameter `values`."""
+        for element, s in zip(self._elements, self._slices, strict=True):
+            yield element, values[s]
+
+    def settled(self, values: Values, sine: Sine, derivatives: int) -> StiffnessGradient:
+        """Return the sum of the elements' F_k/X_1 with its derivatives, unchecked."""
+        parts = [
+            element.settled(numbers, sine, derivatives) for element, numbers in self.of(values)
+        ]
+        value, by_amplitude, _ = parts[0]
+        for part in parts[1:]:
+            value, by_amplitude = value + part.value, by_amplitude + part.by_amplitude
+        return StiffnessGradient(
+            value, by_amplitude, tuple(d for part in parts for d in part.by_parameter)
+        )
+
+    def history(
+        self, values: Sequence[Any], path: Path, state: float, *, slopes: bool
+    ) -> HistoryGradient:
+        """Return the sum of the elements' forces, unchecked; `state` is the friction's."""
+        parts = [
+            element.history(numbers, path, state if element.has_memory else 0.0, slopes=slopes)
+            for element, numbers in self.of(values)
+        ]
+        value = np.asarray(sum(part.value for part in parts))
+        by_state = np.asarray(sum(part.by_state for part in parts))
+        return HistoryGradient(value, by_state, tuple(d for p in parts for d in p.by_parameter))
+
+    def start_with(self, values: Sequence[Any], force: float) -> float:
+        """Return the friction's unknown; at most one element has memory if there is a force."""
+        return sum(e.start_with(numbers, force) for e, numbers in self.of(values) if e.has_memory)
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether a force determines the motion."""
+        return any(element.has_inertia for element in self._elements)
+
+    def _check_start(self, values: Sequence[float], initial_force: float) -> None:
+        with_memory = [(e, numbers) for e, numbers in self.of(values) if e.has_memory]
+        if not with_memory:
+            super()._check_start(values, initial_force)
+        if initial_force and len(with_memory) > 1:
+            raise ValidationError(
+                f"initial_force is {initial_force!r} for {len(with_memory)} elements with memory; "
+                "evaluate them one by one, or leave it out"
+            )
+        for element, numbers in with_memory:
+            element._check_start(numbers, initial_force)
+
+    def force_bounds(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of the elements' bounds of abs(N) and A abs(N)."""
+        bounds = [element.force_bounds(numbers) for element, numbers in self.of(values)]
+        steepest, largest = (np.asarray(sum(b[i] for b in bounds)) for i in (0, 1))
+        return steepest, largest
+
+    def knee(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest knee of the elements; NaN where all are linear."""
+        low, high = np.full((), np.nan), np.full((), np.nan)
+        for element, numbers in self.of(values):
+            first, last = element.knee(numbers)
+            low, high = np.fmin(low, first), np.fmax(high, last)
+        return low, high
+
+    def transient_decay(
+        self, values: Values, amplitude: FloatArray, omega: FloatArray
+    ) -> FloatArray:
+        """Return the decay of the element that forgets most slowly."""
+        slowest = super().transient_decay(values, amplitude, omega)
+        for element, numbers in self.of(values):
+            slowest = np.maximum(slowest, element.transient_decay(numbers, amplitude, omega))
+        return slowest
 
     def resolved(self, values: Values, amplitude: FloatArray) -> Values:
-        """Return the values, each limited to the range in which it has an effect at `amplitude`."""
-        return values
+        """Return the values of all elements, each limited to where it has an effect."""
+        return [
+            v for element, numbers in self.of(values) for v in element.resolved(numbers, amplitude)
+        ]
 
     def physical_objections(self, values: Sequence[float]) -> tuple[str, ...]:
-        """Return sentences that say why the values are physically impossible."""
-        return ()
-
-    def rational_stiffness(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return a linear element's numerator and denominator of Z(s), highest power first."""
-        return None
-
-    def system_at(self, values: Sequence[float]) -> Any:
-        """Return the python-control system from which the element was made, or None."""
-        return None
-
-
-def prefixed(name: str | None, label: str) -> str:
-    """Return the full name of the parameter `label` of an element called `name`."""
-    if name is None:
-        return label
-    if not str(name).isidentifier():
-        raise ValidationError(
-            f"name is {name!r}; expected letters, digits and underscores, such as 'pivot'"
+        """Return the objections of all elements to their values."""
+        return tuple(
+            text
+            for element, numbers in self.of(values)
+            for text in element.physical_objections(numbers)
         )
-    return f"{name}_{label}"
+
+    def coarser(self) -> Model:
+        """Return a model of elements whose motion under a force costs less, or this model."""
+        elements = [element.coarser() for element in self._elements]
+        same = all(new is old for new, old in zip(elements, self._elements, strict=True))
+        return self if same else Model(*elements)
+
+    def with_parameters(self, changes: Mapping[str, Parameter]) -> Model:
+        """Return this model with some parameters replaced, by name."""
+        self._known(changes)
+        elements = []
+        for element in self._elements:
+            parameters = tuple(changes.get(p.name, p) for p in element.parameters)
+            same = parameters == element.parameters
+            elements.append(element if same else element.copy_with(parameters))
+        return Model(*elements)
+
+    def with_free(self, names: Iterable[str]) -> Model:
+        """Return this model with the named parameters estimated, started from their values."""
+        names = list(names)
+        known = self._known(names)
+        return self.with_parameters({name: known[name].freed() for name in names})
+
+    def with_fixed(self, values: Mapping[str, float]) -> Model:
+        """Return this model with the named parameters held at the given values."""
+        known = self._known(values)
+        return self.with_parameters({n: known[n].fixed(v) for n, v in values.items()})
+
+    def with_values(self, values: Mapping[str, float]) -> Model:
+        """Return this model with values put in, each parameter staying free or fixed as it was."""
+        known = self._known(values)
+        return self.with_parameters({n: replace(known[n], value=v) for n, v in values.items()})
+
+    def _known(self, names: Iterable[str]) -> dict[str, Parameter]:
+        """Return the parameters by name; refuse unknown names."""
+        known = {p.name: p for p in self.parameters}
+        unknown = [str(name) for name in names if name not in known]
+        if unknown:
+            raise ModelError(
+                f"the model has no parameter {', '.join(unknown)}; it has {', '.join(known)}"
+            )
+        return known
+
+    def __repr__(self) -> str:
+        return " + ".join(repr(element) for element in self._elements)
 
 
-def required_history(
-    value: ArrayLike | None, name: str, displacement: FloatArray, element: Element
-) -> FloatArray:
-    """Return a history that an element needs, checked to be as long as `displacement`."""
-    if value is None:
-        raise ValidationError(f"{element!r} needs {name} to give its force; pass {name}=")
-    history = finite_array(value, name)
-    if history.shape != displacement.shape:
-        raise ValidationError(
-            f"{name} has shape {history.shape}; expected that of displacement, {displacement.shape}"
+def as_model(model: Element) -> Model:
+    """Return `model` as a sum, so that one element alone needs no special case."""
+    return model if isinstance(model, Model) else Model(model)
+
+
+def register(cls: type[Element]) -> None:
+    """Enter a class under its kind; a file that is run again replaces its own classes."""
+    other = KINDS.get(cls.kind)
+    if other and _origin(other) != _origin(cls):
+        raise ModelError(
+            f"{cls.__name__} has the kind {cls.kind!r}, which {other.__module__}."
+            f"{other.__qualname__} has already; choose another"
         )
-    return history
+    KINDS[cls.kind] = cls
+
+
+def _origin(cls: type) -> tuple[str, str]:
+    return source_path(cls) or cls.__module__, cls.__qualname__
+
+
+def class_named(name: str) -> type[Element] | None:
+    """Return the class with this kind, or else with this name; None if there is none."""
+    named = [cls for cls in KINDS.values() if cls.__name__ == name]
+    return KINDS.get(name) or (named[0] if len(named) == 1 else None)
+
+
+def laws_of(file: LawFile) -> tuple[type[Element], ...]:
+    """Return the laws that a file defines, registered; it is run unless this process has run it."""
+    module = module_of(file)
+    laws: tuple[Any, ...] = tuple(
+        value
+        for value in vars(module).values()
+        if isinstance(value, type)
+        and issubclass(value, Element)
+        and value.__module__ == module.__name__
+        and not inspect.isabstract(value)
+    )
+    if not laws:
+        raise ModelError(
+            f"{file.path} defines no law; expected a subclass of di.Friction with parameters and "
+            "slope"
+        )
+    for law in laws:
+        if not law.__dict__.get("kind"):
+            law.kind = law.__name__
+        check_declarations(law)
+        register(law)
+    return laws
+
+
+def empty_element(file: LawFile, name: str) -> Any:
+    """Return an element without attributes, of a class that a file defines, for pickle to fill."""
+    if file.module not in sys.modules:
+        laws_of(file)
+    return object.__new__(attrgetter(name)(sys.modules[file.module]))
+
+
+def describe_model(model: Element) -> list[dict[str, Any]]:
+    """Return a model as a list of plain dicts, ready for JSON or TOML.
+
+    A number is a fixed value, {"assumed": number} a default that the user did not give, "free" a
+    parameter to estimate, a dict a free one with its start or bounds.
+
+    Examples
+    --------
+    >>> from dahl_ident import Dahl, Mass
+    >>> describe_model(Dahl(sigma=30.0) + Mass(0.3))
+    [{'kind': 'dahl', 'f_max': 'free', 'sigma': 30.0, 'alpha': {'assumed': 1.0}},
+     {'kind': 'mass', 'mass': 0.3}]
+    """
+    return [_describe(element) for element in as_model(model).elements]
+
+
+def model_from_description(description: list[Mapping[str, Any]]) -> Model:
+    """Return the model that :func:`describe_model` described.
+
+    Examples
+    --------
+    >>> model_from_description([{"kind": "spring", "stiffness": "free"}])
+    Spring(stiffness=free)
+    """
+    return Model(*(_build(entry) for entry in description))
+
+
+def _describe(element: Element) -> dict[str, Any]:
+    if element.kind not in KINDS:
+        raise ModelError(
+            f"{element!r} cannot be written to a file; give its class a kind, such as "
+            'kind = "my_law"'
+        )
+    return element.describe()
+
+
+def _build(entry: Mapping[str, Any]) -> Element:
+    content = dict(entry)
+    kind = content.pop("kind", None)
+    cls = class_named(str(kind))
+    if cls is None:
+        raise ModelError(
+            f"the element {dict(entry)} has the kind {kind!r}; expected a law of your own, "
+            "whose file was imported or given as laws (on the command line --laws), or one of "
+            f"{choices(KINDS, str(kind))}"
+        )
+    name = content.pop("name", None)
+    return cls.from_description(content, name)

@@ -15,14 +15,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
 from dahl_ident.arrays import FloatArray
+from dahl_ident.elements.element import Element, Model
 from dahl_ident.elements.law_checks import symbolic_mechanics
 from dahl_ident.errors import ModelError
 
 if TYPE_CHECKING:
     import casadi as ca
 
-    from dahl_ident.elements.element import Element
-    from dahl_ident.elements.model import Model
     from dahl_ident.elements.parameter import Parameter
     from dahl_ident.engine import Equations
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-
-if TYPE_CHECKING:
-    from dahl_ident.elements.element import Element
 
 Values = Sequence[FloatArray]
 """Values of an element's parameters, in their order."""
@@ -224,23 +221,6 @@ class UniversalCurve(NamedTuple):
 
     stiffness: float
     response: Callable[[FloatArray], ComplexArray]
-
-
-class Alternative(NamedTuple):
-    """Elements in place of one.
-
-    Attributes
-    ----------
-    elements : tuple of Element
-        In parallel.
-    shows : {"shape", "asymmetry", "speed", "masing"}
-        The evidence for them: the dependence of force on amplitude, and the odd harmonics; the
-        mean force and the even harmonics; a force that falls with the speed; or parallel Jenkins
-        elements, which would leave a much smaller misfit.
-    """
-
-    elements: tuple[Element, ...]
-    shows: str = "shape"
 
 
 def difference(function: Callable[[Any], Any], at: Any, step: Any) -> Any:

@@ -26,7 +26,7 @@ from dahl_ident.arrays import (
     positive_number,
     whole_number,
 )
-from dahl_ident.elements.element import Element, required_history
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import (
     SOFTENED,
     HistoryGradient,
@@ -36,6 +36,7 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     Values,
 )
+from dahl_ident.elements.force_law import required_history
 from dahl_ident.elements.held_motion import force_along, loops_of, same_both_ways
 from dahl_ident.elements.law_checks import check_declarations, check_slope, scaling_the_force
 from dahl_ident.errors import ModelError, ValidationError

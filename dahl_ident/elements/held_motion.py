@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element
+from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.equations import FirstState, law_equations
 from dahl_ident.elements.facts import HistoryGradient, Path
-from dahl_ident.elements.model import as_model
 
 if TYPE_CHECKING:
-    from dahl_ident.elements.friction import Friction
     from dahl_ident.engine import Loops, System
 
 _SYSTEMS: dict[Hashable, System] = {}
@@ -97,7 +95,7 @@ def loops_of(
 
 
 def force_along(
-    law: Friction,
+    law: Element,
     values: Sequence[Any],
     path: Path,
     state: float | FloatArray,

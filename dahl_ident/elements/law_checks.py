@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from keyword import iskeyword
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -21,12 +21,9 @@ from numpy.typing import NDArray
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.elements.facts import Mechanics
+from dahl_ident.elements.force_law import ForceLaw
 from dahl_ident.elements.parameter import UNITS, Parameter
 from dahl_ident.errors import ModelError, ValidationError
-
-if TYPE_CHECKING:
-    from dahl_ident.elements.element import Element
-    from dahl_ident.elements.friction import Friction
 
 _TRIALS = 12  # sets of values
 _SPREAD = 0.5  # decades to either side of a typical value
@@ -52,12 +49,29 @@ _CHECKED: WeakKeyDictionary[type, set[tuple[Parameter, ...]]] = WeakKeyDictionar
 _SCALING: WeakKeyDictionary[type, tuple[str, ...]] = WeakKeyDictionary()
 
 
+class _SlopeLaw(Protocol):
+    """What is asked of a friction law here."""
+
+    parameters: tuple[Parameter, ...]
+    rate_independent: bool
+    one_state: bool
+
+    @property
+    def n_states(self) -> int: ...
+
+    def label(self, parameter: Parameter) -> str: ...
+
+    def slope(self, force: Any, direction: Any, velocity: Any, values: Sequence[Any]) -> Any: ...
+
+    def output(self, force: Any, slope: Any, velocity: Any, values: Sequence[Any]) -> Any: ...
+
+
 def is_of_package(law: type) -> bool:
     """Return whether a class belongs to this package."""
     return law.__module__.partition(".")[0] == "dahl_ident"
 
 
-def check_declarations(law: type[Element]) -> None:
+def check_declarations(law: type[ForceLaw]) -> None:
     """Refuse parameters that are not declared as they should be."""
     if is_of_package(law):
         return
@@ -125,7 +139,7 @@ def check_declarations(law: type[Element]) -> None:
             )
 
 
-def check_slope(law: Friction) -> None:
+def check_slope(law: _SlopeLaw) -> None:
     """Refuse a law whose slope cannot be that of a friction law."""
     if is_of_package(type(law)) or not law.one_state:
         return
@@ -150,7 +164,7 @@ def check_slope(law: Friction) -> None:
     checked.add(parameters)
 
 
-def _check_overridden(law: Friction, values: list[FloatArray]) -> None:
+def _check_overridden(law: _SlopeLaw, values: list[FloatArray]) -> None:
     """Refuse an overridden method that does not return as many arrays as the original."""
     for method, count in _OVERRIDDEN.items():
         if is_of_package(next(c for c in type(law).__mro__ if method in vars(c))):
@@ -170,7 +184,7 @@ def _check_overridden(law: Friction, values: list[FloatArray]) -> None:
             )
 
 
-def scaling_the_force(law: Friction) -> tuple[str, ...]:
+def scaling_the_force(law: _SlopeLaw) -> tuple[str, ...]:
     """Return the labels of the parameters with a unit of force, which together scale the force.
 
     Empty if the slope does not agree with the units.
@@ -181,7 +195,7 @@ def scaling_the_force(law: Friction) -> tuple[str, ...]:
     return _SCALING[type(law)]
 
 
-def _agrees_with_units(law: Friction) -> bool:
+def _agrees_with_units(law: _SlopeLaw) -> bool:
     """Return whether the slope scales with the force and all parameters with a unit of force."""
     powers = [p.dimension[0] for p in law.parameters]
     if not set(powers) <= {0, 1}:
@@ -207,7 +221,7 @@ def _agrees_with_units(law: Friction) -> bool:
 class _Trial:
     """A law's slope at one set of values."""
 
-    def __init__(self, law: Friction, values: FloatArray) -> None:
+    def __init__(self, law: _SlopeLaw, values: FloatArray) -> None:
         self._law = law
         self._values = values
         # forces in the direction of motion, and the slopes there for both directions
@@ -506,7 +520,7 @@ def _short_repr(value: Any) -> str:
 
 
 def symbolic_mechanics(
-    element: Element, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
+    element: ForceLaw, values: Sequence[Any], x: Any, v: Any, s: Any, states: Sequence[Any]
 ) -> Mechanics:
     """Return an element's part in an equation of motion, in symbols; check a user's."""
     if is_of_package(type(element)):

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dahl_ident.arrays import ComplexArray, FloatArray
-from dahl_ident.elements.element import Element, required_history
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import (
     HistoryGradient,
     Mechanics,
@@ -17,6 +17,7 @@ from dahl_ident.elements.facts import (
     StiffnessGradient,
     Values,
 )
+from dahl_ident.elements.force_law import required_history
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.units import power_of_s
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import ComplexArray, FloatArray
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.record import is_even
-from dahl_ident.elements.element import Element, prefixed, required_history
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import (
     STEP,
     HistoryGradient,
@@ -33,6 +33,7 @@ from dahl_ident.elements.facts import (
     difference,
     each_harmonic,
 )
+from dahl_ident.elements.force_law import prefixed, required_history
 from dahl_ident.elements.parameter import Parameter
 from dahl_ident.elements.rational import Rational, typical_rate
 from dahl_ident.elements.recursion import matrix_recursion

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from dahl_ident.arrays import FloatArray, positive_array, whole_number
-from dahl_ident.elements.element import Element, prefixed
 from dahl_ident.elements.facts import (
     HistoryGradient,
     Path,
@@ -17,6 +16,7 @@ from dahl_ident.elements.facts import (
     Values,
     each_harmonic,
 )
+from dahl_ident.elements.force_law import prefixed
 from dahl_ident.elements.held_motion import force_along
 from dahl_ident.elements.masing import Masing, jenkins
 from dahl_ident.elements.parameter import Parameter
@@ -104,7 +104,7 @@ class MaxwellSlip(Masing):
         self.like_parts = tuple(zip(self.labels[n:], self.labels[:n], strict=True))
 
     @classmethod
-    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Element:
+    def from_description(cls, description: Mapping[str, Any], name: str | None) -> Self:
         """Return the element that :meth:`describe` described."""
         n = max(1, sum(str(label).startswith("slip_") for label in description))
         return cls(n, name=name)._described(description)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import gamma, rgamma
 
 from dahl_ident.arrays import FloatArray
-from dahl_ident.elements.element import Element, required_history
+from dahl_ident.elements.element import Element
 from dahl_ident.elements.facts import (
     STEP,
     HistoryGradient,
@@ -32,6 +32,7 @@ from dahl_ident.elements.facts import (
     difference,
     each_harmonic,
 )
+from dahl_ident.elements.force_law import required_history
 from dahl_ident.elements.parameter import Parameter
 
 _SMOOTHED = 1e-12  # square of the speed over the reference speed, below which the force is smooth

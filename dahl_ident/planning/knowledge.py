@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
 from dahl_ident.elements import Element, Model, Parameter
 from dahl_ident.elements.driven_motion import Steady
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import HIGH, LOW, ValidationError, argument, choices
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.record_problem import RecordProblem

@@ -12,7 +12,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray, non_negative_array, positive_array, positive_number
 from dahl_ident.diagnostics.confidence_levels import coverage_factor
 from dahl_ident.elements import Element, Model
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError, argument, choices, spelled
 from dahl_ident.planning.knowledge import Knowledge
 from dahl_ident.planning.trajectories import KINDS, PlannedMotion

@@ -15,7 +15,7 @@ from dahl_ident.data.readers import is_frame
 from dahl_ident.data.rows import Rows
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import Steady
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import DataError, ValidationError, argument
 from dahl_ident.problem.base import Problem
 from dahl_ident.problem.record_problem import RecordProblem

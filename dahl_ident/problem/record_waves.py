@@ -16,8 +16,8 @@ from dahl_ident.data.record import at_even_times, unbroken
 from dahl_ident.data.rows import one_run
 from dahl_ident.elements import Element, Friction, Model, Parameter
 from dahl_ident.elements.coefficients import Coefficients
+from dahl_ident.elements.element import as_model
 from dahl_ident.elements.equations import FirstState, plant_equations
-from dahl_ident.elements.model import as_model
 from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import DataError, ModelError, ValidationError, argument
 from dahl_ident.problem.base import Problem

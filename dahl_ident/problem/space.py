@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray, positive_array, real_array
 from dahl_ident.elements import Element, Model, Parameter
-from dahl_ident.elements.element import prefixed
+from dahl_ident.elements.force_law import prefixed
 from dahl_ident.errors import ModelError, ValidationError
 from dahl_ident.sensors import Sensors
 

@@ -19,7 +19,7 @@ from dahl_ident.data.rows import Rows, row_names
 from dahl_ident.data.tabular import assumes_frequency
 from dahl_ident.elements import Element
 from dahl_ident.elements.driven_motion import ACCURACY, STEADY, Shooting, Steady, obstacle
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.elements.parameter import Dimension
 from dahl_ident.errors import DataError, ModelError, argument
 from dahl_ident.noise import (

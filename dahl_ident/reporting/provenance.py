@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dahl_ident.elements.law_checks import is_of_package
-from dahl_ident.elements.law_files import source_path, user_laws
+from dahl_ident.elements.law_files import user_laws
+from dahl_ident.elements.law_module import source_path
 from dahl_ident.problem import TableProblem
 from dahl_ident.reporting.comparison import of_kind
 from dahl_ident.reporting.tables import prior_text

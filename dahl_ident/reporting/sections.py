@@ -18,7 +18,7 @@ from dahl_ident.diagnostics.confidence_levels import CONFIDENCE, level_text
 from dahl_ident.diagnostics.formatting import listed, with_unit
 from dahl_ident.diagnostics.judgement import VerdictStatus
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model
+from dahl_ident.elements.element import as_model
 from dahl_ident.errors import ValidationError
 from dahl_ident.reporting import provenance, tables
 from dahl_ident.reporting.comparison import KINDS, comparison_of, numbered, of_kind, side_by_side

@@ -18,8 +18,8 @@ from dahl_ident.arrays import FloatArray
 from dahl_ident.data import FrequencyResponse, Record
 from dahl_ident.data.columns import COLUMNS
 from dahl_ident.data.storage import digest, plain_data
+from dahl_ident.elements.element import describe_model, model_from_description
 from dahl_ident.elements.law_files import describe_laws, require_laws
-from dahl_ident.elements.model import describe_model, model_from_description
 from dahl_ident.errors import DataError
 from dahl_ident.fitting.optimum import ConstraintCost, DeterminedCombination, Optimum, Status
 from dahl_ident.problem import Problem, TableProblem

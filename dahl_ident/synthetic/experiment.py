@@ -18,7 +18,7 @@ import tomli_w
 from dahl_ident.data.columns import one_of
 from dahl_ident.data.storage import read_text
 from dahl_ident.elements import Element
-from dahl_ident.elements.model import as_model, describe_model, model_from_description
+from dahl_ident.elements.element import as_model, describe_model, model_from_description
 from dahl_ident.errors import DahlIdentError, DataError, ValidationError
 from dahl_ident.synthetic.acquisition import Acquisition, Channel, Table
 from dahl_ident.synthetic.excitation import (
