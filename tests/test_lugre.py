@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import simpson, solve_ivp
 
 from dahl_ident import (
     Dahl,
     Damper,
+    FrequencyResponse,
     Friction,
     LuGre,
     Mass,
@@ -64,6 +65,33 @@ def moved(t):
     return np.asarray(x), np.asarray(v), np.asarray(a)
 
 
+def stiffness_by_quadrature(numbers, A, w, n=2000):
+    """Return N of half a cycle in which the speed is positive, by Runge and Kutta's method.
+
+    The bristles' equation is then linear in their force, so two of its solutions give the settled
+    one, which ends at minus its beginning.
+    """
+    f_max, sigma, ratio, speed, micro, viscous = numbers
+
+    def rate(psi, force):
+        limit = f_max * (1.0 + (ratio - 1.0) * np.exp(-((A * w * np.sin(psi) / speed) ** 2)))
+        return sigma * A * np.sin(psi) * (1.0 - force / limit)
+
+    h, forces = np.pi / n, [np.stack([np.zeros(A.size), np.ones(A.size)])]
+    for psi in h * np.arange(n):
+        y = forces[-1]
+        k1 = rate(psi, y)
+        k2 = rate(psi + 0.5 * h, y + 0.5 * h * k1)
+        k3 = rate(psi + 0.5 * h, y + 0.5 * h * k2)
+        forces.append(y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(psi + h, y + h * k3)))
+    zero, one = np.stack(forces, axis=1)
+    force = zero - zero[-1] / (1.0 + one[-1] - zero[-1]) * (one - zero)
+    psi = np.linspace(0.0, np.pi, n + 1)[:, None]
+    whole = force + (micro / sigma * rate(psi, force) * w) + viscous * A * w * np.sin(psi)
+    # the displacement is -A cos(psi): that of a cosine half a cycle later
+    return -2.0 / np.pi * simpson(whole * np.exp(-1j * psi), psi, axis=0) / A
+
+
 class Stribeck(Friction):
     """A user's law that depends on the speed."""
 
@@ -114,6 +142,34 @@ def test_a_record_of_it_is_fitted():
     found = fit(Record(t, displacement=x, force=force), LuGre())
     for name, truth in (("f_max", 1.0), ("sigma", 300.0), ("static_ratio", 1.6)):
         assert found.params[name].value == pytest.approx(truth, rel=0.02)
+
+
+def test_its_damping_may_be_far_larger_than_the_force_of_the_bristles():
+    A, w = np.geomspace(3e-4, 0.1, 7), np.repeat(62.8, 7)
+    numbers = (1.0, 300.0, 1.6, 0.02, 30.0, 0.3)
+    assert LuGre(*numbers).dynamic_stiffness(A, w) == pytest.approx(
+        stiffness_by_quadrature(numbers, A, w), rel=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("numbers", "model"),
+    [
+        ((1.0, 300.0, 1.6, 0.02, 0.4, 0.3), LuGre(micro_damping=None, viscous=None)),
+        ((5.0, 1e5, 1.3, 1e-3, 40.0, 0.5), LuGre(micro_damping=None, viscous=0.5)),
+    ],
+)
+def test_its_damping_is_found_without_a_start(numbers, model):
+    f, ratio = (a.ravel() for a in np.meshgrid([0.3, 10.0], np.geomspace(0.1, 30.0, 9)))
+    A = ratio * numbers[0] / numbers[1]
+    N = stiffness_by_quadrature(numbers, A, 2.0 * np.pi * f)
+    noise = np.random.default_rng(1).standard_normal((2, A.size))
+    found = fit(FrequencyResponse(f, N * np.exp(0.005 * (noise[0] + 1j * noise[1])), A), model)
+    for parameter, truth in zip(found.params.values(), numbers, strict=True):
+        if not parameter.vary:
+            continue
+        assert abs(parameter.value - truth) <= 3.0 * parameter.stderr
+        assert parameter.stderr <= 0.15 * truth
 
 
 def test_a_motion_that_turns_just_before_a_sample_ends_there():

@@ -166,7 +166,7 @@ def _solve(f, psi, h, F, at):
 
 @compiled
 def _error(f, psi, h, F, output, at):
-    """Return the difference of the polynomial's slopes from the rates, over the local force."""
+    """Return the differences of the polynomials from rates and output, over the local values."""
     largest, size = 0.0, max(abs(F), _FLOOR * at.numbers[3])
     for j in range(STAGES):
         size = max(size, abs(F + at.stages[j]))
@@ -180,12 +180,13 @@ def _error(f, psi, h, F, output, at):
         if not abs(change) < np.inf:
             return np.inf
         largest = max(largest, abs(change))
-    change = -output
+    change, total = -output, max(size, abs(output))
     for j in range(STAGES):
         change += VALUE_BEFORE[j] * at.output[j]
+        total = max(total, abs(at.output[j]))
     if not abs(change) < np.inf:
         return np.inf
-    return max(largest, abs(change)) / size if size > 0.0 else 0.0
+    return max(largest / size, abs(change) / total) if size > 0.0 else 0.0
 
 
 @compiled

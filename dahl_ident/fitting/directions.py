@@ -29,6 +29,15 @@ class Direction:
     dimension: Dimension
     """Powers of force, displacement and time."""
 
+    @classmethod
+    def of(cls, parameter: Parameter, over: Parameter | None) -> Direction:
+        """Return a parameter, or its ratio to another one, with its dimension."""
+        divisor = (0, 0, 0) if over is None else over.dimension
+        force, displacement, time = (
+            a - b for a, b in zip(parameter.dimension, divisor, strict=True)
+        )
+        return cls(parameter, over, (force, displacement, time))
+
     @property
     def is_number(self) -> bool:
         """Whether it has no unit."""
@@ -112,14 +121,7 @@ def directions(element: Element) -> Directions:
             continue
         if element.is_linear:  # its dependence on the parameter is unknown
             continue
-        over = reference if parameter in scale else None
-        force, displacement, time = parameter.dimension
-        if over is not None:
-            force -= over.dimension[0]
-            displacement -= over.dimension[1]
-            time -= over.dimension[2]
-        dimension = force, displacement, time
-        searched.append(Direction(parameter, over, dimension))
+        searched.append(Direction.of(parameter, reference if parameter in scale else None))
     return Directions(
         element, tuple(p for p in linear if p.free), scale, reference, tuple(searched)
     )

@@ -163,6 +163,10 @@ class _LinearPart:
     def is_positive(self) -> bool:
         return any(is_positive(p) for p in self.parameters)
 
+    @property
+    def may_vanish(self) -> bool:
+        return not any(p.positive for p in self.parameters)
+
 
 @dataclass(frozen=True)
 class _Curves:
@@ -191,11 +195,24 @@ class _Grid:
     mixed: bool  # nodes of several directions are in one axis, so neighbours need not be near
 
     def solved(self) -> tuple[FloatArray, FloatArray]:
-        """Return the sum of squares, (..., C), and the linear coefficients, (..., C, Q)."""
-        cost, coefficients = _solve_linear(*self._system())
-        separate = coefficients[..., len(self.common) :]
-        positive = [c.is_positive for curves in self.curves for c in curves.columns]
-        allowed = ((separate > 0.0) | ~np.array(positive, dtype=np.bool_)).all(axis=-1)
+        """Return the sum of squares, (..., C), and the linear coefficients, (..., C, Q).
+
+        A column that may vanish is left out where its coefficient would be negative.
+        """
+        target, common, columns = self._system()
+        parts = [column for curves in self.curves for column in curves.columns]
+        positive = np.array([p.is_positive for p in parts], dtype=np.bool_)
+        may_vanish = np.array([p.may_vanish for p in parts], dtype=np.bool_)
+        while True:
+            cost, coefficients = _solve_linear(target, common, columns)
+            separate = coefficients[..., len(common) :]
+            negative = (separate < 0.0) & positive & may_vanish
+            if not negative.any():
+                break
+            columns = [
+                np.where(negative[..., [i]], 0.0, column) for i, column in enumerate(columns)
+            ]
+        allowed = ((separate > 0.0) | ~positive | may_vanish).all(axis=-1)
         return np.where(allowed, cost, np.inf), coefficients
 
     def _system(self) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
@@ -311,49 +328,62 @@ def _columns(
 
     `values` are those of the directions, each (..., K).
     """
-    linear = {p.name for p in d.linear}
-    scaled = {p.name for p in d.scale} if d.is_free else set()
+    element = d.element
+    linear = [p for p in map(element.parameter, element.linear_parameters) if p.free or p.value]
+    scaled = d.scale if d.is_free else ()
     missing = [
         p.name
-        for p in d.element.parameters
-        if p.value is None and p.name not in {*linear, *scaled, *values}
+        for p in element.parameters
+        if p.value is None and p.name not in values and p not in linear and p not in scaled
     ]
     if missing:
         raise FitError(
-            f"{', '.join(missing)} has no value to start from, and {d.element!r} does not say how "
+            f"{', '.join(missing)} has no value to start from, and {element!r} does not say how "
             f"its force depends on it; give it a value and name it in {argument('free')}"
         )
 
-    def stiffness_at(unit: Parameter | None, scale: float) -> ComplexArray:
+    def stiffness_at(unit: Parameter | None, scale: float, size: float = 1.0) -> ComplexArray:
         numbers = []
-        for p in d.element.parameters:
+        for p in element.parameters:
             value: FloatArray | float
             if p.name in values:
                 value = values[p.name]
-            elif p.name in linear:
-                value = float(p is unit)
-            elif p.name in scaled:
+            elif p in linear:
+                value = size * (p is unit)
+            elif p in scaled:
                 value = scale
             else:
                 value = float("nan") if p.value is None else p.value
             numbers.append(np.asarray(value, dtype=np.float64))
         with np.errstate(all="ignore"):  # a law may overflow far out, where it is not a start
-            return view.stiffness_of(d.element, numbers, at_nodes=bool(values))
+            return view.stiffness_of(element, numbers, at_nodes=bool(values))
 
     columns = []
-    if not d.linear:
+    known = np.zeros((), dtype=np.complex128)
+    scales = [element.parameter(label) for label in element.scale_parameters]
+    if linear and all(p in linear for p in element.parameters):  # a linear element
+        curves = [stiffness_at(p, 0.0) for p in linear]
+    elif scales and all(p in linear for p in scales):
+        curves = [stiffness_at(p, 1.0) for p in linear]
+    else:
         base = stiffness_at(None, 1.0)
-        return (None, [_LinearPart(d.scale, base)]) if scaled else (base, [])
-    if all(p in d.linear for p in d.element.parameters):  # a linear element
-        return None, [_LinearPart((p,), stiffness_at(p, 0.0)) for p in d.linear]
-    scales = d.element.scale_parameters
-    if scales and {d.element.parameter(label).name for label in scales} <= linear:
-        return None, [_LinearPart((p,), stiffness_at(p, 1.0)) for p in d.linear]
-    base = stiffness_at(None, 1.0)
-    if scaled:
-        columns.append(_LinearPart(d.scale, base))
-    columns += [_LinearPart((p,), stiffness_at(p, 1.0) - base) for p in d.linear]
-    return (None if scaled or not np.any(base) else base), columns
+        if scaled:
+            columns.append(_LinearPart(scaled, base))
+        else:
+            known = base
+        over = d.reference if scaled else None
+        # by differences about as large as the base, whose errors they have
+        sizes = [float(np.exp(Direction.of(p, over).sizes(view).min())) for p in linear]
+        curves = [
+            (stiffness_at(p, 1.0, size) - base) / size
+            for p, size in zip(linear, sizes, strict=True)
+        ]
+    for p, curve in zip(linear, curves, strict=True):
+        if p.free:
+            columns.append(_LinearPart((p,), curve))
+        else:
+            known = known + (p.value or 0.0) * curve
+    return (known if np.any(known) else None), columns
 
 
 def _curves(d: Directions, view: StiffnessData, most: float) -> _Curves:
