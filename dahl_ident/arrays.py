@@ -14,8 +14,14 @@ ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
+EPS = float(np.finfo(np.float64).eps)
+"""Distance from 1 to the next number."""
+
 TINY = float(np.finfo(np.float64).tiny)
 """Replaces 0 in denominators, so that quotients are finite."""
+
+NORMAL_MEDIAN = 0.6745
+"""Median of a normal variable's absolute value, in standard deviations."""
 
 SMALLEST, LARGEST = 1e-90, 1e90
 """Allowed magnitudes: squares, products and ratios of such numbers remain representable."""

@@ -128,7 +128,7 @@ _COMMON_PART = re.compile(
     r"(\s*[*/]\s*|\s+|)(?:\(([^()]+)\)|([A-Za-z]+|\N{DEGREE SIGN}|1\b))(?:\^(-?\d))?"
 )
 _TOKEN = re.compile(r"[A-Za-zµμ°%Ω_]\w*|\b1\b|(?<![\d(])\^-?\d(?!\d)|[*/() ]")
-_LONGEST = 60  # characters; longer text in brackets is not a unit
+_LONGEST_UNIT = 60  # characters; longer text in brackets is not a unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,9 +165,9 @@ def parse_unit(text: str) -> Unit:
     ('1e-06', 'rms')
     """
     symbols = text.strip()
-    if len(symbols) > 2 * _LONGEST:
+    if len(symbols) > 2 * _LONGEST_UNIT:
         raise UnitError(
-            f"[{symbols[:_LONGEST]}...] is not a unit: it has {len(symbols)} characters"
+            f"[{symbols[:_LONGEST_UNIT]}...] is not a unit: it has {len(symbols)} characters"
         )
     decibel = _DECIBEL.match(symbols)
     if decibel:
@@ -277,7 +277,7 @@ def _normalised(text: str, written: str) -> str:
     out = re.sub(r"(?<=[A-Za-z])(-?\d)", r"^\1", out)
     out = re.sub(r"[A-Z][a-z]{3,}", lambda m: m[0].lower(), out)  # Newtons, Volts
     out = re.sub(r"[A-Za-z]+", lambda m: _SPELLINGS.get(m[0], m[0]), out)
-    if not out or len(out) > _LONGEST or _TOKEN.sub("", out):
+    if not out or len(out) > _LONGEST_UNIT or _TOKEN.sub("", out):
         raise UnitError(
             f"[{written}] is not a unit; expected one such as [m], [um rms], [kN], [m/s^2] or "
             "[N m/rad]"

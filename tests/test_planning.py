@@ -100,7 +100,7 @@ class TestModelError:
                       LINEAR)  # fmt: skip
 
     def test_departures_predict_what_kriging_does(self, monkeypatch):
-        monkeypatch.setattr(prediction_error, "_NEGLIGIBLE", 1e-9)
+        monkeypatch.setattr(prediction_error, "_NEGLIGIBLE_SHAPES", 1e-9)
         monkeypatch.setattr(error_sources, "_SMOOTH", 1e-9)
         errors = self._fit().errors
         A, omega = np.geomspace(0.3, 4.0, 4) * X_C, np.full(4, 2.0 * np.pi)

@@ -33,7 +33,7 @@ from dahl_ident.app.commands import JobStep
 from dahl_ident.data.storage import write_whole
 from dahl_ident.errors import DataError
 
-_LONGEST = 60  # letters of a stored name
+_LONGEST_NAME = 60  # letters of a stored name
 _ENDING = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,2}$")
 _IDENTITY = re.compile(r"\d{4}-\d\d-\d\d-\d+")
 _SUCCESS = (0, 3)  # exit status of commands with a result; 3: not to be used, as the output says
@@ -120,7 +120,7 @@ class Work:
         match = _ENDING.search(last)
         ending = match.group() if match else ""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", last.removesuffix(ending)).strip("_-")
-        stem = stem[:_LONGEST] or "file"
+        stem = stem[:_LONGEST_NAME] or "file"
         for number in range(1, 10_000):
             path = self.folder / "data" / f"{stem}{f'_{number}' * (number > 1)}{ending}"
             if not path.exists():

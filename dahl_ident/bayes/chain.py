@@ -30,7 +30,7 @@ _GROWTH = 1.25  # ratio of steps between checks: at most a quarter more than nee
 _ROUND = 50  # checks are at multiples of this number of steps
 _PIECE = 50  # fewest steps between two calls of the listeners
 _PIECES = 20  # pieces between the calls for a long chain
-_PARTS = 8  # parts into which the points of one call are split for a pool
+_POOL_PARTS = 8  # parts into which the points of one call are split for a pool
 
 Pool = Any
 """Anything with map: multiprocessing, concurrent.futures, mpi4py."""
@@ -136,7 +136,7 @@ def _sampler(density: LogDensity, settings: ChainSettings, pool: Pool | None) ->
 
     def mapped(x: FloatArray) -> FloatArray:
         assert pool is not None
-        return np.concatenate(list(pool.map(density, np.array_split(x, _PARTS))))
+        return np.concatenate(list(pool.map(density, np.array_split(x, _POOL_PARTS))))
 
     function = density if pool is None else mapped
     moves = moves_for(settings.ensembles, density.decorrelation)

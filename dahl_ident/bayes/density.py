@@ -51,7 +51,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 LIKELIHOODS = ("gaussian", "student_t", "none")
 SCALE = "noise_scale"
 TAIL_DOF = 4.0  # degrees of freedom of Student's t: heavy tails, but a finite variance
-_FARTHEST = 300.0  # largest ln s, against overflow of s^2
+_LARGEST_LOG_MISFIT = 300.0  # largest ln s, against overflow of s^2
 Sums = Callable[[FloatArray], FloatArray]
 _COLUMNS = (  # of a table, on which its likelihood depends
     "quantity",
@@ -231,7 +231,7 @@ class Density(LogDensity):
         P = len(self.problem.names)
         result = self.log_prior(x[:, :P])
         if self.has_scale:  # where the scale would overflow, the likelihood is zero
-            result[np.abs(x[:, P]) > _FARTHEST] = -np.inf
+            result[np.abs(x[:, P]) > _LARGEST_LOG_MISFIT] = -np.inf
         inside = result > -np.inf
         if self.likelihood != "none" and inside.any():
             result[inside] += self.log_likelihood(*self.split(x[inside]))

@@ -47,19 +47,19 @@ Rows = IntArray
 # degrees of freedom of the components' Student's t: tails heavier than a posterior's, yet few
 # points are wasted there
 _DOF = 4.0
-_WIDER = 1.5  # covariance of a component over that of its points, so that components overlap
-_PARTS = 16  # most components
+_OVERLAP = 1.5  # covariance of a component over that of its points, so that components overlap
+_MOST_COMPONENTS = 16  # most components
 _FEWEST_POINTS = 40  # effective points of a component, at least
 _ROUND = 1024  # points drawn before the mixture is fitted again
 _ROUNDS = 12  # most fits; two or three are usual
 _GOOD = 0.5  # effective points, over the points of a round, at which the mixture is good enough
 # independent randomizations, whose scatter is the error: the fewer, the more even each one's points
-_REPEATS = 6
-_FIRST = 128  # points drawn from each component at first; their number then doubles
+_RANDOMIZATIONS = 6
+_FIRST_POINTS = 128  # points drawn from each component at first; their number then doubles
 _MOST_POINTS = 2**18  # evaluations of a density
 _COVERAGE = 2.6  # standard errors in an error: 95 % of Student's t, six repeats' 5 dof
 _LIMITS = ndtr(np.linspace(-2.0, 2.0, 9))  # probabilities whose error counts
-_BLOCK = 256  # points in one call of the density: its arrays stay in the processor's cache
+_BATCH = 256  # points in one call of the density: its arrays stay in the processor's cache
 _KNOTS = ndtr(np.linspace(-4.5, 4.5, 46))  # probabilities between which a density is smoothed
 
 
@@ -140,7 +140,7 @@ def integrate(
 
 def in_blocks(function: Function, theta: FloatArray) -> FloatArray:
     """Return the values of a function at points (S, D), computed in blocks, which is faster."""
-    return np.concatenate([function(theta[i : i + _BLOCK]) for i in range(0, len(theta), _BLOCK)])
+    return np.concatenate([function(theta[i : i + _BATCH]) for i in range(0, len(theta), _BATCH)])
 
 
 class _Batch(NamedTuple):
@@ -235,10 +235,10 @@ def _split(phi: FloatArray, weights: FloatArray) -> _Mixture:
     root = _root(phi, weights)
     x = np.linalg.solve(root, phi.T).T.astype(np.float64)  # so that axes can be compared
     parts = [np.flatnonzero(weights)]
-    while 2 * len(parts) * _FEWEST_POINTS <= _effective(weights) and len(parts) < _PARTS:
+    while 2 * len(parts) * _FEWEST_POINTS <= _effective(weights) and len(parts) < _MOST_COMPONENTS:
         parts = [half for part in parts for half in _halves(part, x, weights)]
     means = np.array([np.average(x[part], axis=0, weights=weights[part]) for part in parts])
-    roots = [np.sqrt(_WIDER) * _root(x[part], weights[part]) for part in parts]
+    roots = [np.sqrt(_OVERLAP) * _root(x[part], weights[part]) for part in parts]
     return _Mixture(means @ root.T, root @ np.array(roots))
 
 
@@ -263,9 +263,9 @@ def _root(x: FloatArray, weights: FloatArray) -> FloatArray:
 def _repeated(target: _Integrand, mixture: _Mixture, tolerance: float) -> WeightedPoints:
     """Return points from one mixture, doubled in number until their error is small enough."""
     D = mixture.means.shape[1]
-    sequences = [mixture.sequences(_ROUNDS + number) for number in range(_REPEATS)]
-    theta, log_weights = np.empty((_REPEATS, 0, D)), np.empty((_REPEATS, 0))
-    size = _FIRST
+    sequences = [mixture.sequences(_ROUNDS + number) for number in range(_RANDOMIZATIONS)]
+    theta, log_weights = np.empty((_RANDOMIZATIONS, 0, D)), np.empty((_RANDOMIZATIONS, 0))
+    size = _FIRST_POINTS
     while True:
         new = [mixture.draw(target, sequence, size) for sequence in sequences]
         theta = np.concatenate([theta, [b.theta for b in new]], axis=1)

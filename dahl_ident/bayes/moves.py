@@ -47,7 +47,7 @@ _JITTER = 1e-5  # relative scatter of a step, against lattices of walkers
 _JUMP = 0.1  # share of the steps of the full difference of two walkers
 _TAIL = 2.0  # degrees of freedom of the independent proposals: few, for heavy tails
 _SNOOKER = 1.7  # length of a snooker step: the mean of ter Braak and Vrugt's range, as in emcee
-_FARTHEST = 1e300  # replaces a shift that is not finite; outside any prior
+_OUTSIDE_PRIORS = 1e300  # replaces a shift that is not finite; outside any prior
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Decorrelation:
                 for e in self.friction
             )
             shift = interleaved(np.asarray(N)) @ self.projection
-        moved[:, self.linear] += sign * np.where(np.isfinite(shift), shift, _FARTHEST)
+        moved[:, self.linear] += sign * np.where(np.isfinite(shift), shift, _OUTSIDE_PRIORS)
         return moved
 
 

@@ -34,7 +34,7 @@ from dahl_ident.problem import Problem
 
 # Factors of the default bounds:
 _BEYOND_DATA = 1e5  # over the sizes in the data, of positive parameters: a knee may lie so far away
-_WIDER = 10.0  # over 1, of gains (more is a mistake); over the estimate, of either sign
+_PRIOR_SPREAD = 10.0  # over 1, of gains (more is a mistake); over the estimate, of either sign
 _BEYOND_RANGE = 5.0  # over the range that a parameter declares
 _RESONANCE = 1e3  # a plant's parts over their sum: at a resonance they nearly cancel
 _TAIL = 1e-10  # tail probability that is neglected, where a distribution is unbounded
@@ -254,7 +254,7 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
         half = np.pi * float(problem.unit_sizes((0, 0, 1)).min())
         return -half, half
     if parameter.name in ("force_gain", "displacement_gain"):
-        return 1.0 / _WIDER, _WIDER
+        return 1.0 / _PRIOR_SPREAD, _PRIOR_SPREAD
     # the problem shows units of rotation where the data do; dimensions follow those declared
     parameter = next((p for p in problem.model.parameters if p.name == parameter.name), parameter)
     if parameter.prior is not None:
@@ -275,7 +275,7 @@ def _default(problem: Problem, parameter: Parameter, estimate: float) -> tuple[f
     else:
         high = _RESONANCE * float(problem.unit_sizes(parameter.dimension).max())
         if np.isfinite(estimate):
-            high = max(high, _WIDER * abs(estimate))
+            high = max(high, _PRIOR_SPREAD * abs(estimate))
         low = -high
     low, high = max(low, parameter.lower), min(high, parameter.upper)
     if not (np.isfinite([low, high]).all() and low < high):

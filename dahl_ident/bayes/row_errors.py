@@ -27,7 +27,7 @@ from scipy.special import chdtri
 from dahl_ident.arrays import FloatArray
 
 _SIZES = 32  # values of lambda: limits of Student's t with 2 dof then err by 2 % at 95 %
-_MANY = 200.0  # degrees of freedom from which Student's t is normal to 1 % at 95 %
+_NEARLY_NORMAL = 200.0  # degrees of freedom from which Student's t is normal to 1 % at 95 %
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class RowErrors:
     @cached_property
     def sizes(self) -> FloatArray:
         """Values of lambda, (M,), equally probable."""
-        if self.dof > _MANY or not self.share > 0.0:
+        if self.dof > _NEARLY_NORMAL or not self.share > 0.0:
             return np.ones(1)
         whole = self.dof / chdtri(self.dof, (np.arange(_SIZES) + 0.5) / _SIZES)
         return np.asarray(np.maximum(1.0 + (whole - 1.0) / self.share, 0.0))

@@ -263,12 +263,12 @@ def _with_scale(density: Density, sums_of: Function, points: WeightedPoints) -> 
     return np.column_stack([points.theta, ln_s])
 
 
-_WIDER = 2.0  # spread of the starts over that of the posterior, above 1 for R-hat
+_START_SPREAD = 2.0  # spread of the starts over that of the posterior, above 1 for R-hat
 _TRIES = 60  # most draws of a start, each 0.8 as wide as the last
 _INSIDE = 1e-3  # distance of a centre from the prior's ends, over its width
 _PRIOR_DRAWS = 4096  # draws of the prior: 98 % probability to hit a region of 1e-3 of it
 _POSITIONS = 5  # values tried for a parameter outside its prior, each with a fit of the others
-_EXACT = 1e-13  # relative noise below which residuals are rounding
+_EXACT_DATA = 1e-13  # relative noise below which residuals are rounding
 
 
 def optimum_of(problem: Problem, tell: Tell | None = None) -> Optimum | None:
@@ -296,7 +296,7 @@ def starting_points(
     """Return `walkers` points of finite density, (walkers, D)."""
     theta, covariance = centre_and_covariance(density, optimum, random)
     centre, root = _centre_and_root(density, theta, covariance)
-    spread = np.full(walkers, _WIDER)
+    spread = np.full(walkers, _START_SPREAD)
     points = np.empty((walkers, len(centre)))
     missing = np.arange(walkers)
     for _ in range(_TRIES):
@@ -406,7 +406,7 @@ def _scale(density: Density, theta: FloatArray) -> float:
     else:
         squares = 2.0 * density.curvature(theta)[0]
     scale = float(np.sqrt(squares / density.problem.n_residuals))
-    if not scale > _EXACT:
+    if not scale > _EXACT_DATA:
         raise SamplingError(
             f"the model fits the data to {scale:.1e} of their size, so there is no noise whose "
             "scale could be estimated; data without noise need a covariance for sampling"

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 USABLE = ("trusted", "approximate")
 """Statuses whose numbers and uncertainties can be used."""
 _NODES = 31  # grid points in tau and in omega; twice as many change no interval by 1 %
-_NEGLIGIBLE = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
+_GRID_DROP = 14.0  # drop of the log-likelihood, a factor of a million, at which the grid ends
 _LARGEST_TAU = 20.0  # in REML, in standard deviations of the estimates
 _FALSE_ALARMS = 0.01  # probability that any device is called outlying if none is
 # Lucas and Saccucci (1990): one false alarm in 370 points, as with three standard deviations
@@ -487,7 +487,7 @@ def _nodes(data: _Fits, mode: tuple[float, float], axis: int) -> FloatArray:
     point = list(mode)
     top = data.solve(*point).log_likelihood
     step = 0.1 * float(np.sqrt(np.median(data.u2)))
-    while top - data.solve(*point).log_likelihood < _NEGLIGIBLE:
+    while top - data.solve(*point).log_likelihood < _GRID_DROP:
         point[axis] = 1.3 * point[axis] + step
     return np.asarray(point[axis] * np.linspace(0.0, 1.0, _NODES) ** 1.5)
 

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 _Tag = TypeVar("_Tag")
 _JOURNAL = "journal.jsonl"
-_TRIALS = 3  # fits that show whether the options of a new campaign can be used at all
+_TRIAL_FITS = 3  # fits that show whether the options of a new campaign can be used at all
 _ROWS_AT_ONCE = 2000
 """Rows that are in memory as dictionaries, which are ten times as large as in a table."""
 _JOURNAL_ONLY = ("key", "retry", "refused")
@@ -274,7 +274,7 @@ def campaign(
             with closing(place):
                 done = run_jobs(work, place, limits, patience)
                 if not agree:
-                    done = _unless_refused(done, min(_TRIALS, len(missing)), definition.source)
+                    done = _unless_refused(done, min(_TRIAL_FITS, len(missing)), definition.source)
                 try:
                     for number, (key, row) in enumerate(done, start=1):
                         if not agree:

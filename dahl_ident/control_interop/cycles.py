@@ -41,7 +41,7 @@ _BEYOND_KNEES = (1e-6, 1e8)  # factors beyond which N is at its limits, sigma an
 _BEYOND_ROOTS = 1e3  # beyond all poles and zeros L is a power of the frequency
 _AROUND_RESONANCE = np.geomspace(0.01, 300.0, 60)  # times |Re| of a pole, its half width
 _PAIRS_AT_ONCE = 2**20  # of segments: 16 MB for each complex array
-_STEP = 1e-5  # relative, of the frequency: truncation 1e-10, rounding 2e-11
+_FREQUENCY_STEP = 1e-5  # relative, of the frequency: truncation 1e-10, rounding 2e-11
 _NEWTON_STEPS = 40  # of at most 0.5 in a logarithm: almost nine decades
 _RESIDUAL = 1e-6  # of ln(-L/N); where Newton's method converges, it is far smaller
 
@@ -235,8 +235,8 @@ def stiffness_of(linear: Element, omega: FloatArray) -> ComplexArray:
 def stiffness_slope(linear: Element, omega: FloatArray) -> ComplexArray:
     """Return dL/domega by central differences, one-sided at the ends of the known range."""
     low, high = known_range(linear)
-    before = np.maximum(omega * (1.0 - _STEP), low)
-    after = np.minimum(omega * (1.0 + _STEP), high)
+    before = np.maximum(omega * (1.0 - _FREQUENCY_STEP), low)
+    after = np.minimum(omega * (1.0 + _FREQUENCY_STEP), high)
     values = stiffness_of(linear, np.concatenate([np.ravel(before), np.ravel(after)]))
     first, second = np.split(np.broadcast_to(values, (2 * np.size(omega),)), 2)
     return np.asarray((second - first).reshape(np.shape(omega)) / (after - before))

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 HARMONICS = tuple(range(10))
 """The harmonics of a motion that are returned."""
-_SAME = 1e-6  # relative difference below which two motions are the same
+_SAME_MOTION = 1e-6  # relative difference below which two motions are the same
 _CYCLES = 3  # cycles simulated from an estimate, so that the memory of its start fades
-_STEP = 0.005  # of a continuation: change of ln of drive and of frequency together
+_CONTINUATION_STEP = 0.005  # of a continuation: change of ln of drive and of frequency together
 _MOST_STEPS = 40  # between two points; points farther apart do not belong to one sweep
 
 
@@ -61,7 +61,7 @@ def exact_motions(
     """
     shooting = Shooting(model)
     log_points = np.log([omega, drive])
-    steps = np.ceil(np.abs(np.diff(log_points)).sum(axis=0) / _STEP)
+    steps = np.ceil(np.abs(np.diff(log_points)).sum(axis=0) / _CONTINUATION_STEP)
     begins_sweep = np.append(True, steps > _MOST_STEPS)
     steps = steps.clip(1, _MOST_STEPS)
     steps[unique[1:] & unique[:-1]] = 1.0
@@ -91,7 +91,7 @@ def exact_motions(
             at_point = motions[rows[i]]
             motion = _Orbit(solution.harmonics[i], float(solution.multiplier[i]))
             X = motion.fundamental
-            if all(abs(X - other.fundamental) >= _SAME * abs(X) for other in at_point):
+            if all(abs(X - other.fundamental) >= _SAME_MOTION * abs(X) for other in at_point):
                 at_point.append(motion)
                 new.append(i)
         return np.array(new, dtype=np.intp)

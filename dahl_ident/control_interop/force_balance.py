@@ -22,21 +22,19 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from dahl_ident.arrays import EPS, BoolArray, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements.element import Element, as_model
 from dahl_ident.elements.facts import Sine
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _Values = list[Sequence[FloatArray]]
 
-_EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
-_ROUNDING = 8.0 * _EPS  # of sums such as k - m omega^2, relative to the sizes of the terms
-_LARGEST = 1e300  # represents an unbounded amplitude
+_ROUNDING_OF_SUMS = 8.0 * EPS  # of sums such as k - m omega^2, relative to the sizes of the terms
+_UNBOUNDED = 1e300  # represents an unbounded amplitude
 _DECADES = 40  # of amplitude below and above 1 m that are searched if N has no bounds
 _SCAN_PER_DECADE = 128  # nodes, 1.8 % apart; closer pairs of roots may be missed
 _COARSE_SCAN = 32  # nodes per decade if only one amplitude is needed
-_BLOCK = 2**15  # points times nodes computed at once, so that arrays stay in the cache
-_AT_REST = np.zeros(())
+_POINTS_AT_ONCE = 2**15  # points times nodes computed at once, so that arrays stay in the cache
 
 
 @dataclass(frozen=True)
@@ -128,12 +126,12 @@ class Plant:
         stiffness = np.abs(self.linear)
         with np.errstate(divide="ignore", over="ignore"):
             low = 0.999 * self.drive / (stiffness + steepest)
-            high = np.minimum(1.001 * (self.drive + largest) / stiffness, _LARGEST)
+            high = np.minimum(1.001 * (self.drive + largest) / stiffness, _UNBOUNDED)
         bounded = np.isfinite(steepest) & np.isfinite(largest)
         unbounded = np.flatnonzero(~np.broadcast_to(bounded, stiffness.shape))
         grid = 10.0 ** np.arange(-_DECADES, _DECADES, 0.25)
-        for start in range(0, unbounded.size, _BLOCK // grid.size):
-            points = unbounded[start : start + _BLOCK // grid.size]
+        for start in range(0, unbounded.size, _POINTS_AT_ONCE // grid.size):
+            points = unbounded[start : start + _POINTS_AT_ONCE // grid.size]
             least, most = self.at(points)._grid_bounds(grid)
             low[points] = np.maximum(low[points], least)
             high[points] = np.minimum(high[points], most)
@@ -160,7 +158,7 @@ def flatten(
     friction: _Values = []
     for element, numbers in as_model(model).of(values):
         if element.is_linear:
-            part = element.stiffness(numbers, _AT_REST, omega)
+            part = element.stiffness(numbers, np.zeros(()), omega)
             linear, size = linear + part, size + np.abs(part)
         else:
             elements.append(element)
@@ -188,7 +186,7 @@ def flatten(
     )
     return Plant(
         _flat(linear / stiffness, shape),
-        _flat(_ROUNDING * size / stiffness, shape),
+        _flat(_ROUNDING_OF_SUMS * size / stiffness, shape),
         _flat(drive / force, shape),
         _flat(vectors, shape),
         _flat(force / stiffness, shape),
@@ -320,7 +318,7 @@ def _polish(
         low[active[~is_high]] = A[~is_high]
         left, right = low[active], high[active]
         inside = (newton >= left) & (newton <= right)
-        converged = (np.abs(excess) <= 64.0 * _EPS * kappa) | (right <= left * (1.0 + 4.0 * _EPS))
+        converged = (np.abs(excess) <= 64.0 * EPS * kappa) | (right <= left * (1.0 + 4.0 * EPS))
         amplitude[active] = np.where(
             inside, newton, np.where(converged, A, np.sqrt(left) * np.sqrt(right))
         )
@@ -356,7 +354,7 @@ def _scan(plant: Plant, points: IntArray, per_decade: int) -> tuple[IntArray, Fl
     chosen = plant.at(points)
     order = np.argsort(high)  # groups the few points near a resonance, which need a long grid
     decades = np.log10(high[order[order.size // 2]] / low.min())
-    block = max(1, int(_BLOCK / (per_decade * max(decades, 1.0))))
+    block = max(1, int(_POINTS_AT_ONCE / (per_decade * max(decades, 1.0))))
     parts = []
     for first in range(0, points.size, block):
         part = order[first : first + block]

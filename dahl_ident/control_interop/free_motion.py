@@ -26,9 +26,9 @@ from dahl_ident.errors import FitError
 
 _STARTS = (1.0, 0.7, 1.4, 0.5, 0.35, 0.25)  # starts over the estimate, tried until one converges
 _EVALUATIONS = 60  # at most from each start; usually ten are needed
-_CLOSED = 1e-7  # largest difference of first and last state, relative to the states' sizes
+_CLOSED_CYCLE = 1e-7  # largest difference of first and last state, relative to the states' sizes
 _DIVERGED = 1e3  # the same for a motion that grows without bound
-_FARTHEST = np.log(5.0)  # log ratio of amplitude or period to the estimate; more: another motion
+_ANOTHER_MOTION = np.log(5.0)  # largest log ratio of amplitude or period to the estimate
 _SAMPLES = 256  # per period, for the harmonics
 _HIGHEST = 9  # harmonic
 
@@ -111,7 +111,7 @@ class _Loop:
             ftol=1e-14,
             max_nfev=_EVALUATIONS,
         )
-        if not np.abs(solution.fun).max() < _CLOSED or solution.x[-1] <= 0.0:
+        if not np.abs(solution.fun).max() < _CLOSED_CYCLE or solution.x[-1] <= 0.0:
             return None
         mismatch(solution.x)
         return state(solution.x), float(solution.x[-1]) * period, last[1]
@@ -141,7 +141,7 @@ class _Loop:
         X = 2.0 * np.fft.rfft(x[:-1])[: _HIGHEST + 1] / _SAMPLES
         amplitude, omega = abs(X[1]), 2.0 * np.pi / full_period
         distance = np.abs(np.log([max(amplitude, 1e-300) / near[0], omega / near[1]]))
-        if distance.max() > _FARTHEST:
+        if distance.max() > _ANOTHER_MOTION:
             return None
         others = np.append(0.5 * X[0], X[2:])
         multipliers = np.linalg.eigvals(slope)

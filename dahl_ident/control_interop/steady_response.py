@@ -39,7 +39,7 @@ from dahl_ident.units import percent
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _DISTORTED = 0.02  # third harmonic over fundamental with an error like that of a measurement
 _MOST_CHECKED = 1000  # points, evenly spread, because neighbours hardly differ
-_RANGE = (1e-290, 1e290)  # of amplitudes; floating-point numbers end at 1e-308 and 1e308
+_AMPLITUDES = (1e-290, 1e290)  # of amplitudes; floating-point numbers end at 1e-308 and 1e308
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,7 @@ def _not_a_sine(plant: Model, omega: FloatArray, drive: FloatArray, A: FloatArra
 
 def _check_range(amplitude: FloatArray) -> None:
     """Refuse amplitudes too large or too small for floating-point arithmetic."""
-    least, most = _RANGE
+    least, most = _AMPLITUDES
     outside = (amplitude < least) | (amplitude > most)
     if outside.any():
         row = int(np.argwhere(outside)[0, 0])

@@ -28,10 +28,10 @@ _STUCK_SAMPLES, _STUCK_TRAVEL = 8, 0.02  # samples of one value; change of the o
 _SELDOM, _MOSTLY = 0.01, 0.5  # fractions of repeated values: hardly any, and most of the signal
 _SWITCH = 8  # samples before and after a change of unit that are compared
 _DECADES = 1.0  # by which an apparent change of unit may differ from a factor of 1000
-_NEAR = 4.0  # steps; a smooth signal continues within so many, and is far from zero beyond twice
+_CONTINUOUS = 4.0  # steps within which a smooth signal continues; beyond twice it is not zero
 _LARGEST_STEP = 5.0  # mean steps that a signal may move from one sample to the next
 _MOST_CHANGES = 2  # of the unit, there and back; more mean a signal of many scales
-_PART = 1 << 20  # samples compared at once, to limit memory
+_AT_ONCE = 1 << 20  # samples compared at once, to limit memory
 _SMALL_PHASE = 0.1  # rad, over the relative change of the gain
 
 
@@ -202,8 +202,8 @@ def _usual(steps: FloatArray) -> float:
 
 def _unit_changes(values: FloatArray, partner: FloatArray) -> IntArray:
     """Return the samples from which values are 1000 times larger or smaller than before."""
-    if values.size > 2 * _PART:
-        parts = [slice(i, i + _PART + 2 * _SWITCH) for i in range(0, values.size, _PART)]
+    if values.size > 2 * _AT_ONCE:
+        parts = [slice(i, i + _AT_ONCE + 2 * _SWITCH) for i in range(0, values.size, _AT_ONCE)]
         return np.unique(
             np.concatenate([p.start + _unit_changes(values[p], partner[p]) for p in parts])
         )
@@ -227,7 +227,7 @@ def _scaled_values(values: FloatArray) -> IntArray:
         return np.zeros(0, dtype=np.intp)
     steps = np.abs(np.diff(values))
     before, first, second = values[2:-2], values[3:-1], values[4:]
-    least = _NEAR * np.maximum(steps[:-3], steps[1:-2])
+    least = _CONTINUOUS * np.maximum(steps[:-3], steps[1:-2])
     far = (np.abs(before) > 2.0 * least) & (least > 0.0)
     scaled = np.zeros(before.shape, dtype=bool)
     for factor in (1e3, 1e-3):

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 DriveUnit = Literal["N", "N m", "V", "A"]
 _GAP = 1.5  # median steps; a longer step misses a sample
-_SMALLEST = SMALLEST**0.5  # products and ratios of such numbers have representable squares
+_SMALLEST_VALUE = SMALLEST**0.5  # products and ratios of such numbers have representable squares
 _LONG_GAP = 5.0  # median steps; a longer gap is not interpolated
 _MOST_GAPS = 0.02  # fraction of the samples; with more gaps the record has uneven steps
 _SHOWN_GAPS = 3
-_EVEN = 0.01  # fraction of a step by which samples may deviate from an even grid
+EVEN = 0.01  # fraction of a step by which samples may deviate from an even grid
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -110,10 +110,10 @@ class Record(Tabular):
         }
         for name, samples in values.items():
             size = 0.0 if samples is None else float(np.abs(samples).max())
-            if 0.0 < size < _SMALLEST:
+            if 0.0 < size < _SMALLEST_VALUE:
                 raise ValidationError(
                     f"no sample of {name} is above {size:.3g} in size; expected at least "
-                    f"{_SMALLEST:g}: check the unit"
+                    f"{_SMALLEST_VALUE:g}: check the unit"
                 )
         motions = [name for name in MOTION_KINDS if values[name] is not None]
         if len(motions) != 1:
@@ -374,7 +374,7 @@ def is_even(time: FloatArray) -> bool:
     """Return whether every sample lies within 1 % of a step of an even grid."""
     grid = np.linspace(time[0], time[-1], time.size)
     step = (time[-1] - time[0]) / (time.size - 1)
-    return bool(np.abs(time - grid).max() <= _EVEN * step)
+    return bool(np.abs(time - grid).max() <= EVEN * step)
 
 
 def gaps(time: FloatArray) -> FloatArray:

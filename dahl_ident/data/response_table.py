@@ -40,7 +40,7 @@ from dahl_ident.units import (
 _FORMS = (("response",), ("real", "imag"), ("gain", "phase"), ("gain_db", "phase"))
 _NUMBER = r"([0-9.]+(?:[eE][-+]?[0-9]+)?)"
 _SWEEP = re.compile(rf"\s*{_NUMBER}\s*:\s*{_NUMBER}\s*(Hz|kHz)[\s,]+(log|linear)\s*")
-_DEGREES = 10.0  # a phase in degrees exceeds this in a sweep through a resonance, or through slip
+_LARGE_PHASE = 10.0  # exceeded in degrees by a sweep through a resonance, or through slip
 _UNKNOWN_FREQUENCY = (
     "the table says no frequency: taken as 1 Hz, and good for laws that do not depend on it"
 )
@@ -81,7 +81,7 @@ def response_from(
     if source.format == TRACE and not {"gain", "phase"} & columns.roles.keys():
         first, second = map(source.numbers, source.channels[:2])
         largest = np.abs(second).max()
-        in_degrees = _DEGREES < largest <= 360.0 and largest > 10.0 * first.max()
+        in_degrees = _LARGE_PHASE < largest <= 360.0 and largest > 10.0 * first.max()
         if in_degrees and (first > 0.0).all():
             gain, phase = {"column": "real", "unit": ANY}, {"column": "imag", "unit": "deg"}
             polar = column_map_of({"gain": gain, "phase": phase})

@@ -20,7 +20,7 @@ from dahl_ident.units import Motion, shown_unit
 
 _UNCERTAIN = 0.3  # relative standard uncertainty of a parameter that is not determined
 _LONG_ENOUGH = 0.02  # share of samples near reversals that suffices
-_ALIKE = 0.95  # correlation at which two parameters cannot be distinguished
+_INDISTINGUISHABLE = 0.95  # correlation at which two parameters cannot be distinguished
 _BECAUSE = {  # reasons and remedies by the largest source of uncertainty
     EXPONENT: "of the exponent, which was not given: give it if it is known, or estimate it too",
     RUNS: "the records ask for different values: fit each alone, and look at what differs",
@@ -205,7 +205,7 @@ def _largest_source(problem: RecordProblem, errors: RecordErrors, place: int) ->
             return f" because {_BECAUSE[source]}"
     with np.errstate(all="ignore"):
         size = np.sqrt(covariance.diagonal())
-        alike = np.abs(covariance[place] / size / size[place]) > _ALIKE
+        alike = np.abs(covariance[place] / size / size[place]) > _INDISTINGUISHABLE
     others = [n for i, n in enumerate(problem.names) if alike[i] and i != place]
     if others:
         return f": it cannot be distinguished from {', '.join(others)}; fix one of them"

@@ -48,7 +48,7 @@ _SPECIFIC = {
     "residuals": "residuals sample by sample",
 }
 """Attributes that fits of one kind of data only have, in words."""
-_OUTSIDE = 2.0  # standard uncertainties beyond the end of a range
+_OUTSIDE_RANGE = 2.0  # standard uncertainties beyond the end of a range
 _NOISE = {
     "measured": "measured: the data's covariance, scale known",
     "relative": "relative: constant variance of (ln gain, phase)",
@@ -394,7 +394,7 @@ class TableAssessment(Assessment):
                 continue
             low, high = p.prior or (0.0, np.inf)
             value, u = errors.values[p.name], errors.stderr[p.name]
-            if max(low - value, value - high) > _OUTSIDE * u:
+            if max(low - value, value - high) > _OUTSIDE_RANGE * u:
                 yield ContradictedExponent(p.name, value, value, u, (low, high))
 
     @property

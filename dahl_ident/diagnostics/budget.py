@@ -35,7 +35,7 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 
 _DETERMINED, _HARDLY = 0.25, 1.0  # u of a logarithm
-_ROUNDING = 1e-12  # variance over the combined one that is a rounding error
+_VARIANCE_ROUNDING = 1e-12  # variance over the combined one that is a rounding error
 _SAME = 1e-6  # relative tolerance of equal limits
 _COLUMNS = ("source", "type", "u", "dof", "share", "k", "U")
 
@@ -297,7 +297,7 @@ def parameter_budget(
         if np.isinf(u2):
             share = float(np.isinf(part))
         else:
-            part = part if part > _ROUNDING * u2 else 0.0
+            part = part if part > _VARIANCE_ROUNDING * u2 else 0.0
             share = part / u2 if u2 > 0.0 else 0.0
         kind: Literal["A", "B"] = "A" if source in TYPE_A else "B"
         dof = errors.dof(direction, source) if part else np.inf

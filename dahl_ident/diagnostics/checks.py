@@ -43,7 +43,7 @@ from dahl_ident.units import si_unit
 _TOO_LARGE = 0.5  # rms misfit: the model does not describe half of the response
 _FAIRLY = 0.2  # rms misfit in excess of noise, above which intervals do not hold
 _OF_WRONG_LAW = 0.05  # the same where another law has a far smaller misfit
-_SLOW = 0.3  # effective share of the samples, below which noise looks like a wrong law,
+_SLOW_SAMPLES = 0.3  # effective share of the samples, below which noise looks like a wrong law,
 _VISIBLE = 0.05  # if its rms is more than this share of the output
 _FEW = 10.0  # degrees of freedom: an uncertainty is then known to 20 %
 _FEWEST_INSIDE = 0.8  # of held-out values in 95 % bands, below which the bands do not hold
@@ -159,7 +159,7 @@ def _misfit_of_records(fit: RecordAssessment) -> Iterator[Finding]:
             remedy = f"add a {kind}, or {remedy}"
         yield described("records_misfit", _APPROXIMATE, follows=follows, remedy=remedy)
     effective = fit.errors.effective / problem.n_samples
-    if not fit.exceeds_noise and effective < _SLOW and fit.goodness.rms_in_band > _VISIBLE:
+    if not fit.exceeds_noise and effective < _SLOW_SAMPLES and fit.goodness.rms_in_band > _VISIBLE:
         yield described("slow_misfit", _APPROXIMATE, rms=fit.goodness.rms_in_band)
     if fit.errors.dof_of(NOISE) < _FEW:
         few = {"effective": fit.errors.effective, "unknowns": len(problem.names)}

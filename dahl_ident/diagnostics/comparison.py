@@ -48,19 +48,19 @@ from dahl_ident.fitting import Optimum, solve
 from dahl_ident.problem import Problem
 from dahl_ident.units import percent, si_unit
 
-_BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
+_RISE_BY_CHANCE = 4.0  # rise of the log density that the best of ten needless candidates may have
 _ASTRAY = 0.5  # misfit above which a search has failed
-_RATES = 1.05  # least ratio of highest to lowest frequency that can show rate dependence
-_SMOOTH = 8  # degree in ln A of the change of gain that is allowed at every frequency
-_FALSE_ALARM = 1e-4  # rate for a force that falls with the frequency, which adds a candidate
-_SEEN = 3.0  # rms difference over noise averaged over all rows, that distinguishes laws
+_RATE_RANGE = 1.05  # least ratio of highest to lowest frequency that can show rate dependence
+_GAIN_DEGREE = 8  # degree in ln A of the change of gain that is allowed at every frequency
+_FALL_BY_CHANCE = 1e-4  # rate for a force that falls with the frequency, which adds a candidate
+_DISTINGUISHED = 3.0  # rms difference over noise averaged over all rows, that distinguishes laws
 _RUNAWAY = 100.0  # ratio to the fit's value, above which the data leave a parameter open
 _UNUSUAL = 5.0  # factor beyond the usual range of an exponent that no mechanism has
 _DISAGREE = 0.2  # relative difference of force limits or stiffnesses that matters to the user
 _PLACES = 6  # decimals of a change: less is rounding
 _VAGUE = 0.5  # relative standard error from which a parameter is not determined
 _OF_FRICTION = "force limit", "stiffness at zero force"  # the same in all laws
-_LEVELS = 3  # amplitudes at which the energy of a cycle is tabulated
+_TABULATED = 3  # amplitudes at which the energy of a cycle is tabulated
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class ComparedModel:
         for element in problem.model.elements:
             at_element = [values[p.name] for p in element.parameters]
             resemblance = element.resembles(at_element, *_levels(problem))
-            if resemblance is not None and resemblance[1] < _SEEN * self.density.noise:
+            if resemblance is not None and resemblance[1] < _DISTINGUISHED * self.density.noise:
                 sentences.append(
                     f"{self.name}: at these levels it differs from {resemblance[0]} by "
                     f"{percent(resemblance[1])} rms, too little for these data to distinguish the "
@@ -200,7 +200,7 @@ class ModelComparison:
         likeliest = max(physical, key=lambda model: model.density.total)
         gain, error = likeliest.density.gain_over(best.density)
         far_less = likeliest.density.misfit < FAR_LESS * best.density.misfit
-        return likeliest if far_less and gain > max(error, _BY_CHANCE) else None
+        return likeliest if far_less and gain > max(error, _RISE_BY_CHANCE) else None
 
     @cached_property
     def undecided(self) -> tuple[ComparedModel, ...]:
@@ -225,7 +225,7 @@ class ModelComparison:
         alike = []
         for model in self.models:
             gain, error = self._likeliest.density.gain_over(model.density)
-            if gain <= max(error, _BY_CHANCE) and self._is_sound(model):
+            if gain <= max(error, _RISE_BY_CHANCE) and self._is_sound(model):
                 alike.append(model)
         return alike
 
@@ -343,7 +343,7 @@ def _levels(problem: Problem) -> tuple[FloatArray, FloatArray]:
 def _meaning(problem: Problem, values: Mapping[str, float]) -> dict[str, float]:
     """Return the quantities common to all laws at the parameters' values, see `ComparedModel`."""
     A, rates = _levels(problem)
-    sizes = np.geomspace(A.min(), A.max(), _LEVELS if A.max() > A.min() else 1)
+    sizes = np.geomspace(A.min(), A.max(), _TABULATED if A.max() > A.min() else 1)
     omega = np.asarray(np.exp(np.mean(np.log(rates))))
     limit, stiffness, energy = 0.0, 0.0, np.zeros(sizes.size)
     for element in problem.model.elements:
@@ -540,7 +540,7 @@ def _candidates(
     several, span = True, misfit
     if problem.response is not None:
         f = problem.response.frequency_hz
-        several = bool(f.max() > _RATES * f.min())
+        several = bool(f.max() > _RATE_RANGE * f.min())
         span += f"; frequencies from {f.min():.3g} to {f.max():.3g} Hz"
         if not several:
             span = f"{misfit}; one frequency, so only the amplitude can tell"
@@ -578,12 +578,12 @@ def _falling_force(optimum: Optimum) -> str:
     view, fitted = problem.stiffness_data, problem.predicted_stiffness(optimum.theta).stiffness
     rows = view.harmonic == 1
     rate, ln_A = np.log(view.omega[rows]), np.log(view.amplitude[rows])
-    if not np.ptp(rate) > np.log(_RATES):
+    if not np.ptp(rate) > np.log(_RATE_RANGE):
         return ""
     with np.errstate(divide="ignore", invalid="ignore"):
         y = np.log(np.abs(view.stiffness / fitted))[rows]
     unit_range = 2.0 * (ln_A - ln_A.mean()) / max(float(np.ptp(ln_A)), 1e-9)
-    degree = min(_SMOOTH, np.unique(ln_A.round(2)).size - 1)
+    degree = min(_GAIN_DEGREE, np.unique(ln_A.round(2)).size - 1)
     smooth = legendre.legvander(unit_range, degree)
     slopes = legendre.legvander(unit_range, min(2, degree))
     X = np.hstack([smooth, slopes * (rate - rate.mean())[:, None]])
@@ -597,7 +597,7 @@ def _falling_force(optimum: Optimum) -> str:
     p = float(special.fdtrc(Q, dof, explained / Q / (remaining / dof)))
     change = (slopes @ solution[-Q:]) * float(np.ptp(rate))
     fall = -float(change[np.argmax(np.abs(change))])
-    if not (p < _FALSE_ALARM and fall > 0.0):
+    if not (p < _FALL_BY_CHANCE and fall > 0.0):
         return ""
     f = view.omega[rows] / (2.0 * np.pi)
     return f"force falls by {percent(fall)} from {f.min():.3g} to {f.max():.3g} Hz"

@@ -20,7 +20,7 @@ from dahl_ident.problem.record_noise import HIGHEST_ORDER, SAMPLES_PER_ORDER
 
 _SINGULAR = 1e-13  # eigenvalue of J'J, with unit diagonal, that is rounding
 _INVOLVED = 1e-6  # squared component of a parameter in undetermined directions that matters
-_SLIGHT = 1e-3  # change of autocovariances over the variance that does not matter
+_SLIGHT_CHANGE = 1e-3  # change of autocovariances over the variance that does not matter
 _TRANSFORM = 2**15  # samples: enough unless the noise is very slow
 _VANISHED = 1e-9  # autocovariance over the variance that is rounding
 _CORRECTIONS = 4  # most iterations of the correction, which converges fast
@@ -122,13 +122,13 @@ def autoregression(
     if jacobian is None or observed[0] <= 0.0:
         return model
     peak = float(np.max(spectrum_of(model, fft.next_fast_len(2 * n, real=True))))
-    if 3.0 * jacobian.shape[1] * peak < _SLIGHT * n * observed[0]:  # bound of the part
+    if 3.0 * jacobian.shape[1] * peak < _SLIGHT_CHANGE * n * observed[0]:  # bound of the part
         return model
     basis = np.linalg.qr(jacobian)[0]
     explained: FloatArray = np.zeros(highest + 1)
     for _ in range(_CORRECTIONS):
         before, explained = explained, _explained_by_fit(basis, model, highest)
-        if np.max(np.abs(explained - before)) < _SLIGHT * observed[0]:
+        if np.max(np.abs(explained - before)) < _SLIGHT_CHANGE * observed[0]:
             break
         corrected = observed + explained
         if np.linalg.eigvalsh(toeplitz(corrected))[0] <= 0.0:

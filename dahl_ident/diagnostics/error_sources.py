@@ -37,7 +37,7 @@ from dahl_ident.units import COMPLIANCES
 _SAME_LEVEL = 0.02  # of ln A and ln f: values farther apart are different levels
 _MOST_LEVELS = 50  # levels with an error each: the cost is cubic in their number
 _EQUAL = 1e-9  # of the same: equal except for rounding
-_BY_CHANCE = 0.01  # share of tables without repeats in which some levels seem repeated
+_REPEATS_BY_CHANCE = 0.01  # share of tables without repeats in which some levels seem repeated
 FEWEST_TESTS = 3  # runs, or labelled levels, that count as tests
 
 # Share of tables in which noise alone may look like a model error, or like noisy levels: if it is
@@ -174,7 +174,7 @@ def _agreeing(x: FloatArray, groups: IntArray) -> IntArray:
     mean = np.maximum(np.cumsum(larger[::-1])[::-1][k] / (len(larger) - k) - small, _EQUAL)
     unlikely = k * np.log(np.expm1(-larger[k] / mean) / np.expm1(-small / mean))
     widest_repeat = _EQUAL
-    if unlikely.max(initial=0.0) > np.log(max(len(gaps), 1) / _BY_CHANCE):
+    if unlikely.max(initial=0.0) > np.log(max(len(gaps), 1) / _REPEATS_BY_CHANCE):
         widest_repeat = float(small[np.argmax(unlikely)])
 
     def labelled(breaks: BoolArray) -> IntArray:

@@ -42,22 +42,22 @@ from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
 _NOTICED = 1e-5  # singular value over the largest, below which a direction is undetermined
-_OUTSIDE = 1e-3  # undetermined part of a direction that counts as rounding
+_UNDETERMINED = 1e-3  # undetermined part of a direction that counts as rounding
 GAIN = "force_gain"
-_STEPS = 60  # most Gauss-Newton steps; five are usual
+_GAUSS_NEWTON_STEPS = 60  # most Gauss-Newton steps; five are usual
 _NO_BETTER = 0.25  # variance of an exponent over that of its range: there may be two minima
-_APART = 0.1  # distance of two different minima, in standard deviations
+_TWO_MINIMA = 0.1  # distance of two different minima, in standard deviations
 _NEAR_ENOUGH = 0.03  # last step of an estimate of a jackknife, in standard deviations
 _LINEAR = 0.3  # change of a logarithm up to which the model is linear
 _SETTLED = 1e-3  # last step of a search, in standard deviations
 _LONGEST_STEP = 0.7  # change of a logarithm in one step of the linearised model
 _FIRST_DAMPING, _DAMPED = 1e-3, 10.0  # damping after a step that fails, and its factor
-_TRIALS = 8  # trials of one step, each with more damping
+_STEP_TRIALS = 8  # trials of one step, each with more damping
 _ROOT_STEPS = 200  # most Newton steps for the misfit; far from the root, it doubles
 _LEAST_LEFT = 1e-3  # least part of a test's residuals that is left at high leverage
 _MOST_DISAGREEMENT = 1e6  # largest factor of the harmonics' variance
 _SAME_FACTOR = 1e-8  # tolerance of the logarithm of that factor
-_SAME = 1e-9  # relative tolerance of the misfit's square
+_SAME_MISFIT = 1e-9  # relative tolerance of the misfit's square
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Basis:
         scaled = (slopes / largest) @ self.slopes * self.size
         outside = scaled - (scaled @ self.directions) @ self.directions.T
         length = np.linalg.norm(scaled, axis=-1)
-        determined = np.linalg.norm(outside, axis=-1) <= _OUTSIDE * length
+        determined = np.linalg.norm(outside, axis=-1) <= _UNDETERMINED * length
         return np.asarray(determined & ((length > 0.0) | ~slopes.any(axis=-1)))
 
 
@@ -293,7 +293,7 @@ def weighted_estimate(
                 minima += [minimum] if np.isfinite(minimum.deviance) else []
     best, *others = sorted(minima, key=lambda minimum: minimum.deviance)
     different = [
-        m for m in others if np.linalg.norm(best.columns @ (m.theta - best.theta)) > _APART
+        m for m in others if np.linalg.norm(best.columns @ (m.theta - best.theta)) > _TWO_MINIMA
     ]
     if not different:
         return best
@@ -318,7 +318,7 @@ def jackknife_with_weights(
         kept[test] = False
         others, refitted = rows.take(kept), theta.copy()
         with suppress(np.linalg.LinAlgError):  # the others do not determine it
-            for _ in range(_STEPS):
+            for _ in range(_GAUSS_NEWTON_STEPS):
                 at = others.moved(refitted - theta)
                 r, columns = at.weighted(at.squares(loss))
                 y = scores_of(r, 2 * len(at.z), loss)
@@ -412,7 +412,7 @@ def _minimum(
         basis = Basis.of(J, theta, chart_of_limit(optimum, problem))
     last: FloatArray | None = None
     damping, bounds = 0.0, problem.bounds()
-    for _ in range(_STEPS):
+    for _ in range(_GAUSS_NEWTON_STEPS):
         variance, scale = _weights(stated, theta, loss)
         weighted = stated.widened(variance)
         r, J = weighted.residuals_and_jacobian(theta, scale, tails=loss is None)
@@ -430,7 +430,7 @@ def _minimum(
         step, last = factor * step, moved if factor == 1.0 else None
         mean = 1.0 if loss is None else loss.mean_slope(squares_of(r[:m]))
         cost = _cost(r, m, loss, mean)
-        for _ in range(_TRIALS):
+        for _ in range(_STEP_TRIALS):
             if damping:
                 rows = np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))
                 both, last = np.vstack([columns, rows]), None
@@ -575,7 +575,7 @@ def _square(z: FloatArray, b: FloatArray, target: float, loss: Loss | None) -> f
     for _ in range(_ROOT_STEPS):
         counts = loss.counts(np.sum(z / (1.0 + b * x), axis=1), target)
         last, x = x, _root(counts[:, None] * z, b, target)
-        if abs(x - last) <= _SAME * x:
+        if abs(x - last) <= _SAME_MISFIT * x:
             break
     return x
 
@@ -594,7 +594,7 @@ def _root(z: FloatArray, b: FloatArray, target: float) -> float:
         slope = float((parts * b / (1.0 + b * x)).sum())
         step = excess / slope if slope > 0.0 else 0.0
         x += step
-        if step <= _SAME * x:
+        if step <= _SAME_MISFIT * x:
             break
     return x
 

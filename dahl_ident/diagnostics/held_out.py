@@ -42,7 +42,7 @@ from dahl_ident.diagnostics.mixed_model import MixedState
 _MOST_TESTS = 100  # tests left out: the share inside is then known to 2 %
 _PRIOR_SCORES = 10.0  # weight c of Student's t
 _NORMAL = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
-_WIDEST = 1e6  # standard deviation of ln gain or phase above which there is no prediction
+_UNPREDICTED = 1e6  # standard deviation of ln gain or phase above which there is no prediction
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def held_out(estimate: WeightedEstimate, state: MixedState) -> HeldOut | None:
         spread = np.einsum("kra,kl,lra->ra", by_source[1:], W, by_source[1:])
         dof = satterthwaite(variance, spread)
         std = np.sqrt(variance)
-        std = np.where((std > 0.0) & (std < _WIDEST), std, np.nan)
+        std = np.where((std > 0.0) & (std < _UNPREDICTED), std, np.nan)
         kept = first[rows]
         parts = (rows, np.full(len(rows), number), deviations[..., 0], std, dof)
         of_tests.append([part[kept] for part in parts])

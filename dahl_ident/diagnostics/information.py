@@ -6,10 +6,8 @@ import numpy as np
 
 from dahl_ident.arrays import FloatArray
 from dahl_ident.fitting import Optimum
+from dahl_ident.fitting.optimum import NOTICEABLE_PART, UNDETERMINED
 from dahl_ident.problem import TableProblem
-
-_NULL = 1e-13  # eigenvalue of the scaled information below which a direction is undetermined
-_PART = 1e-4  # component of a direction in undetermined ones that matters
 
 
 def parameter_values(optimum: Optimum) -> dict[str, float]:
@@ -46,7 +44,7 @@ class Information:
         self._eigenvalues, self._vectors = np.linalg.eigh(
             np.where(np.isfinite(scaled), scaled, 0.0)
         )
-        self._null = self._eigenvalues <= _NULL * max(1.0, float(self._eigenvalues[-1]))
+        self._null = self._eigenvalues <= UNDETERMINED * max(1.0, float(self._eigenvalues[-1]))
 
     def variance(self, directions: FloatArray) -> FloatArray:
         """Return the variance of directions . theta, shape (...), for directions (..., P)."""
@@ -58,7 +56,7 @@ class Information:
         scaled = directions / self._size
         parts = scaled @ self._vectors
         length = np.linalg.norm(scaled, axis=-1, keepdims=True)
-        lost = np.abs(parts[..., self._null]) > _PART * length
+        lost = np.abs(parts[..., self._null]) > NOTICEABLE_PART * length
         known = parts[..., ~self._null] ** 2 / self._eigenvalues[~self._null]
         return np.where(lost.any(axis=-1), np.inf, known.sum(axis=-1))
 

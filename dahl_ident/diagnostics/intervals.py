@@ -52,7 +52,7 @@ _BY_FACTOR = 0.2  # u of a logarithm, above which limits are value * factor and 
 _LARGE = 0.1  # u of a logarithm from noise alone, above which a side may be open
 _SIZE_THAT_MATTERS = 0.1  # of the response, for parameters that may be zero
 _DISAGREES = 0.2  # half widths between the limits of two methods
-_ROUNDING = 1e-9  # relative difference of limits that is rounding
+_LIMIT_ROUNDING = 1e-9  # relative difference of limits that is rounding
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
@@ -337,7 +337,7 @@ def compare(
                 half_width = np.abs(trusted_theta - theta)
                 apart = np.abs(trusted_theta - compared_theta) > _DISAGREES * half_width
             apart |= np.isinf(trusted_theta) != np.isinf(compared_theta)
-            apart &= ~np.isclose(trusted, compared, rtol=_ROUNDING, atol=0)
+            apart &= ~np.isclose(trusted, compared, rtol=_LIMIT_ROUNDING, atol=0)
             for row, i in np.argwhere(apart).tolist():
                 level = float(last.levels[row])
                 limits = (compared[row, i], trusted[row, i])

@@ -27,15 +27,15 @@ from dahl_ident.fitting.global_start import global_starts
 from dahl_ident.problem import TableProblem
 from dahl_ident.units import percent
 
-_LEVEL = 0.01  # false-alarm rate of the worst of all points
+_CHANCE = 0.01  # false-alarm rate of the worst of all points
 _SHARE = 0.1  # of the rows: if more deviate, the model or noise is wrong, not single rows
 _ONE_BY_ONE = 500  # rows up to which each is removed before the next is judged
 _LEAST_DOF = 4  # without the suspicious rows; fewer do not show the noise
 _GOOD = "good"
 EXPLAINS = 3.0  # factor by which a cause lowers the misfit
 _PROMISING = 1.5  # the same at the start of a search
-_BY_CHANCE = 0.01  # probability that rows at random lie as close together
-_RANGE = 5  # fewest values of which the first and the last are ends
+_CLUSTER_BY_CHANCE = 0.01  # probability that rows at random lie as close together
+_FEWEST = 5  # fewest values of which the first and the last are ends
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _suspicious(optimum: Optimum, space: ResidualSpace) -> list[tuple[int, float
         deviant += worst
         if len(worst) < at_once:
             break
-    significant = [i for i, (*_, p) in enumerate(deviant, start=1) if p < _LEVEL]
+    significant = [i for i, (*_, p) in enumerate(deviant, start=1) if p < _CHANCE]
     return deviant[: max(significant, default=0)]
 
 
@@ -91,7 +91,7 @@ def _outliers(optimum: Optimum) -> list[tuple[int, float, float]]:
     tail = special.chdtrc(2, squares) if optimum.scale_known else special.fdtrc(2, dof, squares / 2)
     p = np.minimum(1.0, squares.size * tail)
     order = np.argsort(-squares)
-    return [(int(i), float(np.sqrt(squares[i])), float(p[i])) for i in order if p[i] < _LEVEL]
+    return [(int(i), float(np.sqrt(squares[i])), float(p[i])) for i in order if p[i] < _CHANCE]
 
 
 def _most_deviant(
@@ -252,7 +252,7 @@ def neighbourhood(optimum: Optimum, rows: Sequence[int]) -> str:
         span = int(((values >= low) & (values <= high)).sum())
         to_end = min(int((values >= low).sum()), int((values <= high).sum()))
         as_close = sum((n - s + 1) * comb(s - 2, k - 2) for s in range(k, span + 1))
-        if min(as_close, 2 * comb(to_end, k)) < _BY_CHANCE * comb(n, k):
+        if min(as_close, 2 * comb(to_end, k)) < _CLUSTER_BY_CHANCE * comb(n, k):
             return f"{name} from {low:.3g} to {high:.3g} {unit}"
     return ""
 
@@ -261,7 +261,7 @@ def is_at_end(optimum: Optimum, rows: Sequence[int]) -> bool:
     """Return whether a row is the first or last of a covariate, where the model may fail."""
     if len(rows) != 1:
         return False
-    ranges = (values for _, values, _ in covariates(optimum) if np.unique(values).size >= _RANGE)
+    ranges = (values for _, values, _ in covariates(optimum) if np.unique(values).size >= _FEWEST)
     return any(values[rows[0]] in (values.min(), values.max()) for values in ranges)
 
 

@@ -27,14 +27,14 @@ from scipy import linalg, special
 
 from dahl_ident.arrays import TINY, BoolArray, FloatArray, IntArray
 
-_STEPS = 40  # at most; the likelihood rises in each, so the last is the best
+_SCORING_STEPS = 40  # at most; the likelihood rises in each, so the last is the best
 _LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.02)  # of a scoring step, until the likelihood rises
-_CLOSE = 1e-3  # rise of the log-likelihood that no longer matters
+_LIKELIHOOD_SETTLED = 1e-3  # rise of the log-likelihood that no longer matters
 _LEAST_NOISE = 1e-6  # of the mean square of the residuals: less is lost in rounding
 _UNSEEN = 1e-100  # root of the information on a variance of which nothing is known
 _DRAWS = 5000  # of noise alone: a level of 1 % over ten tests is known to a half
 _RATIOS = (0.1, 1e4, 21)  # of a source's largest variance over the noise's, from, to and count
-_ALIKE = 1e-9  # added to correlations of one: sources that do the same share a variance
+_RIDGE = 1e-9  # added to correlations of one: sources that do the same share a variance
 
 
 class MixedModel:
@@ -120,10 +120,10 @@ class MixedModel:
     ) -> MixedState:
         """Return the state of the highest likelihood less price . s, from s on."""
         state = self.at(s)
-        for _ in range(_STEPS):
+        for _ in range(_SCORING_STEPS):
             before = state.log_likelihood - price @ s
             aim = np.clip(state.scored(price, most > least), least, most)
-            if (state.gradient - price) @ (aim - s) < _CLOSE:
+            if (state.gradient - price) @ (aim - s) < _LIKELIHOOD_SETTLED:
                 break
             for length in _LENGTHS:
                 try:
@@ -136,7 +136,7 @@ class MixedModel:
             else:
                 break
             s, state = trial.variances, trial
-            if rise < _CLOSE:
+            if rise < _LIKELIHOOD_SETTLED:
                 break
         return state
 
@@ -231,7 +231,7 @@ class MixedState:
         )
         rank = len(model.y) - model.parameters - (0.0 if known else left_of_sure)
         values, vectors = np.linalg.eigh(self._Q[columns, columns])
-        kept = np.flatnonzero(values > _ALIKE * values[-1])[-max(int(rank), 1) :]
+        kept = np.flatnonzero(values > _RIDGE * values[-1])[-max(int(rank), 1) :]
         if not kept.size:  # the parameters explain all of it
             return 1.0
         values = values[kept]
@@ -281,7 +281,7 @@ class MixedState:
         units, s = 1.0 / size[part], self.variances.copy()
         scaled = units[:, None] * F[np.ix_(part, part)] * units
         values, vectors = np.linalg.eigh(scaled)
-        root = np.sqrt(np.maximum(values, _ALIKE))  # rounding may leave some below zero
+        root = np.sqrt(np.maximum(values, _RIDGE))  # rounding may leave some below zero
         R = root[:, None] * vectors.T
         rise = units * (self.gradient - price)[part]
         aim = R @ (s[part] / units) + (vectors.T @ rise) / root

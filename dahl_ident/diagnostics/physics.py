@@ -25,9 +25,9 @@ from dahl_ident.fitting.optimum import Status, values_at_bounds
 from dahl_ident.problem.steady_rows import levels
 from dahl_ident.units import engineering, percent, shown_unit
 
-_SEEN = 1e-3  # relative difference that is worth stating
+_WORTH_STATING = 1e-3  # relative difference that is worth stating
 _DISTORTED = 0.05  # distortion of a force that matters: less changes the fundamental below 1 %
-_LEVEL = 1e-3  # false-alarm rate, low as such a fit is called physically impossible
+_OBJECTION_BY_CHANCE = 1e-3  # false-alarm rate, low as such a fit is called physically impossible
 _OFF = 0.02  # relative error of a prediction: as large as a good measurement's
 _CLEARLY = 2.0  # standard uncertainties below zero
 _IMPOSSIBLE = 3.0  # standard errors of a limit by which a force has to exceed it
@@ -48,7 +48,7 @@ _TYPICAL_ROTATION = {
 }
 _DIMENSIONS = {FORCE: "force limit", STIFFNESS: "contact stiffness"}
 _RATIOS = {2.0: "peak-to-peak", 2.0**-0.5: "root-mean-square"}
-_ALIKE = 0.05  # largest relative difference from such a ratio
+_NEAR_RATIO = 0.05  # largest relative difference from such a ratio
 Estimates = tuple[Mapping[str, float], Mapping[str, float]]
 """Values and their standard uncertainties, by name."""
 
@@ -82,7 +82,7 @@ def steady_findings(optimum: Optimum, model: Model) -> Iterator[Finding]:
         return
     if problem.is_exact:
         row, error = _largest_difference(optimum)
-        if error >= _SEEN:
+        if error >= _WORTH_STATING:
             yield described("steady", difference=error, row=row_names(problem.data, [row])[0])
         yield from _distorted(problem.data)
         yield from _jumps(problem.data, model)
@@ -204,7 +204,7 @@ def beyond_friction_limit(
     excess = np.nan_to_num((force - bound) / error, nan=-np.inf)
     row, tests = int(np.argmax(excess)), max(np.isfinite(excess).sum(), 1)
     dof = 1e9 if optimum.scale_known else max(optimum.dof, 1)
-    if excess[row] > special.stdtrit(dof, 1.0 - _LEVEL / tests):
+    if excess[row] > special.stdtrit(dof, 1.0 - _OBJECTION_BY_CHANCE / tests):
         shown = {"force": with_unit(force[row], error[row], unit), "limit": f"{bound:.3g} {unit}"}
         yield described("beyond_slip", _APPROXIMATE, row=names([row])[0], **shown)
     if problem.data.drive is None:
@@ -338,7 +338,7 @@ def _levels(optimum: Optimum) -> Iterator[str]:
         return
     ratio = size / level
     for wrong, name in _RATIOS.items():
-        if np.all(np.abs(ratio / wrong - 1.0) < _ALIKE):
+        if np.all(np.abs(ratio / wrong - 1.0) < _NEAR_RATIO):
             yield (
                 f"every {'drive' if driven else 'amplitude'} is {np.median(ratio):.3g} times its "
                 f"nominal level: {name} values, where zero-to-peak is meant?"

@@ -25,7 +25,7 @@ from dahl_ident.diagnostics.error_sources import error_sources, log_points, part
 from dahl_ident.diagnostics.estimate import relative_units
 from dahl_ident.problem import TableProblem
 
-_NEGLIGIBLE = 0.1  # variance of neglected shapes over that of a row's noise
+_NEGLIGIBLE_SHAPES = 0.1  # variance of neglected shapes over that of a row's noise
 
 
 class PredictionError(NamedTuple):
@@ -147,7 +147,7 @@ def departures(
     _, singular, directions = np.linalg.svd(every, full_matrices=False)
     noise = float(errors.noises[0]) * errors.noise_square
     remaining = np.cumsum(singular[::-1] ** 2)[::-1] / len(every)
-    directions = directions[remaining > _NEGLIGIBLE * noise].T
+    directions = directions[remaining > _NEGLIGIBLE_SHAPES * noise].T
     others = [k for k, source in enumerate(errors.sources) if source.name != MODEL_ERROR]
     state, noises = errors.state, errors.state.model.noises
     # residuals fall as a prediction rises

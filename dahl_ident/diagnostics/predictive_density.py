@@ -27,8 +27,8 @@ from dahl_ident.errors import FitError
 from dahl_ident.fitting import Optimum
 from dahl_ident.problem import RecordProblem
 
-_EXACT = 1e-5  # relative error that is rounding
-_ROUNDING = 1e-12  # variance of residuals, over that expected, that is rounding
+_RELATIVE_ROUNDING = 1e-5  # relative error that is rounding
+_NO_RESIDUALS = 1e-12  # variance of residuals, over that expected, that is rounding
 _RANK = 1e-7  # singular value of the derivatives, over the largest, that is rounding
 _LEAST_LEFT = 1e-9  # least weight of a row that the others predict exactly
 _LEAST_SHARED = 1e-6  # information on a direction outside a block, over all, that is negligible
@@ -99,14 +99,14 @@ def predictive_density(optimum: Optimum, fitted: Optimum | None = None) -> Predi
     _, group = np.unique(group[kept], return_inverse=True)
     groups, y, stated = int(group.max()) + 1, y[kept], stated[kept]
     excess = np.maximum(np.bincount(group, y**2 - stated) / np.bincount(group), 0.0)
-    unit = np.sqrt(stated + excess[group] + _EXACT**2)
+    unit = np.sqrt(stated + excess[group] + _RELATIVE_ROUNDING**2)
     Z = [columns[kept] / unit[:, None] for columns in scatter]
     model = MixedModel(
         y / unit,
         orthonormal(X[kept] / unit[:, None]),
         Z,
         group,
-        np.full(groups, _ROUNDING),
+        np.full(groups, _NO_RESIDUALS),
         groups,
         np.full(len(Z), np.inf),
     )
@@ -135,7 +135,7 @@ def _of_records(optimum: Optimum, weighed: RecordProblem) -> PredictiveDensity:
     residuals = [weighed.filtered((y - p.output) / problem.output_std) for y, p in pairs]
     y, blocks = np.concatenate(residuals), blocks_of(residuals)
     Q = orthonormal(np.concatenate([weighed.filtered(p.by) for p in predicted]), _RANK)
-    variance = float(y @ y) / max(y.size - Q.shape[1], 1) + _EXACT**2
+    variance = float(y @ y) / max(y.size - Q.shape[1], 1) + _RELATIVE_ROUNDING**2
     first = np.cumsum([0, *(len(e) for e in residuals)])
     tests = np.empty(len(blocks))
     for number, (record, rows) in enumerate(blocks):

@@ -37,20 +37,20 @@ from dahl_ident.problem import Quadratic
 
 # Searches for limits
 _NEAR = 1e-3  # distance of the root from its target at which one last Newton step is exact enough
-_CLOSED = 1e-4  # width of a bracket over its distance, and
+_CLOSED_BRACKET = 1e-4  # width of a bracket over its distance, and
 _NARROW = 0.01  # in conditional standard errors, at which a limit is known well enough
 _MARGIN = 0.02  # distance that a step keeps from the ends of a bracket, over its width
 _GROWTH, _SHRINKAGE = 3.0, 0.3  # of a step over the last one, until the target is bracketed
-_LONGEST = 3.0  # step of a logarithm
-_STEPS = 60  # most steps of the searches, which are made together
-_TOGETHER = 8  # points of a curve computed at once, from the last one on their side
+_LONGEST_LOG_STEP = 3.0  # step of a logarithm
+_CURVE_STEPS = 60  # most steps of the searches, which are made together
+_POINTS_AT_ONCE = 8  # points of a curve computed at once, from the last one on their side
 # Constrained searches
 _SEARCH_STEPS = 40
 _TOLERANCE_FACTOR = 1e5  # the deviance, flat at its minimum, still errs by 1e-6 only
 _ENOUGH = 1e-8  # fall of the cost at which a search along a flat valley ends
 _SAME_DEVIANCE = 0.1  # relative difference: 5 % of the distance to a limit
 # Where a search gives up
-_FARTHEST = 1e6  # conditional standard errors, if the parameter is not a logarithm
+_FARTHEST_LINEAR = 1e6  # conditional standard errors, if the parameter is not a logarithm
 _FARTHEST_LOG = 80.0  # distance of a logarithm from the optimum
 _FARTHEST_RATIO = 4.0  # the same of a pure number: an exponent or a gain
 _LEAST_X_C = 1e-14  # over the smallest amplitude
@@ -96,7 +96,7 @@ class Bracket:
             newton = (target - value) / slope
             width = self._outer[a] - self._inner[a]
             met = (np.abs(value - target) < _NEAR) & np.isfinite(newton)
-            least_width = np.minimum(_CLOSED * self._outer[a], self._least_width[a])
+            least_width = np.minimum(_CLOSED_BRACKET * self._outer[a], self._least_width[a])
             met |= np.isfinite(self._outer[a]) & (width <= least_width)
         newton = np.where(np.isfinite(newton), newton, np.inf)
         at_bound = below & (position >= self._furthest[a]) & ~met
@@ -123,7 +123,7 @@ class Bracket:
         last = np.where(below, self._step[a], np.inf)
         shortest = np.where(bracketed, 0.0, _SHRINKAGE * last)
         longest = _GROWTH * last
-        longest = np.where(self._logarithmic[a], np.minimum(_LONGEST, longest), longest)
+        longest = np.where(self._logarithmic[a], np.minimum(_LONGEST_LOG_STEP, longest), longest)
         forward = np.clip(np.where(newton > 0.0, newton, np.inf), shortest, longest)
         new = position + np.where(below, forward, newton)
         width = np.where(bracketed, outer - inner, 0.0)
@@ -191,7 +191,7 @@ class Profiler:
         tangent, origin = self._tangents[index], self._optimum.theta[index]
         was_reachable = np.zeros(len(index), dtype=np.bool_)
         bracket = self._bracket(index, sign, target)
-        for _ in range(_STEPS):
+        for _ in range(_CURVE_STEPS):
             a = bracket.active
             moved = sign[a] * bracket.position[a] + origin[a] - theta[a, index[a]]
             at = self._from_best_start(index[a], theta[a], self._along(tangent[a], moved))
@@ -248,7 +248,7 @@ class Profiler:
     def _along(self, tangent: FloatArray, moved: FloatArray) -> FloatArray:
         """Return the change of theta along its tangent; steps of other logarithms are limited."""
         change = moved[:, None] * tangent
-        limited = np.clip(change, -_LONGEST, _LONGEST)
+        limited = np.clip(change, -_LONGEST_LOG_STEP, _LONGEST_LOG_STEP)
         return np.where(self._logarithmic & (change != moved[:, None]), limited, change)
 
     # Constrained problems
@@ -258,7 +258,7 @@ class Profiler:
         distance = coordinate - self._optimum.theta[index]
         order = np.argsort(np.abs(distance))
         deviance, last = np.empty(len(coordinate)), np.tile(self._optimum.theta, (2, 1))
-        for block in np.array_split(order, max(1, order.size // _TOGETHER)):
+        for block in np.array_split(order, max(1, order.size // _POINTS_AT_ONCE)):
             side = (distance[block] > 0.0).astype(np.intp)
             start = last[side]
             start[:, index] = coordinate[block]
@@ -418,7 +418,7 @@ class Profiler:
         """Distance from the optimum beyond which a search gives up."""
         pure = np.array([p.unit == "" for p in self._problem.parameters])
         logarithms = np.where(pure, _FARTHEST_RATIO, _FARTHEST_LOG)
-        far = _FARTHEST * self._conditional + 2.0 * np.abs(self._optimum.theta)
+        far = _FARTHEST_LINEAR * self._conditional + 2.0 * np.abs(self._optimum.theta)
         return np.where(self._logarithmic, logarithms, far)
 
 

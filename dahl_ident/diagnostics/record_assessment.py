@@ -43,7 +43,7 @@ from dahl_ident.problem import RecordProblem, TableProblem
 from dahl_ident.problem.record_noise import share_in_band
 from dahl_ident.units import percent, shown_unit
 
-_LEAST = 1e-100  # smallest positive value, or misfit over the response
+_POSITIVE = 1e-100  # smallest positive value, or misfit over the response
 _SEGMENTS = 50  # of a record: the worst one is 2 % of it
 _UNKNOWN = 1e24  # variance of a logarithm that the records do not determine
 
@@ -379,14 +379,14 @@ class RecordAssessment(Assessment):
         problem: TableProblem = self.problem.for_table(row).like(noise="relative")
         count = self.problem.n_reported
         values = self.optimum.values[:count]
-        least = np.where(problem.space.positive, _LEAST, -np.inf)
+        least = np.where(problem.space.positive, _POSITIVE, -np.inf)
         theta = problem.to_search(np.maximum(values, least))
         slopes = problem.value_slopes(theta)
         with np.errstate(divide="ignore", invalid="ignore"):
             covariance = self.covar[:count, :count] / np.outer(slopes, slopes)
         unknown = ~np.isfinite(covariance)
         covariance[unknown] = np.where(np.eye(count)[unknown] > 0.0, _UNKNOWN, 0.0)
-        share = (0.5 * self.goodness.unexplained_share) ** 0.5 if self.exceeds_noise else _LEAST
+        share = (0.5 * self.goodness.unexplained_share) ** 0.5 if self.exceeds_noise else _POSITIVE
         optimum = replace(
             self.optimum,
             problem=problem,

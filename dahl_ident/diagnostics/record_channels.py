@@ -31,7 +31,7 @@ _BENT = 6.0  # times the displacement's noise: exceeded by a second difference b
 _OTHER_WINDOW = 0.5  # of its length: errors of a polynomial of degree 4 fall to a thirtieth
 _DRAWS = 8  # of noise: give the mean square change to a half
 _MOST_TURNS = 40  # turning points of a record that are evaluated
-_STEP = 1e-5  # of the displacement's range, for slopes
+_DISPLACEMENT_STEP = 1e-5  # of the displacement's range, for slopes
 _HIDDEN = 10.0  # times the noise in differences: a correlation of 0.98 leaves a tenth
 _FORGOTTEN = 1e-3  # of a pattern's peak, below which the force has forgotten the turn
 RELATIVE_STEP = 1e-5
@@ -290,7 +290,7 @@ def _patterns(fit: LinearFit, number: int) -> tuple[FloatArray, IntArray, int]:
     chosen = turns[
         np.unique(np.linspace(0, turns.size - 1, min(_MOST_TURNS, turns.size)).astype(int))
     ]
-    step, pattern = _STEP * float(np.ptp(x)), x[:0]
+    step, pattern = _DISPLACEMENT_STEP * float(np.ptp(x)), x[:0]
     while chosen.size:
         ends = []
         for sign in (1.0, -1.0):

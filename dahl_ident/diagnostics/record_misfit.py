@@ -29,12 +29,12 @@ from dahl_ident.errors import FitError
 from dahl_ident.problem.record_noise import in_band
 from dahl_ident.problem.record_problem import RecordProblem
 
-_FALSE_ALARM = 1e-3  # of all functions together; wrong laws are far more significant
+_FUNCTION_BY_CHANCE = 1e-3  # of all functions together; wrong laws are far more significant
 _SEEN = 0.01  # part of a function that the parameters do not explain, above which it counts
-_LEVELS = np.linspace(-1.0, 1.0, 7)  # of the friction force in the direction of motion
+_FRICTION_LEVELS = np.linspace(-1.0, 1.0, 7)  # of the friction force in the direction of motion
 _SPEEDS = 2.0 ** np.arange(1, 4)  # highest speed over the speeds of decaying functions
 _BLOCKS = 60  # of all records, between which the noise may differ: far more than functions
-_STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
+_FORCE_STEP = 1e-3  # of the drive, for the motion's derivatives with respect to a force
 FRICTION, VELOCITY, DISPLACEMENT = "the friction force", "the velocity", "the displacement"
 REMEDY = {
     FRICTION: ("", "fit another friction law"),
@@ -99,7 +99,7 @@ def motion_misfit(
         square = float(fitted @ np.linalg.solve(by_noise, fitted))
         expected = Q.shape[1] * max(_between_blocks(Q, remaining, blocks, by_noise), 1.0)
         chance = special.fdtrc(Q.shape[1], dof, square / expected)
-        if not chance < _FALSE_ALARM / len(unexplained):
+        if not chance < _FUNCTION_BY_CHANCE / len(unexplained):
             continue
         along = Q.T @ waves[name]
         unit = float(np.trace(np.linalg.solve(by_noise, along @ along.T)))
@@ -154,7 +154,7 @@ def _functions(fit: LinearFit, number: int) -> dict[str, FloatArray]:
         x = x if problem.paths is None else problem.paths[number]
         return _forces(problem, values, x, v if v.size else np.gradient(x, record.time))
     plain = fit.outputs[number]
-    step = _STEP * float(problem.unit_sizes(FORCE)[number])
+    step = _FORCE_STEP * float(problem.unit_sizes(FORCE)[number])
 
     def moved(force: FloatArray) -> FloatArray:
         driven = problem.driven_more({number: step * force})
@@ -190,8 +190,8 @@ def _forces(
     lengths = {min(length, farthest) for length in lengths if length > 0.0} or {farthest}
     ahead = heading * friction / (np.abs(friction).max() or 1.0)
     speed, position = v / (np.abs(v).max() or 1.0), (x - x.mean()) / (np.ptp(x) or 1.0)
-    width = _LEVELS[1] - _LEVELS[0]
-    levels = np.maximum(1.0 - np.abs(ahead[:, None] - _LEVELS) / width, 0.0)
+    width = _FRICTION_LEVELS[1] - _FRICTION_LEVELS[0]
+    levels = np.maximum(1.0 - np.abs(ahead[:, None] - _FRICTION_LEVELS) / width, 0.0)
     limits = ahead[:, None] * np.exp(-((speed[:, None] * _SPEEDS) ** 2))
 
     def decaying(slopes: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 BLOCKS = 20
 """Number of blocks of all records together, from which the model error is estimated."""
-_LEVEL = 0.9995  # confidence at which scatter between blocks exceeds the noise
+_SCATTER_CONFIDENCE = 0.9995  # confidence at which scatter between blocks exceeds the noise
 _RUNS_LEVEL = 0.95  # the same between records: rather counted too often than too seldom
 _LONG = 0.05  # step of an exponent's logarithm, above which the model is not linear
 _CONTRADICTED = 3.3  # standard deviations: once in 1000 by chance
@@ -73,7 +73,7 @@ class LinearFit:
         if sum(e.size for e in self.residuals) < BLOCKS * BLOCKS:
             return None
         blocks = [[block] for block in blocks_of(self.residuals)]
-        return _between(self, blocks, self.by_noise[0], _LEVEL)
+        return _between(self, blocks, self.by_noise[0], _SCATTER_CONFIDENCE)
 
     @cached_property
     def inverse(self) -> FloatArray:

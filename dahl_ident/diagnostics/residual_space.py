@@ -30,7 +30,7 @@ from dahl_ident.fitting import Optimum
 from dahl_ident.fitting.losses import loss_named
 from dahl_ident.problem import TableProblem
 
-_STEPS = 2  # of Gauss-Newton, from the linear mixed model's deviations of runs
+_RUN_STEPS = 2  # of Gauss-Newton, from the linear mixed model's deviations of runs
 _RANK = 1e-9  # singular value of the Jacobian, over the largest, that counts as zero
 _GAUSSIAN = 1e12  # degrees of freedom beyond which Student's t is the normal distribution
 _NOTHING = 1e-100  # length of a column that counts as zero
@@ -97,7 +97,7 @@ def run_deviations(
     labels, scatters = np.unique(np.asarray(problem.data.run)), spread > 0.0
     unit, b = spread[scatters], effects.copy()
     centre = np.append(mean, [0.0, 0.0])
-    for _ in range(_STEPS):
+    for _ in range(_RUN_STEPS):
         near = Linearization(problem, estimate.theta, RunDeviations(labels, centre + b, scatters))
         if not (np.isfinite(near.residuals).all() and np.isfinite(near.J).all()):
             return None

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from dahl_ident.arrays import TINY
 from dahl_ident.bayes.row_errors import RowErrors
 from dahl_ident.diagnostics.contributions import NOISE, RUNS
 from dahl_ident.diagnostics.error_model import ErrorModel
 
-_SAME = 1e-6  # relative rise of the noise's variance up to which it is as stated
+_AS_STATED = 1e-6  # relative rise of the noise's variance up to which it is as stated
 
 
 def row_errors(errors: ErrorModel) -> RowErrors | None:
     """Return the residuals' covariance from all sources; None if rows are independent."""
     problem, estimate, m = errors.problem, errors.estimate, errors.problem.n_residuals
-    as_stated = not estimate.problem.has_misfit and (errors.noises < 1.0 + _SAME).all()
+    as_stated = not estimate.problem.has_misfit and (errors.noises < 1.0 + _AS_STATED).all()
     if not errors.sources and (as_stated or not problem.scale_known):
         return None
     counted = tuple(dict.fromkeys((NOISE, *(s.name for s in errors.sources))))
@@ -70,7 +71,7 @@ def _dof_and_share(errors: ErrorModel) -> tuple[float, float]:
     """
     names = {s.name for s in errors.sources if s.name != NOISE}
     shared = sum((np.diagonal(errors.contributions[n]) for n in names), np.zeros(len(errors.names)))
-    shares = shared / np.maximum(np.diagonal(errors.covariance), np.finfo(float).tiny)
+    shares = shared / np.maximum(np.diagonal(errors.covariance), TINY)
     shares[[errors.names.index(name) for name in errors.assumed]] = 0.0
     largest = int(np.argmax(shares))
     return errors.dof(np.eye(len(shares))[largest]), float(shares[largest])

@@ -32,7 +32,7 @@ _BELOW = 100.0  # smallest amplitude over the smallest slip displacement, where 
 _SMOOTHING = 10.0 ** np.arange(1.0, -6.5, -0.5)  # tried in this order, the smoothest first
 _ALLOWED = 1.05  # misfit of a smooth density over the least misfit
 _FEWEST_ROWS = 6  # for which a misfit is informative
-_EXACT = 1e-4  # misfit that is rounding
+_NO_MISFIT = 1e-4  # misfit that is rounding
 FAR_LESS = 0.5  # of a model's misfit, below which another law is far better
 
 
@@ -118,7 +118,7 @@ def slip_density(data: FrequencyResponse, parallel: Element | None = None) -> Sl
         (
             pair
             for s in _SMOOTHING
-            if (pair := _solved(system, s))[1] <= max(_ALLOWED * least, _EXACT)
+            if (pair := _solved(system, s))[1] <= max(_ALLOWED * least, _NO_MISFIT)
         ),
         _solved(system, 0.0),
     )

@@ -38,12 +38,12 @@ _FEWEST_ROWS = 3  # in a band
 LEAST_DOF = 6  # least degrees of freedom of a test of residuals of unknown scale
 _DEGREES = {"amplitude": 3, "drive": 3, "frequency": 2}
 _FEWEST_IN_A_GROUP = 3  # rows on average
-_SAME = 0.01  # of the covariate's logarithm: closer values are equal
+_SAME_COVARIATE = 0.01  # of the covariate's logarithm: closer values are equal
 LEAST_RANGE = np.log(1.05)  # of the logarithm of a covariate that varies
 _LEAST_DOF_PER_COLUMN = 3  # for each shape; with fewer, tests detect little
 _FEWEST_SIGNS = 10  # of each sign on average, for a normal number of runs
 _STEEPEST = np.log(10.0)  # largest change of a logarithm that is stated as a number
-_FARTHEST = 9.0  # the same of a relative departure
+_LARGEST_DEPARTURE = 9.0  # the same of a relative departure
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Trend:
     @property
     def _departure(self) -> str:
         size = "more than tenfold"
-        if self.largest < _FARTHEST:
+        if self.largest < _LARGEST_DEPARTURE:
             size = f"by up to {percent(self.largest)}"
         return f"the data depart from the model {size}"
 
@@ -238,7 +238,7 @@ def trends(optimum: Optimum, space: ResidualSpace) -> list[Trend]:
     friction, relative = _friction_parts(optimum), RelativeSpace(optimum)
     for name, values, unit in covariates(optimum):
         x = np.log(values)
-        distinct = 1 + int((np.diff(np.sort(x)) > _SAME).sum())
+        distinct = 1 + int((np.diff(np.sort(x)) > _SAME_COVARIATE).sum())
         degree = min(_DEGREES[name], distinct - 1, space.dof // (2 * _LEAST_DOF_PER_COLUMN))
         if degree < 1:
             continue

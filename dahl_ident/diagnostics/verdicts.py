@@ -59,7 +59,7 @@ _BY_PRIOR = 0.7  # u over that of the prior, above which the prior has more info
 _NO_DIFFERENCE = 1.0  # of -2 ln L, between two values that are equally likely
 _DIFFERENT = 9.0  # of -2 ln L, to first order: parameters that differ by 3 u
 _MOST_EXCHANGED = 6  # parameters exchanged at once, in pairs
-_EVEN = "measure the mean force or even harmonics too"
+_MEASURE_EVEN = "measure the mean force or even harmonics too"
 _VECTOR_PART = 0.05  # component of the undetermined direction worth naming
 
 
@@ -326,7 +326,7 @@ def _ambiguous(optimum: Optimum) -> dict[str, str]:
         if not problem.parameters[i].positive and abs(theta[i]) > error[i] and alike(mirrored):
             reasons[names[i]] = (
                 f"its size is {shown(i, abs(float(optimum.values[i])))}, its sign is not "
-                f"determined: the fundamental is the same for either; {_EVEN}"
+                f"determined: the fundamental is the same for either; {_MEASURE_EVEN}"
             )
     for order in _exchanges(optimum):
         move = theta[order] - theta
@@ -337,7 +337,7 @@ def _ambiguous(optimum: Optimum) -> dict[str, str]:
                 either = " or ".join(shown(k, float(optimum.values[k])) for k in (i, j))
                 reasons[names[i]] = (
                     f"either {either}, as {names[i]} and {names[j]} are exchangeable: these data "
-                    f"are the same for either order; {_EVEN}"
+                    f"are the same for either order; {_MEASURE_EVEN}"
                 )
             break
     return reasons

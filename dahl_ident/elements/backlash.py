@@ -32,7 +32,7 @@ from dahl_ident.errors import ModelError
 if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
-_CLOSED = 1e-9  # gap over the smallest amplitude, in the limit of no gap
+_CLOSED_GAP = 1e-9  # gap over the smallest amplitude, in the limit of no gap
 _NARROWEST = 1e-9  # gap over the path: the crossing of a narrower gap is not resolved
 
 
@@ -182,7 +182,7 @@ class Backlash(Friction):
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
         """Return the limits of the element, and that without a gap."""
-        closed = Asymptote("no_gap", "no gap", {"gap": _CLOSED * low}, None, {"gap": 0.0})
+        closed = Asymptote("no_gap", "no gap", {"gap": _CLOSED_GAP * low}, None, {"gap": 0.0})
         return (*self.element.asymptotes(low, high), closed)
 
     def combinations(self) -> tuple[Combination, ...]:

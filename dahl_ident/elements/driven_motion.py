@@ -33,7 +33,7 @@ NEUTRAL = 1e-6
 """Deviation from 1, by rounding, of the multiplier of a motion that no spring holds in place."""
 
 _STATES = 24  # random states at which the two directions are compared
-_ALIKE = 1e-9  # relative difference of their rates
+_SAME_RATE = 1e-9  # relative difference of their rates
 
 LINEAR = "the model is linear"
 """The obstacle to an exact motion of a plant whose response is a sine."""
@@ -100,7 +100,7 @@ class Shooting:
         size = (self.system.order + 1, _STATES)
         states = rng.standard_normal(size) * 10.0 ** rng.uniform(-3.0, 3.0, size)
         rates, sums = self._rates(np.vstack([states, np.sign(states[1])]), values)
-        return bool(np.any(np.abs(sums.full()) > _ALIKE * np.abs(rates.full())))
+        return bool(np.any(np.abs(sums.full()) > _SAME_RATE * np.abs(rates.full())))
 
     @cached_property
     def _rates(self) -> Any:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from dahl_ident.engine import Loops
 
 _SMALLEST = 1e-100  # m; smaller amplitudes count as rest
-_FARTHEST = 1e9  # m; a law that has not slipped fully there never does
+_FARTHEST_SLIP = 1e9  # m; a law that has not slipped fully there never does
 _SECTIONS = 16  # of a bracket, in the search for the force at which the slope vanishes
 
 
@@ -212,7 +212,7 @@ class Friction(Element):
     def force_limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the forces of full slip in both directions, N; inf if there is none."""
         shape = np.broadcast_shapes(*(np.shape(v) for v in values))
-        largest = np.broadcast_to(self.rest_stiffness(values) * _FARTHEST, shape)
+        largest = np.broadcast_to(self.rest_stiffness(values) * _FARTHEST_SLIP, shape)
         return self._limit(values, 1.0, largest), self._limit(values, -1.0, largest)
 
     def _limit(self, values: Values, direction: float, largest: FloatArray) -> FloatArray:

@@ -26,8 +26,8 @@ _IS_ODD: dict[Hashable, bool] = {}
 _FIRST_STATES: dict[Hashable, FirstState] = {}
 """The maps from the unknowns at the first sample to the states, by law."""
 
-_EVEN = 0.1  # error of even sampling, over a step of the displacement, up to which it is assumed
-_FINER = 10.0  # times finer than a driven motion, for laws of one state
+_EVEN_SAMPLING = 0.1  # its error, over a step of the displacement, up to which it is assumed
+_FINER_FOR_ONE_STATE = 10.0  # times finer than a driven motion, for laws of one state
 
 
 def system_of(law: Element, values: Sequence[Any], chosen: Sequence[int] = ()) -> System:
@@ -130,7 +130,7 @@ def force_along(
             numbers,
             chosen=chosen or (),
             derivatives=chosen is not None,
-            finer=_FINER if law.n_states == 1 else 1.0,
+            finer=_FINER_FOR_ONE_STATE if law.n_states == 1 else 1.0,
         )
         force = motion.output[rows]
         if chosen is not None:
@@ -168,7 +168,7 @@ def _in_time(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     even_steps = interval * integral
     size = np.abs(even_steps)
     intervals = np.full(steps.shape, interval)
-    fits = np.all(np.abs(steps - even_steps) <= _EVEN * (size + 0.1 * size.max()))
+    fits = np.all(np.abs(steps - even_steps) <= _EVEN_SAMPLING * (size + 0.1 * size.max()))
     if not (interval > 0.0 and fits):
         with np.errstate(all="ignore"):
             intervals = np.asarray(2.0 * steps / (v[1:] + v[:-1]))

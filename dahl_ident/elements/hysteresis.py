@@ -22,7 +22,7 @@ from dahl_ident.elements.facts import HistoryGradient
 from dahl_ident.elements.general_dahl import turning_force
 from dahl_ident.elements.recursion import linear_recursion, stretches
 
-_TINY = 1e-300  # stands for a margin of 0, which has no negative power
+_NO_MARGIN = 1e-300  # stands for a margin of 0, which has no negative power
 _HUGE = 1e300  # longer than any path, and small enough to be scaled without overflow
 
 
@@ -108,7 +108,7 @@ def _margin_change(margin: FloatArray, path: FloatArray, alpha: float) -> FloatA
     if alpha == 1.0:
         return margin * np.expm1(-path)
     p = 1.0 - alpha
-    fraction = np.maximum(np.abs(margin), _TINY) ** -p
+    fraction = np.maximum(np.abs(margin), _NO_MARGIN) ** -p
     with np.errstate(divide="ignore", over="ignore", under="ignore"):
         fraction *= p * path
         return np.asarray(margin * np.expm1(np.log1p(-np.minimum(fraction, 1.0)) / p))
@@ -132,7 +132,7 @@ def _turning_margins(start: float, legs: FloatArray, alpha: float) -> FloatArray
     z = start
     margins = [z]
     for scaled in (p * legs).tolist():
-        fraction = scaled * (abs(z) or _TINY) ** -p  # a start may be beyond the limit
+        fraction = scaled * (abs(z) or _NO_MARGIN) ** -p  # a start may be beyond the limit
         z = 2.0 - (z + z * expm1(log1p(-fraction) / p)) if fraction < 1.0 else 2.0
         margins.append(z)
     return np.asarray(margins)

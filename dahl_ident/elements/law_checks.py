@@ -30,12 +30,12 @@ _SPREAD = 0.5  # decades to either side of a typical value
 _MAGNITUDES = np.geomspace(1e-12, 1e12, 481)  # N
 _REST = len(_MAGNITUDES)  # index of force 0, after all negative ones
 _FRACTIONS = np.linspace(0.0, 1.0, 201)  # of the largest force in each direction
-_FAR = 1e3  # times the scale: the largest force of a law without full slip
+_LARGEST_FORCE = 1e3  # times the scale: the largest force of a law without full slip
 _EXCEEDED = 1.001  # of the force of full slip, which stages of an integrator may exceed
 _OVERFLOW = 1e6  # times the slope at rest: a law that hardens so far has no full slip
 _ZOOMS = 8  # by 64 each, towards the largest slope; then forces differ by rounding only
 _CHANGED = 0.1  # of the slope at rest: the force at which it has changed so much is the scale
-_ROUNDING = 1e-9  # of the largest slope
+_SLOPE_ROUNDING = 1e-9  # of the largest slope
 _LOOP = 0.98  # of the force of full slip: the largest force of a loop
 _LOOP_WITHOUT_SLIP = 2.94  # times the scale: the same for a law without full slip
 _CREATED = 0.01  # of the work in both directions: energy that integration may create
@@ -351,7 +351,7 @@ class _Trial:
         with np.errstate(invalid="ignore"):
             steepest = np.maximum(np.abs(before), np.abs(after))
             wild = ~(steepest < _OVERFLOW * self._rest_slope) & (scale < _MAGNITUDES)
-        farthest = np.where(wild, _MAGNITUDES, _FAR * scale).min()
+        farthest = np.where(wild, _MAGNITUDES, _LARGEST_FORCE * scale).min()
         return np.asarray(scale * np.expm1(_FRACTIONS * np.log1p(farthest / scale)))
 
     def _peak(
@@ -388,7 +388,7 @@ class _Trial:
                 f"is {self._rest_slope:.4g} N/m {where}; expected a positive slope at rest and "
                 "up to full slip"
             )
-        negative = slopes < -_ROUNDING * np.max(np.abs(slopes))
+        negative = slopes < -_SLOPE_ROUNDING * np.max(np.abs(slopes))
         before_slip = np.flatnonzero(negative & (forces < forces[-1] * (1.0 - 1e-3)))
         if not before_slip.size:
             return ""
@@ -404,7 +404,7 @@ class _Trial:
         limit, slopes, forces = self._limits[side], self._slopes[side], self._forces
         near = (forces > limit) & (forces < 1e3 * limit)
         with np.errstate(invalid="ignore"):
-            smallest = _ROUNDING * self._rest_slope
+            smallest = _SLOPE_ROUNDING * self._rest_slope
             negative = np.flatnonzero(near & (slopes < -smallest))
             later = np.flatnonzero(near & (slopes > smallest))
         negative = negative[negative < later.max(initial=-1)]
@@ -421,7 +421,7 @@ class _Trial:
         """Return the objection to a slope that is the same for all forces and directions."""
         slopes = np.concatenate(self._slopes)
         slopes = slopes[np.isfinite(slopes)]  # forces far beyond full slip may overflow
-        same = slopes.size and np.ptp(slopes) <= _ROUNDING * np.max(np.abs(slopes))
+        same = slopes.size and np.ptp(slopes) <= _SLOPE_ROUNDING * np.max(np.abs(slopes))
         if not (same and self._law.rate_independent):
             return ""
         return (

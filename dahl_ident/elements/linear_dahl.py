@@ -42,7 +42,7 @@ from scipy import fft, special
 
 from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-_BLOCK = 8192
+_AMPLITUDES_AT_ONCE = 8192
 """Amplitudes computed together, so that intermediate arrays stay in the processor's cache."""
 
 _BLOCK_NODES = 65536
@@ -51,7 +51,7 @@ _BLOCK_NODES = 65536
 _SMALL, _LARGE = 0.2, 300.0
 """Below and above these beta the formulas lose digits."""
 
-_TINY = 1e-200
+_SMALLEST_BETA = 1e-200
 """Replaces beta = 0 in quotients, which then give their limits."""
 
 _COTH_DENOMINATORS = (3.0, 5.0, 7.0, 9.0, 11.0)  # below _SMALL the next, 13, changes 2e-16
@@ -71,7 +71,7 @@ def describing_function(beta: FloatArray) -> ComplexArray:
     array([1.      +0.j      , 0.732508+0.303548j])
     """
     flat, h = beta.reshape(-1), np.empty(beta.size, np.complex128)
-    for block in _blocks(beta.size, _BLOCK):
+    for block in _blocks(beta.size, _AMPLITUDES_AT_ONCE):
         b = flat[block]
         tanh, inverse, _, h.real[block] = _bessel_part(b)
         h.imag[block] = _loss(b, _indices(b < _SMALL), inverse, tanh * inverse)
@@ -95,7 +95,7 @@ def describing_function_gradient(
     # one allocation, because three smaller ones may cost fresh pages at every call
     flat, result = beta.reshape(-1), np.empty((3, beta.size), np.complex128)
     real, imag = result.real, result.imag
-    for block in _blocks(beta.size, _BLOCK):
+    for block in _blocks(beta.size, _AMPLITUDES_AT_ONCE):
         b = flat[block]
         small = _indices(b < _SMALL)
         tanh, inverse, i1e, stiffness = _bessel_part(b)
@@ -122,7 +122,7 @@ def _indices(condition: BoolArray) -> IntArray:
 
 def _bessel_part(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return tanh(beta), 1/beta, I_1 exp(-beta) and Re h."""
-    positive = np.maximum(b, _TINY)
+    positive = np.maximum(b, _SMALLEST_BETA)
     tanh = np.tanh(b)
     inverse = 1.0 / positive
     i1e = special.i1e(positive)

@@ -16,7 +16,7 @@ from dahl_ident.elements.facts import Asymptote, Values
 from dahl_ident.elements.friction import Friction
 from dahl_ident.elements.parameter import Parameter
 
-_FAR = 1e12  # factor on the range of speeds: exp(-(v/stribeck_speed)^2) is 0 or 1 to every digit
+_SPEED_RANGE = 1e12  # factor: exp(-(v/stribeck_speed)^2) is 0 or 1 to every digit
 
 
 class LuGre(Friction):
@@ -116,8 +116,8 @@ class LuGre(Friction):
 
     def asymptotes(self, low: float, high: float) -> tuple[Asymptote, ...]:
         """Return the limits 0 and inf of the Stribeck speed, in which the law is linear Dahl."""
-        fast = {"stribeck_speed": low / _FAR}
-        slow = {"stribeck_speed": high * _FAR}
+        fast = {"stribeck_speed": low / _SPEED_RANGE}
+        slow = {"stribeck_speed": high * _SPEED_RANGE}
         static = (("f_max*static_ratio", {"f_max": 1.0, "static_ratio": 1.0}),)
         return (
             Asymptote(

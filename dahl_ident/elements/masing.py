@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from dahl_ident.arrays import ComplexArray, FloatArray, IntArray
+from dahl_ident.arrays import EPS, ComplexArray, FloatArray, IntArray
 from dahl_ident.elements.facts import (
     STEP,
     HistoryGradient,
@@ -41,7 +41,7 @@ from dahl_ident.errors import ModelError
 
 _SERIES = 0.1  # angle below which y - sin(y) loses digits
 _NEARLY_SLIPS = 1.0 - 1e-6
-_DIGITS = 4.0 * float(np.finfo(np.float64).eps)  # of a root
+_ROOT_ROUNDING = 4.0 * EPS  # of a root
 
 
 class Masing(Friction):
@@ -103,7 +103,7 @@ class Masing(Friction):
         def excess(load: float) -> float:
             return float(self.backbone(at, np.asarray(load * full_slip))) - abs(force)
 
-        return float(np.sign(force) * brentq(excess, 0.0, 1.0, xtol=1e-300, rtol=_DIGITS))
+        return float(np.sign(force) * brentq(excess, 0.0, 1.0, xtol=1e-300, rtol=_ROOT_ROUNDING))
 
     def start_bounds(self, values: Values) -> tuple[float, float]:
         """Return the bounds of a load, just below slip: at slip a spring forgets its load."""

@@ -27,10 +27,10 @@ from dahl_ident.engine.radau import (
     restart,
 )
 
-_ITERATIONS = 40  # of shooting; five are typical
+_SHOTS = 40  # of shooting; five are typical
 # Changes of the initial states over the largest states:
 _CONVERGED = 1e-4  # the last cycle corrects the error, which is the square of this
-_FAR = 1.0  # a larger change by Newton's method is replaced by a cycle,
+_LARGEST_CHANGE = 1.0  # a larger change by Newton's method is replaced by a cycle,
 _NEWTON_EVERY = 4  # except every fourth: in a sharp resonance cycles alone take too long
 _AGREED = 1e-3  # a larger change by the last cycle is due to rounding: nothing settles
 _FOLLOWS = 1e-9  # relative difference of two changes by a cycle that count as proportional
@@ -137,7 +137,7 @@ def cycles(
             y[0], y[1] = amplitudes[row], 0.0
         for coarse in (_COARSE, 1.0):  # if coarse steps fail, fine ones may not
             converged[row] = 0
-            for iteration in range(_ITERATIONS):
+            for iteration in range(_SHOTS):
                 w[at.scale : at.scale + n] *= _FADING
                 x, S = y.copy(), np.zeros((n, free + 1))
                 for i in range(free):
@@ -181,7 +181,7 @@ def cycles(
                         largest = max(largest, abs(columns[i, 0]) / w[at.scale + begin + i])
                 for i in range(free):
                     is_forced = largest < np.inf and iteration % _NEWTON_EVERY == _NEWTON_EVERY - 1
-                    if largest <= _FAR or is_forced:
+                    if largest <= _LARGEST_CHANGE or is_forced:
                         y[begin + i] += columns[i, 0]
                     else:
                         y[begin + i] = sign * x[begin + i]

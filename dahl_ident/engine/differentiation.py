@@ -7,7 +7,7 @@ import numpy as np
 from dahl_ident.arrays import FloatArray
 
 _DEGREE = 4  # of the polynomials; that of the acceleration is 2
-_POWER = 0.9999  # share of the velocity's power in the band of the signal
+_POWER_SHARE = 0.9999  # share of the velocity's power in the band of the signal
 _MARGIN = 4.0  # pass band of the filter over that band: at 2 a mass has an error of 2 %
 ABOVE_NOISE = 20.0
 """Power over the median of noise, which noise exceeds in one frequency of a million."""
@@ -54,7 +54,7 @@ def filter_window(samples: FloatArray) -> int:
     upper = power.size // 2
     noise *= np.median(power[upper:] / noise[upper:])
     above = np.flatnonzero(power > ABOVE_NOISE * noise)
-    highest = min(np.searchsorted(np.cumsum(power) / total, _POWER), above.max(initial=0))
+    highest = min(np.searchsorted(np.cumsum(power) / total, _POWER_SHARE), above.max(initial=0))
     band = float(highest + 1) / power.size
     half = int(((_DEGREE + 1.0) / min(1.0, _MARGIN * band) + 4.6) / 3.2)
     return 2 * max(2, min(half, samples.size // 4)) + 1

@@ -8,7 +8,7 @@ from scipy import fft
 from dahl_ident.arrays import FloatArray
 
 _DERIVATIVES = 4  # of a sine with five samples a period the polynomials miss 1e-9
-_BAND = 0.8  # fraction of half the sampling rate above which a smooth extension has little power
+_SMOOTH = 0.8  # fraction of half the sampling rate above which a smooth extension has little power
 
 
 def band_limited(samples: FloatArray, interval: float) -> FloatArray:
@@ -32,7 +32,7 @@ def band_limited(samples: FloatArray, interval: float) -> FloatArray:
     extensions = [samples, np.concatenate([deviation, -deviation[-2:0:-1]])]
     spectra = [fft.rfft(wave) for wave in extensions]
     beyond_band = [
-        float(np.sum(np.abs(spectrum[int(_BAND * spectrum.size) :]) ** 2)) / wave.size**2
+        float(np.sum(np.abs(spectrum[int(_SMOOTH * spectrum.size) :]) ** 2)) / wave.size**2
         for spectrum, wave in zip(spectra, extensions, strict=True)
     ]
     periodic = beyond_band[0] <= beyond_band[1]

@@ -28,9 +28,9 @@ DECADE = 0.1  # a step that ends nearer is checked for a slope that fades
 LEFT = 1e-11  # at a smaller distance the limit counts as reached
 FADED = 0.6  # share of the slope left after such a step, below which it fades
 _BISECTIONS = 60
-_AT_REST = 1e-14  # of the largest velocity: rounding
-_SMALL = 1e-6  # relative change of a state, or of a step, that counts as none
-_REPEATS = 12  # of a step that is shortened to an event; two are typical
+_VELOCITY_ROUNDING = 1e-14  # of the largest velocity: rounding
+_NO_CHANGE = 1e-6  # relative change of a state, or of a step, that counts as none
+_SHORTENINGS = 12  # of a step that is shortened to an event; two are typical
 POSITIONS = np.concatenate(
     [a + (b - a) * np.arange(1, 5) / 4 for a, b in zip([0.0, *NODES[:-1]], NODES, strict=True)]
 )
@@ -107,7 +107,7 @@ def crosses_over(f, signal, t, h, y, e, w, at):
     On the present branch it may stay at zero, as a force does that unloads immediately.
     """
     put_interpolated(y, 1.0, w, at)
-    if e == 0 and (at.held or abs(w[2]) < _AT_REST * w[at.scale + 1]):
+    if e == 0 and (at.held or abs(w[2]) < _VELOCITY_ROUNDING * w[at.scale + 1]):
         return False
     w[at.sides + e] *= -1.0
     evaluate(f, signal, t + h, 1.0, w, at)
@@ -187,7 +187,7 @@ def state_jumps(position, y, w, at):
     put_interpolated(y, position, w, at)
     for r in range(at.n):
         size = max(abs(y[r]), w[at.scale + r])
-        if size > 0.0 and abs(w[1 + r] - y[r]) > _SMALL * size:
+        if size > 0.0 and abs(w[1 + r] - y[r]) > _NO_CHANGE * size:
             return True
     return False
 
@@ -220,7 +220,7 @@ def step_to_event(f, solved, followers, signal, t, h, position, e, y, span, w, a
     shorten(position, w, at)
     row = at.n + e if e else 1
     value, change, near = 0.0, np.inf, NEAR * w[at.scale + row]
-    for _ in range(_REPEATS):
+    for _ in range(_SHORTENINGS):
         if not solve_stages(f, solved, followers, signal, t, length, y, w, at, matrix, columns):
             return 0.0, False
         read_stage(f, solved, followers, 1, STAGES - 1, y, w, at)
@@ -228,14 +228,14 @@ def step_to_event(f, solved, followers, signal, t, h, position, e, y, span, w, a
         if value == 0.0:
             return length, True
         change = -value / slope if slope != 0.0 else np.inf
-        if abs(change) <= max(min(1e-15 * span, _SMALL * length), 1e-12 * length):  # rounding
+        if abs(change) <= max(min(1e-15 * span, _NO_CHANGE * length), 1e-12 * length):  # rounding
             return length, True
         if not 0.0 < length + change <= h:
             break
         change = max(change, -0.5 * length)
         shorten(1.0 + change / length, w, at)
         length += change
-    if abs(value) <= near or abs(change) <= min(LOCATED * span, _SMALL * length):
+    if abs(value) <= near or abs(change) <= min(LOCATED * span, _NO_CHANGE * length):
         return length, True
     return (length if value * w[at.sides + e] > 0.0 else 0.0), False
 

@@ -42,10 +42,10 @@ from dahl_ident.engine.radau import (
 
 _TURNING = 10.0  # factor on errors next to a turning point, where laws are least smooth
 _FAILED = 0.25  # factor on a step whose stages did not converge
-_SMALLEST = 1e-14  # of the span: a shorter step cannot advance the time
+_SMALLEST_STEP = 1e-14  # of the span: a shorter step cannot advance the time
 _DENSE = 1e-2  # factor on the tolerance of a polynomial that is read between its ends
 _DENSE_STEP = _DENSE ** (1.0 / (STAGES + 1))  # factor on the step for that
-_TOGETHER = 1e-8  # of the span: events that are as near to each other may exchange their order
+_SAME_TIME = 1e-8  # of the span: events that are as near to each other may exchange their order
 _NEAREST = 0.005  # rad of a sine, or of an interval: the last step before a turning point
 _MOST, _PER_SAMPLE = 20_000, 200  # steps at most
 _BEYOND_BOUNDS = 1e100  # m/s: far beyond any motion, and its square is still finite
@@ -237,7 +237,7 @@ def advance(
             converged = solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns)
         if not converged:
             step, last = h * _FAILED, 0.0
-            if step < _SMALLEST * span:
+            if step < _SMALLEST_STEP * span:
                 return 0.0
             continue
         error = (
@@ -269,7 +269,7 @@ def advance(
             h, at_event = step_to_event(
                 f, solved, followers, signal, t, h, where, which, y, span, w, at, matrix, columns
             )
-            if h <= 0.0 or (h > _TOGETHER * span and passed_another(which, w, at)):
+            if h <= 0.0 or (h > _SAME_TIME * span and passed_another(which, w, at)):
                 step, last = 0.5 * where * full, 0.0
                 continue
             error = (

@@ -44,17 +44,17 @@ _NEWTON = 15  # iterations of the stages
 _SOLVED = 1e-7  # last relative change of the stages, whose error is rounding: its square
 _LOCATED = 1e-14  # rad: shorter steps count as zero
 _MOST = 500  # steps of a half cycle, in addition to those for the highest harmonic
-_ITERATIONS = 60  # of shooting with coarse steps; one is typical, three without a guess
+_SHOTS = 60  # of shooting with coarse steps; one is typical, three without a guess
 # Changes of the initial force over the largest force:
 _CONVERGED = 1e-5  # with coarse steps; the error is its square
-_CLOSE = 1e-7  # in the last pass: derivatives have errors of this size
-_PREDICTED = 1e-6  # second-order part of a guess whose error is below _CLOSE
+_LAST_PASS = 1e-7  # in the last pass: derivatives have errors of this size
+_PREDICTED = 1e-6  # second-order part of a guess whose error is below _LAST_PASS
 _AGREED = 1e-3  # a larger change by the last pass means that nothing settles
 _COARSE = 10.0  # errors of steps while shooting, over those of the last pass
 _SHORTEST = 12.0  # least number of steps in a cycle of the highest harmonic
 _FLOOR = 1e-6  # of the largest force: smaller local forces are no scale for errors
 _BEYOND_BOUNDS = 1e200  # N: far beyond any force
-_FIRST = 0.05  # rad, guess of the first step after a turning point
+_FIRST_STEP = 0.05  # rad, guess of the first step after a turning point
 _EXPANDS = 3.0  # largest ln of a step's growth; steps controlled by the error grow less
 _PASSES = 4  # with fine steps, if coarse ones ended elsewhere; one is typical
 _REPEATS, _BISECTIONS = 8, 60  # of a step that ends at an event; two are typical
@@ -523,7 +523,7 @@ def _settle(f, y, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, l
     for last_pass in (False, True):
         if sure and not last_pass:
             continue
-        for _ in range(_PASSES if last_pass else _ITERATIONS):
+        for _ in range(_PASSES if last_pass else _SHOTS):
             F = y
             at.S[:] = 0.0
             at.S[0] = 1.0
@@ -548,7 +548,7 @@ def _settle(f, y, sure, halves, sign, gap, chosen, harmonics, sums, tolerance, l
                 steps[half] = first
             excess, one_minus_map = sign * F - y, 1.0 - sign * at.S[0]
             change = excess / one_minus_map if one_minus_map != 0.0 else np.inf
-            near = abs(change) <= (_CLOSE if last_pass else _CONVERGED) * at.numbers[3]
+            near = abs(change) <= (_LAST_PASS if last_pass else _CONVERGED) * at.numbers[3]
             if near and last_pass:
                 return True, y, change, one_minus_map
             start, y = y, y + (change if abs(change) < np.inf else excess)
@@ -616,7 +616,7 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
         highest = max(highest, float(h))
     longest = 2.0 * np.pi / (_SHORTEST * highest)
     sign, halves = (-1.0, 1) if odd else (1.0, 2)
-    steps, last, rise, older, older_rise = np.full(2, _FIRST), -1, 0.0, 0.0, 0.0
+    steps, last, rise, older, older_rise = np.full(2, _FIRST_STEP), -1, 0.0, 0.0, 0.0
     for row in range(rows):
         amplitude, gap = amplitudes[row], parameters[row, P] if gaps else 0.0
         if 2.0 * amplitude <= gap:
@@ -651,7 +651,7 @@ def loops(f, sizes, odd, gaps, amplitudes, omegas, parameters, chosen, harmonics
         else:
             last = -1
         if not settles:
-            steps[:] = _FIRST
+            steps[:] = _FIRST_STEP
             settles, y, change, one_minus_map = _settle(
                 f,
                 0.0,

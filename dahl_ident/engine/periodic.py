@@ -16,7 +16,7 @@ from dahl_ident.arrays import BoolArray, ComplexArray, FloatArray
 from dahl_ident.engine.motion import settled
 from dahl_ident.engine.translate import System
 
-_FINER = 10.0  # factor: coarse steps may pass over two turning points that are close together
+_FINER_STEPS = 10.0  # factor: coarse steps may pass over two turning points that are close together
 _LONG = 30  # cycles in which a motion leaves an unstable branch for a stable one
 # runs of cycles without Newton's method, and cycles of each, more than the kernel computes
 _LONG_RUNS, _ALL_CYCLES = 3, 1000
@@ -130,8 +130,8 @@ def steady_motions(
     unstable = np.isfinite(result.multiplier)
     failed = possible & ~result.found & ~unstable
     # a search passes values at which nothing settles; then only a few rows are worth the time
-    if must_be_stable or np.all(parameters == parameters[0]) or _FINER * failed.sum() <= rows:
-        solve(failed, finer=_FINER)
+    if must_be_stable or np.all(parameters == parameters[0]) or _FINER_STEPS * failed.sum() <= rows:
+        solve(failed, finer=_FINER_STEPS)
     solve(possible & ~result.found & unstable, None, _LONG)
     if must_be_stable and system.odd:
         unstable = np.isfinite(result.multiplier)

@@ -30,10 +30,10 @@ from dahl_ident.arrays import FloatArray
 
 STAGES = 5
 SHRINK, GROW, SAFETY = 0.1, 6.0, 0.8  # limits and safety of the factor to the next step
-_ITERATIONS = 20  # of the stages; two of Newton's method are typical
+_STAGE_ITERATIONS = 20  # of the stages; two of Newton's method are typical
 # Relative changes of the stages in an iteration:
 _NEAR, _FAST = 1e-2, 0.2  # largest first one of fixed-point iterations, and largest ratio of two
-_EXACT = 1e-11  # last one of fixed-point iterations, whose error is a tenth of it
+_FIXED_POINT = 1e-11  # last one of fixed-point iterations, whose error is a tenth of it
 _SOLVED = 1e-7  # last one of Newton's method, whose error is rounding: its square
 _HARDLY = 1e-6  # of the displacement: a smaller follower is no scale for errors
 _PIVOT = 0.1  # of the largest number in a row: a smaller diagonal is not a pivot
@@ -455,7 +455,7 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
     keep_signal(signal, t, h, w, at)
     complete_stages(followers, h, y, w, at)
     newton, before = w[at.stiff] > 0.0, _NEAR / _FAST
-    for count in range(_ITERATIONS):
+    for count in range(_STAGE_ITERATIONS):
         for i in range(STAGES):
             read_stage(f, solved, followers, 1 if newton else 0, i, y, w, at)
         if R == 0:
@@ -491,7 +491,7 @@ def solve_stages(f, solved, followers, signal, t, h, y, w, at, matrix, columns):
             for a in range(R):
                 w[z + i * n + solved[a]] += columns[i * R + a, 0]
         complete_stages(followers, h, y, w, at)
-        done = largest < (_SOLVED if newton else _EXACT)
+        done = largest < (_SOLVED if newton else _FIXED_POINT)
         for e in range(at.k if done and newton else 0):  # laws are least linear next to a switch
             size = w[at.scale + n + 1 + e]
             for i in range(STAGES):

@@ -160,7 +160,7 @@ _ODD = (
     ca.OP_ATANH,
     ca.OP_ERF,
 )
-_EVEN = (ca.OP_COS, ca.OP_COSH)
+_EVEN_FUNCTIONS = (ca.OP_COS, ca.OP_COSH)
 
 
 def _factors(equations: Equations, states: Sequence[float], others: float) -> list[float]:
@@ -217,7 +217,7 @@ def _factors(equations: Equations, states: Sequence[float], others: float) -> li
                 factor = a
             elif (
                 (code in (ca.OP_LT, ca.OP_LE) and common > 0.0)
-                or (code in _EVEN and a == -1.0)
+                or (code in _EVEN_FUNCTIONS and a == -1.0)
                 or all(factor in (0.0, 1.0) for factor in factors)
             ):
                 factor = 1.0

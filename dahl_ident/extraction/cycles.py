@@ -27,8 +27,8 @@ from dahl_ident.arrays import TINY, BoolArray, ComplexArray, FloatArray, IntArra
 _THRESHOLD = 0.3  # fraction of the amplitude that half a cycle exceeds; noise may be a tenth
 _QUANTILES = (0.995, 0.9, 0.7)  # that give the amplitude, tried in turn: a few peaks may be large
 _QUIET = 1.5  # half cycles; a longer time within the threshold may hold another level
-_FEWEST_SAMPLES = 16  # a shorter quiet part is not searched for cycles
-_ALIKE = 0.1  # of one sine: largest relative difference of periods, and phase error in cycles
+_SHORTEST_PART = 16  # a shorter quiet part is not searched for cycles
+_ONE_SINE = 0.1  # of one sine: largest relative difference of periods, and phase error in cycles
 _MOST_BRIDGED = 10.0  # cycles; a longer pause ends a sine
 _MOST_NESTED = 12  # quiet parts within quiet parts, each below _THRESHOLD of the last: 5e-7 in all
 _QUANTILE_SAMPLES = 50_000  # samples at most from which the quantiles are computed
@@ -37,7 +37,7 @@ _NOISIEST_CUT = 0.05  # largest noise of the log amplitude of a cycle whose freq
 _FEWEST_CUTS = 3  # cycles that must remain; fewer do not show whether the level is constant
 _NOISIEST_CROSSING = 0.1  # largest noise of the log amplitude of a cycle between two crossings
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)  # its multiples are spread most evenly
-_TOGETHER = 100_000  # samples computed at once, so that intermediate arrays stay in the cache
+_SAMPLES_AT_ONCE = 100_000  # computed together, so that intermediate arrays stay in the cache
 _GAP = 1.0 / 3.0  # fraction of a cycle without samples that makes its amplitude unknown
 Mode = Literal["auto", "steps", "sweep"]
 MODES: tuple[Mode, ...] = ("auto", "steps", "sweep")
@@ -45,13 +45,13 @@ AMPLITUDE_TOLERANCE = 0.02  # of log amplitude within a plateau; steps of level 
 FREQUENCY_TOLERANCE = 0.01  # of log frequency within a plateau
 _UNSTEADY = 5.0  # factor by which tolerances widen for groups of cycles whose drive varies
 _NOISE_FACTOR = 6.0  # least tolerance in standard deviations, so that noise splits no plateau
-_WIDEST = 0.3  # largest tolerance, however large the noise
+_LARGEST_TOLERANCE = 0.3  # largest tolerance, however large the noise
 _LEAST_NOISE = 1e-12  # least noise of a log amplitude: its inverse square, a weight, stays finite
 _NOISIEST = 0.2  # noise of a cycle's log amplitude above which it is not a cycle
 _EDGE_TOLERANCE = 0.005  # relative; cycles at the ends of a plateau that differ more are left out
 _MOSTLY_HELD = 0.5  # least share of the cycles in plateaus; with less, the record is a sweep
 _CLEARLY_MORE = 1.5  # groups replace plateaus if they hold this many times as many cycles
-_SLOW = 0.005  # largest change of log amplitude per cycle that friction follows without lag
+_SLOW_CHANGE = 0.005  # largest change of log amplitude per cycle that friction follows without lag
 _SCATTERED = 4.0  # largest trend, in standard deviations about a line, that may be scatter
 _SWEEP_RANGE = 0.2  # least change of log amplitude or frequency over a whole sweep
 _SWEEP_STEP = 0.2  # largest change of log amplitude or frequency from cycle to cycle of a sweep
@@ -115,7 +115,7 @@ class Cycles:
         n = len(self)
         line = np.polyfit(np.arange(n), a, 1)
         scatter = float(np.std(a - np.polyval(line, np.arange(n)), ddof=min(2, n - 1)))
-        return self.trending and abs(_change(a)) > max(_SLOW * n, _SCATTERED * scatter)
+        return self.trending and abs(_change(a)) > max(_SLOW_CHANGE * n, _SCATTERED * scatter)
 
     def span(self, *, sweep: bool = False) -> Span:
         """Return the time span of the cycles, and their mean frequency."""
@@ -163,8 +163,8 @@ def _joined(runs: list[FloatArray]) -> list[FloatArray]:
             period, next_period = last[-1] - last[-2], edges[1] - edges[0]
             pause = (edges[0] - last[-1]) / period
             whole = round(pause)
-            alike = abs(next_period / period - 1.0) < _ALIKE
-            if alike and pause < _MOST_BRIDGED and abs(pause - whole) < _ALIKE:
+            alike = abs(next_period / period - 1.0) < _ONE_SINE
+            if alike and pause < _MOST_BRIDGED and abs(pause - whole) < _ONE_SINE:
                 bridge = np.linspace(last[-1], edges[0], whole + 1)[1:-1]
                 joined[-1] = np.concatenate([last, bridge, edges[0 if whole else 1 :]])
                 continue
@@ -174,7 +174,7 @@ def _joined(runs: list[FloatArray]) -> list[FloatArray]:
 
 def _crossing_runs(time: FloatArray, motion: FloatArray, depth: int) -> list[FloatArray]:
     """Return the rising crossings, split at quiet parts, and those within these parts."""
-    if time.size < _FEWEST_SAMPLES or depth > _MOST_NESTED:
+    if time.size < _SHORTEST_PART or depth > _MOST_NESTED:
         return []
     trials = (_runs_at(time, motion, quantile, depth) for quantile in _QUANTILES)
     return next(filter(None, trials), [])
@@ -190,7 +190,7 @@ def _runs_at(time: FloatArray, motion: FloatArray, quantile: float, depth: int) 
     beyond = np.flatnonzero(np.abs(motion) > threshold)
     above = motion[beyond] > 0.0
     pause = np.diff(beyond) - 1
-    long = np.flatnonzero(pause >= _FEWEST_SAMPLES)
+    long = np.flatnonzero(pause >= _SHORTEST_PART)
     quiet = long[pause[long] > _QUIET * _lobe_spacing(beyond, above, long)]
     breaks = np.concatenate([[0], quiet + 1, [beyond.size]])
     runs: list[FloatArray] = []
@@ -267,7 +267,7 @@ def _measured(time: FloatArray, motion: FloatArray, edges: FloatArray, periods: 
 
 def groups_of_cycles(cuts: IntArray) -> Iterator[tuple[int, int]]:
     """Yield the first cycle, and that after the last, of groups whose samples fit in the cache."""
-    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _TOGETHER), side="right") - 1
+    groups = np.searchsorted(cuts, np.arange(cuts[0], cuts[-1], _SAMPLES_AT_ONCE), side="right") - 1
     yield from pairwise([*np.unique(groups).tolist(), cuts.size - 1])
 
 
@@ -341,7 +341,7 @@ def find_spans(runs: Sequence[Cycles], mode: Mode, fewest: int, window: int | No
 
 def _tolerances(noise: float) -> tuple[float, float]:
     """Return how much log amplitude and log frequency may vary within a plateau."""
-    widened = min(_NOISE_FACTOR * noise, _WIDEST)
+    widened = min(_NOISE_FACTOR * noise, _LARGEST_TOLERANCE)
     return max(AMPLITUDE_TOLERANCE, widened), max(FREQUENCY_TOLERANCE, widened / np.pi)
 
 

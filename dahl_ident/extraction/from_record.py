@@ -48,7 +48,7 @@ from dahl_ident.extraction.sine_fit import (
 from dahl_ident.extraction.transient import MOST_CYCLES, estimate_transient
 from dahl_ident.units import percent
 
-_NEGLIGIBLE = 0.2  # bias over standard error down to which settling cycles are left out
+_NEGLIGIBLE_BIAS = 0.2  # bias over standard error down to which settling cycles are left out
 _TOLERATED = 1.0  # bias over standard error above which a point has not settled
 
 _WELL_COVERED = 0.8  # fraction of the moving time; points that cover more are no coincidence
@@ -177,7 +177,7 @@ def _settling_periods(phasors: Phasors, cycles: int) -> int:
     ratio = phasors.cycles / (cycles - q)
     bias = abs(phasors.bias[0]) * np.exp(-phasors.transient.rate * q) * ratio
     error = np.sqrt(phasors.fundamental[1][0, 0] * ratio)
-    negligible = bias <= _NEGLIGIBLE * error  # if it never is: the least mean square error
+    negligible = bias <= _NEGLIGIBLE_BIAS * error  # if it never is: the least mean square error
     return int(np.argmax(negligible) if negligible.any() else np.argmin(bias**2 + 2.0 * error**2))
 
 

@@ -52,10 +52,10 @@ from dahl_ident.extraction.sine_fit import (
 from dahl_ident.extraction.transient import SIGNIFICANT, Transient
 from dahl_ident.units import percent
 
-_DISTORTED = 0.02  # share of harmonics above which the fundamental misses percents of the loss
+_LOSS_DISTORTED = 0.02  # share of harmonics above which the fundamental misses percents of the loss
 _MOVING_MEAN = 0.02  # drift of the mean over the amplitude, if the force is controlled
 _BEYOND_NOISE = 5.0  # standard errors above which a drift is more than white noise
-_ROUNDING = 1e-9  # least relative standard deviation of a response
+_LEAST_RESPONSE_STD = 1e-9  # least relative standard deviation of a response
 _ALIASED = 0.01  # alias as a fraction of the fundamental above which it is reported
 _RESIDUAL_SAMPLES = 10_000  # most samples from which the residual is computed
 _FEW_STEPS = 10.0  # amplitude in steps of the sensor below which rounding matters
@@ -378,7 +378,7 @@ class Phasors:
         """Return the objections to all rows."""
         objections = []
         N, covariance, _, dof = self.fundamental
-        std = np.hypot(np.sqrt(covariance[1, 1]), _ROUNDING * abs(N))
+        std = np.hypot(np.sqrt(covariance[1, 1]), _LEAST_RESPONSE_STD * abs(N))
         loss = -N.imag if self.settings.of_displacement else N.imag
         if settled and creates_energy(np.asarray(loss), std, np.asarray(dof)):
             objections.append("creates energy: a sign is reversed")
@@ -389,7 +389,7 @@ class Phasors:
             objections.append(f"harmonics alias at {samples:.3g} samples a cycle")
         reference = ("displacement", "force")[self.reference]  # assumed to be a sine
         distorted = quality[f"{reference}_distortion"]
-        if distorted > _DISTORTED:
+        if distorted > _LOSS_DISTORTED:
             objections.append(f"{reference} distorted {percent(distorted)}")
         for name in ("displacement", "force"):
             steps, clipped = quality[f"{name}_steps"], quality[f"{name}_clipped"]

@@ -27,17 +27,17 @@ _STEP_SAMPLES = 20_000  # samples at most from which the sensor's step is estima
 _LONG_GAP = 30.5  # steps; a longer gap between values is not tested for whole steps
 _ON_GRID = 0.1  # largest deviation of the other gaps from whole steps
 _MOSTLY = 0.9  # least fraction of such gaps; with less, the step is too fine to matter
-_SAME = 1e-9  # fraction of the range; values closer together differ only by rounding
+_SAME_VALUE = 1e-9  # fraction of the range; values closer together differ only by rounding
 _RAIL_RUN = 5  # samples in a row at an extreme value that may be clipped
 _CORNER = 3  # samples within which a clipped waveform leaves the rail
 _DEPARTURE = 1e-4  # fraction of the span by which it is then away from the rail
 EVEN = (2, 4, 6, 8)  # the lowest harmonics, which are the largest
 BY_CHANCE = 1e-4  # largest fraction of symmetric points that are called asymmetric
-_LEAST = 1e-3  # fraction of the fundamental; smaller even harmonics do not matter
+_LEAST_HARMONIC = 1e-3  # fraction of the fundamental; smaller even harmonics do not matter
 _CLEAR = 9.0  # least ratio of power to noise of a harmonic used to extrapolate
 _LOWEST_USED = 1.0 / 3.0  # fraction of the fitted orders; lower ones follow other powers
 _FLATTEST, _STEEPEST = 1.0, 3.0  # powers of the order for jumps of the force and its curvature
-_FIRST = 3  # order of the first harmonic of friction after the fundamental
+_FIRST_HARMONIC = 3  # order of the first harmonic of friction after the fundamental
 _LEAST_LEAKAGE = 0.01  # least fraction of an alias in the fundamental that matters
 _FITTED = 5  # fitted parameters: offset, drift, a sine (two) and its frequency
 
@@ -46,7 +46,7 @@ def sensor_step(samples: FloatArray) -> float:
     """Return the sensor's step; 0 if the values do not lie on a grid."""
     values = np.sort(scattered(samples, _STEP_SAMPLES))
     gaps = np.diff(values)
-    gaps = gaps[gaps > _SAME * (values[-1] - values[0])]
+    gaps = gaps[gaps > _SAME_VALUE * (values[-1] - values[0])]
     if gaps.size == 0:
         return 0.0
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
@@ -80,7 +80,7 @@ def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) 
     """
     highest, lowest = float(samples.max()), float(samples.min())
     span = highest - lowest
-    tolerance = max(0.5 * step, _SAME * span)
+    tolerance = max(0.5 * step, _SAME_VALUE * span)
     longest = max(_RAIL_RUN, 1.5 * crest) if noise < 0.5 * step else _RAIL_RUN
     stuck = 0
     for rail, at_rail in (
@@ -99,7 +99,7 @@ def clipped_share(samples: FloatArray, step: float, noise: float, crest: float) 
 
 def crest_samples(amplitude: float, step: float, sample_phase: float) -> float:
     """Return how many samples of a sine lie within one sensor step of its crest."""
-    below = min(max(step / amplitude, _SAME), 2.0)
+    below = min(max(step / amplitude, _SAME_VALUE), 2.0)
     return float(2.0 * np.arccos(1.0 - below) / sample_phase) + 1.0
 
 
@@ -141,7 +141,7 @@ def asymmetry(
     if orders.size == 0:
         return 0.0
     distorted = float(np.sqrt(np.sum(displacement**2)))
-    explained = np.maximum(orders**2 * displacement + distorted, _LEAST)
+    explained = np.maximum(orders**2 * displacement + distorted, _LEAST_HARMONIC)
     excess = np.maximum(np.abs(force) - explained, 0.0) ** 2 / np.maximum(variance, TINY)
     if np.mean(excess) <= fdtri(2 * orders.size, float(np.min(dof)), 1.0 - BY_CHANCE):
         return 0.0
@@ -171,7 +171,7 @@ def has_unmeasured_aliases(fit: SineFit, cycles: int) -> bool:
     """Return whether harmonics alias onto the fundamental while no higher one is fitted."""
     per_cycle = 2.0 * np.pi / fit.segment.sample_phase
     leakage = _leakage(per_cycle, cycles)
-    return not fit.trending and fit.orders < _FIRST and leakage > _LEAST_LEAKAGE
+    return not fit.trending and fit.orders < _FIRST_HARMONIC and leakage > _LEAST_LEAKAGE
 
 
 def _leakage(per_cycle: float, cycles: int) -> float:

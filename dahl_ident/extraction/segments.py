@@ -51,9 +51,9 @@ _EVENLY = 0.5  # largest difference of the drifts in both halves, as a fraction 
 _FEWEST_IN_HALF = 2  # cycles in each half, which show a slope
 _BY_CHANCE = 1e-6  # fraction of segments without a drift in which one is detected
 _PADDED = 16  # spectral lines for each cycle, so that one lies near any peak
-_FEWEST_SAMPLES = 4  # samples in a cycle, one more than sine and offset have parameters
+_SAMPLES_PER_CYCLE = 4  # samples in a cycle, one more than sine and offset have parameters
 _STRAY_BY_CHANCE = 1e-3  # fraction of the cycles of a sine that are called stray
-_NEGLIGIBLE = 1e-4  # fraction of the amplitude that a cycle may stray in any case
+_LEAST_DRIFT = 1e-4  # fraction of the amplitude that a cycle may stray in any case
 _END_CYCLES = 2  # cycles at either end that are not part of the reference ...
 _CYCLES_PER_END_CYCLE = 5  # ... but at most one in this many of all
 _STRAYING = 0.005  # fraction of the amplitude that a further cycle may stray from the sine
@@ -148,7 +148,7 @@ def _refuse_drift(segment: Segment) -> None:
     thinned = segment.thinned()
     cuts = np.searchsorted(thinned.time, _cycle_edges(segment))
     counts = np.diff(cuts)
-    cycle = np.flatnonzero(counts >= _FEWEST_SAMPLES)
+    cycle = np.flatnonzero(counts >= _SAMPLES_PER_CYCLE)
     dof = 2 * cycle.size - 4
     if dof < 1:
         return
@@ -248,7 +248,7 @@ class _Inside:
         fitted = 0.5 * float(np.trace(inverse @ cross @ self.inverse @ cross.T))
         bound = _highest_by_chance(_STRAY_BY_CHANCE, self.dof)
         amplitude = float(np.hypot(*self.coefficients[2:4]))
-        least = 0.5 * time.size * (_NEGLIGIBLE * amplitude) ** 2
+        least = 0.5 * time.size * (_LEAST_DRIFT * amplitude) ** 2
         return bool(explained > max(2.0 * bound * (1.0 + fitted) * self.variance, least))
 
 

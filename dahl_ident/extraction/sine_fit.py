@@ -35,6 +35,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from dahl_ident.arrays import TINY, ComplexArray, FloatArray, IntArray
+from dahl_ident.data.record import EVEN
 from dahl_ident.errors import ExtractionError, argument
 
 FEWEST_CYCLES = 2  # needed to fit offset and drift in addition
@@ -42,11 +43,10 @@ HARMONICS = 9  # least number of fitted harmonics, if the sampling can separate 
 _MOST_HARMONICS = 40  # fitted at most, against leakage if a cycle is not a whole number of samples
 _AFFORDABLE = 4e5  # samples times harmonics; with more samples leakage is less, so fewer suffice
 _NYQUIST_MARGIN = 0.45  # frequency of the highest harmonic over the sampling rate
-_BLOCK = 16384  # samples computed at once, so that their columns stay in the cache
+_SAMPLES_AT_ONCE = 16384  # samples computed at once, so that their columns stay in the cache
 _KEPT = 2_000_000  # entries of the columns up to which they are stored, not computed twice
 _BLOCKS_PER_CYCLE = 64  # averages over such blocks lose 4e-4 of the fundamental
 _MEANS_PER_CYCLE = 256  # averages lose 3e-5 of the fundamental and 0.2 % of the ninth harmonic
-_EVEN = 0.05  # fraction of a step by which samples may deviate from an even grid
 _FEWEST_SAMPLES = 2  # a phase difference needs two samples
 _LARGEST_CONDITION = 1e8  # condition number of normal matrices
 _LEAST_WEIGHT = 1e-6  # least weight of a cycle, as a fraction of the largest
@@ -165,10 +165,10 @@ class Samples:
     def block_size(self, highest_hz: float) -> int:
         """Return the number of samples per block; 1 if they are few per cycle, or uneven."""
         size = int(1.0 / (highest_hz * self.step * _MEANS_PER_CYCLE))
-        for start in range(0, self.time.size if size > 1 else 0, _BLOCK):
-            part = self.time[start : start + _BLOCK]
+        for start in range(0, self.time.size if size > 1 else 0, _SAMPLES_AT_ONCE):
+            part = self.time[start : start + _SAMPLES_AT_ONCE]
             grid = self.time[0] + self.step * np.arange(start, start + part.size)
-            if np.abs(part - grid).max() > _EVEN * self.step:
+            if np.abs(part - grid).max() > EVEN * self.step:
                 return 1
         return max(size, 1)
 
@@ -390,8 +390,8 @@ def column_blocks(
     factors: FloatArray | None = None,
 ) -> Iterator[tuple[slice, FloatArray]]:
     """Yield slices of the samples with their columns."""
-    for start in range(0, theta.size, _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for start in range(0, theta.size, _SAMPLES_AT_ONCE):
+        part = slice(start, start + _SAMPLES_AT_ONCE)
         yield part, columns(theta[part], tau[part], orders, trending, factors)
 
 
@@ -469,8 +469,8 @@ def _line_content(
     theta, residual, counts = _block_sums(fit.segment.theta, residual)
     products = np.zeros((2, len(harmonics), 2, 2, side))
     window = np.zeros(2 * side + 1, dtype=np.complex128)
-    for start in range(0, theta.size, _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for start in range(0, theta.size, _SAMPLES_AT_ONCE):
+        part = slice(start, start + _SAMPLES_AT_ONCE)
         tones = powers(np.exp(-1j / cycles * theta[part]), side)
         window[: side + 1] += tones @ counts[part]
         window[side + 1 :] += tones[1:] @ (counts[part] * tones[side])

@@ -30,7 +30,7 @@ from dahl_ident.extraction.sine_fit import (
 )
 
 SIGNIFICANT = 3.0  # standard deviations at which D_0 differs from zero
-_RATES = np.geomspace(1e-3, 64.0, 29)  # first grid of the rate, 4 beta
+_FIRST_RATES = np.geomspace(1e-3, 64.0, 29)  # first grid of the rate, 4 beta
 _REFINEMENTS = 5  # times that the grid of rates is refined, each time five times finer
 _RATE_SPREAD = 1.0  # standard deviation of ln(rate) about the value derived from the phase
 _FADED = 28.0  # decay constants after which a departure of 1 is 1e-12
@@ -102,7 +102,7 @@ def estimate_transient(
         level = float(np.mean(p * np.abs(content - departure * decaying) ** 2)) / decay.size
         return max(level * float(np.sum(power / p) / np.sum(power)), TINY)
 
-    rates = _RATES
+    rates = _FIRST_RATES
     friction_rates, phases = _friction_phases()
     centre = np.log(np.interp(np.angle(response), phases, friction_rates))
     for _ in range(_REFINEMENTS):
@@ -128,6 +128,6 @@ def _path(theta: FloatArray) -> FloatArray:
 @cache
 def _friction_phases() -> tuple[FloatArray, FloatArray]:
     """Return rates 4 beta of Dahl friction, and the phases of its response."""
-    beta = np.geomspace(_RATES[0] / 4.0, 1e3, 600)
+    beta = np.geomspace(_FIRST_RATES[0] / 4.0, 1e3, 600)
     phase = Dahl(f_max=1.0, sigma=1.0).phase(beta)
     return 4.0 * beta, phase

@@ -55,7 +55,7 @@ _FASTEST = 1e4  # range of rates of either sign in a search, times 1/(smallest a
 _NUMBERS = (1.0 / 250.0, 25.0)
 # lengths in a limit: factors of the largest amplitude, and below the smallest; in slip, the
 # remaining stiffness of a law decreases only with the square root of the length
-_FAR = (1e9, 1e14)
+_LIMIT_LENGTHS = (1e9, 1e14)
 # weight of determined combinations over that of single coordinates, to find phi from theta
 _FIRMLY = 1e3
 
@@ -355,7 +355,7 @@ def _far_out(problem: TableProblem, axes: Directions) -> list[Asymptote]:
             continue
         p, over = direction.parameter, direction.over
         size, rising = direction.sizes(view), direction.dimension[1] > 0
-        above, below = _FAR if direction.dimension[1] >= 0 else _FAR[::-1]
+        above, below = _LIMIT_LENGTHS if direction.dimension[1] >= 0 else _LIMIT_LENGTHS[::-1]
         for far, value in (
             (np.exp(size.max(axis=-1)) * above, np.inf),
             (np.exp(size.min(axis=-1)) / below, 0.0),

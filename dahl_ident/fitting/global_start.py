@@ -40,22 +40,22 @@ from dahl_ident.fitting.directions import Direction, Directions, directions, is_
 from dahl_ident.problem import TableProblem
 from dahl_ident.problem.stiffness import StiffnessData
 
-_STEP = 0.01  # of ln(A/length) in a table, which is read at the nearest step
+_LOG_STEP = 0.01  # of ln(A/length) in a table, which is read at the nearest step
 _LOWEST, _NODES = -3200, 6400  # first step and number of steps of a table: 14 decades either way
-_DECADE = np.log(10.0) / _STEP  # steps in a decade
+_DECADE = np.log(10.0) / _LOG_STEP  # steps in a decade
 # steps between nodes of the grid: four a decade near the data, one a decade farther out
 _FINE, _COARSE = 58, 230
 _FINE_ENDS = (6, 4)  # number of coarse nodes below the fine ones, and above
 _COMPUTED = 10  # steps of a table between computed values, which are interpolated
 _AROUND_KNEE = 1e3  # ratio to the knee beyond which a curve is a power law
 # values tried for a number whose law declares none, by its transform
-_NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
-_LARGEST = 1e150  # weighted stiffness whose square is still a number
+_START_NUMBERS = {"log": (0.25, 0.5, 1.0, 2.0, 4.0), "linear": (-1.0, -0.5, 0.0, 0.5, 1.0)}
+_LARGEST_STIFFNESS = 1e150  # weighted stiffness whose square is still a number
 _DEPENDENT = 1e-12  # part of a column that others do not explain, below which it is rounding
 _MULTIPLES = (1.0, 2.5, 10.0, 100.0)  # several lengths are tried at these times the shortest one
 _MOST_TABLES = 64  # tables kept: 6 MB a harmonic in all, and some seconds to compute
-_LEAST = 4  # amplitudes of a table, for cubic interpolation
-_TOGETHER = 20  # amplitudes computed in one call, until the law overflows
+_LEAST_AMPLITUDES = 4  # amplitudes of a table, for cubic interpolation
+_AMPLITUDES_AT_ONCE = 20  # amplitudes computed in one call, until the law overflows
 _HIGHEST = 3  # highest harmonic in a start; more cost time for little information
 _MOST_COMBINATIONS = 4000  # nodes of all elements together: a limit on memory and time
 _MOST_OF_ONE = 1000  # nodes of one element whose curves are computed node by node
@@ -63,7 +63,7 @@ _MOST_LOOPS = 10_000  # loops integrated for a rate-dependent law: a second or t
 _MOST_ROWS = 20  # rows for which loops are integrated
 _MOST_STARTS = 4  # searches of a table, each of which costs as much as the first
 _HOPELESS = 100.0  # sum of squares over the lowest, above which a node is not a start
-_ALIKE = 0.01  # relative difference of sums of squares within which nodes may be one start
+_ONE_START = 0.01  # relative difference of sums of squares within which nodes may be one start
 
 
 class Starts(NamedTuple):
@@ -441,7 +441,7 @@ def _possible(
 def _numbers(direction: Direction) -> FloatArray:
     """Return the values of a pure number that are nodes."""
     p = direction.parameter
-    values = np.array(p.scan or _NUMBERS[p.transform])
+    values = np.array(p.scan or _START_NUMBERS[p.transform])
     if not p.scan and np.isfinite([p.lower, p.upper]).all() and not p.positive:
         values = p.lower + (p.upper - p.lower) * np.linspace(0.1, 0.9, 5)
     inside = values[(values >= p.lower) & (values <= p.upper)]
@@ -450,12 +450,12 @@ def _numbers(direction: Direction) -> FloatArray:
 
 def _axis(direction: Direction, view: StiffnessData, most: float) -> FloatArray:
     """Return the values of a direction with a unit that are nodes, (..., K)."""
-    position = np.rint(direction.sizes(view) / _STEP).astype(np.intp)
+    position = np.rint(direction.sizes(view) / _LOG_STEP).astype(np.intp)
     low = position.min(axis=-1)
     span = int((position.max(axis=-1) - low).max())
     signed = not is_positive(direction.parameter)
     offsets = _offsets(span, max(6.0, most / (2.0 if signed else 1.0)))
-    values = np.exp((low[..., None] + offsets) * _STEP)
+    values = np.exp((low[..., None] + offsets) * _LOG_STEP)
     if signed:
         values = np.concatenate([-values[..., ::-1], values], axis=-1)
     return np.asarray(values)
@@ -500,7 +500,7 @@ def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curve
         chosen = np.random.default_rng(1).choice(index.shape[1], allowed, replace=False)
         index = index[:, np.sort(chosen)]
     combinations = np.array([a[i] for a, i in zip(axes, index, strict=True)]).T
-    position = np.rint(np.log(view.amplitude) / _STEP).astype(np.intp)
+    position = np.rint(np.log(view.amplitude) / _LOG_STEP).astype(np.intp)
     low = position.min(axis=-1)
     span = int((position.max(axis=-1) - low).max())
     offsets = _offsets(span, max(6.0, most / len(combinations)))
@@ -513,7 +513,7 @@ def _tabulated_curves(d: Directions, view: StiffnessData, most: float) -> _Curve
         axis=-2,
     )
     K = len(combinations)
-    ln_lengths = np.concatenate([ln_length] * K, axis=-1) * _STEP
+    ln_lengths = np.concatenate([ln_length] * K, axis=-1) * _LOG_STEP
     values = {}
     for column, direction in enumerate(ordered):
         unit = np.repeat(combinations[:, column], offsets.size)
@@ -573,12 +573,12 @@ def _computed_table(
     low, high = (float(np.asarray(v)) for v in element.knee(values))
     if not 0.0 < low <= high < np.inf:
         low = high = 1.0
-    first = int(np.log(low / _AROUND_KNEE) / _STEP) // _COMPUTED * _COMPUTED
-    last = int(np.log(high * _AROUND_KNEE) / _STEP)
+    first = int(np.log(low / _AROUND_KNEE) / _LOG_STEP) // _COMPUTED * _COMPUTED
+    last = int(np.log(high * _AROUND_KNEE) / _LOG_STEP)
     coarse = np.arange(max(first, _LOWEST), min(last, _LOWEST + _NODES) + 1, _COMPUTED)
-    x = coarse * _STEP
+    x = coarse * _LOG_STEP
     parts = []
-    for part in np.array_split(x, max(1, x.size // _TOGETHER)):
+    for part in np.array_split(x, max(1, x.size // _AMPLITUDES_AT_ONCE)):
         with np.errstate(all="ignore"):
             parts.append(
                 element.stiffness(
@@ -588,16 +588,16 @@ def _computed_table(
                     np.repeat(orders, part.size),
                 ).reshape(orders.size, -1)
             )
-        if not (np.abs(parts[-1]) < _LARGEST).all():
+        if not (np.abs(parts[-1]) < _LARGEST_STIFFNESS).all():
             break
     Z = np.concatenate(parts, axis=1)
-    fine = np.arange(_LOWEST, _LOWEST + _NODES + 1) * _STEP
-    usable = (np.abs(Z) < _LARGEST).all(axis=0)
+    fine = np.arange(_LOWEST, _LOWEST + _NODES + 1) * _LOG_STEP
+    usable = (np.abs(Z) < _LARGEST_STIFFNESS).all(axis=0)
     count = usable.size if usable.all() else int(usable.argmin())
-    if count < _LEAST:
+    if count < _LEAST_AMPLITUDES:
         return np.full((orders.size, fine.size), np.nan, dtype=np.complex128)
     x, Z, is_cut = x[:count], Z[:, :count], count < x.size
-    table = _interpolated(Z, (np.clip(fine, x[0], x[-1]) - x[0]) / (_COMPUTED * _STEP))
+    table = _interpolated(Z, (np.clip(fine, x[0], x[-1]) - x[0]) / (_COMPUTED * _LOG_STEP))
     for end, near, side in ((0, 1, fine < x[0]), (-1, -2, fine > x[-1])):
         for extended, Y in ((table.real, Z.real), (table.imag, Z.imag)):
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -641,7 +641,7 @@ def _solve_linear(
         else residual[..., None, :][..., :0, :]
     )
     # nodes at which a hardening law overflows are not starts
-    usable = np.asarray((np.abs(columns) < _LARGEST).all(axis=(-2, -1)))
+    usable = np.asarray((np.abs(columns) < _LARGEST_STIFFNESS).all(axis=(-2, -1)))
     if not usable.all():
         columns = np.where(usable[..., None, None], columns, 0.0)
     remaining = _projected(columns, Q[..., None, :, :])
@@ -709,7 +709,7 @@ def _local_minima(cost: FloatArray, *, mixed: bool) -> tuple[IntArray, IntArray]
     table, node = table[order], node[order]
     if mixed:
         costs, alike = flat[table, node], np.zeros(table.size, dtype=np.bool_)
-        alike[1:] = (np.diff(table) == 0) & (costs[1:] <= (1.0 + _ALIKE) * costs[:-1])
+        alike[1:] = (np.diff(table) == 0) & (costs[1:] <= (1.0 + _ONE_START) * costs[:-1])
         alike &= (np.bincount(table[~alike], minlength=S) > 1)[table]
         table, node = table[~alike], node[~alike]
     first = np.searchsorted(table, table)

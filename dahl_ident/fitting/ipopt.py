@@ -61,10 +61,10 @@ _ITERATIONS = 300  # IPOPT takes ten to thirty steps; a search that needs more d
 # least rms residual over the largest change by a parameter, for the units of data without noise
 _LEAST_RESIDUAL = 1e-4
 _ACTIVE = 1e-6  # distance, in units of the step, at which an inequality holds with equality
-_STEP = 1e-4  # of ln p, for differences of gradients
+_LN_STEP = 1e-4  # of ln p, for differences of gradients
 _MOST_STARTS = 6  # of the global grid and the user
 _FACTORS = (1.0, 0.01, 100.0)  # of the data's sizes, from which constraints alone are satisfied
-_SMALL = 1e-6  # weight of the distance from there
+_PROXIMITY = 1e-6  # weight of the distance from there
 _SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 _INFEASIBLE = "Infeasible_Problem_Detected"
 _SILENT: dict[str, Any] = {
@@ -160,7 +160,7 @@ class Relations:
             unit = np.where(problem.space.positive, 1.0, factor * sizes)
             xi = ca.SX.sym("xi", start.size)
             relations = self.at(problem, ca.DM(start) + ca.DM(unit) * xi)
-            nlp = {"x": xi, "f": _SMALL * ca.sumsqr(xi), "g": relations}
+            nlp = {"x": xi, "f": _PROXIMITY * ca.sumsqr(xi), "g": relations}
             solver = ca.nlpsol("ipopt", "ipopt", nlp, _SILENT)
             least = np.where(self.equal, 0.0, -np.inf)
             bounds = {"lbx": (low - start) / unit, "ubx": (high - start) / unit}
@@ -390,7 +390,7 @@ class _Descent:
         largest = np.max(slope * np.where(problem.space.positive, 1.0, np.abs(start)))
         residual = max(float(np.sqrt(2.0 * at.cost / m)), _LEAST_RESIDUAL * float(largest))
         rounding = float(problem.rounding) / self.scale / residual
-        step = _STEP * np.where(problem.space.positive, 1.0, largest / slope) * slope / residual
+        step = _LN_STEP * np.where(problem.space.positive, 1.0, largest / slope) * slope / residual
         return residual / slope, 0.5 / (m * residual**2), max(_TOLERANCE, rounding), step
 
     def optimum(self, end: _End, begin: Optimum) -> Optimum:

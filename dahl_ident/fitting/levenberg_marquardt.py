@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dahl_ident.arrays import BoolArray, FloatArray, IntArray
+from dahl_ident.arrays import EPS, BoolArray, FloatArray, IntArray
 from dahl_ident.fitting.losses import Loss
 from dahl_ident.noise import bend
 from dahl_ident.problem import EXPLICIT, Problem, Quadratic
@@ -36,27 +36,26 @@ Bounds = tuple[FloatArray, FloatArray]
 Fall = Callable[[FloatArray], FloatArray | float]
 """Negligible falls of costs (S,)."""
 
-_EPS = float(np.finfo(np.float64).eps)  # distance from 1 to the next number
 _FIRST_DAMPING = 1e-9  # lambda at first, almost zero for a Gauss-Newton step
 _GAUSS_NEWTON = 1e-3  # lambda above which a short step does not show convergence
 _MOST_DAMPING = 1e12  # lambda above which the search has failed
-_ROUNDING = 1e-12  # rounding errors of a scaled Hessian, some thousand times _EPS
+_ROUNDING = 1e-12  # rounding errors of a scaled Hessian, some thousand times EPS
 _EASING = 0.2  # factor on lambda, at least, after a step that lowers the cost as predicted
 _LONGEST_STEP = 2.0  # of a logarithm: a factor of 7, up to which the cost may be quadratic
 # length of a step, over the residuals' standard deviation, at which a search has converged
 _NOISE_TOLERANCE = 1e-8
 # longest last step of a logarithm, as the Hessian returned is that before this step
 _LAST_STEP = 1e-6
-_ALIKE = 0.9  # squared cosine between two steps of a geometric series
+_GEOMETRIC = 0.9  # squared cosine between two steps of a geometric series
 _SLOWEST = 0.99  # largest ratio of the series: a hundred steps at once
 # change of the residuals, over their size, by a coordinate from bound to bound, below which it has
 # no effect and is kept fixed
 _FLAT = 1e-3
-_NEAR = 0.01  # longest last step over the distance between the bounds
-_UNSEEN = 4.0 * _EPS  # relative change of a cost that may be rounding
+_NEARLY_STILL = 0.01  # longest last step over the distance between the bounds
+_UNSEEN = 4.0 * EPS  # relative change of a cost that may be rounding
 _OF_ACCURACY = 0.3  # the same over the accuracy of predictions, if these are inaccurate
 _OVERTIME = 2.0  # steps of a higher search over those of a converged one, after which it ends
-# relative changes of cost, step and slope at which scipy's searches end: a few hundred times _EPS
+# relative changes of cost, step and slope at which scipy's searches end: a few hundred times EPS
 _OF_COST, _OF_STEP, _OF_SLOPE = 1e-13, 1e-10, 1e-14
 _EVALUATIONS = 300  # most evaluations of scipy's search, which needs about thirty
 NEARLY = 1e-4  # relative difference of costs within which a search that has converged is preferred
@@ -210,12 +209,12 @@ def minimise(
         step, moves, predicted, longest = _step(at, damping, logarithmic, bounds, restraint)
         shortest = tolerance_factor**2 * _tolerance(at, logarithmic, n_residuals, accuracy)
         settled = moves * np.minimum(1.0, moves / last) <= shortest
-        settled |= predicted <= tolerance_factor**2 * _EPS * at.cost
+        settled |= predicted <= tolerance_factor**2 * EPS * at.cost
         settled &= longest <= tolerance_factor * _LAST_STEP
         settled &= predicted <= at.cost  # a larger fall is rounding
         short = settled
         if bounds is not None:  # coordinates with hardly any effect may take long steps
-            short = short & (np.abs(step) <= _NEAR * (bounds[1] - bounds[0])).all(axis=1)
+            short = short & (np.abs(step) <= _NEARLY_STILL * (bounds[1] - bounds[0])).all(axis=1)
         settled = settled | (enough is not None and predicted < enough(at.cost))
         settled &= damping < _GAUSS_NEWTON
         lost = ~np.isfinite(at.cost) | (damping > _MOST_DAMPING)
@@ -316,7 +315,7 @@ def _extrapolation(hessian: FloatArray, step: FloatArray, before: FloatArray) ->
     along, past = ((hessian @ delta[:, :, None])[:, :, 0] for delta in (step, before))
     product, squares = (step * past).sum(axis=1), (before * past).sum(axis=1)
     ratio = product / np.maximum(squares, 1e-300)
-    alike = product**2 > _ALIKE * squares * (step * along).sum(axis=1)
+    alike = product**2 > _GEOMETRIC * squares * (step * along).sum(axis=1)
     return np.where(alike & (ratio > 0.0), 1.0 / (1.0 - np.minimum(ratio, _SLOWEST)), 1.0)
 
 

@@ -21,8 +21,8 @@ _RESCALINGS = 100  # most searches until the noise's scale agrees; five are usua
 _SAME_SCALE = 1e-9  # change of ln scale at which it agrees
 _LONGEST_SECANT = 20.0  # longest step of the secant, in plain steps
 _AT_BOUND = 1e-8  # relative distance from a bound within which an estimate lies at it
-_NULL = 1e-13  # eigenvalue of the information, of unit diagonal, up to which it is rounding
-_PART = 1e-4  # component in such a direction above which a parameter is undetermined
+UNDETERMINED = 1e-13  # eigenvalue of the information, of unit diagonal, up to which it is rounding
+NOTICEABLE_PART = 1e-4  # component in such a direction above which a parameter is undetermined
 _NOTHING = 1e-100  # root of the information on a parameter that counts as zero
 _BARELY = 1.001  # scale over that of rounding, below which residuals are rounding errors
 
@@ -481,12 +481,12 @@ def inverse(information: FloatArray) -> tuple[FloatArray, BoolArray]:
     size = np.where(size > _NOTHING, size, 1.0)
     sizes = size[..., :, None] * size[..., None, :]
     values, vectors = np.linalg.eigh(information / sizes)
-    null = values <= _NULL * np.maximum(1.0, values[..., -1:])
+    null = values <= UNDETERMINED * np.maximum(1.0, values[..., -1:])
     inverted = np.where(null, 0.0, 1.0 / np.where(null, 1.0, values))
     covariance = (vectors * inverted[..., None, :]) @ vectors.swapaxes(-1, -2) / sizes
     if not null.any():
         return covariance, null
-    undetermined = np.any(np.abs(vectors) * null[..., None, :] > _PART, axis=-1)
+    undetermined = np.any(np.abs(vectors) * null[..., None, :] > NOTICEABLE_PART, axis=-1)
     return blanked(covariance, undetermined), undetermined
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dahl_ident.arrays import FloatArray, unit_diagonal
+from dahl_ident.arrays import NORMAL_MEDIAN, FloatArray, unit_diagonal
 from dahl_ident.errors import FitError, FitInterrupted, argument
 from dahl_ident.fitting.convergence import optima
 from dahl_ident.fitting.levenberg_marquardt import Minima, minimise, minimise_by_scipy
@@ -32,14 +32,13 @@ _CORRELATED = 5.0  # standard deviations of the statistic of white noise that re
 _IDLE = 0.5  # standard error of a logarithm above which a parameter has hardly an effect
 _ROUNDS = 8  # most rounds of searches elsewhere: a limit on time
 _WORTH = 3  # searches in each round
-_ALIKE = 1e-8  # eigenvalue over the largest, below which effects of parameters are equal
+_SAME_EFFECT = 1e-8  # eigenvalue over the largest, below which effects of parameters are equal
 _ADAPTED = 0.1, 10.0  # least and largest factor by which a value is adapted
 _PRIORS = 4  # most descents until the noise, and with it the weight of priors, is known
 _SAME_NOISE = 1.3  # factor within which the noise is known
 _SETTLING = 2000  # samples after which simulated noise is stationary
-_MEDIAN = 0.6745  # of the absolute value of a normal variable of unit variance
 _DESCRIBED = 0.1  # unexplained share of variance that shows a wrong model, not a noisy drive
-_REPEATS = 12  # most iterations of the weights
+_REWEIGHTINGS = 12  # most iterations of the weights
 _BANDS = 3  # dead bands tried: one, two and four times the noise that differences show
 _ALIGNED = 0.02  # part of the sum of squares that a delay has to explain to be removed
 _LONGEST_DELAY = 2.0  # samples: twice the assumed standard deviation
@@ -281,7 +280,7 @@ class RecordSearch:
         drives = [record.force_samples for record in problem.records]
         before = share_in_band(drives, problem.measured, residuals)
         white, end = problem, plain
-        for _ in range(_REPEATS):
+        for _ in range(_REWEIGHTINGS):
             white = white.with_whitening(prediction_error_filter(residuals))
             theta = end.theta
             end = self.minimise(white, theta, STEPS)
@@ -392,7 +391,7 @@ class RecordSearch:
             end = self.descend(problem, end.theta[0], STEPS)
             return end.theta[0], dof
 
-        typical = float(np.median(problem.squares(plain.theta[0]))) ** 0.5 / _MEDIAN
+        typical = float(np.median(problem.squares(plain.theta[0]))) ** 0.5 / NORMAL_MEDIAN
         agreed_scale(problem, self.rho, again, max(typical, float(problem.rounding)))
         return end
 
@@ -450,7 +449,7 @@ class RecordSearch:
         matrix, size = unit_diagonal(at.hessian)
         slope = at.gradient / size
         slope[index], matrix[index], matrix[:, index] = 0.0, 0.0, 0.0
-        step = -np.linalg.pinv(matrix, rcond=_ALIKE, hermitian=True) @ slope
+        step = -np.linalg.pinv(matrix, rcond=_SAME_EFFECT, hermitian=True) @ slope
         predicted = float(at.cost) + 0.5 * float(step @ slope)
         step /= size
         # forces are linear in most values, not in their logarithms

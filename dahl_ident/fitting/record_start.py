@@ -23,7 +23,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 
 _LENGTHS = np.geomspace(1e-3, 10.0, 13)  # of the largest displacement
 _SIGNED = np.geomspace(0.03, 30.0, 7)  # rates over the inverse of the largest displacement
-_LONGEST = 8192  # most samples of a record in the scan
+_MOST_SAMPLES = 8192  # most samples of a record in the scan
 _COMBINATIONS = 100  # most nodes of the grid: each takes nearly as long as a step of a search
 STARTS = 4
 """Number of starts that are tried first."""
@@ -31,7 +31,7 @@ MORE_STARTS = 24
 """Number if no motion from those is finite, such as with too stiff a contact."""
 _LOADS = (0.0, 0.9, -0.9)  # of all springs at a first sample: none, or nearly slipping
 _DECAY = 1e-3  # least amplitude in the spectrum of a free decay, over the largest
-_BAND = 1e-5  # least power of the drive in its band, over the largest
+_DRIVE_BAND = 1e-5  # least power of the drive in its band, over the largest
 
 
 def record_starts(problem: RecordProblem, count: int = STARTS) -> FloatArray:
@@ -124,7 +124,7 @@ class _Scan:
         else:
             x, v, a = in_band(record, problem.measured[number])
             force = record.force_samples
-        n = min(x.size, _LONGEST)
+        n = min(x.size, _MOST_SAMPLES)
         energy = np.concatenate([[0.0], np.cumsum((v - v.mean()) ** 2)])
         start = int(np.argmax(energy[n:] - energy[:-n])) if n < x.size else 0
         part = slice(start, start + n)
@@ -309,7 +309,7 @@ class _Scan:
         smooth = max(3, x.size // 256)
         kernel = np.ones(smooth) / smooth
         X, F = (np.sqrt(np.convolve(s**2, kernel, "same")) for s in (X, F))
-        return np.where(_BAND * np.max(F**2) < F**2, X / np.maximum(F, 1e-300), 0.0)
+        return np.where(_DRIVE_BAND * np.max(F**2) < F**2, X / np.maximum(F, 1e-300), 0.0)
 
 
 def started_at(problem: RecordProblem, values: list[float]) -> FloatArray:

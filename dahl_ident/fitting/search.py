@@ -46,16 +46,16 @@ from dahl_ident.problem import Problem, ProblemBatch, Quadratic, TableProblem
 # standard deviation of the logarithm of a friction parameter, above which other minima and limits
 # are searched as well: they may be as good
 DOUBTFUL = 0.3
-_STEPS = 80  # most steps of a search, of which ten are usual
+_MOST_STEPS = 80  # most steps of a search, of which ten are usual
 _BRIEF = 30  # the same where no limit is searched: a repetition is near its optimum
 # fall of the cost, over that of one residual, for which such a search takes no further step
-_SLIGHT = 1e-5
+_SLIGHT_FALL = 1e-5
 _PATIENCE = 1000  # most steps where friction is so faint that each step gains little
 _AT_LIMIT = 1e4  # factor on the tolerance at a limit, where large terms cancel
-_MANY = 30.0  # factor on the tolerance for many tables: 3e-7 standard deviations are near enough
+_MANY_TABLES = 30.0  # factor on the tolerance for them: 3e-7 standard deviations are enough
 _TIE = 1e-12  # relative difference of costs within which a limit wins over a finite optimum
 # relative difference of costs within which limits are alike; the one with fewest parameters counts
-_SAME = 1e-5
+_LIMITS_TIE = 1e-5
 _ROWS_AT_ONCE = 16384  # rows of data searched together: their arrays stay in the processor's cache
 _CURVES_AT_ONCE = 2**20  # the same times the nodes of the grid of starts: 16 MB of complex numbers
 
@@ -172,7 +172,7 @@ def solve_many(batch: ProblemBatch, *, start: ArrayLike | None = None) -> Optimu
     parts = []
     for first in range(0, S, at_once):
         part = batch.take(slice(first, first + at_once))
-        search = TableSearch(part, None, tolerance=_MANY)
+        search = TableSearch(part, None, tolerance=_MANY_TABLES)
         if begin is None:
             parts.append(search.run(global_starts(part)))
         else:
@@ -346,8 +346,8 @@ class TableSearch:
                 inside=None if limit else inside,
                 owner=table,
                 tolerance_factor=_AT_LIMIT if limit else self.tolerance,
-                enough=None if self.limits else lambda cost: _SLIGHT * cost / self.m,
-                steps=steps or (_STEPS if self.limits else _BRIEF),
+                enough=None if self.limits else lambda cost: _SLIGHT_FALL * cost / self.m,
+                steps=steps or (_MOST_STEPS if self.limits else _BRIEF),
                 accuracy=problem.accuracy,
                 bounds=(self.low, self.high) if self.bounded and chart is None else None,
             )
@@ -422,7 +422,7 @@ class TableSearch:
             return
         costs = np.array([np.where(m.converged, m.cost, np.inf) for _, m in candidates])
         sizes = np.array([limit.chart.matrix.shape[1] for limit, _ in candidates])[:, None]
-        alike = (costs <= costs.min(axis=0) * (1.0 + _SAME)) & np.isfinite(costs)
+        alike = (costs <= costs.min(axis=0) * (1.0 + _LIMITS_TIE)) & np.isfinite(costs)
         fewest = np.where(alike, sizes, np.inf).min(axis=0)
         chosen = np.where(alike & (sizes == fewest), costs, np.inf).argmin(axis=0)
         real = end.converged & np.isfinite(self._friction_error(end, scale))

@@ -32,7 +32,7 @@ _CHECKED_DRAWS = 25  # draws at which the number of steady amplitudes is counted
 _OF_DRAWS = ("amplitude", "force", "rows", "variance")  # fields with an axis of draws
 LEAST_CYCLES = 2  # measured at each level: a single cycle does not show its noise
 _LEAST_SETTLING = 1  # cycles before measuring
-_SLOW = 0.9  # quantile of the draws by which the motion must have settled
+_QUANTILE = 0.9  # quantile of the draws by which the motion must have settled
 _STEP = 1e-4  # relative step of frequency in differences: truncation error 1e-8, rounding 1e-12
 
 
@@ -240,7 +240,7 @@ class BenchTime:
             for element, numbers in model.of(values):
                 if element.has_memory:
                     force = force + A * np.abs(element.stiffness(numbers, A, omega + 0.0 * A))
-        return cls(f, np.quantile(decay, _SLOW, axis=0), np.median(force, axis=0), **costs)
+        return cls(f, np.quantile(decay, _QUANTILE, axis=0), np.median(force, axis=0), **costs)
 
     def order(self, levels: Sequence[int] | IntArray) -> IntArray:
         """Return the levels, (..., m), in order of rising friction force.

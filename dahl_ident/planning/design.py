@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from dahl_ident.arrays import BoolArray, FloatArray, IntArray
 from dahl_ident.planning.candidates import LEAST_CYCLES, BenchTime
 
-_POWER = 4.0  # of the norm over the targets: 1 adds their variances, infinity takes the largest
+_NORM = 4.0  # of the norm over the targets: 1 adds their variances, infinity takes the largest
 _IMPROVES = 1e-3  # smallest gain of the criterion for which a level is exchanged
 _TRIED = 3  # candidates whose times are optimised, after a first comparison of all
 _NO_TIME = 1e-9  # s, shared by levels without time, so that all quotients are defined
@@ -115,9 +115,9 @@ class Term:
         starts = np.arange(count) if self.starts is None else self.starts
         sums = np.add.reduceat(variances, starts, axis=-1)
         top = sums.max(axis=-1, keepdims=True)
-        powers = (sums / top) ** (_POWER - 1.0)
+        powers = (sums / top) ** (_NORM - 1.0)
         total = (powers * sums / top).sum(axis=-1)
-        value = -(np.log(top[..., 0]) + np.log(total) / _POWER).mean(axis=-1)
+        value = -(np.log(top[..., 0]) + np.log(total) / _NORM).mean(axis=-1)
         share = np.repeat(powers / (total[..., None] * top), np.diff([*starts, count]), axis=-1)
         return value, (inverse_c * share[..., None, :]) @ inverse_c.swapaxes(-1, -2)
 

@@ -28,8 +28,8 @@ from dahl_ident.units import Motion
 
 # Least relative standard deviation of a range in the search: the later fit does not have the range,
 # so levels must determine the parameters without it.
-_WIDEST = 100.0
-_MANY = 2000  # draws for the covariance of a posterior: each uncertainty is known to 3 %
+_LEAST_RANGE_STD = 100.0
+_POSTERIOR_DRAWS = 2000  # draws for the covariance of a posterior: each uncertainty is known to 3 %
 _NORMAL_RANGE = 2.0 * 1.959964  # width of a 95 % range in standard deviations
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -149,7 +149,7 @@ def gather(source: Any, ranges: Ranges | None, draws: int, seed: int) -> Knowled
     sampled = hasattr(source, "draws")
     if problem.response is None:
         return _of_records(
-            source, source.draws(_MANY, seed) if sampled else None, ranges, draws, rng
+            source, source.draws(_POSTERIOR_DRAWS, seed) if sampled else None, ranges, draws, rng
         )
     centre, std = _moments(problem.parameters, ranges)
     prior = _of_ranges(problem.parameters, centre, std)
@@ -353,8 +353,8 @@ def _among(
 
 
 def _of_ranges(parameters: Sequence[Parameter], centre: FloatArray, std: FloatArray) -> FloatArray:
-    """Return the information of ranges, none of them narrower than `_WIDEST`."""
-    least = _WIDEST * np.where(Space(parameters).positive, 1.0, np.abs(centre))
+    """Return the information of ranges, none of them narrower than `_LEAST_RANGE_STD`."""
+    least = _LEAST_RANGE_STD * np.where(Space(parameters).positive, 1.0, np.abs(centre))
     return np.asarray(1.0 / np.maximum(std, least) ** 2)
 
 

@@ -26,7 +26,7 @@ from dahl_ident.problem.record_problem import RecordProblem
 _PER_PERIOD = 400  # most samples at which derivatives are computed: integrals err by 1e-3
 _LEAST_SAMPLES = 16  # in a period, even if the sample rate is low
 _SIMULATED = 4  # repeats from rest, after which the friction force repeats as well
-_REPEATS = 8  # repeats for which the search computes the information
+_FEW_REPEATS = 8  # repeats for which the search computes the information
 _LEVELS, _SPEEDS, _BANDS = 24, 4, 4  # of the candidates of each kind of motion
 _SLOWER = 2.0  # factor from one speed or band to the next
 _LINES = 10  # highest over lowest frequency of a multisine
@@ -123,7 +123,7 @@ def evaluate_motions(
 ) -> Candidates:
     """Return the candidates that all limits allow, with the information of a repeat.
 
-    This is the mean over the repeats in a record of `lasting` s, by default over `_REPEATS`.
+    This is the mean over the repeats in a record of `lasting` s, by default over `_FEW_REPEATS`.
     """
     rate = recorded.sample_rate
     resolved = [motion for motion in motions if motion.fastest_hz * SAMPLES_PER_CYCLE <= rate]
@@ -147,7 +147,7 @@ def evaluate_motions(
     within = np.flatnonzero(allowed(limits, sizes, len(resolved)))
     period = np.array([motion.period for motion in resolved])[within]
     rows = [
-        sums[k].rows(_REPEATS if lasting is None else max(int(lasting / T), LEAST_CYCLES))
+        sums[k].rows(_FEW_REPEATS if lasting is None else max(int(lasting / T), LEAST_CYCLES))
         for k, T in zip(within.tolist(), period.tolist(), strict=True)
     ]
     S, level = len(knowledge.theta), peaks[within, 0]

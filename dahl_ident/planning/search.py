@@ -24,7 +24,7 @@ _WEIGHTS = (0.0, 0.1, 0.25, 0.5, 0.75)  # of suspected parameters; the least tha
 LONGEST = 30.0 * 86400.0  # s: a month, the longest plan if no time is given
 _TIMES = 20  # corrections at most of the time that reaches a target
 _HELPS = 0.1  # more time is useless below this fraction of the gain by the square root of time
-_CLOSE = 0.985  # fraction of the target at which the search stops
+_TARGET_MET = 0.985  # fraction of the target at which the search stops
 _AIMED = 0.995  # fraction of the target that a corrected time aims at
 _NARROWS = 0.6  # a correction that leaves more than this of the log interval is replaced by halving
 _APART = 2.0  # span of levels, in ranges that a fit takes as one amplitude: these are not exact
@@ -175,7 +175,7 @@ class Search:
                 start = latest.levels.tolist()
             if latest is not None and self.reached(latest):
                 best = latest if best is None or latest.seconds < best.seconds else best
-                if latest.ratio >= _CLOSE:
+                if latest.ratio >= _TARGET_MET:
                     break
             else:
                 short = max(short, time)
@@ -190,7 +190,7 @@ class Search:
                 factor = 4.0 if last is None else float(np.clip(last.ratio**2, 1.3, 1e3))
                 time = min(factor * time, most)
                 continue
-            if short >= _CLOSE * best.seconds:
+            if short >= _TARGET_MET * best.seconds:
                 break
             fixed = best.runs * float(self.bench.fixed(best.levels))
             time = fixed + (best.seconds - fixed) * (best.ratio / _AIMED) ** 2

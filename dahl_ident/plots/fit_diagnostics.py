@@ -425,7 +425,7 @@ def plot_control_charts(
     return tuple(axes)
 
 
-_WIDE = 3.0  # ratio, half a decade; logarithmic ticks of a narrower range are hard to read
+_WIDE_RANGE = 3.0  # ratio, half a decade; logarithmic ticks of a narrower range are hard to read
 _QUANTILES = (0.16, 0.5, 0.84)  # median, and one standard deviation to either side
 
 
@@ -548,7 +548,7 @@ def _logarithmic(values: FloatArray, log: Sequence[bool]) -> list[bool]:
     """Return which axes are logarithmic: the requested ones, if their range is wide."""
     low, high = np.quantile(values, [0.001, 0.999], axis=0)
     requested = list(log) or [False] * values.shape[1]
-    return [bool(r and b > _WIDE * a) for r, a, b in zip(requested, low, high, strict=True)]
+    return [bool(r and b > _WIDE_RANGE * a) for r, a, b in zip(requested, low, high, strict=True)]
 
 
 def _edges(values: Any, log: bool) -> Any:

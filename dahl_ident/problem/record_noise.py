@@ -12,18 +12,18 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import comb
 
-from dahl_ident.arrays import BoolArray, FloatArray
+from dahl_ident.arrays import NORMAL_MEDIAN, BoolArray, FloatArray
 from dahl_ident.data import Record
 
 HIGHEST_ORDER = (
     60  # most coefficients of an autoregression, to limit time; Akaike's criterion chooses
 )
 SAMPLES_PER_ORDER = 20  # samples for each coefficient: with fewer, it follows the noise
-_BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
+_POWER_BAND = 1e-4  # power over the drive's largest, below which a frequency is outside its band
 _FORGETS = 3.0  # samples times the cut, over half the rate, after which a high pass forgets
 _NEIGHBOURS = 16  # fewest frequencies whose mean power is compared: chance halves the least mean
-_PARTS = 64  # of the frequencies, whose mean powers are compared
-_OUTSIDE = 0.1  # share of frequencies outside the band from which noise is estimated
+_FREQUENCY_BANDS = 64  # of the frequencies, whose mean powers are compared
+_OUTSIDE_BAND = 0.1  # share of frequencies outside the band from which noise is estimated
 
 
 def prediction_error_filter(residuals: Sequence[FloatArray]) -> FloatArray:
@@ -91,7 +91,7 @@ def excited(drive: FloatArray) -> BoolArray:
     power = _power(drive)
     if not power.any():
         return np.ones(power.size, dtype=np.bool_)
-    return np.asarray(power >= _BAND * power.max())
+    return np.asarray(power >= _POWER_BAND * power.max())
 
 
 def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -144,12 +144,12 @@ def in_band(record: Record, y: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 
 def _median(power: FloatArray, outside: BoolArray) -> float | None:
     """Return the median power outside a band, that of noise; None if too little is outside."""
-    return float(np.median(power[outside])) if np.mean(outside) >= _OUTSIDE else None
+    return float(np.median(power[outside])) if np.mean(outside) >= _OUTSIDE_BAND else None
 
 
 def _least(power: FloatArray) -> float:
     """Return the least mean power of neighbouring frequencies: noise is not larger."""
-    width = max(_NEIGHBOURS, power.size // _PARTS)
+    width = max(_NEIGHBOURS, power.size // _FREQUENCY_BANDS)
     return float(np.convolve(power, np.full(width, 1.0 / width), "valid").min())
 
 
@@ -162,7 +162,6 @@ def _power(wave: FloatArray) -> FloatArray:
 _ORDER = 4  # order of differences: they contain little of any motion
 _BLOCKS = 50  # parts of a record, in some of which there is little motion
 _QUIET = 0.25  # quantile of the parts, by their noise, that counts as quiet
-_MEDIAN = 0.6745  # median of a normal variable's absolute value, in standard deviations
 _HALF_BAND = 4.0  # standard deviations of noise to either side that are no movement
 LEADS = (1.0, 2.0, 3.0)
 """Least, middle and largest lead of the true displacement over the band's middle."""
@@ -183,7 +182,7 @@ def noise_of(displacement: FloatArray) -> float:
     """
     steps = np.abs(np.diff(displacement, _ORDER)) / np.sqrt(comb(2 * _ORDER, _ORDER))
     blocks = np.array_split(steps, min(_BLOCKS, max(1, steps.size // 20)))
-    return float(np.quantile([np.median(block) for block in blocks], _QUIET)) / _MEDIAN
+    return float(np.quantile([np.median(block) for block in blocks], _QUIET)) / NORMAL_MEDIAN
 
 
 def travelled(displacement: FloatArray, noise: float, lead: float = LEADS[1]) -> FloatArray:

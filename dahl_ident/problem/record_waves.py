@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Output = Literal["force", "motion"]
 SHORTEST = 16  # fewest samples from which noise is estimated
-_SMALL = 0.1  # rate times the size of the motion up to which the rate is searched as a number
+_SLOWEST = 0.1  # rate times the size of the motion up to which the rate is searched as a number
 
 
 class RecordWaves(Problem):
@@ -409,5 +409,5 @@ def bends(free: Sequence[Parameter], count: int, records: Sequence[Record]) -> F
         if not p.positive and not np.isfinite([p.lower, p.upper]).any():
             force, by_length, by_time = p.dimension
             if not force and (by_length or by_time):
-                sizes[i] = _SMALL * length**by_length * time**by_time
+                sizes[i] = _SLOWEST * length**by_length * time**by_time
     return sizes

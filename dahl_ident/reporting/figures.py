@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _MARKED_BETA = (0.3, 1.0, 2.2, 5.0, 20.0)  # spread over the curve from stick to slip
 _LEVELS, _POINTS = 5, 160  # of the plant's response at several levels
-_APART = 1.2  # ratio of the largest frequency to the smallest above which there are several
+_SWEPT = 1.2  # ratio of the largest frequency to the smallest above which there are several
 _PROFILE_POINTS = 41
 _STRAIGHT = 1.5  # log of a profile's range beyond which its axis is logarithmic
 _WIDE = 20.0  # ratio of amplitudes above which loops are drawn over displacement / amplitude
@@ -160,7 +160,7 @@ def _is_plant_over_amplitude(fit: FitResult) -> bool:
     low, high = _ends(data.frequency_hz)
     return (
         len(fit.model.elements) > 1
-        and high > _APART * low
+        and high > _SWEPT * low
         and curves.is_force_controlled(data)
         and not curves.is_over_frequency(data)
     )

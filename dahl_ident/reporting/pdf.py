@@ -39,7 +39,7 @@ _HEADING_HEIGHT, _BEGINNING = 10.0, 28.0  # mm; of a heading, and of the text ke
 _LONGEST = 60  # most letters of a title at the foot of a page
 _WHOLE = 20.0  # mm; paragraphs up to this height are not divided between pages
 _SIGNATURE = 26.0  # mm, height of the fields for date and signature
-_WIDEST = 75.0  # mm, largest width of a column of a table
+_WIDEST_COLUMN = 75.0  # mm, largest width of a column of a table
 _PADDING = 3.5  # mm, on both sides of a column's text
 _NAME_WIDTH = 38.0  # mm, width of the fields' names in the header
 _COLOURS = {
@@ -328,8 +328,8 @@ def _widths(page: FPDF, table: TextTable) -> list[float]:
         words_of = {word for text in column for word in text.split()}
         longest = max((page.get_string_width(word) for word in words_of), default=0.0)
         whole = max(map(page.get_string_width, column), default=0.0)
-        least.append(min(max(widest, longest), _WIDEST) + _PADDING)
-        preferred.append(max(widest, longest, min(whole, _WIDEST)) + _PADDING)
+        least.append(min(max(widest, longest), _WIDEST_COLUMN) + _PADDING)
+        preferred.append(max(widest, longest, min(whole, _WIDEST_COLUMN)) + _PADDING)
     room, more = page.epw - sum(least), sum(preferred) - sum(least)
     if room >= more:
         return preferred

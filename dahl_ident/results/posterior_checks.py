@@ -37,7 +37,7 @@ from dahl_ident.diagnostics.confidence_levels import checked_levels
 from dahl_ident.diagnostics.judgement import Finding, Question, VerdictStatus
 
 _NEARLY_AS_WIDE = 0.5  # width over the prior's, from which the data add little
-_END = 0.01  # probability of the prior that counts as its end
+_PRIOR_END = 0.01  # probability of the prior that counts as its end
 _PRIOR_DRAWS = 1000  # draws of the prior for ArviZ: probabilities to 1.6 %
 _MISFIT = 0.01  # probability at which a check of a right model fails
 _MEANING = {
@@ -181,11 +181,11 @@ def _influence(prior: ParameterPrior, theta: FloatArray) -> PriorInfluence | Non
     low, high = np.quantile(theta, [0.16, 0.84])
     width = float(high - low) / prior.width
     probability = prior.probability(theta)
-    below, above = np.mean(probability < _END), np.mean(probability > 1.0 - _END)
-    at_lower, at_upper = bool(below >= _END), bool(above >= _END)
+    below, above = np.mean(probability < _PRIOR_END), np.mean(probability > 1.0 - _PRIOR_END)
+    at_lower, at_upper = bool(below >= _PRIOR_END), bool(above >= _PRIOR_END)
     if width < _NEARLY_AS_WIDE and not (at_lower or at_upper):
         return None
-    contradicted = bool(max(below, above) > 1.0 - _END)
+    contradicted = bool(max(below, above) > 1.0 - _PRIOR_END)
     return PriorInfluence(prior.parameter.name, width, at_lower, at_upper, contradicted)
 
 

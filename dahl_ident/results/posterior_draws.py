@@ -31,7 +31,7 @@ from dahl_ident.results.result import Estimate, Parameters, Result, part
 if TYPE_CHECKING:
     import pandas as pd
 
-_END = 1e-6  # probability beyond which there are too few draws for a quantile
+_TAIL_END = 1e-6  # probability beyond which there are too few draws for a quantile
 _QUANTILES = {"2.3%": 0.02275, "16%": 0.16, "median": 0.5, "84%": 0.84, "97.7%": 0.97725}
 _LEVELS = np.array(list(_QUANTILES.values()))
 
@@ -153,7 +153,7 @@ class PosteriorDraws(Result):
             In SI units.
         """
         axis = self._axis(name)
-        q = np.atleast_1d(array_between(probabilities, "probabilities", _END, 1.0 - _END))
+        q = np.atleast_1d(array_between(probabilities, "probabilities", _TAIL_END, 1.0 - _TAIL_END))
         theta = self.sample.draws.quantiles(axis, q)
         values = np.exp(theta) if self._density.logarithmic[axis] else theta
         return values.reshape(np.shape(probabilities))

@@ -85,7 +85,7 @@ _FREQUENCY, _TIME = 0, 1  # domains
 _RESPONSE, _COHERENCE = 4, 8  # types of data
 _LOGARITHMIC, _STORED = 1, (2, 3, 4)  # axes; 0 is linear
 _NUMBERS = {1: ">i2", 2: ">i4", 3: ">f4", 4: ">f8"}
-_POWER = 48  # stored exponent of a channel that enters a result as a factor
+_FACTOR = 48  # stored exponent of a channel that enters a result as a factor
 _UNITS = {"hz": "Hz", "g's": "g_n", "g": "g_n", "sec": "s", "eu": ""}  # units by label
 
 
@@ -357,9 +357,9 @@ class _Sdf:
             if channel.overloaded == 1:
                 self.file.warnings.append(f"channel {number + 1} was overloaded")
             sensitivity = channel.sensitivity
-            if not 0.0 < abs(sensitivity) < np.inf or abs(power) not in (_POWER, 2 * _POWER):
+            if not 0.0 < abs(sensitivity) < np.inf or abs(power) not in (_FACTOR, 2 * _FACTOR):
                 raise ValueError(f"channel {number + 1} has the sensitivity {sensitivity:g}")
-            factor *= sensitivity ** (-power / _POWER)
+            factor *= sensitivity ** (-power / _FACTOR)
             units[power < 0] = _unit(channel.unit) or "V"
         return factor, f"({units[0]})/({units[1]})" if all(units) else units[0] or None
 

@@ -26,7 +26,7 @@ from dahl_ident.data.storage import library, read_metadata
 from dahl_ident.data.tabular import listed
 from dahl_ident.errors import DataError
 
-_WIDEST = 64  # a matrix with more columns and more rows is a map or an image
+_MOST_SERIES = 64  # a matrix with more columns and more rows is a map or an image
 _SECONDS, _BYTES_PER_SECOND = 5, 10_000_000  # time limit for a MATLAB file: constant, and by size
 # The same for a check of an HDF5 file. Most take some milliseconds; one of many small objects takes
 # 0.2 ms for each 300 bytes.
@@ -62,7 +62,7 @@ def _channels(path: str, value: Any, unit: str | None) -> Iterator[RawChannel]:
     short = re.split(r"[./]", path)[-1]
     array = value if isinstance(value, Stored) else np.asarray(value)
     shape = tuple(n for n in array.shape if n != 1)
-    too_wide = len(shape) > 2 or (len(shape) == 2 and min(shape) > _WIDEST)
+    too_wide = len(shape) > 2 or (len(shape) == 2 and min(shape) > _MOST_SERIES)
     if array.dtype.kind not in "fiubcU" or 0 in array.shape or too_wide:
         return
     by_columns = len(shape) < 2 or shape[1] <= shape[0]

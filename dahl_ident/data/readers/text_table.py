@@ -56,7 +56,7 @@ _TRACE = re.compile(
 )
 _FOOTER = re.compile(r"\s*[\"']?[^\W\d_]{2}|\s*(?:\*\*|==|--)", re.UNICODE)
 _SUMMARIES = ("min", "max", "mean", "average", "avg", "std", "rms", "sum", "total", "median")
-_SMALL = 1 << 16  # most bytes of a table that is read without pandas
+_SMALL_TABLE = 1 << 16  # most bytes of a table that is read without pandas
 _LIKE_DATA = (
     "the line begins as a comment, yet its cells look like data, {!r}; expected a measured number "
     "in each. Delete the line, or put a number there"
@@ -425,7 +425,7 @@ def _places(body: bytes) -> list[int]:
 
 def _small(body: bytes, layout: _Layout, texts: set[str]) -> list[NDArray[Any]] | None:
     """Return the columns of a small table of plain numbers and words, None for any other."""
-    if len(body) > _SMALL or layout.mark != "." or b'"' in body or not body.isascii():
+    if len(body) > _SMALL_TABLE or layout.mark != "." or b'"' in body or not body.isascii():
         return None
     rows = [line.decode().split(layout.delimiter) for line in _LINE_END.split(body) if line.strip()]
     if any(len(row) != layout.width for row in rows):

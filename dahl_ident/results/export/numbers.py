@@ -14,7 +14,7 @@ from dahl_ident.diagnostics.budget import ParameterBudget
 from dahl_ident.diagnostics.formatting import pair, symbol, tabular, unit
 from dahl_ident.errors import FitError
 
-_WIDE = 0.2  # relative uncertainty above which the logarithm of a positive parameter is drawn
+_UNCERTAIN = 0.2  # relative uncertainty above which the logarithm of a positive parameter is drawn
 
 
 def uncertain(result: Any) -> tuple[dict[str, ParameterBudget], FloatArray]:
@@ -130,7 +130,7 @@ def _normal(result: Any, size: int, seed: int) -> dict[str, FloatArray]:
     budget, covariance = uncertain(result)
     values, u = (np.array([getattr(p, name) for p in budget.values()]) for name in ("value", "u"))
     positive = np.array([result.params[name].min == 0.0 for name in budget])
-    wide = positive & (u > _WIDE * np.abs(values))
+    wide = positive & (u > _UNCERTAIN * np.abs(values))
     scale = np.where(wide, 1.0 / np.where(wide, values, 1.0), 1.0)
     errors = np.random.default_rng(seed).multivariate_normal(
         np.zeros(values.size), covariance * np.outer(scale, scale), size, method="eigh"
