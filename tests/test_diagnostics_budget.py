@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from dahl_ident import BoucWen, Dahl, Damper, FrequencyResponse, Sensors, Spring, fit, load_dataset
+from dahl_ident import (
+    BoucWen,
+    Dahl,
+    Damper,
+    FrequencyResponse,
+    Mass,
+    Sensors,
+    Spring,
+    fit,
+    load_dataset,
+    response,
+)
 from dahl_ident.diagnostics import budget, error_model
 from dahl_ident.diagnostics.error_sources import repeated_levels
 from dahl_ident.diagnostics.mixed_model import MixedModel
@@ -466,6 +477,29 @@ class TestEstimate:
         u = np.sqrt(np.diagonal(whole.covariance))
         assert (np.max(np.abs(moved), axis=0) < 3.0 * u).all()
         assert (u > 0.5 * jackknife).all()
+
+    @pytest.mark.parametrize("seed", [1, 9, 17])
+    def test_a_level_that_alone_shows_the_force_limit_is_one_where_the_model_is_right(self, seed):
+        """In two of these tables chi-square is larger than its degrees of freedom, by chance."""
+        drive, f = np.repeat(np.geomspace(0.02, 1.0, 5), 15), np.tile(np.geomspace(0.3, 3.0, 15), 5)
+
+        def receptance(f_max, sigma, alpha, m, c, k):
+            plant = Dahl(f_max, sigma, alpha) + Mass(m) + Damper(c) + Spring(k)
+            return response(plant, f, drive).receptance
+
+        truth = np.array([0.1, 30.0, 1.0, 0.3, 0.24, 0.3])
+        R, noise = receptance(*truth), np.random.default_rng(seed).standard_normal((2, 75))
+        data = FrequencyResponse(
+            f, R * (1.0 + 0.01 * (noise[0] + 1j * noise[1])), drive=drive, level=drive,
+            controlled="force", quantity="receptance",
+            covariance=(0.01 * np.abs(R))[:, None, None] ** 2 * np.eye(2),
+        )  # fmt: skip
+        found = fit(data, Dahl() + Mass() + Damper() + Spring())
+        changes = [receptance(*(truth * step)) / R - 1.0 for step in 1.0 + 1e-4 * np.eye(6)]
+        J = np.array(changes) / 1e-4 / 0.01
+        u = truth * np.sqrt(np.diagonal(np.linalg.inv((J @ J.conj().T).real)))
+        for name, least in zip(("f_max", "sigma", "alpha", "mass", "damping"), u, strict=False):
+            assert found.params[name].stderr == pytest.approx(least, rel=0.25)
 
     @pytest.mark.parametrize("seed", [0, 1])
     def test_no_source_explains_the_noise_of_a_dense_sweep(self, seed):

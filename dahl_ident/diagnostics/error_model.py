@@ -16,7 +16,8 @@ each. Variances follow from restricted maximum likelihood
 the covariance of the estimate is the sum of G V_k G' over the sources: the rows of an uncertainty
 budget (JCGM 100:2008). Sources widen the estimate and never move it. From five tests on no
 parameter's uncertainty is below that of leaving out each test in turn (the jackknife), and what it
-adds is one more row.
+adds is one more row. The changes by each test are weighted with its leverage, unless chi-square
+shows that the weights are wrong.
 
 Source: Searle, Casella and McCulloch, *Variance Components*, 1992; Huber, *Robust Statistics*,
 1981, section 7.6 (the sandwich); Rasmussen and Williams, *Gaussian Processes*, 2006, section 2.7.
@@ -75,6 +76,7 @@ from dahl_ident.problem import TableProblem
 
 _FEWEST_TESTS = 5  # of which each is left out in turn
 _MOST_REFITS = 20  # tests; if there are more, none changes the weights much by being left out
+_FALSE_ALARM = 0.01  # share of sound tables whose stated noise is doubted
 _TESTS_THAT_LIMIT = 8  # fewer may agree by chance although the model errs
 _SHARED_BY = 4.0  # tests at most that a smooth model error moves alike, of its length
 _UPPER = 0.5 * (1.0 + CONFIDENCE)
@@ -379,7 +381,7 @@ def _with_sources(optimum: Optimum, problem: TableProblem, *, determined: bool) 
         every[EXPONENT] = every[EXPONENT] + np.outer(estimate.second, estimate.second)
     if by_tests is not None and len(tests) >= _FEWEST_TESTS:
         by_chance = 1.0 - 1.0 / np.sqrt(2.0 * (len(tests) - 1))  # the jackknife's own error
-        if estimate.problem.has_misfit and len(tests) <= _MOST_REFITS:
+        if estimate.chance < _FALSE_ALARM and len(tests) <= _MOST_REFITS:
             by_tests = jackknife_with_weights(estimate, optimum, tests)
         C, least = np.asarray(sum(every.values())), by_chance**2 * np.diagonal(by_tests)
         u2 = np.diagonal(C)

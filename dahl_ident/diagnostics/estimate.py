@@ -182,6 +182,15 @@ class WeightedEstimate:
         return float(lost - 2.0 * np.linalg.slogdet(stated)[1].sum())
 
     @cached_property
+    def chance(self) -> float:
+        """Probability that the stated noise alone makes chi-square as large; 1 without misfit."""
+        if not self.problem.has_misfit:
+            return 1.0
+        r = self.problem.widened(np.zeros(self.problem.data.n)).residuals(self.theta)
+        dof = self.problem.n_nonzero + self.problem.n_priors - len(self.problem.names)
+        return float(special.chdtrc(max(dof, 1), r @ r))
+
+    @cached_property
     def y(self) -> FloatArray:
         """Residuals in the least-squares sense, (M,): with a robust loss, its scores."""
         return scores_of(self.residuals, self.problem.n_residuals, self.loss)
@@ -307,7 +316,9 @@ def jackknife_with_weights(
 ) -> FloatArray:
     """Return the covariance of theta, (Q, Q), by estimating it and the weights without each test.
 
-    The model is linearised at the estimate, and refitted where a test moves it far.
+    The model is linearised at the estimate, and refitted where a test moves it far. The changes
+    are not weighted with the leverage, as the weights may be wrong: a test that alone determines a
+    parameter makes it as uncertain as the other tests leave it.
     """
     theta, loss = estimate.theta, estimate.loss
     problem = estimate.problem.widened(np.zeros(estimate.problem.data.n))
